@@ -1,12 +1,12 @@
-# hilsplat: photographs to 3D scenes that answer text queries at three levels, and the paper's tables.
+# hilsplat: 3D scenes with text queries at three levels, from photographs, and the paper's tables.
 #
-#   snakemake --cores 2                                             everything that the configuration names
+#   snakemake --cores 2                                             everything in the configuration
 #   snakemake --cores 2 results/synthetic/table-1/gaussians.ply     one file and what it needs
 #   snakemake --cores 2 tables                                      the tables
 #   snakemake --report results/report.html                          the report of a finished run
 #
-# `hilsplat run` starts it with checks and all cores (docs/workflow.md). rules/common.smk reads config/config.yaml, also
-# for a `module:`, whose `config:` takes the place of any configfile here.
+# `hilsplat run` starts Snakemake with checks and all cores (docs/workflow.md). rules/common.smk reads
+# config/config.yaml, also in a `module:`, whose `config:` replaces any configfile here.
 
 
 report: "workflow/report/overview.rst"
@@ -28,7 +28,7 @@ wildcard_constraints:
 include: "rules/world.smk"
 
 
-if (INSTALLED / "models/training").is_dir():  # of a checkout
+if (INSTALLED / "models/training").is_dir():  # only in a checkout
 
     include: "rules/models.smk"
 

@@ -1,8 +1,8 @@
-# Shared by all rules: the plan of the run (hilsplat/workflow/plan.py), resources, and the environment of the jobs.
+# Shared by all rules: the plan of the run (hilsplat/workflow/plan.py), resources, and the jobs' environment.
 #
-# Priorities lead to a scene's first answer: the job nearest to the CLIP vectors of a semantic tree goes first;
-# fields, scores and pictures come after all of them. Gaussians come before masks because they can be viewed. After
-# the vectors, the longest chain goes first: a trained code, a baseline's field, our fields, scores.
+# Priorities minimise the time to a scene's first answer: jobs closest to the CLIP vectors of a semantic tree
+# run first, and fields, scores and pictures run after all of them. Gaussians precede masks because users can
+# view them. After the vectors, the longest chain runs first: trained code, baseline field, our fields, scores.
 import gc
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from hilsplat.workflow.progress import estimates
 from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.run import mark_run, prepare_process, unmark_run
 
-# The plan of many scenes makes millions of lasting objects: collecting garbage less often saves a tenth of its time.
+# A plan of many scenes creates millions of permanent objects; rarer garbage collection saves 10 % of its time.
 gc.set_threshold(200_000, 50, 100)
 
 LOCK = prepare_process()
@@ -46,7 +46,7 @@ def cache_folder(wildcards, input):
 try:
     PLAN = Plan(merged_config([], config))
     PLAN.require_usable(devices=own_cores() is not None)
-except HilsplatError as error:  # an error that a user can fix needs no traceback
+except HilsplatError as error:  # users can fix these errors without a traceback
     raise WorkflowError(str(error)) from None
 for name, reason in PLAN.absent.items():
     logger.warning(f"{name} is skipped: {reason}")

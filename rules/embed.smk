@@ -4,7 +4,7 @@ rule clip:
         scene="<results>/{dataset}/{scene}/scene",
         masks=PLAN.shared("masks", "masks"),
         semantic_tree=PLAN.crops_tree,  # empty if every mask is embedded
-        features=PLAN.data.features,  # empty, except for vectors of LangSplat
+        features=PLAN.data.features,  # empty, except for LangSplat's vectors
     output:
         clip=directory("<results>/{dataset}/{scene}/{variant}/clip"),
     log:
@@ -30,13 +30,13 @@ rule clip:
         " --threads {threads} --memory {resources.mem_mib} --cache {params.cache:q} --out {output.clip:q}"
 
 
-# What a vocabulary calls the nodes, and how well words are answered by chance.
+# Vocabulary names of the nodes, and vectors of words for absent things, to estimate chance.
 rule names:
     input:
         scene="<results>/{dataset}/{scene}/scene",
         semantic_tree=PLAN.shared("semantic_tree", "semantic_tree"),
         clip=PLAN.shared("clip", "clip"),
-        vocabulary=PLAN.vocabulary,  # empty, except for a file of your own
+        vocabulary=PLAN.vocabulary,  # empty, except for your own file
     output:
         names=directory("<results>/{dataset}/{scene}/{variant}/names"),
     log:

@@ -79,7 +79,7 @@ rule tables:
         targets.tables(PLAN),
 
 
-# What the jobs of finished runs took, from their benchmark files.
+# Times and memory of the jobs of finished runs, from their benchmark files.
 rule efficiency:
     input:
         targets.default(PLAN),

@@ -1,4 +1,4 @@
-# Baselines: another method writes the field of a variant (variants with method.name, hilsplat/methods).
+# Baselines: another method computes the field of a variant (variants with method.name, hilsplat/methods).
 rule method:
     input:
         scene="<results>/{dataset}/{scene}/scene",

@@ -1,4 +1,4 @@
-# The small models of the synthetic world. A default run does not train them: trained ones are committed.
+# The small models of the synthetic world. A default run does not train them, because the repository has them.
 rule train_models:
     output:
         directory("<results>/models/sam-tiny"),
@@ -7,7 +7,7 @@ rule train_models:
         "<results>/models/train.log",
     conda:
         ENVIRONMENT
-    threads: 64  # Snakemake lowers it to the cores
+    threads: 64  # Snakemake lowers this to the number of cores
     resources:
         mem_mb=RESOURCES.memory_mb("train_models"),
         runtime=RESOURCES.minutes("train_models"),

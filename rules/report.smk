@@ -98,7 +98,7 @@ rule comparison:
         semantic_tree=PLAN.compared("semantic_tree", "semantic_tree"),
         field=PLAN.compared("field", "field.safetensors"),
         autoencoder=PLAN.compared("autoencoder", "autoencoder"),
-        scores=PLAN.compared_scores,  # their provenance holds the settings of the answers
+        scores=PLAN.compared_scores,  # their provenance records the settings of the queries
     output:
         methods=report(
             "<results>/figures/{dataset}/{scene}/comparison.png",

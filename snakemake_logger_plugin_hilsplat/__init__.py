@@ -1,7 +1,7 @@
-"""Snakemake logger plugin: the progress of a run in place of Snakemake's block of lines per job.
+"""Snakemake logger plugin that shows the progress of a run instead of Snakemake's block of lines per job.
 
-`profiles/default` switches it on. With --verbose, --quiet, --dry-run or another --logger, Snakemake's own
-output remains. After a dry run comes a table of what the run would take.
+`profiles/default` enables it. With --verbose, --quiet, --dry-run or another --logger, Snakemake's own output
+is unchanged. After a dry run, a table estimates the run's time and memory.
 """
 
 import logging
@@ -14,7 +14,7 @@ from hilsplat.workflow.progress import ProgressDisplay, RunProgress, estimates
 
 
 class LogHandler(LogHandlerBase):
-    """Shows log records of Snakemake; Snakemake's own filter and formatter apply."""
+    """Handler of Snakemake's log records; Snakemake's own filter and formatter apply."""
 
     writes_to_stream = True
     writes_to_file = False
@@ -43,7 +43,7 @@ class LogHandler(LogHandlerBase):
             self.handleError(record)
 
     def _count(self, record: logging.LogRecord) -> None:
-        """Add a job to the estimate of a dry run; the Snakefile has set the plan by then."""
+        """Add a job to the estimate of a dry run; the Snakefile has already set the plan."""
         if self.estimate is None and estimates.resources is not None:
             self.estimate = RunEstimate(estimates.resources)
         if self.estimate is not None:
@@ -52,7 +52,7 @@ class LogHandler(LogHandlerBase):
             self.estimate.add(facts["rule_name"], dict(facts["wildcards"]), memory)
 
     def close(self) -> None:
-        """Remove the line of progress, or print the table of a dry run."""
+        """Remove the progress line, or print the table of a dry run."""
         if self.estimate is not None:
             for line in self.estimate.lines():
                 print(line, file=self.stream, flush=True)

@@ -1,7 +1,7 @@
-"""The annotation page's server: `hilsplat annotate`.
+"""HTTP server of the annotation page: `hilsplat annotate`.
 
-It shares socket, guard and photographs with `hilsplat view`. All geometry is computed here, with the filling
-that evaluation uses; the page only shows it.
+It shares socket, guard and photographs with `hilsplat view`. All geometry is computed here, with the polygon
+filling that evaluation uses; the page only displays it.
 """
 
 import asyncio
@@ -48,18 +48,18 @@ from hilsplat.viewer.server import (
 from hilsplat.viewer.witness import StaleSceneError
 
 MAX_BODY_BYTES = 16 << 20
-"""A COCO file of a whole scene fits."""
+"""Maximum size of a request, enough for a COCO file of a whole scene."""
 Made = TypeVar("Made")
 
 
 class Annotator:
-    """Answers the annotation page's requests about one scene.
+    """Request handlers of the annotation page for one scene.
 
     Args:
-        folder: of the scene, such as results/photos/desk.
-        labels: folder of its label files; made when the first is written.
-        variant: whose masks and tree are proposed.
-        threads: number of threads for drawing.
+        folder: the scene's folder, such as results/photos/desk.
+        labels: folder of its label files; created when the first one is written.
+        variant: variant whose masks and tree are proposed.
+        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.
@@ -71,10 +71,10 @@ class Annotator:
         shared = {name: data for name, data in static_files().items() if name in SHARED}
         self.pages = Pages("annotate.html", {**shared, **static_files("hilsplat.annotate")})
         self.files = ThreadPoolExecutor(1, thread_name_prefix="files")
-        self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # saving does not wait for it
+        self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so saving does not wait for it
 
     def app(self, token: str) -> Guard:
-        """The application, guarded."""
+        """Return the guarded application."""
         routes = [
             *self.pages.routes(),
             Route("/api/scene", self.described),
@@ -93,15 +93,15 @@ class Annotator:
         return guarded(routes, token, {StaleLabelsError: 412, StaleSceneError: 409}, MAX_BODY_BYTES)
 
     async def _do(self, work: Callable[..., Made], *arguments: Any) -> Made:
-        """Run on the one thread that touches files."""
+        """Run on the only thread that accesses files."""
         return await asyncio.get_running_loop().run_in_executor(self.files, work, *arguments)
 
     async def _propose(self, work: Callable[..., Made], *arguments: Any) -> Made:
-        """Run on the one thread that draws views."""
+        """Run on the only thread that renders views."""
         return await asyncio.get_running_loop().run_in_executor(self.drawing, work, *arguments)
 
     def _of(self, request: Request) -> OpenedScene:
-        """The scene, for a page that was loaded with it; who names no state asks for what is here.
+        """Return the scene if the page was loaded with its current state, or sent no state.
 
         Raises:
             StaleSceneError: the page was loaded with another state.
@@ -113,7 +113,7 @@ class Annotator:
     # -- the scene --------------------------------------------------------------------------------
 
     async def described(self, request: Request) -> Response:
-        """Photographs, and what can be proposed; for a page that begins, so what changed is opened again."""
+        """Send the photographs and available proposals to a new page, after reopening a changed scene."""
 
         def describe() -> dict[str, Any]:
             if self.opened.changed():
@@ -135,16 +135,16 @@ class Annotator:
         return answer_json(await self._do(describe))
 
     async def changes(self, request: Request) -> Response:
-        """Whether a page still shows what lies on the disk."""
+        """Send which parts of the scene changed on disk since they were opened."""
         opened = self.opened
         return answer_json({"of": opened.state, "changed": await self._do(opened.changed)})
 
     async def photo(self, request: Request) -> Response:
-        """An undistorted photograph."""
+        """Send an undistorted photograph."""
         return await self._photograph(request, photograph)
 
     async def thumb(self, request: Request) -> Response:
-        """A small photograph."""
+        """Send a thumbnail of a photograph."""
         return await self._photograph(request, thumbnail)
 
     async def _photograph(self, request: Request, send: Callable[[Scene, int], Response]) -> Response:
@@ -159,7 +159,7 @@ class Annotator:
     # -- annotations ------------------------------------------------------------------------------
 
     def known(self, scene: Scene) -> dict[str, list[Label]]:
-        """Annotations of all views that have any."""
+        """Return the annotations of all views that have any."""
         found = {}
         for view in scene.cameras.names:
             labels = read_labels(label_path(self.labels, view), scene.cameras[view].size_hw)
@@ -168,7 +168,7 @@ class Annotator:
         return found
 
     async def all_labels(self, request: Request) -> Response:
-        """Annotations of every view with their versions, in the order of the views."""
+        """Send the annotations of every view with their versions, in view order."""
         scene = self._of(request).scene
 
         def read_all() -> list[dict[str, Any]]:
@@ -192,14 +192,14 @@ class Annotator:
             view = view_name(opened.scene, request.path_params["number"])
             size_hw = opened.scene.cameras[view].size_hw
             labels = cut_to_parents(asked.labels, size_hw)
-            with opened.same_photographs():  # or they would be drawn on others
+            with opened.same_photographs():  # otherwise labels could be saved for other photographs
                 saved = write_labels(label_path(self.labels, view), view, size_hw, labels, version)
             return {"version": saved, "labels": [label.model_dump() for label in labels]}
 
         return answer_json(await self._do(write))
 
     async def shape(self, request: Request) -> Response:
-        """Polygons of a region: what was drawn, and a brush stroke, inside the parent."""
+        """Send the polygons of a region: drawn polygons and a brush stroke, cut to the parent."""
         asked, scene = await read(request, wire.Shape), self._of(request).scene
         polygons, area_px = await self._do(shaped, asked, scene.cameras[view_name(scene, asked.view)].size_hw)
         return answer_json({"polygons": polygons, "area_px": area_px})
@@ -207,7 +207,7 @@ class Annotator:
     # -- proposals --------------------------------------------------------------------------------
 
     async def at(self, request: Request) -> Response:
-        """Outlines that nodes or masks have around a pixel."""
+        """Send the outlines of the nodes or masks that contain a pixel."""
         asked, opened = await read(request, wire.At), self._of(request)
 
         def find() -> list[dict[str, Any]]:
@@ -218,7 +218,7 @@ class Annotator:
         return answer_json(await self._propose(find))
 
     async def segment(self, request: Request) -> Response:
-        """Outlines that the scene's SAM finds around clicks or in a box."""
+        """Send the outlines that the scene's SAM finds around clicks or in a box."""
         asked, opened = await read(request, wire.Segment), self._of(request)
 
         def find() -> list[dict[str, Any]]:
@@ -229,7 +229,7 @@ class Annotator:
         return answer_json(await self._propose(find))
 
     async def carry(self, request: Request) -> Response:
-        """Things of other views carried into a view, as proposals; nothing is written."""
+        """Send things of other views, transferred to a view, as proposals; nothing is written."""
         asked, opened = await read(request, wire.Carry), self._of(request)
 
         def carried() -> list[dict[str, Any]]:
@@ -246,7 +246,7 @@ class Annotator:
     # -- other programs ---------------------------------------------------------------------------
 
     async def take_in(self, request: Request) -> Response:
-        """Annotations with those of files among them, by the number of the view; nothing is written."""
+        """Send the annotations merged with those of files, by view number; nothing is written."""
         asked, scene = await read(request, wire.Given), self._of(request).scene
         cameras = scene.cameras
 
@@ -264,7 +264,7 @@ class Annotator:
         return answer_json(await self._do(merge))
 
     async def export(self, request: Request) -> Response:
-        """All annotations as files of a program."""
+        """Send all annotations in the format of another program."""
         kind, scene = request.path_params["kind"], self._of(request).scene
         if kind not in KINDS:
             raise SettingsError(f"{kind!r} cannot be written", expected=", ".join(KINDS))
@@ -274,7 +274,7 @@ class Annotator:
 
 KINDS: tuple[Kind, ...] = ("hilsplat", "isat", "labelme", "coco")
 SHARED = ("style.css", "elements.js", "http.js", "styles.js")
-"""Files of `hilsplat view` that this page uses too."""
+"""Files of `hilsplat view` that this page also uses."""
 
 
 def run_annotate(
@@ -292,11 +292,11 @@ def run_annotate(
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
         labels: folder of the label files.
-        variant: whose masks and tree are proposed.
-        port: 0: any that is free.
+        variant: variant whose masks and tree are proposed.
+        port: TCP port; 0 for any free port.
         browser: whether to open the page in a browser.
-        threads: number of threads for drawing.
-        told: gets the address, once the page can be opened.
+        threads: number of threads for rendering.
+        told: called with the address once the page can be opened.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.

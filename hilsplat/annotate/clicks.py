@@ -1,4 +1,4 @@
-"""Outlines around clicks or a box, by the SAM that made the masks of a scene."""
+"""Outlines around clicks or a box, by the SAM model that made a scene's masks."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.sam import HEADS, Encoded, SamModel, enlarged
 
 KEPT_VIEWS = 3
-"""Photographs whose features are kept: 4 MB each for SAM ViT-B, up to 40 for SAM 2."""
+"""Number of photographs whose features are cached: 4 MB each for SAM ViT-B, up to 40 MB for SAM 2."""
 BOX_GRID = 4
-"""Points along a side of a box that SAM is asked at: its exports take no boxes, or not all of them do."""
+"""Prompt points along each side of a box, because not all SAM exports accept boxes."""
 OFFERED = 3
 SAME_IOU = 0.9
-"""Masks that overlap by more are one."""
+"""Masks with at least this IoU count as the same mask."""
 
 
 class Clicks:
-    """The SAM of a scene, opened at the first click. Not made for threads.
+    """The SAM model of a scene, opened at the first click. Not thread-safe.
 
     Args:
         scene: photographs.
@@ -41,7 +41,7 @@ class Clicks:
 
     @property
     def name(self) -> str:
-        """The model's; empty: the scene's masks were made without one."""
+        """Name of the model; empty if the scene's masks were made without SAM."""
         return Path(self.folder).name
 
     @cached_property
@@ -54,7 +54,7 @@ class Clicks:
         return SamModel.load(Path(self.folder))
 
     def encoded(self, view: str) -> Encoded:
-        """Features of a photograph, computed once."""
+        """Return the features of a photograph, cached for the last `KEPT_VIEWS` photographs."""
         if view not in self._encoded:
             self._encoded[view] = self.model.encode(self.scene.image(view))
             while len(self._encoded) > KEPT_VIEWS:
@@ -65,13 +65,13 @@ class Clicks:
     def outlines(
         self, view: str, clicks: Sequence[tuple[int, int, bool]], box: tuple[int, int, int, int] | None
     ) -> list[Proposal]:
-        """Outlines of what clicks or a box show, the best first.
+        """Return the outlines of the thing at clicks or in a box, best first.
 
-        Masks are ranked by the clicks that they satisfy, then by SAM's own estimate of their IoU, times
-        the IoU of their box with the given one.
+        Masks are ranked by the number of clicks that they satisfy, then by SAM's predicted IoU, times the
+        IoU of their box with the given box.
 
         Args:
-            view: of the photograph.
+            view: name of the photograph's view.
             clicks: x, y, and whether the pixel is inside the thing.
             box: left, top, right, bottom, inclusive; only without clicks.
 
@@ -88,14 +88,14 @@ class Clicks:
         asked = points[inside] if clicks else _grid(corners)
         iou, logits = self.model.decode(encoded, asked)
         iou, logits = iou.reshape(-1), logits.reshape(-1, *logits.shape[2:])
-        if len(clicks) > 1:  # all of them as one prompt
+        if len(clicks) > 1:  # all clicks as one prompt
             more_iou, more = self.model.decode_clicks(encoded, points, inside)
             iou, logits = np.concatenate([more_iou, iou]), np.concatenate([more, logits])
         masks = enlarged(logits, encoded.frame)
         columns, rows = points.astype(np.int64).T if clicks else (np.zeros(0, np.int64),) * 2
         right = (masks[:, rows, columns] == inside).sum(axis=1)
         fits = iou * [_box_iou(mask, corners) for mask in masks] if box else iou
-        kept: dict[int, Level] = {}  # of masks that are one, the coarsest level
+        kept: dict[int, Level] = {}  # the coarsest level among masks that count as the same
         for row in np.lexsort((-fits, -right)).tolist():
             level = HEADS[row % len(HEADS)]
             same = [other for other in kept if _iou(masks[row], masks[other]) >= SAME_IOU]
@@ -111,7 +111,7 @@ class Clicks:
 
 
 def _grid(box: np.ndarray) -> np.ndarray:
-    """Points inside a box, (BOX_GRID**2, 2)."""
+    """Return points inside a box, (BOX_GRID**2, 2)."""
     steps = (np.arange(BOX_GRID) + 0.5) / BOX_GRID
     x, y = np.meshgrid(box[0] + steps * (box[2] + 1 - box[0]), box[1] + steps * (box[3] + 1 - box[1]))
     return np.stack([x.ravel(), y.ravel()], axis=1)

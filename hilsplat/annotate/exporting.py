@@ -1,6 +1,6 @@
 """Annotations for other programs: ISAT (the labels of LERF-OVS), labelme, COCO.
 
-Only our own format has levels and parents; the others carry them in keys of ours, which their programs ignore
+Only our own format has levels and parents; in the others they are extra keys, which their programs ignore
 or keep.
 """
 
@@ -27,7 +27,7 @@ OURS = ("level", "parent", "origin")
 
 
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
-    """All annotations as a ZIP of a file per view, or, for COCO, as one JSON file."""
+    """Return all annotations as a ZIP with one file per view, or, for COCO, as one JSON file."""
     if kind == "coco":
         return _json(_coco(known, cameras)).encode()
     write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
@@ -44,7 +44,7 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
     Args:
         scene: the posed scene.
         folder: `results/<dataset>/<scene>`.
-        data_root: holds `annotated/<dataset>/<scene>`.
+        data_root: folder that contains `annotated/<dataset>/<scene>`.
         out: folder to write.
 
     Returns:
@@ -71,12 +71,12 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
 def write_lerf_labels(out: Path, known: Mapping[str, Sequence[Label]], scene: Scene) -> None:
     """Write the annotations of a scene as LERF-OVS's labels: `<view>.json` and the view's image.
 
-    An object per polygon, as LangSplat's evaluation needs; levels and parents are in keys that it ignores.
+    Each polygon is an object, as LangSplat's evaluation requires; it ignores the keys for levels and parents.
 
     Args:
         out: folder to write, such as `label/teatime`; replaced.
         known: annotations by view.
-        scene: gives sizes and images.
+        scene: the scene, for sizes and images.
     """
     with atomic_folder(out) as folder:
         for view, labels in known.items():
@@ -108,7 +108,7 @@ def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[s
 
 
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
-    """ISAT has one polygon per object; pieces of a thing share their group."""
+    """Format labels as ISAT, which has one polygon per object; pieces of a thing share their group."""
     size = {"width": size_hw[1], "height": size_hw[0]}
     info: dict[str, object] = {
         "description": "ISAT",
@@ -160,7 +160,7 @@ def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> st
 
 
 def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
-    """Regions as run lengths, because COCO fills polygons otherwise than we do."""
+    """Format labels as COCO, with run lengths, because COCO fills polygons differently than we do."""
     texts = sorted({label.text for labels in known.values() for label in labels})
     content: dict[str, Any] = {
         "info": {"description": "annotations by hilsplat"},

@@ -1,6 +1,6 @@
 """Annotations from other programs: ISAT (the labels of LERF-OVS), labelme, COCO, and our own format.
 
-Without our keys for level and parent a thing comes in as a whole.
+Things without our keys for level and parent are imported as wholes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +19,13 @@ from hilsplat.scene.cameras import Cameras
 
 
 def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
-    """Annotations of a file of any of the four formats, by view.
+    """Read the annotations in a file of any of the four formats, by view.
 
     Ids count from 1 unless the file has its own.
 
     Args:
-        name: of the file; it finds the photograph where the content names none.
-        text: content.
+        name: name of the file, which identifies the photograph if the content does not.
+        text: content of the file.
         cameras: views of the scene.
 
     Raises:
@@ -34,7 +34,7 @@ def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
     try:
         return _imported(name, parse_json(text), cameras)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
-        # the file may hold anything anywhere: a list for an id, a number that is infinite
+        # Any value may have an unexpected type or be invalid: a list for an id, an infinite number.
         raise SceneError(f"{name} cannot be read: {error}", expected="a whole JSON file") from error
 
 
@@ -64,7 +64,7 @@ def _imported(name: str, content: Any, cameras: Cameras) -> dict[str, list[Label
                 )
                 for thing in labels.objects
                 for polygon in thing.polygons
-            ]  # groups of LERF's own files repeat and identify nothing
+            ]  # without our keys, groups are ignored: in LERF's files they repeat and identify nothing
             found[view] = _joined(name, pieces)
     else:
         raise SceneError(
@@ -76,11 +76,11 @@ def _imported(name: str, content: Any, cameras: Cameras) -> dict[str, list[Label
 
 
 Piece = tuple[str, Any, np.ndarray, Mapping[str, Any]]
-"""Text, what identifies its thing or None, vertices, and the keys of the file."""
+"""Text, identifier of its thing or None, vertices, and the keys in the file."""
 
 
 def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
-    """One label per thing; pieces without an identity are things of their own."""
+    """Join pieces into one label per thing; pieces without an identifier are separate things."""
     things: dict[Any, list[Piece]] = {}
     for row, piece in enumerate(pieces):
         things.setdefault((piece[0], piece[1]) if piece[1] is not None else row, []).append(piece)
@@ -145,7 +145,7 @@ def _from_coco(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
 
 
 def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.ndarray]:
-    """Flat lists x1, y1, x2, ..., or run lengths, plain or compressed."""
+    """Read polygons from flat lists x1, y1, x2, ..., or from run lengths, plain or compressed."""
     if isinstance(value, list):
         return [np.array(flat, np.float64).reshape(-1, 2) for flat in value]
     counts = value["counts"]
@@ -160,15 +160,15 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
 
 
 def _from_counts(runs: Sequence[int], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Inverse of `viewer.exports.coco_counts`."""
+    """Return the mask of run lengths: the inverse of `viewer.exports.coco_counts`."""
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T)
 
 
 def unpacked_counts(text: str) -> list[int]:
-    """COCO's compressed run lengths.
+    """Decode COCO's compressed run lengths.
 
-    Five bits a character, low bits first; from the fourth run on, differences from the last but one.
+    Each character has five bits, low bits first; the fourth and later runs are relative to the last but one.
     """
     runs: list[int] = []
     value = shift = 0
@@ -186,7 +186,7 @@ def unpacked_counts(text: str) -> list[int]:
 
 
 def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> str:
-    """View of a file, by the name of its photograph without folder and suffix.
+    """Return the view of a file, by the name of its photograph without folder and suffix.
 
     Raises:
         SceneError: the scene has no such view, or the file was made for another size.

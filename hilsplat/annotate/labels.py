@@ -1,7 +1,7 @@
-"""Annotations of one view: what a thing is called, its level and parent, and which pixels it has.
+"""Annotations of one view: text, level, parent and pixels of each thing.
 
-A file per view in the format of `datasets.images.hi`; the same thing has the same id in all views. Polygons
-have whole pixels as vertices, so that what is drawn is what evaluation fills.
+Each view has a file in the format of `datasets.images.hi`; a thing has the same id in all views. Polygon
+vertices are whole pixels, so that evaluation fills exactly the drawn region.
 """
 
 import json
@@ -45,10 +45,10 @@ class Label(Message):
         id: the same in all views that show the thing.
         level: 1 whole, 2 part, 3 subpart.
         parent: id of a thing one level up in the same view; None if it has none.
-        text: what one would ask for.
+        text: text of a query for the thing.
         polygons: vertices in whole pixels; the region is the union of the filled polygons.
         origin: drawn by hand; proposed by a node, a mask or another view; accepted as proposed; or a proposal
-            that was edited by hand. What is only proposed is not scored.
+            that was edited by hand. Labels that are only proposed are not scored.
     """
 
     id: Annotated[int, Field(ge=1, le=1_000_000)]
@@ -60,10 +60,10 @@ class Label(Message):
 
     @staticmethod
     def read(where: str, **values: object) -> "Label":
-        """A label of a file.
+        """Create a label from values in a file.
 
         Raises:
-            SceneError: a value cannot be used; `where` names the file.
+            SceneError: a value is invalid; `where` names the file.
         """
         try:
             return Label.model_validate(values)
@@ -75,27 +75,27 @@ class Label(Message):
             ) from error
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """The region."""
+        """Return the region."""
         return fill_rings(self.polygons, size_hw)
 
     def with_mask(self, mask: Bool[np.ndarray, "H W"]) -> "Label":
-        """The same thing with other pixels."""
+        """Return the same thing with other pixels."""
         return self.model_copy(update={"polygons": traced(mask)})
 
 
 class StaleLabelsError(ArtifactError):
-    """The annotations of a view were changed by someone else since they were read."""
+    """The annotations of a view changed since they were read."""
 
 
 def fill_rings(
     rings: Sequence[Sequence[tuple[int, int]]], size_hw: tuple[int, int]
 ) -> Bool[np.ndarray, "H W"]:
-    """Union of polygons."""
+    """Return the union of filled polygons."""
     return fill_polygons([np.array(ring, np.float64).reshape(-1, 2) for ring in rings], size_hw)
 
 
 def traced(mask: Bool[np.ndarray, "H W"]) -> list[list[tuple[int, int]]]:
-    """Polygons of exactly these pixels."""
+    """Return polygons that contain exactly the pixels of a mask."""
     return [[(int(x), int(y)) for x, y in polygon] for polygon in trace_polygons(mask)]
 
 
@@ -103,7 +103,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     """Cut every child to its parent, wholes first, so that a subpart also stays inside the whole.
 
     Raises:
-        SettingsError: an id is there twice, a parent is missing or not one level up, or nothing of a thing is
+        SettingsError: an id is used twice, a parent is missing or not one level up, or no pixel of a thing is
             inside the image and its parent.
     """
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
@@ -145,20 +145,20 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
 
 
 def label_path(folder: Path, view: str) -> Path:
-    """File of a view's annotations."""
+    """Return the path of a view's annotations."""
     return Path(folder) / f"{Path(view).stem}.json"
 
 
 def version_of(path: Path) -> str:
-    """What a change must name: digest of the file as it was read."""
+    """Return the digest of the file, which a change must specify."""
     return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
 
 
 def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
-    """Annotations of a view; none if there is no file.
+    """Read the annotations of a view; empty if there is no file.
 
     Raises:
-        SceneError: the file cannot be used, or was drawn on a photograph of another size.
+        SceneError: the file is invalid, or was drawn on a photograph of another size.
     """
     if not path.is_file():
         return []
@@ -174,10 +174,10 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
 
 
 def labels_of(found: IsatFile) -> list[Label]:
-    """Objects of a file in our format.
+    """Return the objects of a file in our format as labels.
 
     Raises:
-        SceneError: an id or a level cannot be used.
+        SceneError: an id or a level is invalid.
     """
     objects = by_id(found)
     parents = parents_of(found, objects, [])
@@ -196,7 +196,7 @@ def labels_of(found: IsatFile) -> list[Label]:
 
 
 def whole_pixels(points: np.ndarray) -> list[tuple[int, int]]:
-    """Vertices as the filling truncates them."""
+    """Truncate vertices to whole pixels, as the polygon filling does."""
     return [(int(x), int(y)) for x, y in points]
 
 
@@ -211,7 +211,7 @@ def write_labels(
         the new version.
 
     Raises:
-        StaleLabelsError: someone else changed them.
+        StaleLabelsError: the file changed since `version` was read.
     """
     with output_lock(path):
         if version_of(path) != version:
@@ -226,7 +226,7 @@ def write_labels(
 
 
 def as_file(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
-    """A view's annotations in our format, one object a line: short files, readable differences."""
+    """Format a view's annotations in our format, one object per line for short files and readable diffs."""
     info = {"name": view, "width": size_hw[1], "height": size_hw[0]}
     lines = [_compact(_as_object(label)) for label in sorted(labels, key=lambda label: label.id)]
     return f'{{"info":{_compact(info)},\n"objects":[\n' + ",\n".join(lines) + "\n]}\n"

@@ -1,4 +1,4 @@
-"""Imported annotations beside those that are there: which thing each one is, and which are there already."""
+"""Merging of imported annotations with existing ones: match each to a thing, and find known ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ from jaxtyping import Bool
 from hilsplat.annotate.labels import Label
 
 SAME_THING = 0.5
-"""A label of a photograph is the same thing as one with its text and level there from this IoU on."""
+"""Labels of a photograph with the same text and level are the same thing if their IoU is at least this."""
 
 
 @dataclass(frozen=True)
 class Merged:
-    """What an import changes.
+    """The result of an import.
 
     Attributes:
         views: all labels of each photograph that changes.
-        added: number of labels that are new, or have another region than before.
-        known: number of labels that were there already.
+        added: number of labels that are new or have a changed region.
+        known: number of labels that already existed.
     """
 
     views: dict[str, list[Label]]
@@ -34,10 +34,10 @@ def merged(
 ) -> Merged:
     """Add the labels of files to those of a scene.
 
-    Ids of a file count only together with text and level: programs without ids number the shapes of every
-    photograph from 1. A label is the thing of the scene that it overlaps, else the one with its id, else one
-    with its text that the photograph does not show yet, else a new one; it must have the thing's text and
-    level.
+    A file's ids are used only together with text and level, because programs without ids number the shapes
+    of every photograph from 1. Among the scene's things with the same text and level, a label is matched to
+    the one that it overlaps, else to the one with its id, else to one that the photograph does not show yet;
+    otherwise it is a new thing.
 
     Args:
         known: labels by view.
@@ -78,7 +78,7 @@ def _kind(label: Label) -> tuple[str, int]:
 def _row_of(
     label: Label, mask: Bool[np.ndarray, "H W"], here: Sequence[Label], size_hw: tuple[int, int]
 ) -> int | None:
-    """Row of the label of a photograph that is the same thing; None if there is none."""
+    """Return the row of a photograph's label that is the same thing; None if there is none."""
     for row, other in enumerate(here):
         if _kind(other) == _kind(label):
             region = other.mask(size_hw)
@@ -88,7 +88,7 @@ def _row_of(
 
 
 def _number(label: Label, here: Sequence[Label], things: Mapping[int, tuple[str, int]]) -> int:
-    """Id of a label that overlaps no label of its kind in the photograph."""
+    """Return the id for a label that overlaps no label of its kind in the photograph."""
     taken = {other.id for other in here}
     alike = [number for number, kind in things.items() if kind == _kind(label) and number not in taken]
     if label.id in alike or label.id not in things:

@@ -1,4 +1,4 @@
-"""What the annotation page was opened with: photographs, and what can be proposed in them."""
+"""The parts of a scene that the annotation page opened: photographs and sources of proposals."""
 
 import secrets
 from collections.abc import Iterator
@@ -13,12 +13,12 @@ from hilsplat.viewer.witness import Witness
 
 
 class OpenedScene:
-    """A scene as far as its run had come when it was opened.
+    """The parts of a scene that existed when it was opened.
 
     Args:
-        folder: of the scene, such as results/photos/desk.
-        variant: whose masks and tree are proposed.
-        threads: number of threads for drawing.
+        folder: the scene's folder, such as results/photos/desk.
+        variant: variant whose masks and tree are proposed.
+        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.
@@ -40,25 +40,25 @@ class OpenedScene:
         self.clicks = Clicks(self.scene, folder / variant / "masks")
 
     def changed(self) -> list[str]:
-        """Parts that were written anew, or exist by now, or no longer."""
+        """Return the parts that were rewritten, created or deleted since the scene was opened."""
         return sorted(path.name for path in self._witness.changed())
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Around proposals: they come from parts that belong together.
+        """Guard proposals: fail if any part changed since the scene was opened.
 
         Raises:
-            StaleSceneError: a part was written anew before or meanwhile.
+            StaleSceneError: a part was rewritten before or during the read.
         """
         with self._witness.unchanged(self.scene.name):
             yield
 
     @contextmanager
     def same_photographs(self) -> Iterator[None]:
-        """Around photographs and what is drawn on them, which another tree does not concern.
+        """Guard photographs and drawing: fail if the photographs changed; other parts may change.
 
         Raises:
-            StaleSceneError: the photographs were written anew before or meanwhile.
+            StaleSceneError: the photographs were rewritten before or during the read.
         """
         with self._witness.unchanged(self.scene.name, self.photographs):
             yield

@@ -1,7 +1,7 @@
-"""Outlines that a person may accept or correct: nodes, masks of the segmenter, and what other views say.
+"""Outlines that the user can accept or correct: nodes, masks of the segmenter, and things of other views.
 
-None of them is an annotation until a person says so: a truth that is the prediction in disguise measures
-nothing.
+A proposal becomes an annotation only when the user accepts it: ground truth copied from a prediction would
+measure nothing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,25 +27,25 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
 LEAST_PX = 20
-"""Smaller proposals are noise."""
+"""Minimum area of a proposal; smaller ones are noise."""
 LEAST_SHARE = 0.05
-"""Pieces and holes of a proposal below this share of it are noise too."""
+"""Minimum area of a proposal's pieces and holes, as a share of the proposal; smaller ones are noise."""
 SMOOTH_PX = 1.0
-"""A proposal's outline may leave its pixels by this much: fewer vertices to correct."""
+"""Maximum deviation of a proposal's outline from its pixels, so that there are fewer vertices to correct."""
 MOST_MASKS = 6
 LEAST_SEEN = 0.25
-"""Share of a pixel that an annotated view must have seen for the pixel to be judged by it."""
+"""Share of a pixel that must be Gaussians seen by annotated views for the pixel to join a thing."""
 VIEWS_MIB = 512.0
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """An outline and where it comes from.
+    """An outline and its source.
 
     Attributes:
-        what: such as "node 12" or "mask 3".
-        text: the node's name, if somebody gave it one.
-        level: of the node or mask.
+        what: source, such as "node 12" or "mask 3".
+        text: the node's name, if the user gave it one.
+        level: level of the node or mask.
         polygons: as in `Label`.
     """
 
@@ -56,13 +56,13 @@ class Proposal:
 
 
 class Proposals:
-    """What can be proposed in the views of a scene, as far as its run has come. Not made for threads.
+    """Proposals in the views of a scene, from the parts that its run has made. Not thread-safe.
 
     Args:
         scene: cameras and photographs.
-        folder: of the scene; Gaussians and a variant's masks and tree are looked for in it.
-        variant: whose masks and tree.
-        threads: number of threads for drawing.
+        folder: the scene's folder, which may contain Gaussians and a variant's masks and tree.
+        variant: variant whose masks and tree are used.
+        threads: number of threads for rendering.
     """
 
     def __init__(self, scene: Scene, folder: Path, variant: str, threads: int) -> None:
@@ -78,11 +78,11 @@ class Proposals:
 
     @property
     def of(self) -> str:
-        """What is proposed at a pixel: nodes, masks or nothing."""
+        """Source of the proposals at a pixel: "nodes", "masks", or "" if there is none."""
         return "nodes" if self.tree is not None else "masks" if (self.masks / "index.json").is_file() else ""
 
     def at(self, view: str, x: int, y: int) -> list[Proposal]:
-        """Outlines of what a pixel shows, large ones first.
+        """Return the outlines of the nodes or masks that contain a pixel, large ones first.
 
         Raises:
             SettingsError: the pixel is outside the photograph.
@@ -111,7 +111,7 @@ class Proposals:
         return _proposals(found)
 
     def _masks_at(self, view: str, x: int, y: int) -> list[Proposal]:
-        path = self.masks / f"{view}.npz"  # views that were held out have none
+        path = self.masks / f"{view}.npz"  # test views have none
         if not path.is_file():
             return []
         masks = HierarchicalMasks.load(path)
@@ -126,19 +126,19 @@ class Proposals:
     def carried(
         self, known: Mapping[str, Sequence[Label]], ids: Sequence[int], view: str
     ) -> list[tuple[Label, list[list[tuple[int, int]]]]]:
-        """Things that other views have, carried into a view by their Gaussians, parents before children.
+        """Transfer things of other views to a view by their Gaussians, parents before children.
 
-        A Gaussian belongs to a thing if more than half of what the annotated views see of it lies inside the
-        thing's regions there. Gaussians that none of those views sees say nothing. Children are cut to their
-        parents here.
+        A Gaussian belongs to a thing if more than half of its weight in the thing's annotated views is inside
+        the thing's regions. Gaussians that none of those views sees are ignored. Children are cut to their
+        parents in this view.
 
         Args:
-            known: annotations by view; proposals that nobody accepted are no evidence.
-            ids: things to carry; those that the view has already are left as they are.
-            view: where to.
+            known: annotations by view; unaccepted proposals are ignored.
+            ids: things to transfer; those that the view already has are not changed.
+            view: the target view.
 
         Returns:
-            a label of each thing in another view, and its polygons here.
+            a label of each thing in another view, and its polygons in this view.
 
         Raises:
             SettingsError: the scene has no Gaussians yet.
@@ -179,7 +179,7 @@ class Proposals:
         return found
 
     def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
-        """Which Gaussians belong to a thing, and which any of its views sees, as 0 and 1."""
+        """Return which Gaussians belong to a thing, and which any of its views sees, as 0 and 1."""
         assert self.gaussians is not None
         inside = np.zeros(len(self.gaussians), np.float64)
         total = np.zeros(len(self.gaussians), np.float64)
@@ -191,7 +191,7 @@ class Proposals:
         return (inside > 0.5 * total).astype(np.float32), seen.astype(np.float32)
 
     def _seen(self, view: str) -> np.ndarray:
-        """How much of each Gaussian a view shows, px."""
+        """Return the visible mass of each Gaussian in a view, px."""
         weights = self._weights(view)
         return self._kept.get(
             ("seen", view), lambda: np.asarray(weights.sum(axis=0)).ravel(), lambda sums: sums.nbytes
@@ -211,7 +211,7 @@ class Proposals:
 
 
 def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:
-    """Proposals with some pixels; of equal ones only the first."""
+    """Return distinct proposals that are not empty after cleaning."""
     kept: list[Proposal] = []
     for what, text, level, mask in found:
         if (mask := cleaned(mask)).any():
@@ -222,14 +222,14 @@ def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Prop
 
 
 def cleaned(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """A mask without specks and pinholes, and with a smoother outline; empty if nothing of size is left."""
+    """Remove specks and pinholes from a mask and smooth its outline; empty if only small pieces remain."""
     least = max(LEAST_PX, LEAST_SHARE * np.count_nonzero(mask))
     contours, ranks = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     canvas = np.zeros(mask.shape, np.uint8)
     if not contours:
         return canvas.astype(bool)
     by_area = sorted(zip(contours, ranks[0], strict=True), key=lambda pair: -cv2.contourArea(pair[0]))
-    for contour, rank in by_area:  # from outside to inside: a hole erases what is around a smaller piece
+    for contour, rank in by_area:  # from outside to inside, so that a hole keeps smaller pieces inside it
         if cv2.contourArea(contour) >= least:
             cv2.fillPoly(canvas, [cv2.approxPolyDP(contour, SMOOTH_PX, True)], int(rank[3] < 0))
     return canvas.astype(bool)

@@ -1,4 +1,4 @@
-"""Regions as hands draw them: polygons and brush strokes."""
+"""Regions drawn by hand: polygons and brush strokes."""
 
 import cv2
 import numpy as np
@@ -9,9 +9,9 @@ from hilsplat.annotate.wire import Shape
 
 
 def shaped(asked: Shape, size_hw: tuple[int, int]) -> tuple[list[list[tuple[int, int]]], int]:
-    """Polygons and area (px) of a region: polygons, plus or minus a stroke, inside another region.
+    """Return polygons and area (px) of a region: polygons, plus or minus a stroke, inside another region.
 
-    Polygons that already are the region are returned as they are: few corners are easier to move than many.
+    A single polygon that equals the region is returned unchanged, because few corners are easier to edit.
     """
     drawn = fill_rings(asked.add, size_hw)
     mask = _mask(asked, drawn)

@@ -1,4 +1,4 @@
-"""What the annotation page sends: strokes, shapes, pixels, labels."""
+"""Request models of the annotation page: strokes, shapes, pixels, labels."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from hilsplat.viewer.wire import Message
 
 
 class Stroke(Message):
-    """A brush stroke: discs of a radius along points, px."""
+    """A brush stroke: discs of one radius along points, px."""
 
     points: Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_000)]
     radius: Annotated[float, Field(ge=0.5, le=500)]
@@ -17,7 +17,7 @@ class Stroke(Message):
 
 
 class Shape(Message):
-    """A region to be made from polygons and a stroke, inside its parent."""
+    """A region composed of polygons and a stroke, inside its parent."""
 
     view: int
     add: Rings
@@ -34,7 +34,7 @@ class At(Message):
 
 
 class Segment(Message):
-    """Clicks of one thing in a photograph (x, y, inside), or a box around it (left, top, right, bottom)."""
+    """Clicks on one thing in a photograph (x, y, inside), or a box around it (left, top, right, bottom)."""
 
     view: int
     clicks: Annotated[tuple[tuple[int, int, bool], ...], Field(max_length=64)] = ()
@@ -42,7 +42,7 @@ class Segment(Message):
 
 
 class Carry(Message):
-    """Things, and the view to carry them into."""
+    """Ids of things, and the view to transfer them to."""
 
     ids: Annotated[list[int], Field(min_length=1, max_length=2000)]
     view: int

@@ -1,4 +1,4 @@
-"""The command and its groups; the other modules of this package fill them."""
+"""The command and its groups; the other modules of this package add the subcommands."""
 
 import typer
 

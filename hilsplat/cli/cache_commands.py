@@ -1,4 +1,4 @@
-"""The caches: finished views, checkpoints of fits, training data of the embedded models, model digests."""
+"""Commands for the caches: views, fit checkpoints, training data of embedded models, model digests."""
 
 from pathlib import Path
 from typing import Annotated
@@ -41,7 +41,7 @@ def cache_prune(
         ),
     ] = None,
 ) -> None:
-    """Delete unfinished files of killed jobs and, with a limit, cache entries, which are computed again."""
+    """Delete unfinished files of killed jobs and, with a limit, cache entries, which can be recomputed."""
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)

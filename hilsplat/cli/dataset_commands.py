@@ -1,4 +1,4 @@
-"""Published data sets: list, check, export."""
+"""Commands for published data sets: list, check, export, fits."""
 
 from pathlib import Path
 from typing import Annotated
@@ -33,7 +33,7 @@ def datasets_check(
     data_root: DataRoot,
     scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
-    """Read all labels of a data set and report, scene by scene, what was found and what is wrong."""
+    """Read all labels of a data set and report what was found and what is wrong, scene by scene."""
     start_logging()
     from hilsplat.datasets.overview import check
     from hilsplat.datasets.registry import dataset_of

@@ -1,4 +1,4 @@
-"""CLIP vectors of masks."""
+"""Commands for CLIP vectors of masks and names of nodes."""
 
 from pathlib import Path
 from typing import Annotated
@@ -31,7 +31,7 @@ def names(
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
 ) -> None:
-    """Name the nodes of a semantic tree by a vocabulary."""
+    """Name the nodes of a semantic tree from a vocabulary."""
     sections = {"query": section_of("query", settings), "evaluate": section_of("evaluate", evaluate)}
     inputs = {"semantic_tree": semantic_tree, "clip": clip}
     if (own := sections["query"].vocabulary) != AUTO:

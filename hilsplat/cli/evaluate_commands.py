@@ -1,4 +1,4 @@
-"""Scores, tables and figures."""
+"""Commands for scores, tables and figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -111,7 +111,7 @@ def evaluate_files(
         ),
     ] = None,
 ) -> None:
-    """Score masks or point labels that any program wrote, under the same protocols."""
+    """Score masks or point labels written by any program, under the same protocols."""
     inputs = {"predictions": predictions, **_truth_inputs(truth, [labels] if labels else [], data_root)}
     inputs |= {"scene": scene} if scene else {}
     with stage("evaluate_files", out, inputs=inputs, plugins=_readers([labels] if labels else [])):
@@ -141,7 +141,7 @@ def _readers(labels: Sequence[str]) -> tuple[str, ...]:
 def _truth_inputs(
     truth: Path | None, labels: Sequence[str], data_root: Path
 ) -> dict[str, Path | Sequence[Path]]:
-    """Return the annotations and label files that a stage scores against."""
+    """Return the annotations and label files against which a stage scores."""
     from hilsplat.datasets.sources import label_files
 
     found: dict[str, Path | Sequence[Path]] = {"truth": truth} if truth else {}
@@ -149,7 +149,7 @@ def _truth_inputs(
 
 
 def _parts(*paths: Path) -> "SceneParts":
-    """The parts of a scene, in the order of `SceneParts`."""
+    """Return the parts of a scene, given in the order of `SceneParts`."""
     from hilsplat.scene.finished import SceneParts
 
     return SceneParts(*paths)

@@ -1,4 +1,4 @@
-"""Write a scene for other programs."""
+"""Command that exports a scene for other programs."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -13,7 +13,7 @@ from hilsplat.cli.user_commands import SceneName, scene_folder
 
 
 class Form(StrEnum):
-    """What a scene is exported as."""
+    """Export formats of a scene."""
 
     TREE = "tree"
     PLY = "ply"
@@ -56,7 +56,7 @@ def export(
 
 
 def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, threads: int) -> str:
-    """Write an export, and return what was written, for people."""
+    """Write an export, and return a human-readable summary."""
     from hilsplat.scene.scene import Scene
 
     if form is Form.TREE:

@@ -1,4 +1,4 @@
-"""Contributions, semantic tree, language field, baselines."""
+"""Commands for contributions, semantic tree, language field and baselines."""
 
 from pathlib import Path
 from typing import Annotated
@@ -50,7 +50,7 @@ def semantic_tree(
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Make nodes at three levels: the masks of all views linked, or Gaussians clustered by features."""
+    """Compute nodes at three levels, by linking masks of all views or clustering Gaussians by features."""
     section = section_of("semantic_tree", settings)
     inputs = {"contributions": contributions, "masks": masks}
     if (section.evidence == "features") != (coverage_tree is not None):
@@ -82,7 +82,7 @@ def autoencoder(
     settings: Settings = "{}",
     seed: Seed = 0,
 ) -> None:
-    """Make the scene's code of CLIP vectors (PCA or autoencoder) and encode the masks."""
+    """Compute the scene's code of CLIP vectors (PCA or autoencoder) and encode the masks."""
     section = section_of("autoencoder", settings)
     inputs = {"clip": clip, "semantic_tree": semantic_tree, "contributions": contributions}
     with stage("autoencoder", out, settings=section, seed=seed, inputs=inputs):
@@ -130,7 +130,7 @@ def method(
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Compute the language field by a baseline (name in the settings)."""
+    """Compute the language field with a baseline, named in the settings."""
     section = section_of("method", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}

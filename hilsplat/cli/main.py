@@ -1,7 +1,7 @@
-"""The `hilsplat` command: one subcommand per stage, plus those that people use on scenes and models.
+"""The `hilsplat` command: one subcommand per stage, and user commands for scenes and models.
 
-A command here is thin: it reads its settings, takes the lock of its output, calls one function of the
-package and writes the provenance. Heavy libraries are imported by the functions, not by these files.
+Commands are thin: each reads its settings, locks its output, calls one function of the package and writes the
+provenance. Heavy libraries are imported by the functions, not by these files.
 """
 
 import gc
@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-# The order in which linear algebra libraries sum depends on the number of threads. Stages use several
-# cores through numba or our own pools, whose results do not.
+# The summation order of linear algebra libraries depends on the number of threads. Stages use several cores
+# through numba or our own pools, whose results do not depend on it.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
@@ -32,7 +32,7 @@ from hilsplat.cli import world_commands, model_commands, dataset_commands, cache
 
 
 def main() -> None:
-    """Run the command; an error that a user can fix ends in a message, without a traceback."""
+    """Run the command; an error that the user can fix prints a message without a traceback."""
     end_with_workflow()
     try:
         require_working_directory()
@@ -44,7 +44,7 @@ def main() -> None:
             raise
         logging.getLogger("hilsplat").error("%s", message)
         sys.exit(1)
-    finally:  # else Python's end searches all that numba and matplotlib made for garbage, for 0.4 s
+    finally:  # otherwise the garbage collection at exit takes 0.4 s, for objects of numba and matplotlib
         gc.freeze()
 
 
@@ -66,7 +66,7 @@ def options(
             raise system_error(error) or error from None
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
-            os.dup2(file, stream.fileno())  # for libraries that print by themselves, too
+            os.dup2(file, stream.fileno())  # also redirects libraries that print to the file descriptor
     if version:
         from hilsplat.base.provenance import library_versions
 

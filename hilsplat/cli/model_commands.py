@@ -1,4 +1,4 @@
-"""Model folders: get, list, check, split, train."""
+"""Commands for model folders: get, list, check, split."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +35,7 @@ def models_get(
 ) -> None:
     """Fetch released models from the model hub and check them.
 
-    A transfer that was cut goes on where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
+    An interrupted download resumes where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
     usual proxy variables are respected.
     """
     start_logging()
@@ -46,7 +46,7 @@ def models_get(
 
 @models_app.command("list")
 def models_list() -> None:
-    """List released models and those that are here, with size, licence and use."""
+    """List released and installed models, with size, licence and use."""
     start_logging()
     from hilsplat.hub.overview import models_table
 
@@ -58,7 +58,7 @@ def models_check(
     folder: Annotated[Path | None, typer.Argument(help="model folder; default: all that are here")] = None,
     variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
 ) -> None:
-    """Describe a model folder, or all that are here, and time one image."""
+    """Describe a model folder, or all installed ones, and time one image."""
     start_logging()
     from hilsplat.embed.model_check import check_model
     from hilsplat.hub.overview import check_models

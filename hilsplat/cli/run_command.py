@@ -1,4 +1,4 @@
-"""The command that runs the workflow."""
+"""Commands that start a project and run the workflow."""
 
 import sys
 from pathlib import Path
@@ -14,7 +14,7 @@ from hilsplat.cli.stage import start_logging
 def init(
     folder: Annotated[Path, typer.Argument(help="folder of the project")] = Path(),
 ) -> None:
-    """Write config/config.yaml and config/scenes.tsv, commented, to edit: they replace the installed ones."""
+    """Write commented config/config.yaml and config/scenes.tsv to edit; they replace the installed ones."""
     start_logging()
     from hilsplat.workflow.run import start_project
 
@@ -37,9 +37,9 @@ def run_command(
         typer.Option(help="configuration file that overrides config/config.yaml; may be repeated"),
     ] = None,
 ) -> None:
-    """Run the workflow: everything that the configuration names, or single scenes, tables or files.
+    """Run the workflow for everything in the configuration, or for single scenes, tables or files.
 
-    A run that was killed continues. Options after -- go to Snakemake, such as: hilsplat run desk -- --cores 1
+    A killed run continues. Options after -- are passed to Snakemake: hilsplat run desk -- --cores 1
     """
     start_logging()
     from hilsplat.workflow.run import run

@@ -1,4 +1,4 @@
-"""Photographs to Gaussians: new, poses, gaussians."""
+"""Commands from photographs to Gaussians: new, poses, gaussians."""
 
 from pathlib import Path
 from typing import Annotated
@@ -52,7 +52,7 @@ def new(
 ) -> None:
     """Add photographs, a video, or a scene of COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.
 
-    Says what was found, what is used, and what is likely to fail.
+    Reports what was found, what is used, and what is likely to fail.
     """
     start_logging()
     from hilsplat.photos.add import add_scene
@@ -90,7 +90,7 @@ def find_poses(
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Find the cameras of photographs, or import a COLMAP model or transforms.json."""
+    """Compute the camera poses of photographs, or import a COLMAP model or transforms.json."""
     section = section_of("poses", settings)
     inputs = {"images": images, **({"poses": poses} if poses and poses.exists() else {})}
     with stage("poses", out, settings=section, seed=seed, threads=threads, inputs=inputs):
@@ -120,7 +120,7 @@ def gaussians(
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Fit 3D Gaussians to the training views, or take your own; a JSON beside them gives the coordinates."""
+    """Fit 3D Gaussians to the training views, or use your own; a JSON file records their coordinates."""
     section = section_of("gaussians", settings)
     optional = {"brought": brought, "dataparser": dataparser, "transforms": transforms}
     inputs = {"scene": scene, **{name: path for name, path in optional.items() if path}}

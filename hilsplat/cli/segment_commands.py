@@ -1,4 +1,4 @@
-"""Masks and coverage trees."""
+"""Commands for masks and coverage trees."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -111,7 +111,7 @@ def _masks_from_truth(
 
 @app.command("coverage-tree")
 def coverage_tree(masks: PathIn, out: PathOut, settings: Settings = "{}") -> None:
-    """Find the parent of each mask: the coverage tree of each view."""
+    """Compute the parent of each mask: the coverage tree of each view."""
     section = section_of("coverage_tree", settings)
     with stage("coverage_tree", out, settings=section, inputs={"masks": masks}):
         from hilsplat.segment.coverage_stage import run_coverage_tree

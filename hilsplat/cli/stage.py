@@ -1,4 +1,4 @@
-"""Options that commands share, and the log, lock and provenance around each stage."""
+"""Options shared by commands, and the log, lock and provenance of each stage."""
 
 import logging
 import os
@@ -30,7 +30,7 @@ Threads = Annotated[
     ),
 ]
 MOST_THREADS = max(16, os.cpu_count() or 1)
-"""More threads than this only take time and memory to start."""
+"""Maximum number of threads; more only cost start-up time and memory."""
 
 Memory = Annotated[
     float | None,
@@ -45,7 +45,7 @@ DataRoot = Annotated[Path, typer.Option(help="folder that holds the data sets")]
 
 DEFAULT_CACHE = Path("results/.cache")
 MIN_FREE_MIB = 200.0
-"""A stage does not start with less free space than this."""
+"""Minimum free disk space to start a stage."""
 
 
 def start_logging(*, timestamps: bool = False) -> None:
@@ -78,21 +78,21 @@ def stage(
     beside: tuple[Path, ...] = (),
     device: Literal["auto", "cpu", "cuda"] | None = None,
 ) -> Iterator[None]:
-    """Surround a stage's function call with its log, lock, disk space check and provenance.
+    """Run a stage's function call with its log, lock, disk space check and provenance.
 
     Args:
         name: key of `STAGES`.
-        out: output; its provenance is written beside it.
-        settings: the section that the stage takes, or several sections by name.
+        out: output; its provenance is written next to it.
+        settings: the section that the stage uses, or several sections by name.
         seed: seed of everything random; None if nothing is random.
         threads: number of threads.
         inputs: files and folders that the stage reads, or lists of files, by name.
         plugins: import paths of the readers or baselines that it uses (`base.plugins`).
         beside: further outputs.
-        device: setting of the rasteriser's device; provenance records the device that `auto` stands for.
+        device: setting of the rasteriser's device; provenance records the device that `auto` resolves to.
 
     Raises:
-        ArtifactError: an output would replace something else than an earlier output of the stage.
+        ArtifactError: an output would replace something other than an earlier output of the stage.
         HilsplatError: an input is missing, or changed while the stage ran.
     """
     from hilsplat.base.provenance import Inputs, require_replaceable, write_provenance
@@ -109,7 +109,7 @@ def stage(
             try:
                 read.require_unchanged()
             except HilsplatError:
-                provenance_path(out).unlink(missing_ok=True)  # the new output is not accepted
+                provenance_path(out).unlink(missing_ok=True)  # without provenance, the output is rebuilt
                 raise
             write_provenance(
                 out,
@@ -125,7 +125,7 @@ def stage(
             )
     except HilsplatError:
         raise
-    except Exception as error:  # a bug of ours: the traceback belongs in the log
+    except Exception as error:  # unless it is a system error, a bug of ours: log the traceback
         if (problem := system_error(error)) is not None:
             raise problem from error
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
@@ -138,36 +138,36 @@ def _each(inputs: Mapping[str, Path | Sequence[Path]]) -> Iterator[Path]:
 
 
 def _command() -> list[str]:
-    """Return the command line without `--log`: a user who copies it reads the output on the terminal."""
+    """Return the command line without `--log`, so that a copied command prints to the terminal."""
     words = ["hilsplat", *sys.argv[1:]]
     return words[:1] + words[3:] if words[1:2] == ["--log"] else words
 
 
 def _recorded(settings: Any) -> dict[str, Any]:
-    """Settings as provenance records them."""
+    """Return settings in the form that provenance records."""
     if isinstance(settings, dict):
         return {name: _recorded(section) for name, section in settings.items()}
     return settings.model_dump(mode="json") if settings is not None else {}
 
 
 def section_of(name: str, text: str) -> Any:
-    """One section of the settings, from JSON; `auto` becomes the models that are there."""
+    """Read one section of the settings from JSON; `auto` becomes the installed models."""
     from hilsplat.configuration import parse_section, with_models
 
     return with_models(parse_section(name, text))
 
 
 def model_input(section: Any) -> dict[str, Path]:
-    """The model folder of a section as an input; a missing one is for the stage to report."""
+    """Return the model folder of a section as an input; empty if missing, which the stage reports."""
     folder = model_path(section.model)
     return {"model": folder} if folder.is_dir() else {}
 
 
 def json_option(option: str, text: str, kind: type) -> Any:
-    """An option that holds JSON: a list of texts, or texts by name.
+    """Parse an option in JSON: a list of texts, or texts by name.
 
     Raises:
-        SettingsError: it is not JSON, or holds something else.
+        SettingsError: it is not JSON, or has another type.
     """
     try:
         value = parse_json(text)

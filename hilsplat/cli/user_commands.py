@@ -1,4 +1,4 @@
-"""Query a finished scene, check results and machine, and print the manual of the settings."""
+"""Commands that query a finished scene, check results and machine, and print all settings."""
 
 import gc
 import glob
@@ -55,13 +55,13 @@ def query(
     device: Annotated[str, typer.Option(help="cpu or cuda, for look-ups of the field")] = "cpu",
     threads: Threads = 2,
 ) -> None:
-    """Find what a text names in a finished scene.
+    """Find the objects or parts that match a text in a finished scene.
 
     Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
-    answer's Gaussians (selection.ply).
+    answers' Gaussians (selection.ply).
     """
     start_logging()
-    gc.disable()  # two seconds of work, of which searching for garbage would be a tenth
+    gc.disable()  # garbage collection would take a tenth of the two seconds
     try:
         from hilsplat.query.answer import answer
 
@@ -120,7 +120,7 @@ def verify(
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="print a list of findings as JSON")] = False,
 ) -> None:
-    """Check this machine: libraries, GPU, models, disk, memory. Exit status 1 if something is at fault."""
+    """Check this machine: libraries, GPU, models, disk, memory. The exit status is 1 if there is a fault."""
     import json
     from dataclasses import asdict
 

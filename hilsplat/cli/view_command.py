@@ -1,4 +1,4 @@
-"""Look at a scene and ask it in a browser, or annotate its photographs there."""
+"""Commands that open a scene in a browser, to view and query it or to annotate its photographs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,9 +22,9 @@ def view(
     browser: Browser = True,
     threads: Threads = 2,
 ) -> None:
-    """Fly through a scene in a browser on this machine, and ask it.
+    """View and query a scene in a browser on this machine.
 
-    Shows what exists: Gaussians while the run goes, answers as soon as they are there. Ctrl-C ends it.
+    During a run, the page shows the Gaussians, and accepts queries as soon as possible. Press Ctrl-C to stop.
     """
     start_logging()
     from hilsplat.viewer.app import run_view
@@ -43,7 +43,7 @@ def annotate(
     browser: Browser = True,
     threads: Threads = 2,
 ) -> None:
-    """Draw what the photographs of a scene show, with levels and parents, in a browser on this machine.
+    """Annotate the photographs of a scene, with levels and parents, in a browser on this machine.
 
     Writes annotated/DATASET/SCENE below the data root after each change; evaluate reads it like any data set.
     """

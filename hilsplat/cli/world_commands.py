@@ -1,4 +1,4 @@
-"""The synthetic world: make a scene, look at it, measure masks and trees against its truth."""
+"""Commands for the synthetic world: make and show scenes, and measure masks and trees against their truth."""
 
 from pathlib import Path
 from typing import Annotated
@@ -66,7 +66,7 @@ def world_gallery(
     seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
     out: Annotated[Path | None, typer.Option(help="PNG to write; default: world_KIND.png")] = None,
 ) -> None:
-    """Draw one view of each of some scenes, with its true labels by level."""
+    """Draw one view of each scene, with its true labels by level."""
     start_logging()
     from hilsplat.world.gallery import draw_scenes
 
@@ -85,7 +85,7 @@ def world_inconsistency(
     ] = 2,
     out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the masks")] = None,
 ) -> None:
-    """Measure by exact geometry how often a surface point gets different masks in neighbouring views."""
+    """Measure with exact geometry how often a surface point has different masks in neighbouring views."""
     truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
     target = out or masks_folder.with_name("consistency.csv")
     with stage("consistency", target, inputs={"truth": truth, "masks": masks_folder}):

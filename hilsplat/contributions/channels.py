@@ -1,9 +1,8 @@
-"""Products of G and A with a field of float32, sixteen channels at a time, with the bytes of the plain loops.
+"""Products of G and A with a float32 field, sixteen channels at a time, with the bytes of the plain loops.
 
-numba turns a loop over the few channels of a row into vector code behind checks, made at every pass, that the
-arrays do not overlap, and keeps the sums in memory. Here rows have a multiple of sixteen channels, one value
-of `lanes` each, and the sums of a row of G stay in registers: 62 ms instead of 168 at d = 16 and 6.7 million
-pairs of Gaussians.
+For a loop over the few channels of a row, numba's vector code keeps sums in memory and checks in every pass
+that arrays do not overlap. Here rows have a multiple of sixteen channels, in values of `lanes`, and the sums
+of a row of G stay in registers: 62 ms instead of 168 ms at d = 16 and 6.7 million pairs of Gaussians.
 """
 
 import numpy as np
@@ -14,11 +13,11 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import LANES, WIDTH, lanes, load, store
 
 BLOCK = 2**15
-"""Gaussians that products with A visit at a time, so that their features stay in the processor's cache."""
+"""Gaussians per pass of a product with A, so that their features stay in the processor's cache."""
 
 
 def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E"]:
-    """Rows with channels of 0 up to a multiple of sixteen, contiguous."""
+    """Pad channels with zeros to a multiple of sixteen, and make rows contiguous."""
     missing = -rows.shape[-1] % WIDTH
     if missing:
         rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], missing), np.float32)], axis=-1)
@@ -27,17 +26,17 @@ def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E
 
 @intrinsic
 def plus(typingctx, total, scales, row):
-    """total + scales * row; each product is rounded before it is added, as in the plain loop."""
+    """Return total + scales * row; each product is rounded before it is added, as in the plain loop."""
 
     def codegen(context, builder, sig, args):
-        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # no flags: never fused
+        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # without flags, so never fused
 
     return LANES(LANES, LANES, LANES), codegen
 
 
 @compiled
 def gram_product(begin, end, indptr, indices, values, features, width, out):
-    """`quadratic._gram_product` for flat features and `out`, with `width` padded channels per row."""
+    """Compute `quadratic._gram_product` for flat features and `out`, with `width` padded channels per row."""
     row, origin = 3 * width, 3 * width * begin
     for i in range(begin, end):
         for c in range(0, width, WIDTH):
@@ -63,7 +62,7 @@ def gram_product(begin, end, indptr, indices, values, features, width, out):
 
 @compiled
 def mask_means(first, last, indptr, indices, data, level_index, features, width, out):
-    """`mask_operator._means` for flat features and `out`, with `width` channels per row."""
+    """Compute `mask_operator._means` for flat features and `out`, with `width` channels per row."""
     num_gaussians = len(features) // (3 * width)
     at = indptr[first:last].copy()
     for begin in range(0, num_gaussians, BLOCK):
@@ -81,7 +80,7 @@ def mask_means(first, last, indptr, indices, data, level_index, features, width,
 
 @compiled
 def mask_spread(begin, end, indptr, indices, data, level_index, values, width, out):
-    """`mask_operator._spread` for flat values and `out`, with `width` channels per row."""
+    """Compute `mask_operator._spread` for flat values and `out`, with `width` channels per row."""
     masks = len(level_index)
     at = np.empty(masks, np.int64)
     for m in range(masks):
@@ -100,7 +99,7 @@ def mask_spread(begin, end, indptr, indices, data, level_index, values, width, o
 
 @compiled
 def columns_below(limit, begin, end, indices):
-    """Where the columns below a limit stop in a row, which lies in begin..end of the sorted `indices`."""
+    """Return the end of the columns below `limit` in a row, begin..end of `indices`, which are sorted."""
     while begin < end and indices[begin] < limit:
         begin += 1
     return begin

@@ -1,4 +1,4 @@
-"""Normalised compositing weights: a pixel shows an average of the Gaussians it sees."""
+"""Normalised compositing weights: a pixel's feature is an average over the Gaussians it shows."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -7,21 +7,21 @@ from jaxtyping import Float32
 from hilsplat.base.compiled import compiled
 
 MIN_ALPHA = 0.5
-"""Pixels with a smaller alpha are ignored: their features would be extrapolated."""
+"""Pixels with a smaller alpha are ignored, since their features would be extrapolated."""
 
 
 def normalised_weights(weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA) -> sp.csr_matrix:
     """Divide the weights of each pixel by their sum, the accumulated alpha.
 
     The weights then sum to 1, so that a rendered feature is an average of features. Weights that the
-    rasteriser dropped as too small do not count in the sum.
+    rasteriser dropped as too small are not in the sum.
 
     Args:
-        weights: compositing weights (pixels x Gaussians), fresh: the result is made in their memory.
+        weights: compositing weights (pixels x Gaussians), whose memory is overwritten by the result.
         min_alpha: pixels with a smaller sum become empty rows.
 
     Returns:
-        the normalised matrix, columns sorted.
+        the normalised matrix, with sorted columns.
     """
     weights.sort_indices()
     kept = _normalise(weights.indptr, weights.indices, weights.data, min_alpha)
@@ -30,7 +30,7 @@ def normalised_weights(weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA) -> 
 
 
 def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
-    """Sum of each Gaussian's weights over the pixels, px; summed in float64."""
+    """Return the sum of each Gaussian's weights over the pixels, px; summed in float64."""
     out = np.zeros(weights.shape[1], np.float64)
     _add_columns(weights.indices, weights.data, out)
     return out.astype(np.float32)

@@ -1,8 +1,8 @@
-"""The sparse products of the solver and of the linkage by torch, for CUDA devices.
+"""Sparse products of the solver and of the linkage in torch, for CUDA devices.
 
-The operators have the methods of `mask_operator.MaskOperator` and `quadratic.Quadratic`: arrays in, arrays
-out, sums in the type of the input. Results equal those of the CPU up to rounding (tested), not byte for byte.
-The code also runs on torch's CPU, where the tests run it on machines without a device.
+The operators have the methods of `mask_operator.MaskOperator` and `quadratic.Quadratic`, with arrays as
+inputs and outputs, and sums in the type of the input. Results equal those of the CPU up to rounding (tested).
+The code also runs on torch's CPU backend, which tests use on machines without a device.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from hilsplat.contributions.quadratic import Gram, Quadratic
 
 
 def sparse_on(matrix: sp.csr_matrix, device: str) -> Tensor:
-    """A CSR matrix as a torch tensor."""
+    """Copy a CSR matrix to a torch tensor."""
     return torch.sparse_csr_tensor(
         torch.from_numpy(matrix.indptr.astype(np.int64)),
         torch.from_numpy(matrix.indices.astype(np.int64)),
@@ -53,7 +53,7 @@ class DeviceMasks:
         )
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
-        """A F at each mask's level."""
+        """Return A F at each mask's level."""
         on_device = torch.from_numpy(np.ascontiguousarray(features)).to(self.device)
         out = np.zeros((sum(map(len, self.rows)), features.shape[2]), features.dtype)
         for index, (rows, part) in enumerate(zip(self.rows, self.forward, strict=True)):
@@ -61,7 +61,7 @@ class DeviceMasks:
         return out
 
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
-        """A' x at each level."""
+        """Return A' x at each level."""
         on_device = torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
         parts = [
             part.to(on_device.dtype) @ on_device[torch.from_numpy(rows).to(self.device)]
@@ -77,7 +77,7 @@ class DeviceQuadratic:
     Attributes:
         forward: W, or the upper triangle of G of each level.
         backward: W', or the strictly lower triangle of each level.
-        valid: which pixels of W count at each level; None for G.
+        valid: whether a pixel of W counts at each level; None for G.
         device: torch device.
         num_gaussians: N.
     """
@@ -110,7 +110,7 @@ class DeviceQuadratic:
         return DeviceQuadratic(tuple(upper), tuple(lower), None, device, num)
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """G_l F_l for every level."""
+        """Return G_l F_l for every level."""
         on_device = torch.from_numpy(np.ascontiguousarray(features)).to(self.device)
         forward, backward = (
             [part.to(on_device.dtype) for part in parts] for parts in (self.forward, self.backward)
@@ -126,7 +126,7 @@ class DeviceQuadratic:
         return torch.stack(parts, dim=1).cpu().numpy()
 
     def form(self, features: Float[np.ndarray, "N 3 D"]) -> float:
-        """Sum over levels of tr F'GF, in float64."""
+        """Return the sum over levels of tr F'GF, in float64."""
         features = features.astype(np.float64)
         return float((features * self.product(features)).sum())
 
@@ -139,18 +139,18 @@ def shared_pairs_on(
     view: Int32[np.ndarray, " M"],
     device: str,
 ) -> tuple[sp.csr_matrix, Float[np.ndarray, "M V"]]:
-    """The two products behind the linkage's evidence: shared weights of pairs, and sizes as views see them.
+    """Compute the products of the linkage's evidence: shared weights of pairs, and sizes visible per view.
 
     Args:
         weighted: w s of each mask and Gaussian.
         shares: s.
-        sizes: what each Gaussian adds to a mask's size.
-        visible: which Gaussians each view sees.
+        sizes: contribution of each Gaussian to a mask's size.
+        visible: whether a Gaussian is visible in a view.
         view: view of each mask.
         device: torch device.
 
     Returns:
-        intersections of pairs of masks a < b of different views, and the size of each mask in each view.
+        intersections of pairs of masks a < b of different views, and each mask's size in each view.
     """
     seen = sparse_on(sizes, device) @ torch.from_numpy(visible.T.astype(np.float64)).to(device)
     product = torch.sparse.mm(sparse_on(weighted, device), sparse_on(shares.T.tocsr(), device)).cpu()

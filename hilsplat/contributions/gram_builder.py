@@ -1,4 +1,4 @@
-"""Sum G over parts of W, in memory that grows with G alone."""
+"""Sum G over parts of W, in memory that grows only with G."""
 
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -12,15 +12,15 @@ from hilsplat.contributions.gram_kernels import SUMS, add_to_block, enlarged, me
 from hilsplat.contributions.quadratic import Gram, StackedWeights
 
 BLOCKS = 64
-"""G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. A block
-of Gaussians that a part does not show stays untouched, which a Morton order makes frequent."""
+"""G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. Blocks
+whose Gaussians a part does not show are skipped, which a Morton order makes frequent."""
 
 MERGE_AT = 8
-"""Late pairs of a block are merged with its rows when there is more than one to so many."""
+"""Late pairs of a block are merged with its rows once they exceed one in this many."""
 
 
 class _Rows:
-    """Some rows of G, in memory that is used again: a page costs time and memory once it is written to."""
+    """Some rows of G, in reused memory: first writes to new pages take time and memory."""
 
     def __init__(self, rows: int) -> None:
         self.indptr = np.zeros(rows + 1, np.int64)
@@ -28,22 +28,22 @@ class _Rows:
 
     @property
     def nonzeros(self) -> int:
-        """Pairs of Gaussians."""
+        """Number of pairs of Gaussians."""
         return int(self.indptr[-1])
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Row starts, columns, values."""
+        """Return row starts, columns and values."""
         return self.indptr, self._indices[: self.nonzeros], self._values[: self.nonzeros]
 
     def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
-        """Copy other rows over these; columns and values may have more room than `indptr` fills."""
+        """Copy other rows over these; columns and values may have more entries than `indptr` uses."""
         kept = int(indptr[-1])
         self._make_room(kept, 0)
         self.indptr = indptr
         self._indices[:kept], self._values[:kept] = indices[:kept], values[:kept]
 
     def merge(self, late: "_Rows") -> None:
-        """Add pairs that are in none of these rows."""
+        """Add pairs that these rows don't contain."""
         self._make_room(self.nonzeros + late.nonzeros, self.nonzeros)
         merge_rows(self.indptr, self._indices, self._values, *late.arrays())
 
@@ -53,10 +53,10 @@ class _Rows:
 
 
 class _Block:
-    """Rows of G, and apart from them the few pairs that came late.
+    """Rows of G, with the few pairs that were added late kept separately.
 
-    A part shows a tenth of the Gaussians of a large scene. Sums of known pairs change in place, and the late
-    ones alone are written anew, until there are enough of them to merge.
+    A part shows a tenth of the Gaussians of a large scene. Sums of known pairs are updated in place, and only
+    the late pairs are rewritten, until there are enough of them to merge.
     """
 
     def __init__(self, rows: int) -> None:
@@ -64,7 +64,7 @@ class _Block:
 
     @property
     def nonzeros(self) -> int:
-        """Pairs of Gaussians."""
+        """Number of pairs of Gaussians."""
         return self.rows.nonzeros + self.late.nonzeros
 
     def replace_late(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
@@ -74,7 +74,7 @@ class _Block:
             self.merged()
 
     def merged(self) -> _Rows:
-        """All pairs."""
+        """Merge the late pairs and return all pairs."""
         if self.late.nonzeros:
             self.rows.merge(self.late)
             self.late = _Rows(len(self.rows.indptr) - 1)
@@ -82,7 +82,7 @@ class _Block:
 
 
 class _Scratch:
-    """What one thread needs to add to a block."""
+    """Buffers that one thread needs to add to a block."""
 
     def __init__(self, num_gaussians: int) -> None:
         self.sums = np.zeros(num_gaussians * SUMS)
@@ -91,14 +91,14 @@ class _Scratch:
 
 
 class GramBuilder:
-    """Sums G over parts of W, such as one view's after another; memory grows with G alone.
+    """Sum of G over parts of W, such as one view after another; its memory grows only with G.
 
-    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on how the pixels
-    were divided into parts nor on the number of threads.
+    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on the division of
+    pixels into parts nor on the number of threads.
 
     Args:
         num_gaussians: N.
-        threads: number of threads that share the blocks of rows.
+        threads: threads that share the blocks of rows.
     """
 
     def __init__(self, num_gaussians: int, threads: int) -> None:
@@ -113,7 +113,7 @@ class GramBuilder:
 
     @property
     def nonzeros(self) -> int:
-        """Pairs of Gaussians so far."""
+        """Number of pairs of Gaussians so far."""
         return sum(block.nonzeros for block in self._blocks)
 
     def add(self, part: StackedWeights) -> None:
@@ -137,10 +137,10 @@ class GramBuilder:
             list(pool.map(grow, range(len(self._blocks))))
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find each Gaussian's weights: start of its list, and lists of pixels and of places in W.
+        """Return each Gaussian's weights in W: start of its list, and lists of pixels and places.
 
-        From such a place on, the pixel's row of W holds the columns of the upper triangle. The lists are
-        reused for the next part: allocating memory takes longer than filling it.
+        From such a place on, the pixel's row of W contains the columns of the upper triangle. The lists are
+        reused for the next part, because allocating memory takes longer than filling it.
         """
         dtype = np.int32 if weights.nnz < 2**31 else np.int64
         if len(self._places) < weights.nnz or self._places.dtype != dtype:
@@ -151,7 +151,7 @@ class GramBuilder:
         return begins, self._pixels, self._places
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything summed so far, as arrays."""
+        """Return everything summed so far as arrays."""
         names = ("indptr", "indices", "values")
         return {
             f"{name}_{number}": array
@@ -165,7 +165,7 @@ class GramBuilder:
             block.rows.replace(*(state[f"{name}_{number}"] for name in ("indptr", "indices", "values")))
 
     def finish(self) -> Gram:
-        """G of everything added; the builder is empty afterwards."""
+        """Return G of everything added, and empty the builder."""
         indptr = np.zeros(self._ranges[-1][1] + 1, np.int64)
         indices = np.empty(self.nonzeros, np.int32)
         values = np.empty((len(indices), len(LEVELS)), np.float32)

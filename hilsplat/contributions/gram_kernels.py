@@ -1,4 +1,4 @@
-"""Compiled loops that sum G from weights, for `gram_builder.GramBuilder`; `mask_kernels` shares two."""
+"""Compiled loops that sum G from weights for `gram_builder.GramBuilder`; `mask_kernels` uses some of them."""
 
 import numpy as np
 from llvmlite import ir
@@ -8,12 +8,12 @@ from numba.extending import intrinsic
 from hilsplat.base.compiled import compiled
 
 SUMS = 4
-"""Numbers that are summed at once: three sums, and how many products were added; 0 of those mean new."""
+"""Numbers that are summed together: three sums, and the number of products added, 0 for a new pair."""
 
 
 @compiled
 def transpose(indptr, indices, begins, pixels, places):
-    """Start of each column's list, and the row and place of its values; `begins` must be zero."""
+    """Return each column's start, and the row and place of its values; `begins` must be zero."""
     for k in range(indptr[-1]):
         begins[indices[k] + 1] += 1
     begins[:] = np.cumsum(begins)
@@ -30,7 +30,7 @@ def transpose(indptr, indices, begins, pixels, places):
 def add_products(typingctx, sums, at, whole, part, subpart, value):
     """Add three numbers times `value`, and 1, to the sums from `at` on, as one vector; nothing is fused.
 
-    Returns how often that was done before.
+    Returns the number of previous additions.
     """
 
     def codegen(context, builder, sig, args):
@@ -51,7 +51,7 @@ def add_products(typingctx, sums, at, whole, part, subpart, value):
 
 @compiled
 def enlarged(indices, values, kept, room):
-    """Copies of both with more room, and the first `kept` entries."""
+    """Return larger copies of both arrays with their first `kept` entries."""
     more_indices = np.empty(room, np.int32)
     more_values = np.empty((room, values.shape[1]), np.float64)
     more_indices[:kept], more_values[:kept] = indices[:kept], values[:kept]
@@ -60,7 +60,7 @@ def enlarged(indices, values, kept, room):
 
 @compiled
 def _load(first, last, indices, values, sums):
-    """Put some pairs of a row where products are added, and mark them as known."""
+    """Load pairs of a row into the sums, and mark them as known."""
     levels = values.shape[1]
     for k in range(first, last):
         at = np.int64(indices[k]) * SUMS
@@ -73,19 +73,19 @@ def _load(first, last, indices, values, sums):
 def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr, out_indices, out_values):
     """Add the pixels of a part to rows begin..end of G.
 
-    Pairs in `rows` are summed in place; pairs in `late`, and new ones, are written to the output.
+    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output.
 
     Args:
         begin, end: range of Gaussians.
-        part: row starts, columns and values of W, and which of its pixels count at each level.
-        columns: what `transpose` makes of it: starts, pixels and places.
-        rows, late: row starts, columns, and sums of a level each (E x 3); no pair is in both.
-        sums: zero, and zero again at the end; SUMS for each Gaussian.
-        fresh: room for all columns.
-        out_indptr, out_indices, out_values: the late pairs, columns sorted within rows.
+        part: row starts, columns and values of W, and whether a pixel counts at each level.
+        columns: output of `transpose` for the part: starts, pixels and places.
+        rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
+        sums: zero before and after the call; SUMS for each Gaussian.
+        fresh: buffer for all columns.
+        out_indptr, out_indices, out_values: late pairs, with columns sorted within rows.
 
     Returns:
-        `out_indices` and `out_values`, or larger copies if these were too small.
+        `out_indices` and `out_values`, or larger copies if they were too small.
     """
     indptr, indices, data, valid = part
     begins, pixels, places = columns
@@ -107,7 +107,7 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
             part_weight = weight if valid[p, 1] else 0.0
             subpart = weight if valid[p, 2] else 0.0
             for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
-                j = np.uint64(indices[k])  # unsigned: no look for negative indices
+                j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
                 at, value = np.int64(j) * SUMS, np.float64(data[k])
                 if add_products(sums, at, whole, part_weight, subpart, value) == 0:
                     fresh[count] = np.int32(j)
@@ -146,12 +146,12 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
 
 @compiled
 def merge_rows(indptr, indices, values, late_indptr, late_indices, late_values):
-    """Merge the late pairs into the rows, in place from the end; `indices` and `values` have room for all."""
+    """Merge late pairs into the rows, in place from the end; `indices` and `values` have room for all."""
     at = indptr[-1] + late_indptr[-1]
     for i in range(len(indptr) - 2, -1, -1):
         k, t = indptr[i + 1] - 1, late_indptr[i + 1] - 1
         if at == k + 1:
-            break  # nothing late is left
+            break  # no late pair is left
         indptr[i + 1] = at
         while k >= indptr[i] or t >= late_indptr[i]:
             at -= 1

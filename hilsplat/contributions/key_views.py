@@ -1,4 +1,4 @@
-"""Key views: training views that together show most of the scene, and are segmented first."""
+"""Key views: training views that together show most of the scene and are segmented first."""
 
 import math
 from pathlib import Path
@@ -15,13 +15,13 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
 SIDE_PX = 200
-"""Longer side of the pictures that visibility is measured in."""
+"""Longer side of the renders in which visibility is measured."""
 
 MIN_WEIGHT = 1 / 255
 """Smaller weights of a Gaussian at a pixel don't count."""
 
 MIN_VISIBLE_PX = 0.02
-"""A Gaussian is visible in a view if its mass there exceeds this: 0.3 px in a view of 800 px."""
+"""A Gaussian is visible in a view if its mass there exceeds this; equals 0.3 px in a view of 800 px."""
 
 
 def run_key_masks(
@@ -33,32 +33,32 @@ def run_key_masks(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Segment the key views alone; see `segment.stage.run_masks`.
+    """Segment only the key views; see `segment.stage.run_masks`.
 
     Args:
-        gaussians_ply: the scene's Gaussians, which choose the views.
+        gaussians_ply: Gaussians of the scene, by which views are chosen.
     """
     views = key_views(Scene.load(scene_folder), gaussians_ply, settings.key_views, threads)
     run_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
-    """Choose training views one by one, each for the Gaussians that it adds.
+    """Choose training views greedily by the Gaussians that each one adds.
 
-    A Gaussian counts by its mean visible mass, and each chosen view that shows it halves its weight, so that
+    The weight of a Gaussian is its mean visible mass, halved by each chosen view that shows it, so that
     the views cover the scene before they repeat.
 
     Args:
-        scene: its cameras; images are not read.
-        gaussians_ply: the scene's Gaussians.
-        share: of the training views, rounded up.
-        threads: views rendered at once; the result does not depend on it.
+        scene: scene whose cameras are used; images are not read.
+        gaussians_ply: Gaussians of the scene.
+        share: share of the training views to choose, rounded up.
+        threads: views rendered in parallel; the result does not depend on it.
 
     Returns:
         The chosen views in camera order.
 
     Raises:
-        SceneError: there is no training view.
+        SceneError: if there is no training view.
     """
     names, gaussians = train_views(scene), load_ply(gaussians_ply)
 
@@ -76,10 +76,10 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
 
 
 def most_covering(seen: Bool[np.ndarray, "V N"], worth: Float64[np.ndarray, " N"], number: int) -> list[int]:
-    """Choose rows greedily by the worth of what they see; each sighting halves what a column is worth.
+    """Choose rows greedily by the worth of the columns that they see; each sighting halves a column's worth.
 
     Returns:
-        The rows in the order of their choice; the first of equal ones.
+        The rows in the order of selection; on ties, the first.
     """
     worth = worth.copy()
     chosen: list[int] = []

@@ -1,4 +1,4 @@
-"""The compiled loop that sums a view's weights mask by mask; `view_matrices.mask_sums` calls it."""
+"""Compiled loop that sums a view's weights mask by mask, for `view_matrices.mask_sums`."""
 
 import numpy as np
 
@@ -8,19 +8,19 @@ from hilsplat.contributions.gram_kernels import SUMS, add_products, enlarged
 
 @compiled
 def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, indices, data, num_gaussians):
-    """Sums of weights over masks first..last, and how many pixels were summed.
+    """Sum weights over masks first..last, and count the summed pixels.
 
     Args:
         first, last: range of masks.
-        runs, offsets, level_index: the masks.
+        runs, offsets, level_index: arrays of the masks.
         labels: row of the painted mask at each pixel and level.
         half: whether a pixel is in the random half.
-        indptr, indices, data: W; a pixel without weights does not count.
+        indptr, indices, data: W; pixels without weights are ignored.
         num_gaussians: N.
 
     Returns:
-        counts of pixels (masks x 2): painted ones and those in the half; row starts, columns, and sums over
-        raw mask, painted pixels and their half (entries x 3, float64, in the order of the pixels).
+        pixel counts (masks x 2): painted ones and those in the half; row starts, columns, and sums over the
+        raw mask, its painted pixels and their half (entries x 3, float64, summed in the order of the pixels).
     """
     sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
     counts = np.zeros((last - first, 2), np.int64)
@@ -41,7 +41,7 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
                 counts[m - first, 0] += painted > 0
                 counts[m - first, 1] += in_half > 0
                 for k in range(indptr[p], indptr[p + 1]):
-                    j = np.uint64(indices[k])  # unsigned: no look for negative indices
+                    j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
                     at, weight = np.int64(j) * SUMS, np.float64(data[k])
                     if add_products(sums, at, 1.0, painted, in_half, weight) == 0:
                         found[count] = np.int32(j)

@@ -14,10 +14,10 @@ from hilsplat.base.lanes import WIDTH
 from hilsplat.contributions.channels import columns_below, mask_means, mask_spread
 
 MEDIAN_SOFTENING = 1e-4
-"""Least distance of a latent to the median, so that a step never divides by zero."""
+"""Minimum distance of a latent to the median, which avoids division by zero."""
 
 SPREAD_PARTS = 4
-"""Ranges of Gaussians that a thread takes one after another: masks do not show all of them equally often."""
+"""Ranges of Gaussians per thread, which balance the load: masks show some Gaussians more often."""
 
 
 @runtime_checkable
@@ -25,26 +25,26 @@ class MaskProducts(Protocol):
     """The two products with A that the solver needs, on any device."""
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
-        """A F: mean rendered feature of each mask at its level."""
+        """Return A F: the mean rendered feature of each mask at its level."""
 
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
-        """A' x at each level: the adjoint of `means`."""
+        """Return A' x at each level: the adjoint of `means`."""
 
 
 @dataclass(frozen=True)
 class MaskOperator:
-    """A for all levels: features of Gaussians to means of masks, and back.
+    """Products with A for all levels: from features of Gaussians to means of masks, and back.
 
-    A is used in place, for instance mapped from its file: nothing of its size is copied. Every sum has one
-    order, whatever the number of threads.
+    A is used in place, for example mapped from its file, and not copied. The order of sums does not depend on
+    the number of threads.
 
     Attributes:
-        indptr: row starts of A in CSR form; a row is a mask, its columns are sorted.
+        indptr: row starts of A in CSR form; rows are masks, with sorted columns.
         indices: Gaussians of the stored values.
         data: the stored values, mean weights.
         level_index: level of each mask, from 0.
         num_gaussians: N.
-        threads: number of threads that share a product.
+        threads: threads that share a product.
     """
 
     indptr: np.ndarray
@@ -56,11 +56,11 @@ class MaskOperator:
 
     @staticmethod
     def of(A: sp.csr_matrix, level: UInt8[np.ndarray, " M"], threads: int = 1) -> "MaskOperator":
-        """From A (M x N) and the level of each row."""
+        """Build the operator from A (M x N) and the level of each row."""
         return MaskOperator(A.indptr, A.indices, A.data, level.astype(np.int64) - 1, A.shape[1], threads)
 
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
-        """A F: mean rendered feature of each mask at its level."""
+        """Return A F: the mean rendered feature of each mask at its level."""
         out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
         features = np.ascontiguousarray(features)
         A = self.indptr, self.indices, self.data, self.level_index
@@ -74,7 +74,7 @@ class MaskOperator:
         return out
 
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
-        """A' x at each level: the adjoint of `means`."""
+        """Return A' x at each level: the adjoint of `means`."""
         out = np.zeros((self.num_gaussians, 3, values.shape[1]), values.dtype)
         values = np.ascontiguousarray(values)
         A = self.indptr, self.indices, self.data, self.level_index
@@ -88,13 +88,13 @@ class MaskOperator:
         return out
 
     def _share(self, work: Callable[[int, int], None], edges: list[int]) -> None:
-        """Give the ranges between edges to the threads."""
+        """Distribute the ranges between edges over threads."""
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(work, edges[:-1], edges[1:]))
 
 
 def _fills_lanes(values: np.ndarray) -> bool:
-    """Whether rows of values are whole vectors of sixteen float32."""
+    """Return whether rows are whole vectors of sixteen float32."""
     return values.dtype == np.float32 and values.shape[-1] % WIDTH == 0
 
 
@@ -104,10 +104,10 @@ def lifted_average(
     pixels: Float32[np.ndarray, " M"],
     latents: Float32[np.ndarray, "M D"],
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Average, for each Gaussian, the latents of the pixels that show it, weighted by how much they do.
+    """Average the latents of the pixels that show each Gaussian, weighted by its share of them.
 
-    Exact, one sparse product, and within about a tenth of the regression's optimum. Gaussians that no
-    labelled pixel shows get 0.
+    This is exact, takes one sparse product and is within about a tenth of the regression's optimum.
+    Gaussians that no labelled pixel shows get 0.
     """
     sums = masks.spread(pixels[:, None] * latents)
     return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
@@ -120,17 +120,17 @@ def lifted_median(
     start: Float32[np.ndarray, "N 3 D"],
     steps: int = 15,
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Geometric median of the same latents with the same weights, which LangSplat's L1 converges to.
+    """Compute the geometric median of the same latents and weights, to which LangSplat's L1 loss converges.
 
-    Masks that merge or miss things shift an average, but hardly a median. By Weiszfeld's iteration: each
-    step, one pass over A, averages with the weights divided by the distance to the latest estimate.
+    Masks that merge or miss objects shift an average much more than a median. Each Weiszfeld iteration,
+    one pass over A, averages with the weights divided by the distance to the latest estimate.
 
     Args:
         masks: A.
         pixels: n.
         latents: h.
-        start: the lifted average; Gaussians that no mask shows keep it.
-        steps: iterations; 15 bring it to about three digits.
+        start: lifted average; Gaussians that no mask shows keep it.
+        steps: iterations; 15 give about three correct digits.
     """
     features = np.ascontiguousarray(start, np.float32).copy()
     for _ in range(steps):

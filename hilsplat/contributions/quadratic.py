@@ -1,7 +1,7 @@
 """The quadratic form of frozen geometry: G_l = sum over views of W' diag(valid_l) W.
 
-W holds the compositing weights of all pixels that have a mask at some level. G is stored once for all
-levels, as an upper triangle with three values per pair of Gaussians. If W has fewer non-zeros, it is kept
+W contains the compositing weights of all pixels that have a mask at some level. G is stored once for all
+levels, as an upper triangle with three values per pair of Gaussians. If W has fewer non-zeros, it is stored
 and streamed instead. Both give the same products.
 """
 
@@ -21,8 +21,8 @@ from hilsplat.contributions.channels import gram_product, padded
 from hilsplat.contributions.streams import mapped
 
 PRODUCT_PARTS = 4
-"""A product with G is summed in this many parts of equally many pairs. Fixed, so that the number of threads
-changes no byte; each part holds the sums of its rows and of those below."""
+"""A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that the
+bytes don't depend on the threads; each part stores the sums of its rows and of those below."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Gram:
 
     Attributes:
         indptr: row starts of the CSR pattern (N, N).
-        indices: its columns, from the diagonal on.
+        indices: columns of the pattern, starting at the diagonal.
         values: G of each level at each pair of the pattern.
-        threads: number of threads that share a product.
+        threads: threads that share a product.
     """
 
     indptr: np.ndarray
@@ -43,7 +43,7 @@ class Gram:
 
     @property
     def nonzeros(self) -> int:
-        """Stored pairs of Gaussians."""
+        """Number of stored pairs of Gaussians."""
         return len(self.indices)
 
     @property
@@ -52,7 +52,7 @@ class Gram:
         return len(self.indptr) - 1
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """G_l F_l for every level, in the precision of F; sums have one order on any number of threads."""
+        """Return G_l F_l for every level, in the precision of F; the order of sums is fixed."""
         channels, is_single = features.shape[2], features.dtype == np.float32
         features = padded(features) if is_single else np.ascontiguousarray(features)
         shares = np.linspace(0, self.nonzeros, PRODUCT_PARTS + 1)[1:-1]
@@ -76,11 +76,11 @@ class Gram:
         return np.ascontiguousarray(total[:, :, :channels])
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Sum over levels of tr F'GF, in float64 but for the product, whose millions of roundings cancel."""
+        """Return the sum over levels of tr F'GF, in float64 except for G F, whose roundings cancel."""
         return float(np.multiply(features, self.product(features), dtype=np.float64).sum())
 
     def save(self, folder: Path) -> None:
-        """Write the folder `G`, whose arrays are mapped when read."""
+        """Write the folder `G`, whose arrays are memory-mapped when read."""
         _save(folder / "G", indptr=self.indptr, indices=self.indices, values=self.values)
 
 
@@ -98,7 +98,7 @@ class StackedWeights:
 
     @property
     def nonzeros(self) -> int:
-        """Stored weights."""
+        """Number of stored weights."""
         return self.weights.nnz
 
     @property
@@ -107,7 +107,7 @@ class StackedWeights:
         return self.weights.shape[1]
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """W' diag(valid_l) W F_l for every level, in the precision of F; by one thread, in one order."""
+        """Return W' diag(valid_l) W F_l for every level, in the precision of F, on one thread."""
         out = np.zeros_like(features)
         _weights_product(
             self.weights.indptr,
@@ -120,12 +120,12 @@ class StackedWeights:
         return out
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Sum over levels of tr F'GF, summed in float64."""
+        """Return the sum over levels of tr F'GF, summed in float64."""
         features = features.astype(np.float64)
         return float((features * self.product(features)).sum())
 
     def save(self, folder: Path) -> None:
-        """Write the folder `W`, whose arrays are mapped when read."""
+        """Write the folder `W`, whose arrays are memory-mapped when read."""
         _save(
             folder / "W",
             indptr=self.weights.indptr,
@@ -141,30 +141,30 @@ Quadratic = Gram | StackedWeights
 
 @runtime_checkable
 class QuadraticProduct(Protocol):
-    """What the solver needs of G, on any device."""
+    """Products with G that the solver needs, on any device."""
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """G_l F_l for every level."""
+        """Return G_l F_l for every level."""
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Sum over levels of tr F'GF, summed in float64."""
+        """Return the sum over levels of tr F'GF, summed in float64."""
 
 
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
-    """Visible mass of each Gaussian in the labelled pixels of each level: G_l 1, since rows of W sum to 1."""
+    """Return each Gaussian's visible mass in the labelled pixels of each level: G_l 1 (W's rows sum to 1)."""
     ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
     return quadratic.product(ones)[:, :, 0]
 
 
 def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
-    """Map G or W from the contributions artifact, whichever the stage kept.
+    """Memory-map G or W from the contributions artifact, whichever the stage kept.
 
     Args:
-        folder: the contributions artifact.
-        threads: number of threads that share a product with G; products with W take one.
+        folder: contributions artifact.
+        threads: threads that share a product with G; products with W use one.
 
     Raises:
-        ArtifactError: the folder holds neither, or a file of it is missing or damaged.
+        ArtifactError: if the folder contains neither, or a file of it is missing or damaged.
     """
     if (folder / "G").is_dir():
         indptr, indices, values = (
@@ -187,7 +187,7 @@ def _save(folder: Path, **arrays: np.ndarray) -> None:
 
 @compiled
 def _gram_product(begin, end, indptr, indices, values, features, out):
-    """Rows begin..end of the upper triangle and their mirror images; `out` starts with row `begin`."""
+    """Multiply rows begin..end of the upper triangle and their mirror images; `out` starts at row `begin`."""
     levels, channels = features.shape[1], features.shape[2]
     for i in range(begin, end):
         for k in range(indptr[i], indptr[i + 1]):

@@ -25,23 +25,23 @@ from hilsplat.contributions.quadratic import Quadratic, StackedWeights
 logger = logging.getLogger(__name__)
 
 CHUNK_WEIGHTS = 2**25
-"""Non-zeros of W to gather before adding them to G; gathering and adding takes 0.6 GiB."""
+"""Non-zeros of W collected before they are added to G; collecting and adding takes 0.6 GiB."""
 
 LARGE_PART = 2**23
-"""A part with so many non-zeros is added to G at once: the copy would take memory, and gain little."""
+"""Parts with this many non-zeros are added to G directly: collecting would copy them for little gain."""
 
 MAX_WEIGHTS = 2**28
-"""W of all views is held in memory up to this many non-zeros, 2 GiB."""
+"""Non-zeros of all views' W up to which it is held in memory, 2 GiB."""
 
 CLEARLY_MORE = 2
-"""W is dropped once it has this many times the non-zeros of G: more views add to W as before, less to G."""
+"""W is dropped once it has this many times the non-zeros of G: W grows linearly with the views, G less."""
 
 CHECKPOINT_SECONDS = 300.0
-"""Time between checkpoints of a long pass; short passes write none."""
+"""Seconds between checkpoints of a long pass; short passes write none."""
 
 
 class _Waiting:
-    """Parts of W, one below the other, in memory that is used again: fresh memory takes longer to fill."""
+    """Stacked parts of W in reused memory, because fresh memory takes longer to fill."""
 
     def __init__(self, num_gaussians: int) -> None:
         self._num_gaussians = num_gaussians
@@ -54,7 +54,7 @@ class _Waiting:
         self._valid = [np.zeros((0, len(LEVELS)), np.bool_)]
 
     def append(self, part: StackedWeights) -> None:
-        """Copy a part below the others."""
+        """Append a copy of a part."""
         before, after = self.nonzeros, self.nonzeros + part.nonzeros
         if after > len(self._data):
             room = max(after, CHUNK_WEIGHTS * 9 // 8)
@@ -66,36 +66,36 @@ class _Waiting:
         self.nonzeros = after
 
     def held(self) -> StackedWeights:
-        """All that waits, until something is appended."""
+        """Return all waiting parts; valid until the next part is appended."""
         indptr = np.concatenate(self._indptr)
         arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
         matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)
         return StackedWeights(matrix, np.concatenate(self._valid))
 
     def take(self) -> StackedWeights:
-        """The same; then nothing waits any more."""
+        """Return all waiting parts, and remove them."""
         held = self.held()
         self._clear()
         return held
 
 
 def _enlarged(array: np.ndarray, kept: int, room: int) -> np.ndarray:
-    """Room for more entries, with the first `kept` of an array."""
+    """Return a larger array with the first `kept` entries of an array."""
     larger = np.empty(room, array.dtype)
     larger[:kept] = array[:kept]
     return larger
 
 
 class QuadraticBuilder:
-    """Collects W part by part and keeps whichever of G and W has fewer non-zeros.
+    """Builder of G or W, part by part; it keeps whichever has fewer non-zeros.
 
-    A product reads each non-zero of either equally often. W is dropped, and G kept, as soon as W has more
-    than `MAX_WEIGHTS` non-zeros, or `CLEARLY_MORE` times those of G so far.
+    A product reads each non-zero of either equally often. W is dropped and G is kept as soon as W has more
+    than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far.
 
     Args:
         num_gaussians: N.
         keep: "auto", or "gram" or "weights" to force one.
-        threads: number of threads that build G.
+        threads: threads that build G.
     """
 
     def __init__(self, num_gaussians: int, keep: str, threads: int) -> None:
@@ -111,7 +111,7 @@ class QuadraticBuilder:
         """Add the labelled pixels of a view."""
         self.weights_nonzeros += part.nonzeros
         if self._keeps_weights:
-            # A part lies in the memory of all weights of its view, of which it may be little.
+            # copied, because a part shares the memory of all weights of its view, which may be much larger
             self._parts.append(StackedWeights(part.weights.copy(), part.valid))
         most = MAX_WEIGHTS
         if self._gram is not None:
@@ -131,7 +131,7 @@ class QuadraticBuilder:
             gram.add(self._waiting.take())
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything added so far, as arrays."""
+        """Return everything added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
             out |= {f"gram_{name}": array for name, array in self._gram.state().items()}
@@ -159,7 +159,7 @@ class QuadraticBuilder:
             (self._parts if name == "parts" else self._waiting).append(part)
 
     def finish(self) -> Quadratic:
-        """G or W of everything added."""
+        """Return G or W of everything added."""
         if self._gram is None:
             return stack_weights(self._parts)
         self._add_waiting(self._gram)
@@ -169,11 +169,11 @@ class QuadraticBuilder:
 
 
 class QuadraticCheckpoint:
-    """The sums so far, kept on disk while a long pass runs.
+    """Checkpoint of the sums, kept on disk during a long pass.
 
     Args:
-        folder: holds checkpoints.
-        keys: digests of what each view contributes, in order.
+        folder: folder of checkpoints.
+        keys: digests of the contributions of each view, in order.
         keep: as in `QuadraticBuilder`.
     """
 
@@ -184,9 +184,9 @@ class QuadraticCheckpoint:
         self._last = time.monotonic()
 
     def resume(self, builder: QuadraticBuilder) -> int:
-        """Restore the builder; returns the number of views it then holds, 0 without a checkpoint.
+        """Restore the builder, and return the number of views it then contains, 0 without a checkpoint.
 
-        A checkpoint that lacks a file, for instance after the cache was pruned, is deleted.
+        An incomplete checkpoint, for example after the cache was pruned, is deleted.
         """
         if not (self._folder / INDEX).is_file():
             return 0
@@ -201,7 +201,7 @@ class QuadraticCheckpoint:
         return int(index["summed"])
 
     def offer(self, builder: QuadraticBuilder, summed: int) -> None:
-        """Write a checkpoint if the last one is old enough and views are left."""
+        """Write a checkpoint if the last one is old enough and views remain."""
         if summed == len(self._keys) or time.monotonic() - self._last < CHECKPOINT_SECONDS:
             return
         state = builder.state()
@@ -217,7 +217,7 @@ class QuadraticCheckpoint:
 
 
 def stack_weights(parts: list[StackedWeights]) -> StackedWeights:
-    """Stack parts, one below the other."""
+    """Concatenate the rows of all parts."""
     if len(parts) == 1:
         return parts[0]
     matrix = sp.vstack([part.weights for part in parts], format="csr")

@@ -1,4 +1,4 @@
-"""The latents that a view's pixels show, level by level, with the bytes of products with its weights."""
+"""Latents rendered at a view's pixels, level by level, with the bytes of products with its weights."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -9,19 +9,19 @@ from hilsplat.base.lanes import WIDTH, lanes, load, store
 from hilsplat.contributions.channels import padded, plus
 
 MIN_LATENT_SHARE = 0.5
-"""A pixel has a latent at a level if Gaussians with one make up more than this share of it."""
+"""A pixel has a latent at a level if more than this share of its weight is of Gaussians with a latent."""
 
 
 def rendered_latents(
     weights: sp.csr_matrix, features: Float32[np.ndarray, "N 3 D"]
 ) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-    """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents.
+    """Return, per level, the pixels that mostly show Gaussians with a latent, and their rendered latents.
 
-    Gaussians without a latent hold zeros, which a code would decode like any other: they are left out, and
+    Gaussians without a latent have zeros, which a code would decode like any latent. They are omitted, and
     the weights of the others are divided by their sum.
 
     Args:
-        weights: of the view (pixels x Gaussians), rows summing to 1 or empty.
+        weights: weights of the view (pixels x Gaussians), rows summing to 1 or empty.
         features: latents of the Gaussians.
     """
     rows = weights.indptr, weights.indices, weights.data
@@ -43,7 +43,7 @@ def _add_shares(indptr, indices, data, has, shares):
     for p in range(len(shares)):
         a, b, c = np.float32(0), np.float32(0), np.float32(0)
         for k in range(np.uint64(indptr[p]), np.uint64(indptr[p + 1])):
-            g = np.uint64(indices[k])  # unsigned: no look for negative indices
+            g = np.uint64(indices[k])  # unsigned: skips the check for negative indices
             a += data[k] if has[g, 0] else np.float32(0)
             b += data[k] if has[g, 1] else np.float32(0)
             c += data[k] if has[g, 2] else np.float32(0)

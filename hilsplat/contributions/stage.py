@@ -1,15 +1,15 @@
-"""The stage `contributions`: how much each Gaussian weighs in each mask, with frozen geometry.
+"""Stage `contributions`: the weight of each Gaussian in each mask, with frozen geometry.
 
 For a view with compositing weights W (pixels x Gaussians, rows divided by their sum) and its masks painted
-into one label map per level, with indicator B and areas n:
+into one label map per level, with indicator B and areas n, the stage computes
 
-- A = diag(1/n) B W: the mean weight of each Gaussian in each mask; A F holds the mask means,
+- A = diag(1/n) B W: the mean weight of each Gaussian in each mask; A F are the mask means,
 - G_l = sum over views of W' diag(valid_l) W (see `quadratic`),
 - A_half: A over a random half of each mask's pixels, for the part loss,
-- S = D W with the raw, overlapping masks D: how much of a Gaussian falls into a mask,
-- mass: how much of a Gaussian is visible in each view.
+- S = D W with the raw, overlapping masks D: the visible weight of each Gaussian in each mask,
+- mass: the visible weight of each Gaussian in each view.
 
-The losses of the language field and the 3D semantic tree need nothing else from the images.
+The losses of the language field and the semantic tree need nothing else from the images.
 """
 
 import logging
@@ -52,15 +52,15 @@ from hilsplat.splat.rasterise.device import choose_device
 logger = logging.getLogger(__name__)
 
 WEIGHTS_PER_PIXEL = 40
-"""Of a typical scene."""
+"""Weights per pixel of a typical scene."""
 
 MAX_WEIGHTS_TOGETHER = 2**25
-"""Views with more weights are prepared one at a time; 256 MiB each, and up to four are waiting."""
+"""Views with more weights are prepared one at a time; each takes 256 MiB, and up to four are waiting."""
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What a view adds: its masks, its matrices, and the rows of W that G still lacks."""
+    """Masks and matrices of a view, and the rows of W not yet in G."""
 
     masks: HierarchicalMasks
     part: dict[str, np.ndarray]
@@ -68,7 +68,7 @@ class _Prepared:
 
 
 def views_together(scene: Scene, threads: int) -> int:
-    """How many views to prepare at once: half of the work on one runs in one thread, but W takes memory."""
+    """Return the number of views to prepare at once: half of the work has one thread, but W takes memory."""
     pixels = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
     return min(2, max(1, threads)) if pixels * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
@@ -82,17 +82,17 @@ def run_contributions(
     settings: ContributionsSettings,
     threads: int,
 ) -> None:
-    """Write A, A_half, S, mass, and G or W, in one pass over the train views.
+    """Write A, A_half, S, mass, and G or W, in one pass over the training views.
 
-    Views are prepared one or two at a time while rows of those before are written and added to G; memory
-    holds them, the sum of G so far, and the weights waiting to be added to it (`quadratic_builder`). A run
-    after a killed one finds the matrices of finished views in the cache, and G as of at most
-    `CHECKPOINT_SECONDS` (and one view) before; it rasterises W again for the views that G lacks.
+    One or two views are prepared while rows of previous views are written and added to G. Memory contains
+    them, the sum of G so far, and the weights waiting to be added to it (`quadratic_builder`). After an
+    interruption, a rerun reads the matrices of finished views from the cache, and G as of at most
+    `CHECKPOINT_SECONDS` (and one view) earlier; it rasterises W again for the views not in that G.
 
     Raises:
-        MisalignedArtifactError: masks and images differ in size, or the masks of a view are not those that
-            their index records.
-        ArtifactError: no train view has masks.
+        MisalignedArtifactError: if masks and images differ in size, or the masks of a view differ from those
+            recorded in their index.
+        ArtifactError: if no training view has masks.
     """
     scene = Scene.load(scene_folder)
     gaussians = load_ply(gaussians_ply)
@@ -195,12 +195,12 @@ def run_contributions(
 
 
 def _name(quadratic: Quadratic) -> str:
-    """Return the name of what was kept."""
+    """Return "G" or "W"."""
     return "G" if isinstance(quadratic, Gram) else "W"
 
 
 def _key(camera: Camera, digests: Mapping[str, str], about: dict) -> str:
-    """Return the digest of everything that the matrices of a view depend on."""
+    """Return a digest of all inputs of a view's matrices."""
     return sha256_of_json(
         {
             **about,

@@ -1,4 +1,4 @@
-"""Arrays that grow on disk, so that a stage never holds all that it writes, and are mapped when read."""
+"""Arrays written row by row, so that a stage never holds all of its output, and memory-mapped when read."""
 
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +15,7 @@ class ArrayStream:
     """A .npy file written row by row; closing it completes its header.
 
     Args:
-        path: the file.
+        path: file to write.
         dtype: type of the numbers.
         columns: numbers per row; None for a one-dimensional array.
     """
@@ -45,7 +45,7 @@ class ArrayStream:
     def close(self) -> None:
         """Complete the header."""
         shape = (self._rows,) if self._columns is None else (self._rows, self._columns)
-        # NumPy's format 1.0: magic, length of the header, and the header padded with spaces.
+        # NumPy's format 1.0: magic, header length, and the header padded with spaces
         text = f"{{'descr': '{self._dtype.str}', 'fortran_order': False, 'shape': {shape}, }}"
         length = HEADER_BYTES - 10
         self._stream.seek(0)
@@ -55,7 +55,7 @@ class ArrayStream:
 
 
 class MatrixStream:
-    """A CSR matrix that grows by rows: a folder with `data.npy`, `indices.npy` and `indptr.npy`."""
+    """A CSR matrix that grows by rows, in a folder with `data.npy`, `indices.npy` and `indptr.npy`."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True)
@@ -66,11 +66,11 @@ class MatrixStream:
 
     @property
     def nonzeros(self) -> int:
-        """Stored values so far."""
+        """Number of stored values."""
         return len(self._data)
 
     def append(self, data: np.ndarray, indices: np.ndarray, indptr: np.ndarray) -> None:
-        """Add the rows of a matrix in CSR form."""
+        """Append the rows of a matrix in CSR form."""
         self._indptr.append(indptr[1:] + self.nonzeros)
         self._data.append(data)
         self._indices.append(indices)
@@ -82,12 +82,12 @@ class MatrixStream:
 
 
 def mapped(folder: Path, name: str) -> np.ndarray:
-    """Map an array from a file of an artifact, read-only.
+    """Memory-map an array from a file of an artifact, read-only.
 
     Raises:
-        ArtifactError: the file is missing, or is not as it was written.
+        ArtifactError: if the file is missing or has changed since it was written.
     """
     path = sealed(folder, name)
-    # A file without any number cannot be mapped.
+    # an empty array cannot be mapped
     mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
     return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)

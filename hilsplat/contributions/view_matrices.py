@@ -1,4 +1,4 @@
-"""A, A_half, S and mass of one view, from its weights and masks; `stage` says what they are."""
+"""Compute A, A_half, S and mass of one view from its weights and masks, as defined in `stage`."""
 
 import hashlib
 from concurrent.futures import ThreadPoolExecutor
@@ -18,12 +18,12 @@ MATRICES = ("A", "A_half", "S")
 
 
 def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
-    """Row of the painted mask at each pixel and level, -1 for none."""
+    """Return the row of the painted mask at each pixel and level, -1 for none."""
     return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
 
 
 def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
-    """B: one row per mask, ones at those of the given pixels that show it (float64)."""
+    """Return B: one row per mask, with ones at those of the given pixels that show it (float64)."""
     rows, columns = [], []
     for index in range(labels.shape[1]):
         row = labels[:, index]
@@ -35,7 +35,7 @@ def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: 
 
 
 def random_half(view: str, pixels: int) -> np.ndarray:
-    """A random half of the pixels, a fair coin for each, seeded by the view's name."""
+    """Select each pixel with probability 1/2, seeded by the view's name."""
     seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
     return np.random.default_rng(seed).random(pixels) < 0.5
 
@@ -49,7 +49,7 @@ def mask_sums(
 ) -> tuple[
     Int64[np.ndarray, "M 2"], Int64[np.ndarray, " M+1"], Int32[np.ndarray, " E"], Float64[np.ndarray, "E 3"]
 ]:
-    """What `mask_kernels.summed_masks` returns, for all masks; the same for any number of threads."""
+    """Return the output of `mask_kernels.summed_masks` for all masks; it does not depend on `threads`."""
     total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
     shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
     edges = [0, *np.searchsorted(total_px, shares).tolist(), len(masks)]
@@ -73,13 +73,13 @@ def mask_sums(
 def view_contributions(
     view: str, weights: sp.csr_matrix, masks: HierarchicalMasks, threads: int = 1
 ) -> dict[str, np.ndarray]:
-    """All matrices of one view except W, as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
+    """Return all matrices of one view except W as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
     Args:
-        view: its name, which seeds the random halves.
+        view: name of the view, which seeds the random halves.
         weights: normalised weights (see `normalised_weights`).
         masks: the view's masks.
-        threads: number of threads; the result does not depend on it.
+        threads: threads to use; the result does not depend on it.
     """
     labels, half = label_maps(masks), random_half(view, weights.shape[0])
     counts, starts, columns, sums = mask_sums(weights, masks, labels, half, threads)
@@ -97,7 +97,7 @@ def view_contributions(
 
 
 def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
-    """The rows of W that have Gaussians and a mask at some level, made in the memory of `weights`."""
+    """Return the rows of W with Gaussians and a mask at some level, stored in the memory of `weights`."""
     sizes = np.diff(weights.indptr)
     valid = (labels >= 0) & (sizes > 0)[:, None]
     rows = np.flatnonzero(valid.any(axis=1))

@@ -1,4 +1,4 @@
-"""Adam for training whose gradients are written out by hand, in one pass over the numbers."""
+"""Adam for training with hand-written gradients, in one pass over the parameters."""
 
 from dataclasses import dataclass, field
 from typing import no_type_check
@@ -8,18 +8,18 @@ import numpy as np
 from hilsplat.base.compiled import compiled
 
 BETA1, BETA2 = 0.9, 0.999
-"""As in torch."""
+"""Decay rates of the moments, as in torch."""
 
 
 @dataclass
 class Adam:
-    """Running moments of one array of parameters, which `step` changes in place.
+    """Adam for one array of parameters, which `step` changes in place.
 
     Attributes:
         values: parameters, float32, contiguous.
-        rate: step size; it may change from step to step.
-        eps: added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS, which
-            the published codes of language fields keep.
+        rate: step size; it may change between steps.
+        eps: number added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS,
+            which the published codes of language fields keep.
     """
 
     values: np.ndarray
@@ -32,7 +32,7 @@ class Adam:
         self._moments = np.zeros(self.values.size, np.float32), np.zeros(self.values.size, np.float32)
 
     def step(self, gradient: np.ndarray) -> None:
-        """One step; the same bytes on any number of threads, for there is one."""
+        """Take one step, on a single thread, so that the bytes are always the same."""
         self.steps += 1
         rate = np.float32(self.rate / (1 - BETA1**self.steps))
         scale = np.float32((1 - BETA2**self.steps) ** -0.5)
@@ -43,7 +43,7 @@ class Adam:
 @compiled(error_model="numpy")
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _step(values, gradient, first, second, rate, scale, eps):
-    """One step in place; `rate` is over 1 - beta1^t, `scale` is 1 / sqrt(1 - beta2^t)."""
+    """Take one step in place; `rate` is divided by 1 - beta1^t, and `scale` is 1 / sqrt(1 - beta2^t)."""
     for k in range(len(values)):
         g = gradient[k]
         first[k] = np.float32(BETA1) * first[k] + np.float32(1 - BETA1) * g

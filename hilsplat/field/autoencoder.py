@@ -1,4 +1,4 @@
-"""The stage that makes the scene's code, a trained network or PCA, and encodes the masks with it."""
+"""Stage `autoencoder`: fit the scene's code, a network or PCA, and encode the masks with it."""
 
 from pathlib import Path
 
@@ -21,10 +21,10 @@ def mask_targets(
     """Return the target vector of each mask, and the distinct vectors to train on.
 
     Args:
-        clip: each mask's own vector; zero where it has none.
+        clip: each mask's own vector, or zero if it has none.
         tree: nodes with their vectors, and the node that each mask fits best.
         targets: "node": the vector of that node, or the mean of all nodes for a mask that shares no Gaussian
-            with any; "mask": always its own, as in the paper. A tree without nodes gives masks their own.
+            with any; "mask": its own vector, as in the paper, which is also used if the tree has no nodes.
     """
     if targets == "node" and len(tree):
         or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
@@ -45,8 +45,8 @@ def run_autoencoder(
     Writes `autoencoder.safetensors`, `latents.npz` (rows as in the contributions) and `index.json`.
 
     Raises:
-        MisalignedArtifactError: the semantic tree or the CLIP vectors belong to other masks.
-        ArtifactError: a mask needs its own vector and has none.
+        MisalignedArtifactError: if the semantic tree or the CLIP vectors belong to other masks.
+        ArtifactError: if a mask needs its own vector and has none.
     """
     require_same_masks(semantic_tree_folder, contributions_folder)
     tree = SemanticTree.load(semantic_tree_folder, clip_folder)

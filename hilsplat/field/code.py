@@ -1,4 +1,4 @@
-"""The scene's code: CLIP vectors to a few numbers and back, by a network or linearly; reading it."""
+"""The scene's code from CLIP vectors to a few numbers and back, by a network or linearly; reading it."""
 
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -14,12 +14,12 @@ from hilsplat.field.linear_code import LinearCode
 from hilsplat.segment.digests import require_same_masks
 
 CHUNK_ROWS = 4096
-"""Rows to decode at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache."""
+"""Rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache."""
 
 
 @runtime_checkable
 class Code(Protocol):
-    """What encodes CLIP vectors: `linear_code.LinearCode` or `network_code.Autoencoder`."""
+    """Encoder and decoder of CLIP vectors: `linear_code.LinearCode` or `network_code.Autoencoder`."""
 
     @property
     def channels(self) -> int:
@@ -30,20 +30,20 @@ class Code(Protocol):
         """Size d of a latent."""
 
     def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
-        """Latents of vectors."""
+        """Encode vectors as latents."""
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """Vectors of unit length."""
+        """Decode latents to vectors of unit length."""
 
     def save(self, path: Path) -> None:
-        """Write a .safetensors file; the same code gives the same bytes."""
+        """Write a .safetensors file; equal codes give equal bytes."""
 
 
 def load_code(folder: Path) -> Code:
-    """Read the code of a finished folder, network or linear.
+    """Read the network or linear code of a finished folder.
 
     Raises:
-        ArtifactError: the file is missing or damaged.
+        ArtifactError: if the file is missing or damaged.
     """
     path = autoencoder_file(folder)
     state, about = read_tensors(path)
@@ -58,7 +58,7 @@ def load_code(folder: Path) -> Code:
 
 
 def autoencoder_file(folder: Path) -> Path:
-    """File of the weights in a finished folder."""
+    """Return the path of the weights in a finished folder."""
     return Path(folder) / "autoencoder.safetensors"
 
 
@@ -66,7 +66,7 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
     """Return the latent of each mask, in the contributions' row order.
 
     Raises:
-        MisalignedArtifactError: the latents belong to other masks.
+        MisalignedArtifactError: if the latents belong to other masks.
     """
     require_same_masks(folder, contributions.folder)
     return read_npz(sealed(folder, "latents.npz"), "latents")["latents"]

@@ -1,6 +1,6 @@
 """The contrastive losses L_ins and L_part (paper, Eq. 3 to 5) as functions of the field.
 
-Both depend on the mask means alone, so a step costs a sparse product and no rendering.
+Both depend only on the mask means, so a step takes a sparse product and no rendering.
 """
 
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
 from hilsplat.settings import FieldSettings
 
 MAX_MASKS_PER_LEVEL = 96
-"""Most masks of one view and level that take part, since the losses compare all pairs."""
+"""Maximum number of masks per view and level in the losses, which compare all pairs."""
 
 
 @dataclass(frozen=True)
 class ViewRelations:
-    """What the contrastive losses need of one view.
+    """Inputs of the contrastive losses for one view.
 
     Attributes:
-        rows: masks that take part, all levels.
-        depth: depth of the deepest common ancestor of every pair of them.
+        rows: selected masks of all levels.
+        depth: depth of the deepest common ancestor of each pair of them.
         level: their levels.
-        part_rows: for PART and SUBPART, the masks that take part.
-        part_parent: the row of their parents in the coverage tree, -1 for none.
+        part_rows: selected masks of PART and of SUBPART.
+        part_parent: rows of their parents in the coverage tree, -1 for none.
     """
 
     rows: Int64[np.ndarray, " m"]
@@ -45,13 +45,13 @@ def view_relations(
     settings: FieldSettings,
     means: Float32[np.ndarray, "M D"] | None = None,
 ) -> list[ViewRelations]:
-    """Choose the masks of each view that take part in the contrastive losses, largest first.
+    """Select the masks of each view for the contrastive losses, largest first.
 
     Args:
-        contributions: rows.
-        parents: per view, the coverage tree's parent of each mask (row among the view's masks).
-        settings: smallest size of a mask, and pruning.
-        means: mean lifted feature of each mask, to prune masks that look alike; None keeps all.
+        contributions: contributions of the scene.
+        parents: parent of each mask in the coverage tree, by view (row among the view's masks).
+        settings: least size of a mask, and pruning.
+        means: mean lifted feature of each mask, used to prune similar masks; None keeps all.
     """
     relations = []
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
@@ -90,10 +90,10 @@ def view_relations(
 def distinct(
     means: Float32[np.ndarray, "m D"], depth: Int64[np.ndarray, "m m"], most_alike: float
 ) -> Int64[np.ndarray, " k"]:
-    """Contrastive sample pruning: rows that do not look like an unrelated row kept before them.
+    """Prune contrastive samples: return rows that aren't similar to an unrelated row kept before them.
 
-    The paper keeps the most distinct samples and gives no numbers. A mask that is unrelated to a kept one in
-    the tree, but looks like it, adds a pair whose gradient says little beyond that of the kept pairs.
+    The paper keeps the most distinct samples and gives no numbers. A pair of masks that are unrelated in the
+    tree but similar adds a gradient almost redundant with those of the kept pairs.
 
     Args:
         means: features, in order of preference.
@@ -109,7 +109,7 @@ def distinct(
 
 
 def compared(relations: list[ViewRelations]) -> tuple[int, int]:
-    """Views that L_ins averages over, and pairs of view and level that L_part averages over."""
+    """Return the number of views in the mean of L_ins, and of pairs of view and level in that of L_part."""
     instance = sum(len(view.rows) > 1 for view in relations)
     part = sum(
         len(rows) > 1 and bool((parent != NONE).any())
@@ -122,12 +122,12 @@ def compared(relations: list[ViewRelations]) -> tuple[int, int]:
 def instance_term(
     means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """L_ins, averaged over the views that have masks to compare, and its gradient.
+    """Compute L_ins, averaged over the views with at least two masks, and its gradient.
 
     Args:
         means: mean feature of each mask.
-        relations: per view.
-        settings: the reading of L_ins, and Omega.
+        relations: relations by view.
+        settings: variant of L_ins, and Omega.
     """
     losses, gradient = [], np.zeros(means.shape)
     for view in relations:
@@ -151,17 +151,17 @@ def part_term(
     relations: list[ViewRelations],
     settings: FieldSettings,
 ) -> tuple[float, tuple[Float64[np.ndarray, "M D"], ...]]:
-    """L_part, averaged over the views and levels that have masks to compare.
+    """Compute L_part, averaged over the views and levels that have masks to compare, and its gradients.
 
     Args:
         means: mean feature of each mask.
         halves: mean feature over a random half of each mask's pixels.
         other_halves: mean feature over the other pixels.
-        relations: per view.
-        settings: the reading of L_part, and tau.
+        relations: relations by view.
+        settings: variant of L_part, and tau.
 
     Returns:
-        the loss, and its gradients by means, halves and other halves.
+        the loss, and its gradients with respect to means, halves and other halves.
     """
     losses = []
     by_means, by_halves, by_others = (np.zeros(means.shape) for _ in range(3))
@@ -194,8 +194,8 @@ class Contrast:
         half_masks: A over a random half of each mask's pixels.
         pixels: n.
         half_pixels: number of pixels in the halves.
-        relations: per view.
-        settings: readings and weights.
+        relations: relations by view.
+        settings: variants and weights of the losses.
     """
 
     masks: MaskProducts
@@ -206,7 +206,7 @@ class Contrast:
     settings: FieldSettings
 
     def values(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
-        """Unweighted L_ins and L_part."""
+        """Return the unweighted L_ins and L_part."""
         means, halves, others = self._means(features)
         instance, _ = instance_term(means, self.relations, self.settings)
         part, _ = part_term(means, halves, others, self.relations, self.settings)
@@ -215,7 +215,7 @@ class Contrast:
     def weighted(
         self, features: Float32[np.ndarray, "N 3 D"], weights: tuple[float, float]
     ) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
-        """The weighted sum of L_ins and L_part, and its gradient; a loss of weight 0 is not computed."""
+        """Return the weighted sum of L_ins and L_part, and its gradient; losses of weight 0 are skipped."""
         means, halves, others = self._means(features)
         total, by_means, by_halves = 0.0, np.zeros(means.shape), None
         if weights[0]:
@@ -234,13 +234,13 @@ class Contrast:
         return total, gradient
 
     def _means(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean feature of each mask, of its random half and of its other half, in float64."""
+        """Return the mean feature of each mask, of its random half and of its other half, in float64."""
         means = self.masks.means(features).astype(np.float64)
         halves = self.half_masks.means(features).astype(np.float64)
         n, half, rest = self._counts()
         return means, halves, (n * means - half * halves) / rest
 
     def _counts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels of each mask, of its random half, and of its other half (at least 1), as columns."""
+        """Return pixel counts of each mask, its random half and its other half (at least 1), as columns."""
         n, half = (count.astype(np.float64)[:, None] for count in (self.pixels, self.half_pixels))
         return n, half, np.maximum(n - half, 1)

@@ -1,7 +1,7 @@
-"""A chain of dense layers with ReLU between them as one compiled loop; values stay in the fastest cache.
+"""Chain of dense layers with ReLUs as one compiled loop, whose values stay in the L1 cache.
 
-Rows are the lanes of vectors, and as many outputs are summed together as the registers hold. The sums of a
-row run in the same order whatever rows it is decoded with.
+Rows are SIMD lanes, and as many outputs are summed together as fit in the registers. The order of the sums
+of a row does not depend on the other rows.
 """
 
 from collections.abc import Sequence
@@ -14,21 +14,21 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 
 ROWS = 2 * WIDE_COLUMNS
-"""Rows that pass the layers together; a weight comes from the second cache once for all of them."""
+"""Rows that pass through the layers together, so that weights are read from the L2 cache once for all."""
 
 UNITS = MOST_ROWS
-"""Outputs of a layer that are summed together; layers get a multiple of them."""
+"""Outputs of a layer that are summed together; layers are padded to a multiple."""
 
 _add_products = rows_of_products(UNITS)
 
 
 class PackedLayers(NamedTuple):
-    """Layers as the loop reads them.
+    """Layers in the layout of the compiled loop.
 
     Attributes:
-        widths: numbers of inputs, of each layer's outputs.
-        weights: layer by layer, output by output.
-        biases: layer by layer.
+        widths: number of inputs, then of each layer's outputs.
+        weights: weights by layer and output.
+        biases: biases by layer.
     """
 
     widths: Int64[np.ndarray, " L_plus_1"]
@@ -48,7 +48,7 @@ class PackedLayers(NamedTuple):
         return PackedLayers(np.array(widths), *found)
 
     def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """Outputs of the last layer, divided by their lengths."""
+        """Return the outputs of the last layer, scaled to unit length."""
         out = np.empty((len(rows), self.widths[-1]), np.float32)
         _through(np.ascontiguousarray(rows, np.float32), *self, out)
         return out

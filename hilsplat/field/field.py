@@ -1,7 +1,7 @@
-"""The stage that solves the language field.
+"""Stage `field`: solve the language field.
 
-Geometry is frozen, so the contributions hold everything that the losses need: see `problem` for the quadratic
-part, `contrast` for the hierarchy losses and `solver` for how they are minimised.
+Geometry is frozen, so the contributions contain all inputs of the losses: see `problem` for the quadratic
+part, `contrast` for the hierarchy losses and `solver` for their minimisation.
 """
 
 import logging
@@ -40,17 +40,17 @@ def run_field(
 ) -> None:
     """Solve the language field of a scene: `field.safetensors` and `field.report.json` beside it.
 
-    Nothing is random with `trainer: fast` unless it starts at random (the view's name seeds the halves of
-    masks), and the result does not depend on `threads` (sums have one order).
+    With `trainer: fast`, only a random start depends on the seed (halves of masks are seeded by the view's
+    name). The result does not depend on `threads`.
 
     Args:
-        seed: of a random start, and of the order of views of `trainer: literal`.
-        rendered: scene, Gaussians and masks, which `trainer: literal` renders.
-        start: the field that `start: langsplat` begins with.
+        seed: seed of a random start, and of the order of views of `trainer: literal`.
+        rendered: scene, Gaussians and masks that `trainer: literal` renders.
+        start: field from which `start: langsplat` begins.
 
     Raises:
-        MisalignedArtifactError: an input belongs to other masks, Gaussians or codes.
-        SettingsError: an input that the settings need is not given.
+        MisalignedArtifactError: if an input belongs to other masks, Gaussians or codes.
+        SettingsError: if an input that the settings require is missing.
     """
     if (settings.trainer == "literal") != (rendered is not None):
         raise SettingsError(
@@ -121,7 +121,7 @@ def run_field(
 
 
 def _first_features(path: Path, contributions: Contributions, autoencoder_folder: Path) -> np.ndarray:
-    """Features of a field of the same Gaussians and the same code."""
+    """Return the features of a field, which must be of the same Gaussians and code."""
     field = LanguageField.load(path)
     digest = sha256_of_file(autoencoder_file(autoencoder_folder))
     if (field.gaussians_sha256, field.autoencoder_sha256) != (contributions.gaussians_sha256, digest):
@@ -133,10 +133,10 @@ def _first_features(path: Path, contributions: Contributions, autoencoder_folder
 
 
 def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
-    """Parent of each mask in the coverage tree of each view.
+    """Return the parent of each mask in the coverage tree of each view.
 
     Raises:
-        MisalignedArtifactError: the trees were computed from other masks.
+        MisalignedArtifactError: if the trees were computed from other masks.
     """
     require_same_masks(tree_folder, contributions.folder)
     return {

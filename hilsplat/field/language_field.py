@@ -14,9 +14,9 @@ class LanguageField:
     """One latent per Gaussian and level.
 
     Attributes:
-        features: latents of N Gaussians at L = 3 levels, coarse to fine; 0 without a latent.
-        gaussians_sha256: digest of the PLY that they belong to.
-        autoencoder_sha256: digest of the autoencoder that decodes them.
+        features: latents of N Gaussians at L = 3 levels, coarse to fine; 0 for no latent.
+        gaussians_sha256: digest of the Gaussians' PLY.
+        autoencoder_sha256: digest of the autoencoder that decodes the latents.
     """
 
     features: Float32[np.ndarray, "N 3 D"]
@@ -24,7 +24,7 @@ class LanguageField:
     autoencoder_sha256: str
 
     def save(self, path: Path) -> None:
-        """Write `field.safetensors` atomically; the same field gives the same bytes."""
+        """Write `field.safetensors` atomically; equal fields give equal bytes."""
         about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
         write_tensors(path, {"features": self.features}, **about)
 
@@ -33,11 +33,11 @@ class LanguageField:
         """Read `field.safetensors`.
 
         Raises:
-            ArtifactError: the file is missing, damaged or not a language field.
+            ArtifactError: if the file is missing, damaged or not a language field.
         """
         return made(LanguageField, *read_tensors(path), path)
 
 
 def report_path(field: Path) -> Path:
-    """Path of the report on a field: `field.report.json` for `field.safetensors`."""
+    """Return the path of a field's report: `field.report.json` for `field.safetensors`."""
     return Path(field).with_suffix(".report.json")

@@ -1,4 +1,4 @@
-"""A linear code of CLIP vectors, their mean and principal directions: the alternative to the network."""
+"""Linear code of CLIP vectors, their mean and principal directions: an alternative to the network."""
 
 from pathlib import Path
 
@@ -9,15 +9,15 @@ from hilsplat.base.arrays import write_tensors
 
 
 class LinearCode:
-    """e = unit(m + U z): d principal directions about the mean.
+    """Code e = unit(m + U z) with d principal directions around the mean.
 
-    Nothing is trained and nothing is random. The average of codes is the code of the average, which holds for
-    no network, and a cosine with any vector needs d products, so relevancy needs no decoding. The price: a
-    network can bend its d numbers around the vectors of the scene.
+    It involves no training and no randomness. Unlike with a network, the code of an average is the average
+    of the codes, and a cosine with any vector takes d products, so relevancy needs no decoding. A network,
+    however, can adapt its d numbers nonlinearly to the vectors of the scene.
 
     Args:
         mean: m.
-        basis: U, orthonormal rows.
+        basis: U, with orthonormal rows.
     """
 
     def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
@@ -35,9 +35,9 @@ class LinearCode:
 
     @staticmethod
     def fit(vectors: Float32[np.ndarray, "B C"], latent: int) -> "LinearCode":
-        """Principal directions of the vectors; each direction's largest component is positive.
+        """Compute the principal directions of the vectors; each direction's largest component is positive.
 
-        If the vectors span fewer than d directions, arbitrary ones fill the rest.
+        If the vectors span fewer than d directions, the remaining ones are arbitrary.
         """
         data = vectors.astype(np.float64)
         mean = data.mean(axis=0)
@@ -49,21 +49,21 @@ class LinearCode:
         return LinearCode(mean.astype(np.float32), basis.astype(np.float32))
 
     def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
-        """Coordinates along the directions."""
+        """Return the coordinates along the directions."""
         return ((vectors - self.mean) @ self.basis.T).astype(np.float32)
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """Vectors of unit length."""
+        """Return vectors of unit length."""
         vectors = self.mean + latents @ self.basis
         return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)).astype(
             np.float32
         )
 
     def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple:
-        """The terms of cosines with decoded vectors.
+        """Return the terms of cosines with decoded vectors.
 
         Returns:
-            m.v and U v of each vector, |m|^2, and U m: they give e.v = (m.v + z.Uv) / |m + U z|.
+            m.v and U v of each vector, |m|^2, and U m, so that e.v = (m.v + z.Uv) / |m + U z|.
         """
         return (
             (vectors @ self.mean).astype(np.float32),
@@ -73,6 +73,6 @@ class LinearCode:
         )
 
     def save(self, path: Path) -> None:
-        """Write a .safetensors file; the same code gives the same bytes."""
+        """Write a .safetensors file; equal codes give equal bytes."""
         arrays = {"mean": self.mean, "basis": self.basis}
         write_tensors(path, arrays, code="pca", channels=self.channels, latent=self.latent)

@@ -1,12 +1,12 @@
-"""Train the field as the paper does: render a view, take its losses, step by Adam. Only features train.
+"""Train the field as in the paper: render a view, compute its losses, take an Adam step on the features.
 
-Slow on purpose: it is the reference for the sparse solver (`solver.solve_field`). Both minimise the same
-objective, term by term; here every term is taken on the rendered maps of one random view per step, and its
-expectation over the views is the solver's.
+It is slow because it is the reference for the sparse solver (`solver.solve_field`). Both minimise the same
+objective, term by term. Here each step computes every term on the rendered maps of one random view, whose
+expectation over the views is the solver's objective.
 
-Departs from minghanqin/LangSplat `train.py`, whose loop it is: one run trains the three levels on the same
-views; rendered features are divided by alpha, so that the losses see what a query sees; thinly covered pixels
-are left out; features of Gaussians are not scaled to unit length before they are blended.
+Departs from `train.py` of minghanqin/LangSplat, whose loop it follows: one run trains the three levels on the
+same views; rendered features are divided by alpha, so that losses and queries use the same features; thinly
+covered pixels are ignored; features of Gaussians are not scaled to unit length before they are blended.
 """
 
 import logging
@@ -36,12 +36,12 @@ from hilsplat.splat.rasterise.device import choose_device
 logger = logging.getLogger(__name__)
 
 CURVE_POINTS = 30
-"""Points of the report's curve of loss over seconds."""
+"""Points of the loss curve in the report."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What is rendered: the scene's cameras, its frozen Gaussians, and the masks of its views."""
+    """Inputs of rendering: the scene's cameras, its frozen Gaussians, and the masks of its views."""
 
     scene: Path
     gaussians: Path
@@ -50,14 +50,14 @@ class Rendered:
 
 @dataclass(frozen=True)
 class ViewTargets:
-    """Masks of one view on its covered pixels.
+    """Masks of one view in its covered pixels.
 
     Attributes:
         rows: rows of its masks in the contributions.
         level: level of each mask, 0 to 2.
-        painted: a row of ones per mask, at the pixels that show it (masks x pixels).
-        half: the same, at the pixels of a random half.
-        relations: masks that L_ins and L_part compare.
+        painted: indicator (masks x pixels) of the pixels that show each mask.
+        half: indicator of those pixels that are in the random half.
+        relations: masks compared by L_ins and L_part.
     """
 
     rows: Int64[np.ndarray, " m"]
@@ -69,7 +69,7 @@ class ViewTargets:
 
 @dataclass(frozen=True)
 class Shares:
-    """What turns losses of one view into an estimate of the whole objective: see `view_losses`."""
+    """Factors that turn losses of one view into an estimate of the whole objective: see `view_losses`."""
 
     views: int
     pixels: float
@@ -84,17 +84,17 @@ def view_losses(
     settings: FieldSettings,
     shares: Shares,
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
-    """Every loss on the rendered maps of one view, and the gradient of their weighted sum.
+    """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
 
     Args:
         shown: rendered features divided by alpha, channels of each level.
-        view: its masks.
-        latents: code of every mask of the scene.
-        settings: weights and readings.
-        shares: the losses are scaled so that their mean over all views is the solver's objective.
+        view: masks of the view.
+        latents: latent of every mask of the scene.
+        settings: weights and variants of the losses.
+        shares: factors that make the mean over all views equal the solver's objective.
 
     Returns:
-        unweighted losses by name; the gradient by the maps, 0 where nothing is painted.
+        unweighted losses by name; gradient with respect to the maps, 0 where no mask is painted.
     """
     pixels, levels, channels = shown.shape
     flat = shown.reshape(pixels, levels * channels)
@@ -118,7 +118,7 @@ def view_losses(
     losses = {"clustering": scale * float(np.square(to_mean).sum())}
     by_pixel = 2 * scale * settings.weight_clustering * to_mean
     if settings.language == "l1":
-        share = 1 / (pixels * channels)  # LangSplat: the mean over all pixels; unlabelled ones count 0
+        share = 1 / (pixels * channels)  # LangSplat averages over all pixels; unlabelled ones add 0
         losses["language"] = share * float(np.abs(to_latent).sum())
         by_pixel += settings.weight_language * share * np.sign(to_latent)
     else:
@@ -158,13 +158,13 @@ def train_literally(
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Adam from the field's start, one random view per step, each once before any is repeated.
+    """Run Adam from the field's start, one random view per step, each once before any is repeated.
 
     Returns:
-        the features, and a report: every loss of the whole objective before and after, and the curve.
+        the features, and a report: every term of the objective before and after, and the loss curve.
 
     Raises:
-        MisalignedArtifactError: the contributions belong to other Gaussians or other masks.
+        MisalignedArtifactError: if the contributions belong to other Gaussians or other masks.
     """
     scene = Scene.load(rendered.scene)
     require_same("contributions", scene.name, rendered.gaussians, contributions.gaussians_sha256)

@@ -1,4 +1,4 @@
-"""Minimise a smooth function of the field in few steps, with the same bytes on any number of threads."""
+"""Minimise a smooth function of the field in few steps, with a result independent of the thread count."""
 
 from collections.abc import Callable
 
@@ -14,12 +14,12 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
-    """Limited-memory BFGS with step halving; every sum is taken in a fixed order.
+    """Minimise by limited-memory BFGS with step halving; every sum is taken in a fixed order.
 
     Args:
-        objective: value and gradient at a point.
-        point: where to start; it is overwritten.
-        steps: iterations; each costs one evaluation unless its step must be halved.
+        objective: function that returns the value and gradient at a point.
+        point: start, which is overwritten.
+        steps: iterations; each takes one evaluation, plus one per halving of its step.
         first_step: inverse curvature assumed before the first step.
     """
     value, gradient = objective(point)
@@ -41,7 +41,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
         else:
             break
         del direction
-        # In the memory of what is no longer needed: a vector of a large scene takes over 100 MiB.
+        # reuse the memory of vectors no longer needed: one takes over 100 MiB in a large scene
         moved, turned = (
             np.subtract(candidate, point, out=point),
             np.subtract(new_gradient, gradient, out=gradient),
@@ -54,7 +54,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Sum of products in float64 (no BLAS: its order of summation depends on the threads)."""
+    """Return the dot product in float64, without BLAS, whose order of summation depends on the threads."""
     return float(_dot(np.ascontiguousarray(a).reshape(-1), np.ascontiguousarray(b).reshape(-1)))
 
 
@@ -73,7 +73,7 @@ def _dot(a, b):
 
 
 def _add(factor: float, vector: np.ndarray, out: np.ndarray) -> None:
-    """Add a multiple to `out`, in float32, without a temporary."""
+    """Add a multiple of a vector to `out`, in float32, without a temporary."""
     _add_flat(np.float32(factor), vector.reshape(-1), out.reshape(-1))
 
 
@@ -86,7 +86,7 @@ def _add_flat(factor, vector, out):
 def _two_loops(
     gradient: np.ndarray, memory: list[tuple[np.ndarray, np.ndarray, float]], first_step: float
 ) -> np.ndarray:
-    """Inverse Hessian times gradient, from the remembered steps."""
+    """Return the approximate inverse Hessian times the gradient, from the remembered steps."""
     result = gradient.copy()
     factors = []
     for moved, turned, curvature in reversed(memory):

@@ -1,4 +1,4 @@
-"""The scene autoencoder of LangSplat: a trained network from CLIP vectors to a few numbers and back."""
+"""Scene autoencoder of LangSplat: a trained network from CLIP vectors to a few numbers and back."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -15,18 +15,18 @@ from hilsplat.field.decoder_kernel import PackedLayers
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 NORM_EPS = 1e-5
-"""Added to the variances of BatchNorm, as by torch."""
+"""Epsilon added to the variances of BatchNorm, as in torch."""
 
 
 class Layer(NamedTuple):
-    """A linear layer, and what comes before it.
+    """A linear layer, with the normalisation and activation before it.
 
     Attributes:
-        name: of its weights in the file.
-        norm: name of the BatchNorm before it; empty for none.
-        relu: whether its inputs are made positive, after the BatchNorm.
-        inputs: their number.
-        outputs: their number.
+        name: name of its weights in the file.
+        norm: name of the BatchNorm before it; empty if there is none.
+        relu: whether a ReLU is applied to its inputs, after the BatchNorm.
+        inputs: number of inputs.
+        outputs: number of outputs.
     """
 
     name: str
@@ -37,12 +37,12 @@ class Layer(NamedTuple):
 
 
 def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
-    """Encoder and decoder; no layer is wider than the vectors."""
+    """Return the layers of encoder and decoder; no layer is wider than the vectors."""
     sides = []
     for side, widths, norm in (("encoder", ENCODER_WIDTHS, True), ("decoder", DECODER_WIDTHS, False)):
         between = [min(width, channels) for width in widths]
         ends = [channels, *between, latent] if norm else [latent, *between, channels]
-        every = 3 if norm else 2  # numbers of torch's nn.Sequential, where norm and ReLU count
+        every = 3 if norm else 2  # numbering of torch's nn.Sequential, which counts norms and ReLUs
         sides.append(
             [
                 Layer(f"{side}.{every * k}", f"{side}.{every * k - 2}" if norm and k else "", k > 0, *sizes)
@@ -53,26 +53,26 @@ def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
 
 
 def torch_generator(seed: int) -> np.random.RandomState:
-    """The generator that `torch.manual_seed(seed)` begins, a Mersenne Twister."""
+    """Return the generator that `torch.manual_seed(seed)` initialises, a Mersenne Twister."""
     return np.random.RandomState(seed % 2**32)
 
 
 def unit(vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B C"]:
-    """Rows divided by their lengths."""
+    """Scale rows to unit length."""
     return vectors / np.maximum(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)), np.float32(1e-12))
 
 
 class Autoencoder:
     """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
 
-    Departs: layer widths never exceed C. The encoder's BatchNorm (better than LayerNorm or none when
-    measured) sees full batches only, and ends with the statistics of all vectors: see
+    Departs: layer widths never exceed C. The encoder's BatchNorm (measured better than LayerNorm or none)
+    is trained on full batches only, and then uses the statistics of all vectors: see
     `network_training.train_autoencoder`. Arrays are named and laid out as in torch's modules.
 
     Args:
         channels: width C of the CLIP vectors.
         latent: size d of a latent.
-        arrays: of the layers, float32.
+        arrays: arrays of the layers, float32.
     """
 
     def __init__(self, channels: int, latent: int, arrays: Mapping[str, np.ndarray]) -> None:
@@ -81,7 +81,7 @@ class Autoencoder:
         self._encoder, self._decoder = layers_of(channels, latent)
 
     def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
-        """Latents of unit length."""
+        """Encode vectors as latents of unit length."""
         values = vectors
         for layer in self._encoder:
             weight, bias = self._affine(layer.name)
@@ -94,7 +94,7 @@ class Autoencoder:
         return unit(values)
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
-        """Vectors of unit length, from latents of any length."""
+        """Decode latents of any length to vectors of unit length."""
         return self._packed_decoder.through(latents)
 
     def _affine(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -106,7 +106,7 @@ class Autoencoder:
 
     @staticmethod
     def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
-        """The weights that torch draws from this state of its generator; BatchNorm has no effect."""
+        """Draw the weights that torch draws from this generator state; BatchNorm is the identity."""
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
             if layer.norm:
@@ -123,10 +123,10 @@ class Autoencoder:
 
     @staticmethod
     def from_arrays(channels: int, latent: int, arrays: dict[str, np.ndarray]) -> "Autoencoder":
-        """A trained network from its saved weights.
+        """Build a trained network from its saved weights.
 
         Raises:
-            ValueError: an array is missing or has another shape.
+            ValueError: if an array is missing or has another shape.
         """
         model = Autoencoder.drawn(channels, latent, torch_generator(0))
         for name, values in model.arrays.items():
@@ -136,5 +136,5 @@ class Autoencoder:
         return model
 
     def save(self, path: Path) -> None:
-        """Write a .safetensors file; the same weights give the same bytes."""
+        """Write a .safetensors file; equal weights give equal bytes."""
         write_tensors(path, self.arrays, channels=self.channels, latent=self.latent)

@@ -1,6 +1,6 @@
 """Training of the scene autoencoder: closed-form gradients on BLAS, without torch.
 
-The matrices are so small (64 x 128) that torch spends most of a step between them.
+The matrices are so small (64 x 128) that torch's overhead would take most of a step.
 """
 
 import math
@@ -16,18 +16,18 @@ from hilsplat.field.network_code import NORM_EPS, Autoencoder, Layer, layers_of,
 from hilsplat.settings import AutoencoderSettings
 
 ADAM_EPS = 1e-8
-"""As in torch."""
+"""Adam's epsilon, as in torch."""
 
 Arrays = dict[str, np.ndarray]
 
 
 class Passed(NamedTuple):
-    """What the way back through a layer needs from the way there.
+    """Values that the forward pass through a layer saves for the backward pass.
 
     Attributes:
         values: inputs of the linear layer, after BatchNorm and ReLU, (B, inputs).
-        scaled: inputs of the BatchNorm with mean 0 and variance 1, (B, inputs); empty without one.
-        spread: 1 over their standard deviation, (inputs).
+        scaled: inputs of the BatchNorm with mean 0 and variance 1, (B, inputs); empty if there is none.
+        spread: reciprocal standard deviations of those inputs, (inputs).
     """
 
     values: np.ndarray
@@ -43,11 +43,11 @@ def train_autoencoder(
     Args:
         vectors: unit CLIP vectors, at least one.
         settings: latent size, steps and weights.
-        seed: for the initial weights and the order of vectors.
+        seed: seed of the initial weights and the order of vectors.
 
     Returns:
-        the trained model; the same bytes for the same input and seed on any number of threads of the stage
-        (the command line gives BLAS one).
+        the trained model; equal inputs and seeds give equal bytes on any number of the stage's threads (the
+        command line limits BLAS to one thread).
     """
     twister = torch_generator(seed)
     channels, latent = vectors.shape[1], settings.latent
@@ -75,7 +75,7 @@ def train_autoencoder(
 
 
 def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray, " n"]:
-    """The order that `torch.randperm(count)` draws from this state of its generator."""
+    """Return the order that `torch.randperm(count)` draws from this generator state."""
     order = np.arange(count)
     _swap(order, twister.randint(0, 2**32, max(count - 1, 0), np.uint32))
     return order
@@ -84,14 +84,14 @@ def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray,
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _swap(order, drawn):
-    """Swap each place with one of those from it on, as drawn."""
+    """Swap each place with itself or a later one, as drawn."""
     for place in range(len(drawn)):
         other = place + np.int64(drawn[place]) % (len(order) - place)
         order[place], order[other] = order[other], order[place]
 
 
 def _as_arrays(flat: Float32[np.ndarray, " P"], like: Arrays) -> Arrays:
-    """Arrays of the same names and shapes, one after another in the memory of `flat`."""
+    """Return consecutive views of `flat` with the names and shapes of `like`."""
     parts = np.split(flat, np.cumsum([values.size for values in like.values()])[:-1])
     return {name: part.reshape(like[name].shape) for name, part in zip(like, parts, strict=True)}
 
@@ -103,18 +103,18 @@ def loss_gradients(
     cosine_weight: float,
     gradients: Arrays,
 ) -> None:
-    """Gradients of the mean squared error plus `cosine_weight` times the mean over vectors of 1 - cosine.
+    """Compute gradients of the mean squared error plus `cosine_weight` times the mean of 1 - cosine.
 
-    Both ends have unit length, so the squared error of a vector is 2 (1 - cosine), over C channels.
+    Inputs and outputs have unit length, so the squared error of a vector is 2 (1 - cosine), over C channels.
 
-    Departs: LangSplat takes the cosine along the batch axis, which compares channels, not vectors.
+    Departs: LangSplat computes the cosine along the batch axis, which compares channels, not vectors.
 
     Args:
-        parameters: of the network, by name.
-        vectors: a batch of unit vectors.
+        parameters: parameters of the network by name.
+        vectors: batch of unit vectors.
         latent: size d of a latent.
-        cosine_weight: see above.
-        gradients: written, under the same names.
+        cosine_weight: weight of the cosine loss.
+        gradients: output, with the same names.
     """
     channels = vectors.shape[1]
     encoder, decoder = layers_of(channels, latent)
@@ -127,7 +127,7 @@ def loss_gradients(
 
 
 def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int) -> Arrays:
-    """Mean and (unbiased) variance of all vectors at each BatchNorm, which takes them from then on."""
+    """Compute the mean and unbiased variance of all vectors at each BatchNorm, for use after training."""
     found: Arrays = {}
     encoder, _ = layers_of(data.shape[1], latent)
     values = data
@@ -139,7 +139,7 @@ def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int
 
 
 def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
-    """What layers make of a batch, with the batch's own statistics, and what the way back needs."""
+    """Return the outputs of layers, with the batch's statistics, and the values for the backward pass."""
     passed = []
     for layer in layers:
         scaled, spread = values[:0], values[:0, 0]
@@ -157,7 +157,7 @@ def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple
 def _back(
     parameters: Arrays, layers: list[Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
 ) -> np.ndarray:
-    """Gradients of the layers' parameters from that of their outputs; returns that of their inputs."""
+    """Compute the gradients of the layers' parameters, and return that of their inputs."""
     for layer, (values, scaled, spread) in zip(layers[::-1], passed[::-1], strict=True):
         np.matmul(slope.T, values, out=gradients[f"{layer.name}.weight"])
         np.sum(slope, axis=0, out=gradients[f"{layer.name}.bias"])
@@ -172,7 +172,7 @@ def _back(
 
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Gradient of vectors from that of `unit` of them: what points along them does nothing."""
+    """Return the gradient before `unit` from that after it; the component along the vectors vanishes."""
     length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
     return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
@@ -181,7 +181,7 @@ def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
 @compiled(error_model="numpy")
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _normalised(values, weight, bias):
-    """BatchNorm with the batch's own statistics, then ReLU: scaled inputs, 1 / deviation, outputs."""
+    """Apply BatchNorm with the batch's statistics and ReLU; return scaled inputs, 1 / deviation, outputs."""
     rows, columns = values.shape
     mean, var = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
     scaled, out = np.empty_like(values), np.empty_like(values)
@@ -203,7 +203,7 @@ def _normalised(values, weight, bias):
 @compiled(error_model="numpy")
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _normalised_back(slope, scaled, spread, weight, of_weight, of_bias):
-    """`slope` of a BatchNorm's outputs becomes that of its inputs; writes those of weight and bias."""
+    """Turn `slope` of a BatchNorm's outputs into that of its inputs, and write those of weight and bias."""
     rows, columns = slope.shape
     of_weight[:] = 0
     of_bias[:] = 0

@@ -1,7 +1,7 @@
 """Updates and sums over a whole field in one pass, without temporaries of its size.
 
-Each such pass is bound by memory: three levels of sixteen numbers for a million Gaussians are 192 MB, and an
-expression of numpy writes and reads that much for every operator. Sums are taken in float64 in one order.
+These passes are memory-bound: three levels of sixteen numbers for a million Gaussians are 192 MB, and a
+NumPy expression reads and writes that much for each operator. Sums are taken in float64 in a fixed order.
 """
 
 from typing import no_type_check
@@ -14,7 +14,7 @@ from hilsplat.base.compiled import compiled
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def channel_dots(a, b):
-    """Sum of products over Gaussians, per level and channel, of fields (N, 3, D)."""
+    """Sum the products of two fields (N, 3, D) over Gaussians, per level and channel."""
     out = np.zeros(a.shape[1:])
     for n in range(len(a)):
         for level in range(a.shape[1]):
@@ -26,7 +26,7 @@ def channel_dots(a, b):
 @compiled
 @no_type_check
 def scaled_squares(scale, a):
-    """`channel_dots` of a field with scale (N, 3) times it."""
+    """Return `channel_dots` of a field and scale (N, 3) times the field."""
     out = np.zeros(a.shape[1:])
     for n in range(len(a)):
         for level in range(a.shape[1]):
@@ -60,7 +60,7 @@ def add_by_channel(factors, a, out):
 @compiled
 @no_type_check
 def redirect(scale, residual, ratio, direction):
-    """The next conjugate direction: scale (N, 3) times the residual plus ratio (3, D) times the last."""
+    """Compute the next conjugate direction: scale (N, 3) times residual plus ratio (3, D) times the last."""
     for n in range(len(residual)):
         for level in range(residual.shape[1]):
             for c in range(residual.shape[2]):
@@ -71,7 +71,7 @@ def redirect(scale, residual, ratio, direction):
 @compiled
 @no_type_check
 def add_slope(factor, curved, right, scale, out):
-    """Add the slope factor (curved - right) of a quadratic form to `out`, and scale (N, 3) the sum."""
+    """Add the slope factor (curved - right) of a quadratic form to `out`, and multiply by scale (N, 3)."""
     for n in range(len(out)):
         for level in range(out.shape[1]):
             for c in range(out.shape[2]):
@@ -82,7 +82,7 @@ def add_slope(factor, curved, right, scale, out):
 @compiled
 @no_type_check
 def pull(mass, features, start):
-    """Sum of mass (N, 3) times the squared distance of two fields."""
+    """Return the sum of mass (N, 3) times the squared distance between two fields."""
     total = 0.0
     for n in range(len(features)):
         for level in range(features.shape[1]):

@@ -7,9 +7,9 @@ With the rendered map M = W F, the mask means A F, the areas n and the mask late
 - clustering loss L_h (Eq. 2):        tr F'GF - sum n |AF|^2
 - ridge: sum of visible mass x |F - F_lifted|^2
 
-Together they are one quadratic form, solved by a few conjugate-gradient steps from the lifted average.
+Their sum is one quadratic form, minimised by a few conjugate-gradient steps from the lifted average.
 
-Departs: the paper's objective has no term with CLIP, and a constant field minimises it. The language loss is
+Departs: the paper's objective has no term with CLIP, so a constant field minimises it. The language loss is
 LangSplat's regression with squared instead of absolute differences, averaged over labelled pixels only.
 """
 
@@ -33,7 +33,7 @@ from hilsplat.field.one_pass import (
 
 @dataclass(frozen=True)
 class QuadraticProblem:
-    """Language loss, clustering loss and ridge: everything but the contrastive losses.
+    """Language loss, clustering loss and ridge: all terms except the contrastive losses.
 
     Attributes:
         masks: A.
@@ -41,8 +41,8 @@ class QuadraticProblem:
         mass: G 1, the visible mass of each Gaussian at each level, px.
         pixels: n.
         latents: h.
-        lifted: what the field starts from, and the ridge pulls towards.
-        weights: of the language loss, the clustering loss and the ridge.
+        lifted: start of the field, to which the ridge pulls.
+        weights: weights of the language loss, the clustering loss and the ridge.
     """
 
     masks: MaskProducts
@@ -63,10 +63,9 @@ class QuadraticProblem:
         start: Literal["average", "median", "random", "langsplat"] | np.ndarray = "average",
         seed: int = 0,
     ) -> "QuadraticProblem":
-        """Compute the mass and what the field starts from, which the ridge pulls towards.
+        """Compute the mass and the start of the field, to which the ridge pulls.
 
-        `start` is a way to make it, or the features (N, 3, D) themselves, as for "langsplat"; `seed` is for
-        "random".
+        `start` names the start or is its features (N, 3, D), as for "langsplat"; `seed` is for "random".
         """
         mass = level_mass(quadratic)
         if isinstance(start, np.ndarray):
@@ -82,13 +81,13 @@ class QuadraticProblem:
 
     @property
     def total_pixels(self) -> float:
-        """Labelled pixels of all levels: the divisor that turns sums into means."""
+        """Number of labelled pixels of all levels, the divisor that turns sums into means."""
         return max(float(self.pixels.sum(dtype=np.float64)), 1.0)
 
     def hessian_product(
         self, features: Float32[np.ndarray, "N 3 D"], curved: Float32[np.ndarray, "N 3 D"] | None = None
     ) -> Float32[np.ndarray, "N 3 D"]:
-        """Half the Hessian of the summed losses, times the features; `curved` is G F if it is known."""
+        """Return half the Hessian of the summed losses times the features; `curved` is G F, if known."""
         language, clustering, ridge = self.weights
         out = self.quadratic.product(features) if curved is None else curved.copy()
         out *= np.float32(language + clustering)
@@ -100,7 +99,7 @@ class QuadraticProblem:
         return out
 
     def right_side(self) -> Float32[np.ndarray, "N 3 D"]:
-        """Right side of the optimality condition, hessian_product(F) = right_side()."""
+        """Return the right side of the optimality condition hessian_product(F) = right_side()."""
         language, _, ridge = self.weights
         target = self.masks.spread(self.pixels[:, None] * self.latents)
         target *= np.float32(language)
@@ -108,9 +107,9 @@ class QuadraticProblem:
         return target
 
     def terms(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
-        """Unweighted means over labelled pixels of the language loss, L_h and the ridge.
+        """Return the language loss, L_h and the ridge, unweighted, as means over labelled pixels.
 
-        Both losses are small differences of large sums, so everything is summed in float64.
+        Both losses are small differences of large sums, so all sums are in float64.
         """
         form = self.quadratic.form(features)
         means = self.masks.means(features.astype(np.float64))
@@ -133,7 +132,7 @@ def conjugate_gradient(
 ) -> np.ndarray:
     """Minimise the quadratic part in a few steps, preconditioned by the visible mass.
 
-    `curved` is G times the start if it is known.
+    `curved` is G times the start, if known.
 
     Levels and channels do not interact, so each has its own step size. Dot products are summed in
     float64 in a fixed order.
@@ -159,5 +158,5 @@ def conjugate_gradient(
 def _ratio(
     above: Float64[np.ndarray, "3 D"], below: Float64[np.ndarray, "3 D"]
 ) -> Float32[np.ndarray, "3 D"]:
-    """Quotient; 0 if a channel is already solved."""
+    """Return the quotient, or 0 if a channel is already solved."""
     return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)

@@ -1,6 +1,6 @@
 """Solve the field: lifted average, conjugate gradient, then L-BFGS if contrastive losses have a weight.
 
-More steps would fit the noise of mask borders, so both solvers stop early.
+Both solvers stop early, since more steps would fit the noise of mask borders.
 """
 
 import numpy as np
@@ -16,15 +16,15 @@ from hilsplat.settings import FieldSettings
 def solve_field(
     problem: QuadraticProblem, contrast: Contrast, settings: FieldSettings
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Lift, conjugate gradient, then L-BFGS if a contrastive loss has a weight.
+    """Solve by lifting, conjugate gradient, and L-BFGS if a contrastive loss has a weight.
 
     Returns:
-        the features, and a report: every loss before and after each part.
+        the features, and a report: every loss before and after each phase.
     """
     weights = (settings.weight_instance, settings.weight_part)
     total = problem.total_pixels
-    # The variables of L-BFGS, whose steps take much memory, are those that a mask shows. They are scaled by
-    # the root of the mass, which makes the quadratic part nearly round.
+    # The steps of L-BFGS take much memory, so its variables are only those that a mask shows. They are scaled
+    # by the root of the mass, which makes the quadratic part nearly isotropic.
     shown = np.flatnonzero(problem.mass)
     root = np.sqrt(problem.mass.reshape(-1)[shown])[:, None]
     inverse_root = np.zeros(problem.mass.shape, np.float32)
@@ -60,7 +60,7 @@ def solve_field(
 
 
 def _rows(features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "R D"]:
-    """One row for each Gaussian and level, in the same memory."""
+    """Return one row per Gaussian and level, in the same memory."""
     return features.reshape(-1, features.shape[2])
 
 
@@ -70,16 +70,16 @@ def keep_labelled(
     total_mass: Float[np.ndarray, " N"],
     min_share: float,
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Remove the latents of Gaussians that masks of a level hardly hold.
+    """Remove the latents of Gaussians with little of their visible weight in a level's labelled pixels.
 
-    Table and walls have no parts. Yet where the border of a mask strays onto them by a pixel, their Gaussians
-    get its latent in full and answer to it everywhere, since the regression sees labelled pixels only.
+    Tables and walls have no part masks. But where a mask border extends onto them by a pixel, their Gaussians
+    get the mask's full latent and match its queries everywhere: the regression uses only labelled pixels.
 
     Args:
         features: the solved field.
         mass: visible weight in labelled pixels of each level.
         total_mass: visible weight in all pixels.
-        min_share: least share of the weight in labelled pixels.
+        min_share: minimum share of the weight in labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
     return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)

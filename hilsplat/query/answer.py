@@ -1,4 +1,4 @@
-"""Ask a finished scene for a text: a ranked list as text, and a picture."""
+"""Query of a finished scene: a ranked list as text, and a picture."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -16,10 +16,10 @@ from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.semantic_tree.export import write_selection_ply
 
 LISTED = 10
-"""Most answers to list."""
+"""Maximum number of answers in a report."""
 
 LONGEST_NAME = 80
-"""Most bytes of a folder's name that are the text's own."""
+"""Maximum length of the query's own text in a folder name, bytes."""
 
 
 def answer(
@@ -36,28 +36,27 @@ def answer(
     device: str = "cpu",
     threads: int = 1,
 ) -> Iterator[str]:
-    """Ask a scene: yield what was found, then write `panel.png` and `selection.ply` and yield their names.
+    """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
 
-    The answer takes milliseconds; the picture, with its libraries and renderings, a second or two.
+    The answer takes milliseconds. The picture takes one to two seconds, including imports and rendering.
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
         text: words, or a path such as "bear > head > nose".
         level: auto, whole, part or subpart.
-        variant: named set of settings whose files answer.
+        variant: named set of settings whose files are queried.
         views: number of views in the panel.
         answerer: "tree" or "field", see `LanguageScene.query`.
-        view: restricts the answers to what this view shows, and puts it first in the panel; None: the
-            whole scene.
-        threshold: least score of an answer; None: those near the best.
+        view: restricts the answers to what this view shows, and is first in the panel; None: the whole scene.
+        threshold: minimum score of an answer; None: answers near the best.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
-        device: "cpu" or "cuda" for look-ups of the field.
+        device: "cpu" or "cuda" for look-ups in the field.
         threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
         SettingsError: the level, answerer, view or device is unknown, or the threshold not between 0 and 1.
-        DeviceError: cuda was asked for and torch finds no device.
+        DeviceError: cuda was requested and torch finds no device.
     """
     found = FinishedScene.locate(Path(folder), variant)
     scene = LanguageScene.of(found, threads=threads, device=device)
@@ -82,7 +81,7 @@ def answer(
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
-    """Views that show the best answers largest, without repeats, then others spread over the scene."""
+    """Return the views that show the best answers largest, without repeats, then others across the scene."""
     best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
     every = scene.scene.views()
     spread = [every[number * len(every) // count] for number in range(count)]
@@ -90,7 +89,7 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 
 
 def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
-    """The answers as text, with doubts; `view` is the one that the query was restricted to."""
+    """Return the answers as text, with doubts; `view` is the view that the query was restricted to."""
     place = scene.scene.name if view is None else f"what {view} shows of {scene.scene.name}"
     hits, doubts = hits_of(scene, found, LISTED), doubts_of(found)
     if not hits:
@@ -124,9 +123,9 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
 
 
 def file_name(text: str) -> str:
-    """Folder name for a query that is safe on every system, such as `bear--nose`.
+    """Return a folder name for a query that is valid on every system, such as `bear--nose`.
 
-    A text that is long, or holds more than words, gets some digits of its digest too: no two share a folder.
+    For texts that are long or contain other characters, the name ends in part of their digest to be unique.
     """
     parts = [part.split() for part in text.split(PATH_SEPARATOR)]
     if all(parts) and all(re.fullmatch(r"[\w.]*\w", word) for part in parts for word in part):

@@ -1,4 +1,4 @@
-"""Look-ups of relevancy by torch, for CUDA devices; tested on torch's CPU if there is none."""
+"""Relevancy look-ups in torch for CUDA devices; tests use torch's CPU if there is none."""
 
 from dataclasses import dataclass
 
@@ -13,13 +13,13 @@ from hilsplat.query.projected_look_up import PlacedProjected
 
 @dataclass(frozen=True)
 class PlacedOnDevice:
-    """What look-ups on the CPU keep of a view, on a device.
+    """Data that the CPU look-ups store per view, copied to a device.
 
     Attributes:
         channels: latents or coordinates (R, P), in their stored type.
-        length: of each decoded vector (P); None if these have unit length.
+        length: length of each decoded vector (P); None if all have unit length.
         generic: cosine with the nearest canonical phrase (P).
-        directions: of the coordinates; None for latents.
+        directions: directions of the coordinates; None for latents.
     """
 
     channels: Tensor
@@ -29,7 +29,7 @@ class PlacedOnDevice:
 
     @staticmethod
     def of(placed: PlacedLinear | PlacedProjected, device: str) -> "PlacedOnDevice":
-        """Copy to a device what the CPU's look-ups keep."""
+        """Copy the data of a CPU look-up to a device."""
         generic = torch.from_numpy(placed.generic).to(device)
         if isinstance(placed, PlacedLinear):
             channels, length = (torch.from_numpy(a).to(device) for a in (placed.channels, placed.length))
@@ -40,7 +40,7 @@ class PlacedOnDevice:
 
     @property
     def nbytes(self) -> int:
-        """Memory held on the device and the host."""
+        """Memory used on the device and the host, bytes."""
         tensors = [self.channels, self.generic, *([] if self.length is None else [self.length])]
         return sum(tensor.nbytes for tensor in tensors) + (
             0 if self.directions is None else self.directions.nbytes
@@ -49,7 +49,7 @@ class PlacedOnDevice:
     def relevancy(
         self, offset: np.float32, weights: Float[np.ndarray, " R"], scale: float
     ) -> Float32[np.ndarray, " P"]:
-        """Relevancy of a text whose cosine is (offset + weights . channels) / length."""
+        """Return the relevancy of a text whose cosine is (offset + weights . channels) / length."""
         on_device = torch.from_numpy(np.ascontiguousarray(weights, np.float32)).to(self.generic.device)
         cosine = float(offset) + on_device @ self.channels.float()
         if self.length is not None:

@@ -1,4 +1,4 @@
-"""What a scene answers from its decoded language field, as in the paper."""
+"""Answers from a scene's decoded language field, as in the paper."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ class FieldAnswers:
 
     Attributes:
         language: the field.
-        code: that it is written in.
-        views: of the scene.
-        text_vectors: unit CLIP vectors of texts.
-        settings: canonical phrases, scale of the relevancy.
+        code: decodes the field.
+        views: views of the scene.
+        text_vectors: returns the unit CLIP vectors of texts.
+        settings: canonical phrases and relevancy scale.
         threads: number of threads for look-ups.
-        device: for look-ups.
+        device: device for look-ups.
     """
 
     language: LanguageField
@@ -45,7 +45,7 @@ class FieldAnswers:
     def relevancy(
         self, texts: Sequence[str], view: str, *, exact: bool = True
     ) -> Float32[np.ndarray, "T 3 H W"]:
-        """Rendered latent -> decoder -> relevancy; see `LanguageScene.field_relevancy`."""
+        """Compute relevancy from decoded rendered latents; see `LanguageScene.field_relevancy`."""
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)
         placed = self._placed_latents(view) if answer.is_linear or not exact else None
@@ -61,7 +61,7 @@ class FieldAnswers:
     def cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Cosine of texts with the decoded latents of some pixels; see `LanguageScene.field_cosine`."""
+        """Return cosines of texts with the decoded latents of pixels; see `LanguageScene.field_cosine`."""
         vectors, code = self.text_vectors(texts), self.code
         height, width = self.views.camera(view).size_hw
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
@@ -76,7 +76,7 @@ class FieldAnswers:
         return found
 
     def of_gaussians(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
-        """Relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
+        """Return each Gaussian's relevancy at a level, or the maximum over levels; 0 without a latent."""
         named = [each for each in LEVELS if level in ("auto", each.label)]
         features = self.language.features
         out = np.zeros(len(features), np.float32)
@@ -90,7 +90,7 @@ class FieldAnswers:
         return out
 
     def image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
-        """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
+        """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
         weights = self.views.weights(view)
         colours = field_colours(self.language.features[:, level.index])
         return to_uint8((weights @ colours).reshape(*self.views.camera(view).size_hw, 3))
@@ -103,7 +103,7 @@ class FieldAnswers:
         return self.code.decode_array(means)
 
     def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-        """Per level, the pixels that show mostly Gaussians with a latent, and their rendered latents."""
+        """Return, per level, the pixels that show mostly Gaussians with a latent, and their latents."""
         return self.views.store.get(
             ("latents", view),
             lambda: rendered_latents(self.views.weights(view), self.language.features),
@@ -111,7 +111,7 @@ class FieldAnswers:
         )
 
     def _placed_latents(self, view: str) -> list:
-        """What look-ups of a view need, level by level; made at its first look-up."""
+        """Return the look-up data of a view for each level, created at the first look-up."""
         return self.views.store.get(
             ("placed", view),
             lambda: [self._latent_relevancy.prepare(latents) for _, latents in self.latents(view)],
@@ -130,11 +130,11 @@ class FieldAnswers:
 
 
 def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "N 3"]:
-    """Three principal directions of a level's features over all Gaussians, stretched to [0, 1].
+    """Map a level's features to colours along their three principal directions, stretched to [0, 1].
 
-    The largest component of each direction is positive, and its 2nd to 98th percentile is stretched to the
-    colour range, so that views share their colours. Gaussians without a feature are black; with fewer than
-    three directions, the remaining channels are 0.
+    The largest component of each direction is positive, and its 2nd to 98th percentile over all Gaussians is
+    stretched to the colour range, so that all views use the same colours. Gaussians without a feature are
+    black; with fewer than three directions, the remaining channels are 0.
     """
     values = features.astype(np.float64)
     seen = np.square(values).sum(axis=1) > 0

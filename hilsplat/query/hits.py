@@ -1,4 +1,4 @@
-"""Answers for people: what was found, where, in which views, and what is doubtful about it."""
+"""Human-readable answers: the node, its position, its best views and any doubts."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -17,19 +17,19 @@ BEST_VIEWS = 3
 
 
 LIKELY_CHANCE = 0.05
-"""An answer is doubtful if more than this share of words for absent things score as high."""
+"""An answer is doubtful if more than this share of the words for absent things score as high."""
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """A text of a query that may be for nothing in the scene.
+    """A text of a query that may match nothing in the scene.
 
     Attributes:
         text: the text.
-        level: the level that was searched, if nodes of another level do answer the text; else None.
-        chance: share of words for absent things whose best score is as high; None: unknown, and no node
-            matches the text better than a generic word.
-        unknown: words of the text that the model does not know.
+        level: the level that was searched, if a node of any level matches the text; otherwise None.
+        chance: share of words for absent things whose best score is as high; None if unknown, in which case
+            no node matches the text better than a generic word.
+        unknown: words of the text that are not in the model's vocabulary.
     """
 
     text: str
@@ -38,7 +38,7 @@ class Doubt:
     unknown: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """The doubt in a sentence."""
+        """Return the doubt as a sentence."""
         who = "nothing" if self.level is None else f"no {self.level.label}"
         if self.unknown:
             words = ", ".join(map(repr, self.unknown))
@@ -51,21 +51,21 @@ class Doubt:
 
 @dataclass(frozen=True)
 class Hit:
-    """One ranked answer, for people.
+    """One ranked answer.
 
     Attributes:
         node: row of the semantic tree.
         level: its level.
-        score: relevancy in (0, 1) of the node and, to a lesser share, of what it is part of; answers are
-            ordered by it, and 0.5 is no better than a generic word. Of what looks like a node or a picture
-            (route "like"), the cosine.
+        score: relevancy in (0, 1) of the node and, with a lower weight, of its ancestors; answers are sorted
+            by it, and 0.5 is no better than a generic word. With route "like", the cosine with a node or
+            picture.
         centroid: scene units.
         box: axis-aligned, lower and upper corner, scene units.
         oriented_box: the box along the node's own axes.
-        best_views: up to three train views that show it largest.
+        best_views: up to three training views that show it largest.
         route: as in `NodeHits`, or "like".
-        doubts: texts of the query that nothing answers; a path is no better than its first text.
-        name: that a person gave the node, else what the vocabulary calls it; empty if nothing fits.
+        doubts: texts of the query that may match nothing; a path is no better than its first text.
+        name: the user's name for the node, otherwise its vocabulary name; empty if nothing fits.
     """
 
     node: int
@@ -86,7 +86,7 @@ class Hit:
         return self._scene.gaussians_of([self.node])
 
     def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
-        """Pixels of a view that consist of the node's Gaussians by more than half.
+        """Return the pixels of a view in which the node's Gaussians have a share above 0.5.
 
         Raises:
             SettingsError: the scene has no such view.
@@ -95,14 +95,14 @@ class Hit:
 
 
 def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
-    """Describe the best nodes that answered, at most `limit`."""
+    """Return the best nodes, at most `limit`, as answers."""
     doubts = doubts_of(found)
     best = zip(found.ids[:limit].tolist(), found.values[:limit], strict=True)
     return [hit_of(scene, node, scene.score(value), found.route, doubts) for node, value in best]
 
 
 def hit_of(scene: "LanguageScene", node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
-    """Describe one node that answered."""
+    """Return one node as an answer."""
     tree = scene.tree
     area = tree.view_area_px[node]
     order = np.lexsort((np.arange(len(area)), -area))[:BEST_VIEWS]
@@ -123,7 +123,7 @@ def hit_of(scene: "LanguageScene", node: int, score: float, route: str, doubts: 
 
 
 def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
-    """Texts of a query that may be for nothing in the scene."""
+    """Return the texts of a query that may match nothing in the scene."""
     doubts = []
     for each in found.texts:
         likely = each.chance is not None and each.chance > LIKELY_CHANCE
@@ -134,5 +134,5 @@ def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
 
 
 def counted(count: int, noun: str) -> str:
-    """A count with its noun: 1 node, 2 nodes."""
+    """Format a count with its noun: 1 node, 2 nodes."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

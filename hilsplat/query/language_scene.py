@@ -1,8 +1,7 @@
-"""A finished scene that answers texts, by the nodes of its semantic tree or by its decoded language field.
+"""A finished scene that accepts text queries, on its semantic tree or on its decoded language field.
 
-`hilsplat.open` opens it; docs/python.md shows how to query it. A text reaches its Gaussians in one chain:
-`query` parses it, `select` searches the tree by cosine margins (`node_search.search`), and a `Hit` has its
-Gaussians.
+`hilsplat.open` opens it; docs/python.md shows how to query it. From text to Gaussians: `query` parses the
+text, `select` searches the tree by cosine margins (`node_search.search`), and each `Hit` has its Gaussians.
 """
 
 import logging
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NAMED = 2.0
-"""Cosine margin of a node for the name that a person gave it: the largest there is, so it comes first."""
+"""Cosine margin of a node for the name that the user gave it: the maximum, so that it is ranked first."""
 
 TextEncoder = Callable[[list[str]], np.ndarray]
 PictureEncoder = Callable[[np.ndarray], np.ndarray]
@@ -51,25 +50,25 @@ Answerer = Literal["tree", "field"]
 
 @dataclass(frozen=True)
 class LanguageScene:
-    """A finished scene that answers texts.
+    """A finished scene that accepts text queries.
 
     Attributes:
         scene: cameras and views.
         gaussians: frozen geometry.
         tree: the nodes.
-        language: the field; None: the run has not come to it yet, and only the tree answers.
+        language: the field; None if the run has not computed it yet, and only the tree accepts queries.
         autoencoder: decodes the field; None if there is no field.
-        encode_texts: unit CLIP vectors of texts.
-        pixel_weights: compositing weights of a view (pixels x Gaussians).
-        settings: canonical phrases, scale of the relevancy, and how nodes are selected.
+        encode_texts: returns the unit CLIP vectors of texts.
+        pixel_weights: returns the compositing weights of a view (pixels x Gaussians).
+        settings: canonical phrases, relevancy scale, and selection of nodes.
         threads: number of threads for look-ups.
-        device: "cpu" or "cuda", for look-ups of the field.
-        caution: why no answer of CLIP means anything here, in a sentence; empty: no such reason.
-        names: names that a person gave to nodes, which answer texts first.
-        naming: what a vocabulary calls the nodes, and words for what is absent; None: the stage has not run.
-        unknown_words: words of a text that the model of texts does not know.
-        encode_picture: unit CLIP vector of an RGB image; None: pictures cannot be looked for.
-        finished: where the scene is, and its variant; None: it was put together from parts.
+        device: "cpu" or "cuda", for look-ups in the field.
+        caution: sentence that explains why CLIP's answers are meaningless here; empty if they are not.
+        names: the user's names for nodes, which are matched first.
+        naming: vocabulary names of the nodes, and words for absent things; None if the stage has not run.
+        unknown_words: returns the words of a text that are not in the text model's vocabulary.
+        encode_picture: returns the unit CLIP vector of an RGB image; None if images cannot be embedded.
+        finished: location and variant of the scene; None if it was assembled from parts.
     """
 
     scene: Scene
@@ -98,14 +97,14 @@ class LanguageScene:
     ) -> "LanguageScene":
         """Open `results/<dataset>/<scene>`, or a copy of it anywhere, with the settings that made it.
 
-        Canonical phrases, template, scale and the selection of nodes are those of the variant's evaluation,
-        or of its panel if the scene has no labels, read from the provenance.
+        Canonical phrases, template, scale and node selection are read from the provenance of the variant's
+        evaluation, or of its panel if the scene has no labels.
 
         Args:
             folder: a finished scene.
-            variant: named set of settings whose files answer.
+            variant: named set of settings whose files are queried.
             threads: number of threads for rasterising and look-ups.
-            device: "cpu" or "cuda", for look-ups of the field (`field_relevancy` with exact=False).
+            device: "cpu" or "cuda", for look-ups in the field (`field_relevancy` with exact=False).
 
         Raises:
             ArtifactError: the scene is not finished.
@@ -122,7 +121,7 @@ class LanguageScene:
     def of(
         found: FinishedScene, *, threads: int = 1, device: str = "cpu", opened: Opened | None = None
     ) -> "LanguageScene":
-        """Open a finished scene that was located, with its own settings and the names given to its nodes."""
+        """Open a located finished scene with its own settings and its nodes' names."""
         scene = LanguageScene.from_parts(
             found.parts,
             found.evaluate_settings(),
@@ -149,16 +148,15 @@ class LanguageScene:
 
         Args:
             parts: paths of the artifacts.
-            settings: how the scene answers.
+            settings: canonical phrases, template, relevancy scale and selection of nodes.
             threads: as in `open`.
             device: as in `open`.
-            opened: artifacts that other variants of the scene opened before.
-            names: names of nodes; None: none, as in evaluation, which scores the models alone.
-            naming: what a vocabulary calls the nodes; None: no doubts about chance, as in evaluation.
+            opened: artifacts that other variants of the scene have already opened.
+            names: the user's names for nodes; None in evaluation, which scores only the models.
+            naming: vocabulary names of the nodes; None in evaluation, which then reports no chance.
 
         Raises:
-            MisalignedArtifactError: the tree or field was made for other Gaussians, or the field for
-                another autoencoder.
+            MisalignedArtifactError: as in `OpenedParts.of`.
             ModelError: the CLIP that embedded the masks is not found.
         """
         from hilsplat.splat.rasterise.api import pixel_weights
@@ -192,13 +190,13 @@ class LanguageScene:
         """Show the scene in a notebook: the page of `hilsplat view` in a frame, served by this process.
 
         Args:
-            text: the first query; "": none.
-            height: of the frame, px.
-            proxy: address under which the browser reaches a port of this machine, with `{port}` in it, if the
-                notebook runs on another one: "/user/me/proxy/{port}/" on a JupyterHub.
+            text: the first query; "" for none.
+            height: height of the frame, px.
+            proxy: address, containing `{port}`, under which the browser reaches a port of this machine, if
+                the browser runs on another machine: "/user/me/proxy/{port}/" on a JupyterHub.
 
         Raises:
-            ArtifactError: the scene was put together from parts, or has too many Gaussians to show.
+            ArtifactError: the scene was assembled from parts, or has too many Gaussians to show.
         """
         from hilsplat.viewer.embedded import EmbeddedViewer
 
@@ -207,10 +205,10 @@ class LanguageScene:
         return EmbeddedViewer(self.finished, text=text, height=height, proxy=proxy, threads=self.threads)
 
     def trained(self) -> tuple[LanguageField, Code]:
-        """The language field, and the code that it is written in.
+        """Return the language field and the code that decodes it.
 
         Raises:
-            ArtifactError: the run has not come to them yet.
+            ArtifactError: the run has not computed them yet.
         """
         if self.language is None or self.autoencoder is None:
             raise ArtifactError(
@@ -231,18 +229,18 @@ class LanguageScene:
         threshold: float | None = None,
         limit: int = 10,
     ) -> list[Hit]:
-        """Ranked answers to a text, or to a path such as "bear > head > nose"; several for "mugs".
+        """Return ranked answers to a text, or to a path such as "bear > head > nose"; several for "mugs".
 
         Args:
             text: words, or words separated by ">".
             level: "whole", "part", "subpart" or "auto"; for a path, the level of its last text.
-            answerer: "tree": nodes answer with their averaged CLIP vectors; "field": with the decoded
-                mean of the paper's field over their Gaussians.
-            view: name of a view, to find only what it shows; None: the whole scene.
-            threshold: least score of an answer, in (0, 1); None: those near the best, whose margin is at most
-                (1 - `node_select`) times the range of the level's margins below it, or three times that if
-                they look like it.
-            limit: most answers to return.
+            answerer: "tree" compares the nodes' averaged CLIP vectors with the text; "field" compares the
+                decoded mean of the paper's field over their Gaussians.
+            view: name of a view, to find only nodes that it shows; None: the whole scene.
+            threshold: minimum score of an answer, in (0, 1); None: answers near the best, whose margin is at
+                most (1 - `node_select`) times the range of the level's margins below it, or three times that
+                if they look like it.
+            limit: maximum number of answers.
 
         Raises:
             SettingsError: the text is empty, the level, answerer or view is unknown, a path has more texts
@@ -252,9 +250,9 @@ class LanguageScene:
         return hits_of(self, found, limit)
 
     def like_node(self, node: int, *, limit: int = 10) -> list[Hit]:
-        """Nodes of a node's own level that look most like it, best first; scores are cosines.
+        """Return the nodes of a node's own level that look most like it, best first; scores are cosines.
 
-        It compares averaged CLIP vectors of masks, so it needs no text.
+        This compares averaged CLIP vectors of masks, so it needs no text.
 
         Raises:
             SettingsError: there is no such node.
@@ -265,10 +263,10 @@ class LanguageScene:
         return self._nearest(self.tree.clip[node], same[same != node], limit)
 
     def like_picture(self, picture: UInt8[np.ndarray, "H W 3"], *, limit: int = 10) -> list[Hit]:
-        """Nodes of any level that look most like a picture or a crop, best first; scores are cosines.
+        """Return the nodes of any level that look most like a picture, best first; scores are cosines.
 
         Raises:
-            ModelError: the CLIP of this scene embeds no pictures.
+            ModelError: the CLIP of this scene cannot embed pictures.
         """
         if self.encode_picture is None:
             raise ModelError(f"{self.scene.name} was opened without a model that embeds pictures")
@@ -290,7 +288,7 @@ class LanguageScene:
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """Like `query`, but return rows of the tree."""
+        """Return the answers of `query` as rows of the tree."""
         path = path_of(text)
         if answerer not in get_args(Answerer):
             raise SettingsError(
@@ -315,7 +313,7 @@ class LanguageScene:
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """The search behind every answer: `query` and `find` call it with the texts of a path.
+        """Search the nodes for the texts of a path; `query` and `find` call this.
 
         Args:
             path: one text, or several from coarse to fine.
@@ -346,7 +344,7 @@ class LanguageScene:
     def _doubted(
         self, answer: TextAnswer, answerer: Answerer, shown: Bool[np.ndarray, " n"] | None
     ) -> TextAnswer:
-        """A text's answer with the share of words for absent things that score as high."""
+        """Return a text's answer with the share of words for absent things that score as high."""
         if self.names.nodes_of(answer.text):
             return answer
         chance = None
@@ -359,16 +357,16 @@ class LanguageScene:
         return replace(answer, chance=chance, unknown=tuple(self.unknown_words(answer.text)))
 
     def _margins_by_chance(self, answerer: Answerer, naming: NodeNaming) -> Float32[np.ndarray, "W n"]:
-        """Cosine margin of every node for words for absent things; see `NodeNaming.rivals`."""
+        """Return each node's cosine margin for the words for absent things (`NodeNaming.rivals`)."""
         if answerer not in self._by_chance:
             canonical = self.text_vectors(self.settings.canonical)
             self._by_chance[answerer] = margins(self.node_vectors(answerer), naming.rivals, canonical)
         return self._by_chance[answerer]
 
     def name_of(self, node: int) -> str:
-        """The name that a person gave a node, else what the vocabulary calls it; empty if nothing fits.
+        """Return the user's name for a node, otherwise its vocabulary name; empty if nothing fits.
 
-        A part is called as part of its whole, "wheel of car", unless its name says that.
+        The vocabulary name of a part includes its whole, as in "wheel of car", unless it already does.
         """
         own, parent = self.own_name_of(node), int(self.tree.parent[node])
         if not own or parent == NONE or node in self.names.of_node:
@@ -379,20 +377,20 @@ class LanguageScene:
         return own if not whole or whole in own else f"{own} of {whole}"
 
     def own_name_of(self, node: int) -> str:
-        """As `name_of`, without the whole that a part belongs to."""
+        """Return `name_of` without the whole that a part belongs to."""
         called = self.naming.of_node[node] if self.naming is not None else ""
         return self.names.of_node.get(node, "") or called
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
-        """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
+        """Return which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
         return self._shown.shown(view)
 
     def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
-        """Rows of `gaussians.ply` that belong to any of the nodes."""
+        """Return the rows of `gaussians.ply` that belong to any of the nodes."""
         return members_of(self.tree, ids)
 
     def node_masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
-        """Pixels that consist of the nodes' Gaussians by more than half."""
+        """Return the pixels in which the nodes' Gaussians have a share above 0.5."""
         return self._shown.masks(view, ids)
 
     # -- views ------------------------------------------------------------------------------------
@@ -403,26 +401,26 @@ class LanguageScene:
         return self.scene.cameras.names
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """The undistorted photograph of a view; read-only because it is cached, so copy it to draw on it."""
+        """Return a view's undistorted photograph; it is cached and read-only, so copy it to draw on it."""
         return self._shown.image(view)
 
     def forget(self, view: str) -> None:
-        """Free what is kept of a view: later answers in it are the same, and take longer again."""
+        """Free the cached results of a view; later queries recompute them."""
         self._views.forget(view)
 
     # -- relevancy --------------------------------------------------------------------------------
 
     def text_vectors(self, texts: Sequence[str]) -> Float32[np.ndarray, "T C"]:
-        """Unit CLIP vectors of texts; each text is encoded once."""
+        """Return the unit CLIP vectors of texts; each text is encoded once."""
         new = [text for text in dict.fromkeys(texts) if text not in self._texts]
         if new:
             self._texts.update(zip(new, np.asarray(self.encode_texts(new), np.float32), strict=True))
         return np.stack([self._texts[text] for text in texts])
 
     def node_margins(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
-        """Cosine margin of every node for every text, over this scene's canonical phrases.
+        """Return each node's cosine margin for each text, relative to this scene's canonical phrases.
 
-        A node has the margin `NAMED` for the name that a person gave it.
+        A node has the margin `NAMED` for the name that the user gave it.
         """
         if not len(texts):
             return np.zeros((0, len(self.tree)), np.float32)
@@ -433,34 +431,32 @@ class LanguageScene:
         return found
 
     def caution_about(self, text: str) -> str:
-        """`caution`, unless a person named nodes by every text of a query, so that no CLIP answers it."""
+        """Return `caution`, or "" if every text of a query is a user-given name, so that CLIP is not used."""
         return "" if all(self.names.nodes_of(part) for part in path_of(text)) else self.caution
 
     def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
-        """Relevancy of every node to every text."""
+        """Return the relevancy of each node to each text."""
         return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
 
     def score(self, margin: float) -> float:
-        """The relevancy of one margin."""
+        """Return the relevancy of one margin."""
         return float(relevancy_of_margins(np.array([margin]), self.settings.relevancy_scale)[0])
 
     def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
-        """Unit vectors that nodes answer with: their own, or decoded from the field of their Gaussians."""
+        """Return the nodes' unit vectors: their own, or decoded from the field of their Gaussians."""
         return self.tree.clip if answerer == "tree" else self._field.node_vectors
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
-        """Relevancy of the nodes that a pixel shows, blended by its weights, at each level.
+        """Blend the relevancy of the nodes that each pixel shows by its weights, at each level.
 
-        Gaussians without a node count as the least relevant node of the level. Pixels that the Gaussians do
-        not cover get the least relevancy of the covered ones, so that they are never selected and do not
-        stretch the range.
+        For Gaussians without a node and for uncovered pixels, see `SceneViews.blended`.
         """
         return self._shown.blended(view, self.node_relevancy(texts))
 
     def field_relevancy(
         self, texts: Sequence[str], view: str, *, exact: bool = True
     ) -> Float32[np.ndarray, "T 3 H W"]:
-        """Rendered latent -> decoder -> relevancy, at every pixel and level, as in the paper.
+        """Compute relevancy from decoded rendered latents at every pixel and level, as in the paper.
 
         Pixels that show mostly Gaussians without a latent at the level count as uncovered (see
         `node_relevancy_map`).
@@ -468,22 +464,22 @@ class LanguageScene:
         Args:
             texts: queries.
             view: name of the view.
-            exact: True: a network decodes every pixel at every call; False: a view is decoded once, and
-                answers differ by at most 2e-3 (see `latent_relevancy`). No difference for a linear code.
+            exact: if True, a network decodes every pixel at every call; if False, a view is decoded once, and
+                results differ by at most 2e-3 (see `latent_relevancy`). No difference for a linear code.
         """
         return self._field.relevancy(texts, view, exact=exact)
 
     def node_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Cosine of texts with the nodes that some pixels show, blended by their weights, at each level.
+        """Blend the cosines of texts with the nodes that pixels show by their weights, at each level.
 
-        Gaussians without a node count as the least cosine of the level; -inf where Gaussians do not cover.
+        Gaussians without a node have the lowest cosine of the level; uncovered pixels have -inf.
 
         Args:
-            texts: queries; names that a person gave play no part.
+            texts: queries; user-given names are ignored.
             view: name of the view.
-            pixels: row * width + column of each.
+            pixels: row * width + column of each pixel.
         """
         cosines = self.text_vectors(texts) @ self.tree.clip.astype(np.float32).T
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
@@ -500,23 +496,22 @@ class LanguageScene:
     def field_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Cosine of texts with the rendered, decoded latent of some pixels, at each level.
+        """Return the cosines of texts with the rendered, decoded latents of pixels, at each level.
 
-        -inf where a pixel shows mostly Gaussians without a latent at the level. Arguments as in
-        `node_cosine`.
+        Pixels that show mostly Gaussians without a latent have -inf. Arguments as in `node_cosine`.
         """
         return self._field.cosine(texts, view, pixels)
 
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
-        """The field's relevancy of every Gaussian at a level, or at its best; 0 without a latent."""
+        """Return each Gaussian's field relevancy at a level, or its maximum over levels; 0 if no latent."""
         return self._field.of_gaussians(text, level)
 
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
-        """The field of a level as colours (see `field_colours`); uncovered pixels are black."""
+        """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
         return self._field.image(view, level)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
-        """W of a view with rows divided by alpha; rows of alpha below a half are empty."""
+        """Return W of a view with rows divided by alpha; rows with an alpha below 0.5 are empty."""
         return self._shown.weights(view)
 
     @cached_property
@@ -532,10 +527,10 @@ class LanguageScene:
 
 
 def path_of(text: str) -> tuple[str, ...]:
-    """The texts of a query, coarse to fine: one, or those of a path such as "bear > head > nose".
+    """Return the texts of a query, coarse to fine: one, or those of a path such as "bear > head > nose".
 
     Raises:
-        SettingsError: one of them is empty, or not UTF-8.
+        SettingsError: a text is empty or not UTF-8.
     """
     if not text.isascii() and text != text.encode(errors="replace").decode():
         raise SettingsError(

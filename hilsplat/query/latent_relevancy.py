@@ -1,7 +1,7 @@
 """Relevancy of rendered latents without decoding every pixel.
 
-- A linear code (PCA): cosines follow from the d numbers of a latent without decoding (`linear_look_up`).
-- A network: a view is decoded once and kept as coordinates along few directions (`projected_look_up`).
+- Linear code (PCA): cosines are computed from the d numbers of a latent without decoding (`linear_look_up`).
+- Network: a view is decoded once and stored as coordinates along a few directions (`projected_look_up`).
 """
 
 from collections.abc import Callable
@@ -32,8 +32,8 @@ class LatentRelevancy:
     Args:
         code: decodes latents.
         canonical: unit vectors of the generic phrases.
-        scale: of the cosines.
-        threads: number of threads that share the pixels; results do not depend on it.
+        scale: scale of the cosines.
+        threads: number of threads; results do not depend on it.
         device: "cpu" or "cuda" for `fast`; results are equal up to rounding.
     """
 
@@ -58,7 +58,7 @@ class LatentRelevancy:
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
     ) -> Float32[np.ndarray, "T P"]:
-        """Relevancy by decoding every latent."""
+        """Compute relevancy by decoding every latent."""
         out = np.empty((len(texts), len(latents)), np.float32)
 
         def decode(span: slice) -> None:
@@ -69,7 +69,7 @@ class LatentRelevancy:
         return out
 
     def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
-        """Prepare these latents for look-ups; once per view."""
+        """Prepare the latents of a view for look-ups."""
         placed: PlacedLinear | PlacedProjected
         if isinstance(self._look_up, LinearLookUp):
             placed = self._look_up.place(latents)
@@ -86,10 +86,10 @@ class LatentRelevancy:
         placed: Placed,
         texts: Float32[np.ndarray, "T C"],
     ) -> Float32[np.ndarray, "T P"]:
-        """Relevancy by the look-up for this code (see the module).
+        """Compute relevancy with the look-up for this code (see the module).
 
         Args:
-            placed: what `prepare` returned.
+            placed: the result of `prepare`.
             texts: unit vectors.
         """
         out = np.empty((len(texts), len(placed.generic)), np.float32)
@@ -115,11 +115,11 @@ class LatentRelevancy:
     ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
         if isinstance(self._look_up, LinearLookUp):
             return self._look_up.text_weights(text)
-        assert placed.directions is not None  # those of a network's latents
+        assert placed.directions is not None  # set for a network's latents
         return self._look_up.text_weights(placed.directions, text)
 
     def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
-        """`_in_parts` for work that decodes: as many rows at once as `decode_array` takes."""
+        """Run work that decodes in parts of as many rows as `decode_array` processes at once."""
         self._in_parts(work, count, CHUNK_ROWS)
 
     def _in_parts(self, work: Callable[[slice], None], count: int, at_a_time: int = PIXELS_AT_A_TIME) -> None:

@@ -2,8 +2,8 @@
 
 The length of a decoded latent and its nearest canonical phrase do not depend on the text, so they are found
 once per view. A text then costs d products per pixel. Latents are stored channel by channel, which lets the
-compiler process eight or sixteen pixels at once; the limit is reading them: 138 MB for three levels of a 986
-x 728 view at d = 16.
+compiler process eight or sixteen pixels at once. Memory bandwidth is the limit: three levels of a 986 x 728
+view at d = 16 are 138 MB.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from hilsplat.query.look_up_kernels import by_channel, lengths_and_generic, line
 
 @dataclass(frozen=True)
 class PlacedLinear:
-    """Latents of a view, ready for texts.
+    """Latents of a view, prepared for look-ups.
 
     Attributes:
         channels: latents, one row per channel.
-        length: of each decoded vector before normalisation.
+        length: length of each decoded vector before normalisation.
         generic: cosine with the nearest canonical phrase.
     """
 
@@ -31,7 +31,7 @@ class PlacedLinear:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory used, bytes."""
         return self.channels.nbytes + self.length.nbytes + self.generic.nbytes
 
 
@@ -43,7 +43,7 @@ class LinearLookUp:
         self._offsets, self._slopes, self._mean_square, self._cross = code.cosine_terms(canonical)
 
     def place(self, latents: Float32[np.ndarray, "P D"]) -> PlacedLinear:
-        """Compute all that does not depend on the text."""
+        """Compute everything that does not depend on the text."""
         channels = by_channel(latents)
         length, generic = (np.empty(len(latents), np.float32) for _ in range(2))
         lengths_and_generic(
@@ -78,6 +78,6 @@ class LinearLookUp:
         )
 
     def text_weights(self, text: Float32[np.ndarray, " C"]) -> tuple[np.float32, Float32[np.ndarray, " D"]]:
-        """Offset and weights of a text, whose cosine is (offset + weights . channels) / length."""
+        """Return a text's offset and weights; its cosine is (offset + weights . channels) / length."""
         offsets, slopes, _, _ = self._code.cosine_terms(text[None])
         return offsets[0], slopes[0]

@@ -1,12 +1,12 @@
-"""Compiled loops of the look-ups: weighted sums of channels, and the relevancy that they give."""
+"""Compiled loops of the look-ups: weighted sums of channels, and the resulting relevancy."""
 
 import numpy as np
 
 from hilsplat.base.compiled import compiled
 
 BLOCK = 2048
-"""Pixels to process at once: their sums stay in the fastest cache, and the part of a channel to read is long
-enough for prefetching."""
+"""Pixels to process at once: their sums fit in the L1 cache, and each channel's part is long enough for
+prefetching."""
 
 TRANSPOSED = 16
 """Rows to transpose at once: their part of a channel fills a cache line."""
@@ -14,7 +14,7 @@ TRANSPOSED = 16
 
 @compiled
 def by_channel(rows):
-    """Latents (P, D) as channels (D, P), a few rows at a time: numpy reads all rows for every channel."""
+    """Transpose latents (P, D) to (D, P), a few rows at a time; numpy reads all rows for every channel."""
     count, channels = rows.shape
     out = np.empty((channels, count), np.float32)
     for begin in range(0, count, TRANSPOSED):
@@ -27,9 +27,9 @@ def by_channel(rows):
 
 @compiled
 def _dots_of_block(channels, begin, end, offset, slope, out):
-    """Write offset plus weighted sum of the channels of pixels begin..end to the start of `out`.
+    """Write the offset plus weighted channel sum of pixels begin..end to the start of `out`.
 
-    Eight channels at a time, so that sums are read and written an eighth as often.
+    Eight channels are summed at a time, so that sums are read and written an eighth as often.
     """
     for p in range(end - begin):
         out[p] = offset
@@ -55,7 +55,7 @@ def _dots_of_block(channels, begin, end, offset, slope, out):
 
 @compiled
 def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, generic):
-    """|m + U z|, and the largest cosine with the phrases; `slopes` (K, D)."""
+    """Write |m + U z|, and the largest cosine with the phrases; `slopes` (K, D)."""
     dots = np.empty(BLOCK, np.float32)
     for begin in range(0, len(length), BLOCK):
         end = min(begin + BLOCK, len(length))
@@ -76,10 +76,10 @@ def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, g
 
 @compiled
 def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
-    """Relevancy of texts (T, p) at pixels from `first` on; channels (D, P).
+    """Write the relevancy of texts (T, p) at pixels starting with `first`; channels (D, P).
 
-    The cosine of a text is (offset + slope . channels) / length. A block of pixels answers all texts while it
-    is in the cache.
+    The cosine of a text is (offset + slope . channels) / length. All texts are processed while a block of
+    pixels is in the cache.
     """
     dots = np.empty(BLOCK, np.float32)
     last = first + out.shape[1]
@@ -94,10 +94,9 @@ def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, o
 
 @compiled
 def projected_relevancy(coordinates, generic, first, weights, scale, out):
-    """Relevancy of texts (T, p) at pixels from `first` on; coordinates (R, P) of 16 bits.
+    """Write the relevancy of texts (T, p) at pixels starting with `first`; coordinates (R, P) of 16 bits.
 
-    The cosine of a text is weights . coordinates. A block of pixels answers all texts while it is in the
-    cache.
+    The cosine of a text is weights . coordinates. All texts are processed while a block of pixels is cached.
     """
     dots = np.empty(BLOCK, np.float32)
     last = first + out.shape[1]
@@ -110,9 +109,9 @@ def projected_relevancy(coordinates, generic, first, weights, scale, out):
 
 @compiled
 def fill_maps(found, least, pixels, level, maps):
-    """Write the values of a level's pixels to its maps (T, 3, P), and each text's least value elsewhere.
+    """Write the values of a level's pixels to its maps (T, 3, P), and each text's `least` elsewhere.
 
-    Pixels that follow each other are copied together.
+    Runs of consecutive pixels are copied together.
     """
     starts = np.empty(len(pixels) + 1, np.int64)
     runs = 0
@@ -131,10 +130,10 @@ def fill_maps(found, least, pixels, level, maps):
 
 @compiled
 def _write_relevancy(cosines, generic, scale, out):
-    """1 / (1 + exp(-scale (cosine - generic))) of at most `BLOCK` pixels.
+    """Write 1 / (1 + exp(-scale (cosine - generic))) for at most `BLOCK` pixels.
 
-    exp(-x) = 2^n 2^f with integer n and f in [-1/2, 1/2]: the first from the bits of a float, the second from
-    seven terms of its series (relative error 1e-8), so that the compiler can process many pixels at once.
+    exp(-x) = 2^n 2^f with integer n and f in [-1/2, 1/2]. 2^n is set as the bits of a float, and 2^f is seven
+    terms of its series (relative error 1e-8), so that the compiler can process many pixels at once.
     """
     fraction, bits = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     power = bits.view(np.float32)

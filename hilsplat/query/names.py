@@ -1,7 +1,7 @@
-"""Names that a person gave to nodes: they answer texts before CLIP does, and need no model.
+"""Names that the user gave to nodes; they are matched before CLIP and need no model.
 
-`names.json` in a scene's folder keeps them per semantic tree, by the digest of its `tree.npz`: rows of one
-tree mean nothing in another, so names of a tree that was made anew wait until that tree is back.
+`names.json` in a scene's folder stores them under the digest of `tree.npz`, because rows of one tree mean
+nothing in another. If a tree is rebuilt, the names of the previous tree are kept but not used.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 FILE = "names.json"
 PATH_SEPARATOR = ">"
 LONGEST = 80
-"""Most characters of a name."""
+"""Maximum number of characters in a name."""
 
 NO_FILE = "none"
 """Version of a file that does not exist."""
@@ -37,28 +37,28 @@ class NodeNames:
 
     Attributes:
         of_node: row of the tree -> its name.
-        version: of the file they were read from; a change must name it.
+        version: version of the file they were read from; `write_names` requires it.
     """
 
     of_node: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}))
     version: str = NO_FILE
 
     def nodes_of(self, text: str) -> list[int]:
-        """Nodes with this name, whatever its capitals and spaces."""
+        """Return the nodes with this name, ignoring case and extra spaces."""
         wanted = _plain(text)
         return [node for node, name in self.of_node.items() if _plain(name) == wanted]
 
 
 def tree_digest(semantic_tree: Path) -> str:
-    """What identifies a semantic tree."""
+    """Return the digest that identifies a semantic tree."""
     return sha256_of_file(Path(semantic_tree) / "tree.npz")
 
 
 def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
-    """Names of a tree; none if nobody gave any.
+    """Return the names of a tree's nodes; empty if unnamed.
 
     Args:
-        folder: of the scene.
+        folder: the scene's folder.
         semantic_tree: the artifact whose nodes are named.
 
     Raises:
@@ -83,15 +83,15 @@ def write_names(
     """Replace the names of a tree, unless the file has changed since `version` was read.
 
     Args:
-        folder: of the scene.
+        folder: the scene's folder.
         semantic_tree: the artifact whose nodes are named.
-        names: row of the tree -> name; all of them, empty names are taken away.
-        num_nodes: of the tree.
+        names: row of the tree -> name, for all named nodes; empty names are removed.
+        num_nodes: number of nodes in the tree.
         version: as in `NodeNames`.
 
     Raises:
-        StaleNamesError: someone else changed the names.
-        SettingsError: a name is too long or holds the separator of paths, or there is no such node.
+        StaleNamesError: the file changed since `version` was read.
+        SettingsError: a name is too long, contains `PATH_SEPARATOR` or is not printable, or a row is invalid.
     """
     path = Path(folder) / FILE
     given = {node: " ".join(name.split()) for node, name in names.items()}
@@ -115,7 +115,7 @@ def write_names(
 
 
 class NamesFile(BaseModel):
-    """What `names.json` holds: by the digest of a tree, names by row."""
+    """Schema of `names.json`: digest of a tree -> row -> name."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -124,7 +124,7 @@ class NamesFile(BaseModel):
 
 
 class StaleNamesError(ArtifactError):
-    """Names were changed by someone else since they were read."""
+    """The names file changed since it was read."""
 
 
 def _plain(text: str) -> str:

@@ -34,21 +34,21 @@ from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings, QuerySettings
 
 CANDIDATES = 5
-"""Texts that are kept for each node, best first."""
+"""Number of texts stored for each node, best first."""
 
 STANDS_OUT = 0.5
-"""A name's margin is at least this many standard deviations of the vocabulary's margins above that of the
-fifth nearest text; synonyms are among the nearest. Chosen on development scenes (docs/experiments.md)."""
+"""Minimum distance of a name's margin above the fifth nearest text's (the nearest include synonyms), in
+standard deviations of the vocabulary's margins. Chosen on development scenes (docs/experiments.md)."""
 
 FEWEST_ABSENT = 100
-"""With fewer words for absent things that the model knows, words that no node is nearest to take their place.
-Fewer of those say nothing about chance."""
+"""Minimum number of known words for absent things. Below it, words that are no node's nearest replace them;
+if those are too few as well, chance is not estimated."""
 
 
 THINGS, PARTS, SURFACES = range(3)
 
 VOCABULARY = "vocabulary.txt"
-"""In a model's folder: what that model knows. In this package: for all others."""
+"""Vocabulary of a model if it is in the model's folder; the file in this package is for all other models."""
 
 COMMON = Path(str(files("hilsplat.query") / VOCABULARY))
 AUTO = "auto"
@@ -57,13 +57,13 @@ SECTIONS = ("things", "parts", "surfaces", "absent")
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Texts, each once.
+    """Distinct texts by kind.
 
     Attributes:
         things: names of objects.
         parts: names of parts; a text such as "car wheel" names the whole too.
-        surfaces: floors, walls and the like, which are listed after the things.
-        absent: words for things that few scenes have; empty: the file has none.
+        surfaces: floors, walls and similar surfaces, which are listed after the things.
+        absent: words for things that few scenes contain; empty if the file has none.
     """
 
     things: tuple[str, ...]
@@ -73,10 +73,10 @@ class Vocabulary:
 
     @staticmethod
     def read(path: Path) -> "Vocabulary":
-        """Read a text file: texts on lines or between commas, below [things] (the default), [parts], ...
+        """Read a text file: texts on lines or between commas, in sections [things] (default), [parts], ...
 
         Raises:
-            SettingsError: it cannot be read, has an unknown section or names nothing.
+            SettingsError: it cannot be read, has an unknown section or contains no text.
         """
         try:
             lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -106,7 +106,7 @@ class Vocabulary:
 
 
 def vocabulary_file(setting: str, model: Path) -> Path:
-    """The file of a setting; `auto` is that of the model if it has one, else the package's."""
+    """Return a setting's vocabulary file; `auto` is the model's if it has one, otherwise the package's."""
     if setting != AUTO:
         return Path(setting)
     own = Path(model) / VOCABULARY
@@ -115,14 +115,13 @@ def vocabulary_file(setting: str, model: Path) -> Path:
 
 @dataclass(frozen=True)
 class NodeNaming:
-    """What a vocabulary calls the nodes of a tree.
+    """Vocabulary names of the nodes of a tree.
 
     Attributes:
-        of_node: name of each node; "": nothing fits.
+        of_node: name of each node; "" if nothing fits.
         candidates: the texts nearest to each node, best first, with their cosine margins.
-        surfaces: whether each node is called a surface.
-        rivals: unit vectors of words for absent things; their best margins are what chance reaches. May be
-            empty.
+        surfaces: whether each node's name is a surface.
+        rivals: unit vectors of words for absent things, to estimate chance; may be empty.
     """
 
     of_node: tuple[str, ...]
@@ -132,10 +131,10 @@ class NodeNaming:
 
     @staticmethod
     def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":
-        """Read the artifact; None if there is none for this tree and these vectors.
+        """Read the artifact; return None if there is none for this tree and these vectors.
 
         Raises:
-            ArtifactError: it is damaged.
+            ArtifactError: the artifact is damaged.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -178,10 +177,10 @@ def run_names(
         semantic_tree: the nodes.
         clip_folder: CLIP vectors of their masks.
         out: folder to write: `names.json`, `rivals.npy` and an index.
-        cache: folder of the cache of text vectors; all scenes of a model share them.
+        cache: cache folder of text vectors, shared by all scenes of a model.
         settings: the vocabulary.
-        evaluate: template and canonical phrases.
-        threads: for CLIP.
+        evaluate: prompt template and canonical phrases.
+        threads: number of threads for CLIP.
 
     Raises:
         SettingsError: the vocabulary cannot be read.
@@ -234,7 +233,7 @@ def run_names(
 
 
 def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32[np.ndarray, "T C"]:
-    """Unit vectors of texts; a real CLIP takes half a minute for a vocabulary, so they are kept."""
+    """Return the unit vectors of texts, cached because a full-size CLIP takes 30 s for a vocabulary."""
     key = sha256_of_json(
         {
             "model": model.digest,
@@ -257,13 +256,13 @@ def named(
     margin: Float32[np.ndarray, "n T"],
     rivals: Float32[np.ndarray, "W C"],
 ) -> NodeNaming:
-    """Give every node the text that its vector is nearest to, if that text stands out from the others.
+    """Name each node by the text nearest to its vector, if that text stands out from the others.
 
     A whole is a thing or a surface. A part or subpart is a part, or a thing: a plate is part of a laid table.
 
     Args:
         tree: the nodes, with their vectors.
-        vocabulary: gives the texts.
+        vocabulary: the texts.
         margin: cosine margins of the nodes for its things, parts and surfaces, in this order.
         rivals: see `NodeNaming`.
     """
@@ -282,7 +281,7 @@ def named(
         names.append(words[may[order[0]]] if fits else "")
         surfaces.append(bool(fits and kinds[may[order[0]]] == SURFACES))
         candidates.append(tuple((words[may[row]], float(own[row])) for row in order))
-    for level in LEVELS[1:]:  # a part is not called what its whole is called
+    for level in LEVELS[1:]:  # a part does not get the name of its parent
         for node in tree.nodes_of(level).tolist():
             parent = int(tree.parent[node])
             if parent != NONE and names[node] == names[parent]:

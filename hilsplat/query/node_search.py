@@ -1,4 +1,4 @@
-"""Choose nodes of the semantic tree by their cosine margins: a level, several hits, paths."""
+"""Selection of semantic tree nodes by cosine margins: level, multiple hits and paths."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,20 +10,20 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.semantic_tree.tree import SemanticTree
 
-# These numbers were chosen on development scenes; docs/experiments.md ("Query") compares them with others.
+# Chosen on development scenes; docs/experiments.md ("Query") compares them with other values.
 
 ALIKE = 0.9
-"""Nodes whose vectors have at least this cosine count as alike, as things of one kind are."""
+"""Nodes whose vectors have at least this cosine count as alike, such as things of one kind."""
 
 ALIKE_REACH = 3.0
-"""A node that looks like the best answer may be this many times further below it than others."""
+"""Factor by which a node that looks like the best answer may be further below it than other nodes."""
 
 ANCESTORS_SHARE = 0.5
 """Share of an ancestor's distance below the best of its level that is subtracted from a node on a path."""
 
 PLAUSIBLE = 0.25
 """A node competes on a path only if its ancestor is at most this share of the range below the best answer to
-the first text: the nose of something that is not a bear does not answer "bear > nose"."""
+the first text: the nose of something other than a bear is no answer to "bear > nose"."""
 
 WITHOUT_ANCESTOR = 0.1
 """A missing ancestor counts as this share of the range below the best."""
@@ -31,15 +31,15 @@ WITHOUT_ANCESTOR = 0.1
 
 @dataclass(frozen=True)
 class TextAnswer:
-    """How well one text of a query was answered at best.
+    """The best match of one text of a query.
 
     Attributes:
         text: the text.
         level: the level at which it was searched.
         margin: cosine margin of the best node that competed there; -inf if none did.
-        anywhere: the same for the best node of any level.
-        chance: share of words for absent things whose best margin is as high; None: unknown.
-        unknown: words of the text that the model does not know.
+        anywhere: cosine margin of the best node of any level.
+        chance: share of words for absent things whose best margin is as high; None if unknown.
+        unknown: words of the text that are not in the model's vocabulary.
     """
 
     text: str
@@ -61,12 +61,12 @@ class NodeHits:
 
     Attributes:
         ids: rows of the semantic tree, best first.
-        values: what they are ordered by: the cosine margin for the last text, plus what their ancestors add
-            (one text) or take away (a path).
-        route: how the best was reached: "flat", or on a path "child" (it has an ancestor at the level of
-            every earlier text, the last of which is its parent), "descendant" (at some, or the last is not
-            its parent) or "fallback" (at none, or no node is part of what answers the first text).
-        texts: how well each text of the query was answered at best, coarse to fine.
+        values: sort key: the cosine margin for the last text, plus a bonus (one text) or minus a penalty (a
+            path) from their ancestors.
+        route: how the best node was reached: "flat"; or on a path "child" (it has an ancestor at the level of
+            every earlier text, and the last one is its parent), "descendant" (at some, or the last one is not
+            its parent) or "fallback" (at none, or no node is part of a plausible answer to the first text).
+        texts: the best match of each text of the query, coarse to fine.
     """
 
     ids: Int64[np.ndarray, " n"]
@@ -96,16 +96,16 @@ def search(
     Args:
         tree: the nodes.
         margin: cosine margin of every node for each text.
-        vectors: unit vectors of every node, which decide what looks alike.
+        vectors: unit vectors of every node, which determine which nodes look alike.
         path: the texts, coarse to fine.
         threshold: see `best_nodes`.
         ancestors: share of the mean margin of a node's ancestors that is added to its own; ignored for a path
             of several texts, which names the ancestors itself.
         level: level of the last text; None: chosen by `automatic_level` or `_search_path`.
-        shown: which nodes may answer; None: all.
+        shown: which nodes are allowed as answers; None: all.
 
     Raises:
-        SettingsError: the path is empty, or has more texts than there are levels down to that of the last.
+        SettingsError: the path is empty, or has more texts than there are levels down to the last text's.
     """
     margin = margin.astype(np.float64)
     anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
@@ -127,17 +127,17 @@ def best_nodes(
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None = None,
 ) -> Int64[np.ndarray, " h"]:
-    """Candidates near the best one, and those a little further away that look like it.
+    """Return the candidates near the best one, and those slightly further away that look like it.
 
-    They are ordered best first, equals by row.
+    They are sorted best first, on a tie by row.
 
     Args:
-        value: rank of every node: its cosine margin plus anything added.
+        value: sort key of every node: its cosine margin plus the ancestors' share.
         vectors: as in `search`.
         candidates: the nodes of a level, which define the range of values.
         threshold: answers are at most (1 - threshold) times the range below the best one shown, or
             `ALIKE_REACH` times that if they look like it.
-        shown: which nodes may answer; None: all.
+        shown: as in `search`.
     """
     may = candidates if shown is None else candidates[shown[candidates]]
     spread = np.ptp(value[candidates]) if len(candidates) else 0.0
@@ -150,7 +150,7 @@ def _near_best(
     vectors: Float32[np.ndarray, "n C"],
     reach: float,
 ) -> Int64[np.ndarray, " h"]:
-    """Candidates at most `reach` below the best one, or `ALIKE_REACH` times that if they look like it."""
+    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it."""
     if not len(candidates):
         return np.zeros(0, np.int64)
     own = value[candidates]
@@ -162,11 +162,10 @@ def _near_best(
 
 
 def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Mean margin of each node's ancestors: "kettle knob" more likely means a knob of a kettle.
+    """Return the mean margin of each node's ancestors: "kettle knob" more likely means a knob of a kettle.
 
-    A node without an ancestor gets the least margin of all. A whole gets 0: wholes have no ancestors and
-    only compete with each other. The share to add was chosen on development scenes (docs/experiments.md,
-    "Query").
+    A node without an ancestor gets the lowest margin of all. A whole gets 0: wholes have no ancestors and
+    compete only with each other. `search` adds a share that was chosen on development scenes.
     """
     ancestors = tree.ancestors()
     above = (ancestors != NONE) & (ancestors != np.arange(len(tree))[:, None])
@@ -179,12 +178,12 @@ def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> F
 def automatic_level(
     tree: SemanticTree, margin: Float64[np.ndarray, " n"], shown: Bool[np.ndarray, " n"] | None = None
 ) -> Level:
-    """Level that a text most likely means: that of the best node; of equally good ones, the coarsest.
+    """Return the level of the node that best matches a text; on a tie, the coarsest.
 
-    LangSplat's rule, applied to nodes instead of pixels. A node's vector is an average over views, and a
-    level has tens of nodes, so noise does not lift the finest level above the others, as it does with the
-    maximum over 100,000 pixels. Rules that climb to the parent of the best node, standardise each level's
-    margins or consult siblings were all worse on development scenes (docs/experiments.md, "Query").
+    This is LangSplat's rule, applied to nodes instead of pixels. A node's vector is an average over views,
+    and a level has tens of nodes, so noise does not favour the finest level, as it does with the maximum over
+    100,000 pixels. Rules that choose the best node's parent, standardise each level's margins or consult
+    siblings were all worse on development scenes (docs/experiments.md, "Query").
     """
     levels = tree.level if shown is None else tree.level[shown]
     own = margin if shown is None else margin[shown]
@@ -194,12 +193,11 @@ def automatic_level(
 
 
 def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
-    """Range of some nodes' margins for a text, extended to include 0, the margin of the canonical phrases.
+    """Return the range of nodes' margins for a text, extended to include 0, the canonical phrases' margin.
 
     This is the scale of a path's penalties. Among many things, some are further from a text than a generic
-    phrase is, so 0 is inside the range of the nodes. With a single thing, or things that all answer the text,
-    the nodes alone would span next to nothing and penalties would vanish; the generic phrase is a rival in
-    every scene.
+    phrase is, so 0 is inside the range of the nodes. With a single thing, or things that all match the text,
+    the range of the nodes alone would be close to 0 and penalties would vanish.
     """
     return float(margin.max(initial=0.0) - margin.min(initial=0.0))
 
@@ -214,18 +212,18 @@ def _search_path(
     level: Level | None,
     shown: Bool[np.ndarray, " n"] | None,
 ) -> NodeHits:
-    """Find a node that answers the last text and is part of what answers the texts before it.
+    """Find nodes that match the last text and are part of nodes that match the earlier texts.
 
     Every text has its own level. All nodes of the last text's level compete, each together with its
-    ancestors: a bear that answers "bear" slightly worse than a cushion does still has the better head and
-    nose. A node that is not part of anything like the first text does not compete (`PLAUSIBLE`), unless that
-    leaves none.
+    ancestors: a bear that matches "bear" slightly worse than a cushion does still has the better head and
+    nose. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`) does not compete,
+    unless no node is.
 
-    A path with fewer texts than levels leaves open which levels it means: the handle of a mug may be a part
-    or a subpart, and the head of ("head", "nose") is not a whole. So all ways through the levels are
-    searched. Those whose best answer has an ancestor for every text come first, and of these the one with the
-    largest sum of margins. Ancestors need not be shown; they compete with nodes that are shown or hold a node
-    that is.
+    If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
+    part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are
+    therefore searched. Those whose best answer has an ancestor for every text are preferred, and among these
+    the one with the largest sum of margins. Ancestors need not be shown; they compete with nodes that are
+    shown or that hold a shown node.
     """
     ways = [way for way in combinations(LEVELS, len(path)) if way and level in (None, way[-1])]
     if not ways:
@@ -246,7 +244,7 @@ def _search_path(
 
 @dataclass(frozen=True)
 class _Way:
-    """What a path found at certain levels.
+    """The result of a path at one combination of levels.
 
     Attributes:
         ids: answers to the last text, best first.
@@ -255,8 +253,8 @@ class _Way:
         margins: margin of the best node that competed for each text.
         route: as in `NodeHits`.
         total: sum of the margins of the best answer and its ancestors.
-        complete: whether the best answer is part of what answers the first text, and has an ancestor for
-            every text.
+        complete: whether the best answer is part of a plausible answer to the first text, and has an ancestor
+            for every text.
     """
 
     ids: Int64[np.ndarray, " h"]
@@ -286,7 +284,7 @@ def _search_way(
     for text, (of_text, level) in enumerate(zip(margin[:-1], levels[:-1], strict=True)):
         holder, of_level = ancestors[:, level.index], tree.nodes_of(level)
         rivals = of_level
-        if shown is not None:  # a node may itself be hidden behind a shown one that it holds
+        if shown is not None:  # an ancestor may be hidden by a shown node that it holds
             rivals = of_level[shown[of_level] | np.isin(of_level, holder[may])]
         margins.append(float(of_text[rivals].max(initial=-np.inf)))
         best = margins[-1] if len(rivals) else 0.0
@@ -310,7 +308,7 @@ def _search_way(
 
 
 def _route(holders: Int32[np.ndarray, " a"], parent: int, inside: bool) -> str:
-    """See `NodeHits`; `inside`: the best answer is part of what answers the first text."""
+    """Return the route (see `NodeHits`); `inside`: a node is part of a plausible answer to the first text."""
     if not inside or (holders == NONE).all():
         return "fallback"
     return "child" if (holders != NONE).all() and holders[-1] == parent else "descendant"

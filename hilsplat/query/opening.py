@@ -1,4 +1,4 @@
-"""Opening a finished scene: every artifact once, and only if they belong together."""
+"""Artifacts of a finished scene, each read once and checked to belong together."""
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 
 class Opened:
-    """Artifacts by path: variants of a scene share most of them, so each is opened and hashed once."""
+    """Artifacts by path, each opened and hashed once because the variants of a scene share most of them."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[Hashable, ...], Any] = {}
 
     def get(self, how: Callable[..., Any], path: Path, *more: Hashable) -> Any:
-        """`how(path, *more)`, or what it returned before."""
+        """Return `how(path, *more)`, computed on the first call."""
         key = (how, Path(path).resolve(), *more)
         if key not in self._kept:
             self._kept[key] = how(path, *more)
@@ -34,16 +34,16 @@ class Opened:
 
 @dataclass(frozen=True)
 class OpenedParts:
-    """The artifacts of `SceneParts`, opened and found to belong together.
+    """The artifacts of `SceneParts`, opened and checked to belong together.
 
     Attributes:
         scene: cameras and views.
         gaussians: frozen geometry.
         tree: the nodes.
-        language: the field; None: the run has not come to it yet.
-        code: the field is written in it; None if there is no field.
+        language: the field; None if the run has not computed it yet.
+        code: decodes the field; None if there is no field.
         clip: the model that embedded the masks.
-        caution: why no answer of it means anything here, in a sentence; empty: no such reason.
+        caution: sentence that explains why this model's answers are meaningless here; empty if they are not.
     """
 
     scene: Scene
@@ -60,13 +60,13 @@ class OpenedParts:
 
         Args:
             parts: paths of the artifacts.
-            template: sentence that texts are put into before CLIP embeds them.
+            template: prompt template of the texts that CLIP embeds.
             threads: number of threads for CLIP.
-            opened: artifacts that other variants of the scene opened before.
+            opened: artifacts that other variants of the scene have already opened.
 
         Raises:
-            MisalignedArtifactError: the tree or field was made for other Gaussians, or the field for
-                another autoencoder.
+            MisalignedArtifactError: the tree or field was made for other Gaussians or cameras, or the field
+                for another autoencoder.
             ModelError: the CLIP that embedded the masks is not found.
         """
         from hilsplat.embed.clip import open_clip_of

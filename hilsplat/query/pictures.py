@@ -21,20 +21,20 @@ SH_CONSTANT = 0.28209479177387814
 """Value of the constant spherical harmonic; colour is 0.5 + this times row 0 of `sh`."""
 
 TITLE_LETTERS = 110
-"""Longest line of a title over a panel."""
+"""Maximum number of characters in a line of a panel's title."""
 
 MAX_POINTS = 30_000
-"""Most Gaussians that a map from above shows."""
+"""Maximum number of Gaussians in a map from above."""
 
 
 def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """A photograph as an unobtrusive background: its luminance, 0 to 255."""
+    """Return a photograph's luminance, 0 to 255, as an unobtrusive background."""
     luminance = image @ np.array([0.299, 0.587, 0.114])
     return np.repeat(luminance[..., None], 3, axis=2)
 
 
 def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
-    """A line along the inner border of a mask."""
+    """Return a line along the inner border of a mask."""
     import cv2
 
     kernel = np.ones((2 * width_px + 1, 2 * width_px + 1), np.uint8)
@@ -43,7 +43,7 @@ def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H
 
 
 def line_px(image: UInt8[np.ndarray, "H W 3"]) -> int:
-    """Width of outlines, visible at any image size."""
+    """Return a width of outlines that is visible at any image size."""
     return max(1, round(max(image.shape[:2]) / 256))
 
 
@@ -52,7 +52,7 @@ def paint_answer(
     answer: Bool[np.ndarray, "H W"] | None,
     truth: Bool[np.ndarray, "H W"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """An answer filled in orange over the dimmed photograph, the true region outlined in cyan."""
+    """Paint an answer in orange over the dimmed photograph, and outline the true region in cyan."""
     if answer is None:
         painted = image.astype(float)
     else:
@@ -68,7 +68,7 @@ def paint_answer(
 def paint_relevancy(
     image: UInt8[np.ndarray, "H W 3"], relevancy: Float[np.ndarray, "H W"], low: float, high: float
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Relevancy in colours, stretched from `low` to `high`, over the grey photograph."""
+    """Paint relevancy in colours, stretched from `low` to `high`, over the grey photograph."""
     stretched = np.clip((relevancy - low) / max(high - low, 1e-6), 0, 1)
     colours = colormaps[RELEVANCY_COLOURS](stretched)[..., :3] * 255
     return (0.78 * colours + 0.22 * grey(image)).clip(0, 255).astype(np.uint8)
@@ -82,7 +82,7 @@ def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold:
     for spine in axes.spines.values():
         spine.set_linewidth(2.0 if bold else 0.5)
         spine.set_color("#ff7a00" if bold else "#888888")
-    # titles hold texts and names of people: a dollar sign in them is no mathematics
+    # Titles contain queries and user-given names, in which a dollar sign does not start mathematics.
     axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal", parse_math=False)
 
 
@@ -94,7 +94,7 @@ def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
 def show_from_above(
     axes: Axes, gaussians: Gaussians, cameras: Cameras, selected: Bool[np.ndarray, " N"], title: str
 ) -> None:
-    """Gaussians seen along the cameras' mean up direction, selected ones orange; cameras as triangles."""
+    """Draw Gaussians along the cameras' mean up direction, selected ones in orange; cameras as triangles."""
     means = gaussians.means.astype(np.float64)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     rotation = _from_above(cameras)
@@ -119,7 +119,7 @@ def show_from_above(
 
 
 def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
-    """Rotation whose third axis is the cameras' mean up direction (OpenCV cameras: up is -y)."""
+    """Return the rotation whose third axis is the cameras' mean up direction (OpenCV: up is -y)."""
     up = -cameras.cam_from_world[:, 1, :3].mean(axis=0)
     up = up / max(np.linalg.norm(up), 1e-9) if np.linalg.norm(up) > 1e-9 else np.array([0.0, 0.0, 1.0])
     right = cameras.cam_from_world[0, 0, :3]
@@ -129,8 +129,8 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 
 
 def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
-    """Write a PNG atomically, with this package in its metadata instead of the library's version."""
-    packed = {"compress_level": 4}  # half the time of the usual 6, for 4 % more bytes
+    """Write a PNG atomically; its metadata names this package instead of Matplotlib's version."""
+    packed = {"compress_level": 4}  # half the time of the default 6, for 4 % more bytes
     with atomic_path(out) as temporary:
         figure.savefig(
             temporary,

@@ -1,11 +1,11 @@
-"""Relevancy of a network's latents: every pixel of a view is decoded once and kept in compressed form.
+"""Relevancy of a network's latents: every pixel of a view is decoded once and stored in compressed form.
 
-The decoded vectors of one view lie near a subspace of few directions (about 65 of 128, 105 of 512). Each is
-kept as its coordinates there, in 16 bits, with the cosine of its nearest canonical phrase, found from the
-whole vector. A text then costs one product per pixel and direction; the limit is reading the coordinates.
+The decoded vectors of one view are close to a subspace of few directions (about 65 of 128, 105 of 512). Each
+is stored as its coordinates there, in 16 bits, with the cosine of its nearest canonical phrase, computed from
+the full vector. A text then costs one product per pixel and direction; memory bandwidth is the limit.
 
-The directions come from a sample of the pixels. Every pixel is then checked: those that lose too much for the
-error bound (`lost_for_error`), such as a small object that the sample missed, get additional directions.
+The directions are computed from a sample of the pixels. Every pixel is then checked: pixels that lose too
+much for the error bound (`lost_for_error`), such as a small unsampled object, get additional directions.
 """
 
 from collections.abc import Callable
@@ -18,24 +18,24 @@ from hilsplat.field.code import Code
 from hilsplat.query.look_up_kernels import projected_relevancy
 
 ERROR = 2e-3
-"""Largest error of the relevancy of any pixel."""
+"""Maximum error of the relevancy of any pixel."""
 
 RESIDUAL = 5e-5
-"""Root mean square of what decoded vectors lose outside the kept directions."""
+"""Root mean square of the decoded vectors' component outside the stored directions."""
 
 SAMPLE = 8192
-"""Size of the sample of latents that gives the directions."""
+"""Number of latents in the sample from which the directions are computed."""
 
 STEPS = 32767
-"""Steps of a coordinate from 0 to 1; rounding errs by up to 1.5e-5."""
+"""Steps of a coordinate from 0 to 1; the rounding error is at most 1.5e-5."""
 
 Parts = Callable[[Callable[[slice], None], int], None]
-"""Runs work on all parts of a number of pixels."""
+"""Function that splits a number of pixels into parts and runs work on each."""
 
 
 @dataclass(frozen=True)
 class PlacedProjected:
-    """Decoded vectors of a view, ready for texts.
+    """Decoded vectors of a view, prepared for look-ups.
 
     Attributes:
         coordinates: along each direction, in units of 1 / `STEPS`; one row per direction.
@@ -49,28 +49,28 @@ class PlacedProjected:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory used, bytes."""
         return self.coordinates.nbytes + self.directions.nbytes + self.generic.nbytes
 
 
 class ProjectedLookUp:
-    """Relevancy of a network's latents: within `ERROR` of that of the decoded vectors, at every pixel."""
+    """Relevancy of a network's latents, within `ERROR` of the decoded vectors' relevancy at every pixel."""
 
     def __init__(self, code: Code, canonical: Float32[np.ndarray, "K C"], scale: float) -> None:
         self._code, self._canonical, self._scale = code, canonical, np.float32(scale)
         self._may_lose = lost_for_error(scale, code.channels)
 
     def place(self, latents: Float32[np.ndarray, "P D"], in_parts: Parts) -> PlacedProjected:
-        """Compute all that does not depend on the text: decode every pixel, and again if it loses too much.
+        """Compute everything that does not depend on the text, and decode pixels that lose too much again.
 
-        The directions of a sample of all pixels lose `RESIDUAL` on that sample. Pixels that lose more than
-        they may get additional directions in the same way, orthogonal to all before; the other pixels have 0
-        along these, so their loss does not change. Each round takes at least one of the C directions, so the
-        loop ends, at the latest when nothing is left to lose.
+        The directions computed from a sample lose `RESIDUAL` on that sample. Pixels whose loss exceeds the
+        limit get additional directions in the same way, orthogonal to all previous ones. The other pixels
+        have 0 along these, so their loss does not change. Each round uses at least one of the C directions,
+        so the loop ends.
 
         Args:
-            latents: of pixels.
-            in_parts: shares the pixels among threads.
+            latents: latents of pixels.
+            in_parts: distributes the pixels among threads.
         """
         directions, others = self._directions(latents, np.eye(self._code.channels))
         coordinates, generic, lost = self._decode(latents, directions, in_parts)
@@ -78,7 +78,7 @@ class ProjectedLookUp:
         while len(missed) and len(others):
             more, others = self._directions(latents[missed], others)
             directions = np.concatenate([directions, more])
-            # Rows of 0 in place: a copy would hold a large view twice.
+            # Rows of 0 are added in place; a copy would store a large view twice.
             coordinates.resize((len(directions), len(latents)), refcheck=False)
             coordinates[:, missed], generic[missed], lost = self._decode(
                 latents[missed], directions, in_parts
@@ -100,13 +100,13 @@ class ProjectedLookUp:
     def text_weights(
         self, directions: Float32[np.ndarray, "R C"], text: Float32[np.ndarray, " C"]
     ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
-        """Offset and weights of a text, whose cosine is offset + weights . coordinates."""
+        """Return a text's offset and weights; its cosine is offset + weights . coordinates."""
         return np.float32(0), (directions @ text / STEPS).astype(np.float32)
 
     def _directions(
         self, latents: Float32[np.ndarray, "P D"], among: Float64[np.ndarray, "A C"]
     ) -> tuple[Float32[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-        """`main_directions` of a decoded sample."""
+        """Return the `main_directions` of a decoded sample."""
         some = latents[:: max(1, -(-len(latents) // SAMPLE))]
         found, others = main_directions(self._code.decode_array(some), among)
         return found.astype(np.float32), others
@@ -114,7 +114,7 @@ class ProjectedLookUp:
     def _decode(
         self, latents: Float32[np.ndarray, "P D"], directions: Float32[np.ndarray, "R C"], in_parts: Parts
     ) -> tuple[Int16[np.ndarray, "R P"], Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
-        """Coordinates, cosine with the nearest phrase, and the loss of each outside the directions."""
+        """Return coordinates, cosine with the nearest phrase, and loss outside the directions per pixel."""
         coordinates = np.empty((len(directions), len(latents)), np.int16)
         generic, lost = np.empty(len(latents), np.float32), np.empty(len(latents), np.float32)
 
@@ -123,7 +123,7 @@ class ProjectedLookUp:
             generic[span] = (vectors @ self._canonical.T).max(axis=1)
             along = directions @ vectors.T
             coordinates[:, span] = np.rint(along * STEPS)
-            # 1 minus the squares of the coordinates is too inexact: 1e-7, the square of 3e-4.
+            # 1 minus the squared coordinates is too inexact: its error of 1e-7 is the square of 3e-4.
             rest = vectors - along.T @ directions
             lost[span] = np.sqrt(np.einsum("pc,pc->p", rest, rest))
 
@@ -132,20 +132,20 @@ class ProjectedLookUp:
 
 
 def lost_for_error(scale: float, channels: int) -> float:
-    """How much of a decoded unit vector the directions may lose for relevancy to err by at most `ERROR`.
+    """Return how much of a decoded unit vector the directions may lose for a relevancy error of `ERROR`.
 
-    Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. The nearest phrase's g comes from the whole
-    vector, so only e.q errs: by at most |q| = 1 times the distance of e from what is kept of it, which is the
-    loss outside the directions plus the rounding of at most C coordinates, sqrt(C) / (2 `STEPS`). The slope
-    is at most s / 4, where text and phrase tie. So the directions may lose
+    Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. The nearest phrase's g is computed from the
+    full vector, so only e.q has an error: at most |q| = 1 times the distance of e from its stored form. This
+    distance is the loss outside the directions plus the rounding of at most C coordinates,
+    sqrt(C) / (2 `STEPS`). The slope is at most s / 4, where text and phrase tie. So the directions may lose
 
         4 `ERROR` / s - sqrt(C) / (2 `STEPS`),
 
-    which is 4.5e-4 with s = 10 and C = 512. (Loss and rounding are orthogonal, so together they are less than
-    their sum, which leaves room for sums in 32 bits.)
+    which is 4.5e-4 with s = 10 and C = 512. (Loss and rounding are orthogonal, so their combined length is
+    less than their sum, which leaves a margin for 32-bit sums.)
 
-    Departs: never less than `RESIDUAL`. From s = 20 (C = 512) on, 16 bits cannot keep to `ERROR`, and
-    relevancy errs by up to s / 4 times the sum of `RESIDUAL` and rounding.
+    Departs: never less than `RESIDUAL`. At s >= 20 (C = 512), 16 bits are too few for `ERROR`, and relevancy
+    has an error of up to s / 4 times the sum of `RESIDUAL` and rounding.
     """
     return max(4 * ERROR / scale - channels**0.5 / (2 * STEPS), RESIDUAL)
 
@@ -153,10 +153,10 @@ def lost_for_error(scale: float, channels: int) -> float:
 def main_directions(
     vectors: Float32[np.ndarray, "P C"], among: Float64[np.ndarray, "A C"]
 ) -> tuple[Float64[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-    """The fewest directions, at least one, that hold vectors up to `RESIDUAL`; and the others (A = R + B).
+    """Return the fewest directions (at least one) that lose at most `RESIDUAL`, and the others (A = R + B).
 
     Args:
-        vectors: only their components in the span of `among` count.
+        vectors: only their components in the span of `among` are used.
         among: orthonormal rows, at least one; all directions are in their span.
     """
     double = vectors.astype(np.float64)

@@ -1,4 +1,4 @@
-"""The picture of a query: answer and relevancy in a few views, and the answer from above."""
+"""Picture of a query: answer and relevancy in a few views, and the answer from above."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ TITLE_PX = 20
 HEADING_PX = 26
 MAP_PX = 460
 NAMED = 3
-"""Most names of answers in the title."""
+"""Maximum number of answer names in the title."""
 
 
 def query_panel(
@@ -46,7 +46,7 @@ def query_panel(
 ) -> None:
     """Draw a query: photograph, answer and relevancy at three levels per view, and the scene from above.
 
-    `note` ends the title; doubts follow below it. With the answerer "field", relevancy is that of the field.
+    `note` is appended to the title, with doubts below. With the answerer "field", relevancy is the field's.
     """
     last = path_of(text)[-1]
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
@@ -89,8 +89,8 @@ def query_panel(
 class _Page:
     """A figure addressed in pixels from its upper left corner.
 
-    Pictures are scaled and placed as they are. An `Axes` for each, and a layout that is found by drawing
-    everything twice, took most of the time of a query.
+    Pictures are scaled and placed directly. One `Axes` per picture, with a layout computed by drawing
+    everything twice, would take most of the time of a query.
     """
 
     def __init__(self, width_px: int, height_px: int) -> None:
@@ -100,7 +100,7 @@ class _Page:
     def write(
         self, text: str, x: float, y: float, *, size: float = 8.0, bold: bool = False, rotation: float = 0.0
     ) -> None:
-        """Write a text around a place."""
+        """Write a text centred at (x, y)."""
         weight = "bold" if bold else "normal"
         place = (x / self.width_px, 1 - y / self.height_px)
         written = self.figure.text(*place, text, ha="center", va="center", size=size, rotation=rotation)
@@ -110,7 +110,7 @@ class _Page:
     def show(
         self, picture: UInt8[np.ndarray, "H W 3"], title: str, left: int, top: int, row_px: int, bold: bool
     ) -> None:
-        """Show a picture below its title, as large as its cell allows."""
+        """Draw a picture below its title, as large as its cell allows."""
         import cv2
 
         height, width = picture.shape[:2]

@@ -1,4 +1,4 @@
-"""How well an embedding answers a text: its cosine margin, and LERF's relevancy, computed from it."""
+"""How well an embedding matches a text: its cosine margin, and LERF's relevancy, computed from it."""
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -14,10 +14,10 @@ def margins(
     texts: Float[np.ndarray, "T C"],
     canonical: Float[np.ndarray, "K C"],
 ) -> Float32[np.ndarray, "T B"]:
-    """Cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
+    """Return the cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
 
-    0 means as close to the text as to the nearest generic phrase. All ranking and comparing of embeddings
-    uses margins, because relevancies saturate and margins do not.
+    0 means as close to the text as to the nearest generic phrase. Embeddings are ranked and compared by
+    margins, because relevancies saturate and margins do not.
 
     Args:
         embeddings: unit vectors.
@@ -36,12 +36,12 @@ def margins(
 
 
 def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
-    """The score for people and protocols: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
+    """Return the score that users and protocols see: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
     return 1 / (1 + np.exp(-scale * margin))
 
 
 def margin_of_relevancy(score: float, scale: float) -> float:
-    """The margin that has a score: the inverse of `relevancy_of_margins`.
+    """Return the margin with a given score: the inverse of `relevancy_of_margins`.
 
     Raises:
         SettingsError: the score is not between 0 and 1.
@@ -57,7 +57,7 @@ def relevancy(
     canonical: Float[np.ndarray, "K C"],
     scale: float = 10.0,
 ) -> Float32[np.ndarray, "T B"]:
-    """Least softmax score of a text against each canonical phrase, in (0, 1).
+    """Return the lowest softmax score of a text against each canonical phrase, in (0, 1).
 
     rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)), which is the logistic function of the
     scaled margin: an embedding at margin 0 scores exactly 0.5, no better than generic.
@@ -68,7 +68,7 @@ def relevancy(
         embeddings: unit vectors.
         texts: unit vectors of the queries.
         canonical: unit vectors of the generic phrases, at least one.
-        scale: of the cosines; LERF and LangSplat use 10.
+        scale: scale of the cosines; LERF and LangSplat use 10.
 
     Example:
         cosines 0.30 with the text and 0.25, 0.28, 0.20, 0.22 with the phrases: the nearest phrase

@@ -1,4 +1,4 @@
-"""Which nodes and pixels a scene's views show; what is slow to find out is kept, view by view."""
+"""Nodes and pixels that a scene's views show; slow results are cached per view."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_nodes import ViewNodes
 
 MIN_SHOWN_SHARE = 1e-4
-"""Least share of a view that shows a node: 14 px of 384 x 384 show nothing."""
+"""Minimum share of a view that shows a node: 14 px of 384 x 384 are too few."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class SceneViews:
         scene: cameras and photographs.
         tree: the nodes.
         pixel_weights: compositing weights of a view (pixels x Gaussians).
-        store: keeps results.
+        store: caches results.
     """
 
     scene: Scene
@@ -37,7 +37,7 @@ class SceneViews:
     store: ViewStore
 
     def camera(self, view: str) -> Camera:
-        """Camera of a view.
+        """Return the camera of a view.
 
         Raises:
             SettingsError: the scene has no such view.
@@ -52,7 +52,7 @@ class SceneViews:
         return self.scene.cameras[view]
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """The undistorted photograph of a view, read-only."""
+        """Return the undistorted photograph of a view, read-only."""
         self.camera(view)
 
         def read() -> np.ndarray:
@@ -63,7 +63,7 @@ class SceneViews:
         return self.store.get(("image", view), read, lambda kept: kept.nbytes)
 
     def weights(self, view: str) -> sp.csr_matrix:
-        """W of a view with rows divided by alpha; rows of alpha below a half are empty."""
+        """Return W of a view with rows divided by alpha; rows with an alpha below 0.5 are empty."""
         return self.store.get(
             ("weights", view),
             lambda: normalised_weights(self.pixel_weights(view)),
@@ -71,7 +71,7 @@ class SceneViews:
         )
 
     def nodes(self, view: str, level: Level) -> ViewNodes:
-        """Nodes of a level, pixel by pixel."""
+        """Return the nodes of a level in each pixel of a view."""
         return self.store.get(
             ("nodes", view, level),
             lambda: ViewNodes.of(self.weights(view), self.tree.node_of_gaussian[:, level.index]),
@@ -79,7 +79,7 @@ class SceneViews:
         )
 
     def shown(self, view: str) -> Bool[np.ndarray, " n"]:
-        """Which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
+        """Return which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
         height, width = self.camera(view).size_hw
 
         def measure() -> np.ndarray:
@@ -90,7 +90,7 @@ class SceneViews:
         return self.store.get(("shown", view), measure, lambda kept: kept.nbytes)
 
     def masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
-        """Pixels that consist of the nodes' Gaussians by more than half."""
+        """Return the pixels in which the nodes' Gaussians have a share above 0.5."""
         ids = np.asarray(ids, np.int64)
         height, width = self.camera(view).size_hw
         if not len(ids):
@@ -105,10 +105,10 @@ class SceneViews:
         return (self.weights(view) @ member > 0.5).reshape(height, width)
 
     def blended(self, view: str, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
-        """Scores of the nodes that a pixel shows, blended by its weights, at each level.
+        """Blend the scores of the nodes that each pixel shows by its weights, at each level.
 
-        Gaussians without a node count as the least node of the level. Pixels that the Gaussians do not cover
-        get the least score of the covered ones, so that they are never selected and do not stretch the range.
+        Gaussians without a node get the lowest node score of the level. Uncovered pixels get the lowest value
+        of the covered ones, so that they are never selected and do not stretch the range.
         """
         height, width = self.camera(view).size_hw
         maps = np.zeros((len(scores), len(LEVELS), height * width), np.float32)
@@ -123,5 +123,5 @@ class SceneViews:
 
 
 def members_of(tree: SemanticTree, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
-    """Gaussians that belong to any of the nodes."""
+    """Return the Gaussians that belong to any of the nodes."""
     return np.flatnonzero(np.isin(tree.node_of_gaussian, np.asarray(ids)).any(axis=1))

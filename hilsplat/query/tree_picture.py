@@ -1,4 +1,4 @@
-"""The semantic tree of a scene as a picture: a crop per node, parents above their children."""
+"""Picture of a scene's semantic tree: a crop per node, parents above their children."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from hilsplat.semantic_tree.export import readable_nodes, write_tree_ply
 CELL_PX = 84
 GAP_PX = 6
 LABEL_PX = 32
-"""A line for the name of a node and one for its number."""
+"""Height of two lines: the name of a node and its number."""
 
 BLOCK_GAP_PX = 18
 MARGIN_PX = 84
@@ -24,7 +24,7 @@ MARGIN_PX = 84
 
 ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18
-"""Leaves in a row of the picture; wholes are placed side by side until it is full."""
+"""Leaves in a row of the picture; wholes are placed side by side until the row is full."""
 
 BACKGROUND = 250
 LINE = (150, 150, 150)
@@ -42,7 +42,7 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
         threads: number of threads for rendering.
 
     Returns:
-        what was written, for people.
+        human-readable summary of the written files.
     """
     found = FinishedScene.locate(folder, variant)
     scene = LanguageScene.of(found, threads=threads)
@@ -56,10 +56,10 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
 
 
 def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the tree: one row of crops per level, blocks of a whole and all below it side by side.
+    """Draw the tree: one row of crops per level, one block per whole and its descendants, side by side.
 
-    Orphans of finer levels have their own blocks at their level. A crop shows the node in the view that
-    shows it largest, with the rest of that view dimmed, above the node's name and number.
+    Orphans of finer levels have their own blocks at their level. A crop shows the node in the view in which
+    it is largest, with the rest of that view dimmed, above the node's name and number.
     """
     tree = scene.tree
     roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
@@ -76,7 +76,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     placed: list[tuple[int, int, int]] = []
 
     def place(node: int, left: int, top: int) -> tuple[int, int]:
-        """Place a node and its descendants and draw their lines; returns its middle and the width used."""
+        """Place a node and its descendants, draw their lines, and return its middle and the width used."""
         index = Level(int(tree.level[node])).index
         y = top + index * ROW_PX
         kids, used, middles = tree.children_of(np.array([node])), 0, []
@@ -87,7 +87,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
             used += width
         used = max(used, step)
         x = left + (used - step) // 2
-        bar = y + CELL_PX + LABEL_PX + GAP_PX  # below it every child has columns of its own
+        bar = y + CELL_PX + LABEL_PX + GAP_PX  # below this line, children do not share columns
         for middle, below in middles:
             canvas[bar:below, middle] = LINE
             canvas[bar, min(middle, x + CELL_PX // 2) : max(middle, x + CELL_PX // 2) + 1] = LINE
@@ -114,7 +114,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
 def _labelled(
     canvas: UInt8[np.ndarray, "H W 3"], labels: list[tuple[str, int, int]]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Write texts around their places (x, y), no wider than a crop."""
+    """Write texts centred at (x, y), no wider than a crop."""
     from matplotlib.font_manager import findfont
 
     font = ImageFont.truetype(findfont("DejaVu Sans"), TEXT_PX)
@@ -134,7 +134,7 @@ def _leaves(tree, node: int) -> int:
 
 
 def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
-    """A square crop of the node in the view that shows it largest, the rest dimmed."""
+    """Return a square crop of the node in the view in which it is largest, the rest dimmed."""
     import cv2
 
     view = scene.tree.view_names[int(scene.tree.view_area_px[node].argmax())]

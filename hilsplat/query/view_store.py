@@ -1,21 +1,21 @@
-"""Results per view, kept in bounded memory."""
+"""Cache of results per view, in bounded memory."""
 
 from collections.abc import Callable
 from typing import Any
 
 VIEW_CACHE_MIB = 1024.0
-"""Memory for the results used last."""
+"""Memory limit of the cache, MiB."""
 
 
 class ViewStore:
-    """Results per view; the least recently used go first when they exceed `most_mib`."""
+    """Cache of results per view; above `most_mib`, the least recently used are dropped."""
 
     def __init__(self, most_mib: float = VIEW_CACHE_MIB) -> None:
         self._most_bytes = most_mib * 2**20
         self._kept: dict[tuple, tuple[Any, int]] = {}
 
     def get(self, key: tuple, compute: Callable[[], Any], size: Callable[[Any], int]) -> Any:
-        """The kept value, or a newly computed one."""
+        """Return the cached value, or compute and cache it."""
         if key in self._kept:
             self._kept[key] = self._kept.pop(key)
             return self._kept[key][0]
@@ -26,6 +26,6 @@ class ViewStore:
         return value
 
     def forget(self, view: str) -> None:
-        """Drop the results of a view; the second part of a key is the view."""
+        """Drop the results of a view, which is the second item of their keys."""
         for key in [key for key in self._kept if key[1] == view]:
             del self._kept[key]

@@ -1,4 +1,4 @@
-"""What the networks predict for a view: the costly, cached half of automatic mask generation."""
+"""Predict mask candidates of a view: the costly, cached half of automatic mask generation."""
 
 import math
 from collections.abc import Iterator
@@ -29,13 +29,13 @@ LOOSE = 0.1
 """Masks below this predicted IoU or stability, or below a lower threshold of the settings, are not cached."""
 
 BAND_PX = 3
-"""Low-resolution pixels on either side of a mask's edge whose logits are kept (see `Candidates`)."""
+"""Logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)."""
 
 REPEAT_IOU = 0.95
-"""A preview's mask whose box has a higher IoU with that of a better one repeats it (`distinct_prompts`)."""
+"""A preview mask repeats a better one if the IoU of their boxes exceeds this (`distinct_prompts`)."""
 
 REPEAT_SLACK = 0.05
-"""Stability that a repeated mask may have above the better one, as a preview counts it: pixels are few."""
+"""Amount by which a repeated mask's preview stability, counted on few pixels, may exceed the better one's."""
 
 CROP_OVERLAP = 512 / 1500
 """Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
@@ -43,20 +43,20 @@ CROP_OVERLAP = 512 / 1500
 
 @dataclass(frozen=True)
 class Candidates:
-    """K masks as the decoder gave them, before any threshold that a user may change.
+    """K masks as decoded, before any threshold that a user may change.
 
-    A mask's logits are kept inside a window around it, in steps of `sam.LOGIT_STEP` (for the official
-    generator as they are), and set to +-127 wherever no edge is within `BAND_PX`: the two bilinear
-    resizings up to the view read logits at most three pixels apart, so no pixel of any mask changes, and
-    the window is constant almost everywhere and compresses well. Outside the window logits are -127.
+    A mask's logits are kept in a window around it, in steps of `sam.LOGIT_STEP` (unrounded for the official
+    generator). Logits with no edge within `BAND_PX` are set to +-127, so that windows compress well. This
+    changes no pixel of a mask: the two bilinear resizings up to the view read logits at most three pixels
+    apart. Outside the window logits are -127.
 
     Attributes:
-        logits: the windows one after the other, row by row.
-        offsets: where each mask's window begins, and where the last one ends.
+        logits: concatenated windows, each row by row.
+        offsets: start of each mask's window, and the end of the last one.
         window_xyxy: low-resolution px, end exclusive.
         low_hw: height and width of the decoder's masks.
         head: row of `HEADS`.
-        predicted_iou: as the network gives it; a released SAM exceeds 1 at its surest masks.
+        predicted_iou: as predicted; a released SAM exceeds 1 for its most certain masks.
         stability: `sam.read_logits` or `sam.full_stability`.
         crop: row of the view's crop boxes.
     """
@@ -74,12 +74,12 @@ class Candidates:
         return len(self.head)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All fields as plain arrays."""
+        """Return all fields as plain arrays."""
         return dict(vars(self))
 
     @staticmethod
     def concatenate(parts: "list[Candidates]") -> "Candidates":
-        """Rows of all parts, at least one, one after the other."""
+        """Concatenate the rows of all parts (at least one)."""
         names = ("window_xyxy", "head", "predicted_iou", "stability", "crop")
         return Candidates(low_hw=parts[0].low_hw, **join_rows(parts, "logits", names))
 
@@ -87,7 +87,7 @@ class Candidates:
 def crop_boxes(
     size_hw: tuple[int, int], layers: int
 ) -> tuple[Int32[np.ndarray, "C 4"], UInt8[np.ndarray, " C"]]:
-    """Boxes (xyxy, px) of the whole image and of each layer's overlapping crops, and their layers.
+    """Return the boxes (xyxy, px) of the whole image and of each layer's overlapping crops, and their layers.
 
     Layer i has 2**i crops per side; crops of one layer overlap by 512/1500 of the shorter side,
     divided by 2**(i - 1).
@@ -114,7 +114,7 @@ def candidates_key(
     settings: MasksSettings,
     points: Float[np.ndarray, "P 2"] | None = None,
 ) -> str:
-    """Cache key of a view's candidates: everything that `decode_candidates` depends on."""
+    """Return the cache key of a view's candidates, a digest of all inputs of `decode_candidates`."""
     thresholds = model.thresholds(settings)
     return sha256_of_json(
         {
@@ -140,13 +140,13 @@ def candidates_key(
 
 
 def floors(thresholds: Thresholds) -> tuple[float, float]:
-    """Predicted IoU and stability below which candidates are not kept; a threshold of 0 drops nothing."""
+    """Return the predicted IoU and stability below which candidates are dropped; 0 drops none."""
     lowest = (min(LOOSE, thresholds.predicted_iou_min), min(LOOSE, thresholds.stability_min))
     return lowest[0] or -math.inf, lowest[1]
 
 
 def needs_full_size(settings: MasksSettings) -> bool:
-    """Whether stability counts pixels at the size of the view."""
+    """Return whether stability is counted at the view's size."""
     return settings.stability == "full" or settings.generator == "official"
 
 
@@ -156,12 +156,12 @@ def decode_candidates(
     settings: MasksSettings,
     points: Float[np.ndarray, "P 2"] | None = None,
 ) -> Candidates:
-    """Prompt the network at every grid point of the image and of its crops, or at those worth it.
+    """Decode masks at grid points of the image and its crops, skipping repeats (`distinct_prompts`).
 
     Args:
         image: the view.
-        model, settings: what decodes it, and how.
-        points: at least one point (x, y, px) in place of the grid on the whole image; crops keep the grid.
+        model, settings: SAM model and mask settings.
+        points: at least one point (x, y, px) that replaces the grid on the whole image; crops keep the grid.
     """
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
@@ -181,10 +181,10 @@ def decode_candidates(
 
 
 def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
-    """Prompts call by call, and how many of a call count.
+    """Yield the prompts of each decoder call, and how many of them count.
 
-    Every call has the same number of prompts, the last one repeated: some networks fix it, and so results
-    cannot depend on how a batch was cut.
+    The last prompt is repeated to fill the last call: some networks have a fixed batch size, and with a
+    constant size the results don't depend on how the prompts are split into calls.
     """
     total = len(next(iter(prompts.values())))
     for start in range(0, total, batch):
@@ -193,8 +193,8 @@ def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
 
 
 def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
-    """Whether prompts that repeat others are left out: if the model can tell, and if what they give would be
-    suppressed anyway."""
+    """Return whether repeated prompts are skipped: the model must have previews, and the settings must
+    suppress repeated masks anyway."""
     may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
     return model.previews and not may_repeat
 
@@ -202,11 +202,11 @@ def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
 def distinct_prompts(
     encoded: Encoded, prompts: Prompts, model: SamModel, settings: MasksSettings, batch: int
 ) -> Prompts:
-    """Preview prompts and drop each one whose masks all repeat a better mask of the same head.
+    """Preview prompts and drop each one whose masks all repeat better masks of the same head.
 
     Masks are compared by their boxes in the preview, which has every second or fourth row and column of the
-    decoder's masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of a thousand
-    prompts two to three hundred stay (docs/segment.md), and at least one.
+    decoder's masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of 1000
+    prompts, 200 to 300 remain (docs/segment.md); at least one is kept.
     """
     iou_floor, stability_floor = floors(model.thresholds(settings))
     found, kept = [], []
@@ -236,7 +236,7 @@ def keep_candidates(
     settings: MasksSettings,
     thresholds: Thresholds,
 ) -> Candidates:
-    """The masks of one decoder call that are above the floors."""
+    """Return the masks of one decoder call that pass `floors`."""
     iou_floor, stability_floor = floors(thresholds)
     predicted_iou = scores.reshape(-1)
     flat = logits.reshape(-1, *logits.shape[2:])
@@ -262,7 +262,7 @@ def keep_candidates(
 
 
 def positive_boxes(logits: Float32[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
-    """Box (xyxy, end exclusive) of what is above 0 in each picture, all 0 if nothing is."""
+    """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
     above = np.greater(logits, 0)
     boxes = np.zeros((len(logits), 4), np.int32)
     for low, high, along in ((0, 2, above.any(axis=1)), (1, 3, above.any(axis=2))):

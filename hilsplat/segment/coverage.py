@@ -1,4 +1,4 @@
-"""The coverage tree of a view: which mask lies in which (paper, Sec. III-B)."""
+"""Coverage tree of a view: the parent of each mask (paper, Sec. III-B)."""
 
 from dataclasses import replace
 
@@ -13,28 +13,27 @@ from hilsplat.segment.masks import HierarchicalMasks
 def coverage_parents(
     overlap_px: Int64[np.ndarray, "M M"], level: UInt8[np.ndarray, " M"] | None, theta: float
 ) -> Int32[np.ndarray, " M"]:
-    """Find the parent of every mask of one view (paper, Sec. III-B).
+    """Return the parent of every mask of one view (paper, Sec. III-B).
 
-    Mask `a` is a child of mask `b` when more than `theta` of `a` lies in `b` while less
-    than `theta` of `b` lies in `a`. The smallest such `b` is the parent; of two equally
-    small ones, the lower row.
+    Mask `a` is a child of mask `b` if more than `theta` of `a` is inside `b` and less than `theta` of `b` is
+    inside `a`. The parent is the smallest such `b`, and on a tie the lower row.
 
     Departs: the paper leaves open which levels a parent may come from. Here it is coarser than
-    its child; a subpart may hang directly under a whole.
+    its child; the parent of a subpart may be a whole.
 
     Args:
         overlap_px: pixels that each pair of masks shares; the diagonal holds their areas.
-        level: `Level` of each mask; None: a parent may come from any level, as printed.
+        level: `Level` of each mask; None allows parents from any level, as printed in the paper.
         theta: coverage threshold, a share in (0, 1); the paper uses 0.9.
 
     Returns:
         Row of each mask's parent, or `NONE` if no mask covers it.
 
     Raises:
-        EmptyMaskError: a mask has no pixel, so its coverage is undefined.
+        EmptyMaskError: if a mask has no pixel, so that its coverage is undefined.
 
     Example:
-        >>> overlap_px = np.array([[4, 2], [2, 2]])  # the second mask lies in the first
+        >>> overlap_px = np.array([[4, 2], [2, 2]])  # the second mask is inside the first
         >>> coverage_parents(overlap_px, np.array([1, 2], np.uint8), theta=0.9)
         array([-1,  0], dtype=int32)
     """
@@ -58,7 +57,7 @@ def coverage_parents(
 
 
 def depths(parent: Int32[np.ndarray, " M"]) -> UInt8[np.ndarray, " M"]:
-    """Depth of every mask in its tree: roots 1, their children 2, and so on."""
+    """Return the depth of every mask in its tree: 1 for roots, 2 for their children, and so on."""
     depth = np.ones(len(parent), dtype=np.uint8)
     ancestor = parent.copy()
     while (ancestor != NONE).any():
@@ -71,16 +70,16 @@ def depths(parent: Int32[np.ndarray, " M"]) -> UInt8[np.ndarray, " M"]:
 def coverage_tree(
     masks: HierarchicalMasks, theta: float
 ) -> tuple[Int32[np.ndarray, " M"], UInt8[np.ndarray, " M"]]:
-    """Parent (row or `NONE`) and depth (roots 1) of every mask of a view, always a forest."""
+    """Return the parent (row or `NONE`) and the depth (1 for roots) of every mask of a view."""
     parent = coverage_parents(masks.overlaps_px(), masks.level, theta)
     return parent, depths(parent)
 
 
 def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMasks:
-    """Masks whose level is their depth in the view's tree, in `content_order`.
+    """Return the masks with levels set to their depths in the view's tree, in `content_order`.
 
-    Roots become wholes, their children parts, all other descendants subparts (a comment in the source of the
-    paper, Sec. III-B); the heads that made the masks don't count.
+    Roots become wholes, their children parts, and all other descendants subparts (a comment in the source of
+    the paper, Sec. III-B). The heads that made the masks don't count.
     """
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
     found = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""The stage `coverage_tree`: the coverage tree of every view that has masks."""
+"""Stage `coverage_tree`: build the coverage tree of every view that has masks."""
 
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,13 @@ def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSetti
     """Build the coverage tree of every view.
 
     Args:
-        masks_folder: what `run_masks` wrote.
-        out: folder to write: `<view>.npz` with `parent` i32 (M) and `depth` u8 (M), rows as the
+        masks_folder: output of `run_masks`.
+        out: folder to write: `<view>.npz` with `parent` i32 (M) and `depth` u8 (M), in the order of the
             masks, and `index.json`.
         settings: threshold.
 
     Raises:
-        MisalignedArtifactError: the masks of a view are not those that their index records.
+        MisalignedArtifactError: if the masks of a view differ from those recorded in their index.
     """
     scene, digests = read_index(masks_folder)["scene"], digests_in(masks_folder)
     index: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Square crops of masked regions, as CLIP sees them in training and at run time."""
+"""Square crops of masked regions, the input of CLIP in training and at run time."""
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -7,7 +7,7 @@ from hilsplat.base.errors import EmptyMaskError
 
 BACKGROUNDS = ("black", "keep", "dim")
 DIM = 0.35
-"""Brightness that `dim` leaves to pixels outside the mask."""
+"""Brightness factor of pixels outside the mask for the background `dim`."""
 
 
 def square_crop(
@@ -17,7 +17,7 @@ def square_crop(
     context: float,
     size: int,
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """Cut out a mask's box with a margin, and make it square (`crop_to_square`).
+    """Crop a mask's box with a margin, and make it square (`crop_to_square`).
 
     Args:
         image: the view.
@@ -28,7 +28,7 @@ def square_crop(
         size: side of the result, px.
 
     Raises:
-        EmptyMaskError: the mask has no pixel.
+        EmptyMaskError: if the mask has no pixel.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
@@ -51,12 +51,12 @@ def crop_to_square(
     The side of the square is the longer side of the box. Shrinking averages areas; enlarging is bilinear.
 
     Args:
-        box: the part of the image inside the mask's box.
-        inside: the mask in it.
+        box: image crop at the mask's box.
+        inside: mask in the crop.
         background: pixels outside the mask: `black`, `keep` (unchanged), or `dim` (0.35 of their brightness).
         size: side of the result, px.
-        as_langsplat: as LangSplat's preprocessing does it: without the last row and column of the box (but
-            never nothing), and bilinear also when it shrinks.
+        as_langsplat: follow LangSplat's preprocessing: omit the last row and column of the box (but keep at
+            least one), and resize bilinearly also when shrinking.
     """
     if background not in BACKGROUNDS:
         raise ValueError(f"background {background!r} is not one of {', '.join(BACKGROUNDS)}")
@@ -70,7 +70,7 @@ def crop_to_square(
     square = np.zeros((side, side, 3), np.uint8)
     top, left = (side - height) // 2, (side - width) // 2
     square[top : top + height, left : left + width] = box
-    import cv2  # takes a while
+    import cv2  # slow import
 
     method = cv2.INTER_AREA if side > size and not as_langsplat else cv2.INTER_LINEAR
     return cv2.resize(square, (size, size), interpolation=method)

@@ -1,8 +1,8 @@
-"""Compiled loops of the factored decoder (`factored_decoder`), a block of pixels at a time.
+"""Compiled loops of the factored decoder (`factored_decoder`), one block of pixels at a time.
 
-Arrays are flat float32. Those of an image are stored block by block, each block as (rows, BLOCK) with pixels
-last, or pixels first where a sum runs over pixels. H heads, T tokens, D channels of a head, P pixels of a
-block. A prompt has R factors per layer: the softmax weights of all tokens of a head but the last.
+Arrays are flat float32. Image arrays are stored block by block, each block as (rows, BLOCK) with pixels
+last, or with pixels first where a sum runs over pixels. H: heads; T: tokens; D: channels of a head; P: pixels
+of a block. A prompt has H (T - 1) factors per layer: each head's softmax weights of all tokens but the last.
 """
 
 from typing import no_type_check
@@ -37,10 +37,10 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 @compiled
 @no_type_check
 def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
-    """y[r, c] = sum over k of a[r, k] x[k, c], in addition to what y holds if not `begin`.
+    """Compute y[r, c] = sum over k of a[r, k] x[k, c]; add it to y unless `begin`.
 
     Args:
-        y, a, x: flat arrays, each with the place of its first number and the step from row to row.
+        y, a, x: flat arrays, each with the index of its first element and the row stride.
         rows, inner, columns: sizes; columns are a multiple of 16.
     """
     c = 0
@@ -74,11 +74,11 @@ def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, 
 @compiled
 @no_type_check
 def linear(x, weights, bias, rows, inner, y):
-    """y = x W + bias.
+    """Compute y = x W + bias.
 
     Args:
         x: (rows, inner).
-        weights: W by panels of 16 columns, each (inner, 16).
+        weights: W in panels of 16 columns, each (inner, 16).
         y: (rows, outer); outer is a multiple of 16.
     """
     outer = len(bias)
@@ -92,7 +92,7 @@ def linear(x, weights, bias, rows, inner, y):
 @compiled
 @no_type_check
 def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns, x_step, x_head, y_step, y_head):
-    """`multiply` for each head: rows of `a` follow each other, `x` and `y` have a step from head to head."""
+    """Run `multiply` for each head: `a` is contiguous, `x` and `y` have a stride between heads."""
     for h in range(heads):
         multiply(
             y, y0 + h * y_head, y_step, a, a0 + h * rows * inner, inner, x, x0 + h * x_head, x_step,
@@ -103,7 +103,7 @@ def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns, x_step, x_head, y_
 @compiled
 @no_type_check
 def multiply_below(y, y_step, a, a0, x, rows, columns):
-    """`multiply` with the lower triangle of a square matrix, added to `y`."""
+    """Add the product of a square matrix's lower triangle and `x` to `y`."""
     for r in range(0, rows, MOST_ROWS):
         many = min(MOST_ROWS, rows - r)
         multiply(y, r * y_step, y_step, a, a0 + r * rows, rows, x, 0, y_step, many, r + many, columns, False)
@@ -112,7 +112,7 @@ def multiply_below(y, y_step, a, a0, x, rows, columns):
 @compiled
 @no_type_check
 def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
-    """y = scale * x + shift for rows of pixels; `scale` is one row."""
+    """Compute y = scale * x + shift for rows of pixels; `scale` is one row."""
     for c in range(0, pixels, WIDTH):
         factor = load(scale, c)
         for r in range(rows):
@@ -123,10 +123,10 @@ def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
 @compiled
 @no_type_check
 def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
-    """Softmax over the tokens of each head at each pixel; the share of a head's last token is left out.
+    """Compute the softmax over the tokens of each head at each pixel, without each head's last token.
 
     Args:
-        s: scores (H, T, P) to the base 2, overwritten.
+        s: base-2 scores (H, T, P), overwritten.
         offset, scale: `offset[h, t] * scale[p]` is added to the scores.
         e: shares (H, T - 1, P).
     """
@@ -154,17 +154,17 @@ def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
 @compiled
 @no_type_check
 def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, width, rows, pixels):
-    """Weights of a block's pixels in softmaxes over all pixels, and their sums so far.
+    """Compute the weights of a block's pixels in softmaxes over all pixels, and update the running sums.
 
-    A softmax over all blocks needs its largest score only at the end: what was summed before a larger one is
-    scaled down when it is met.
+    The largest score of all blocks is known only at the end: when a block has a larger score, the sums so far
+    are scaled down.
 
     Args:
-        s: scores (rows, P) to the base 2, overwritten by weights.
+        s: base-2 scores (rows, P), overwritten by weights.
         scaled: weights times `u`.
         offset: (rows, 2); `offset[r, 0] * u[p] + offset[r, 1] * v[p]` is added to the scores.
         top: largest score of each row so far.
-        sums: (rows, width); the last 16 columns begin with the sums of weights, and of weights by u and v.
+        sums: (rows, width); the last 16 columns begin with the sums of weights, weights * u and weights * v.
     """
     for r in range(rows):
         first, second = load_same(offset, offset0 + 2 * r), load_same(offset, offset0 + 2 * r + 1)
@@ -202,11 +202,11 @@ def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, widt
 @compiled
 @no_type_check
 def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, heads, tokens, pixels, depth):
-    """Add a block to the sums over pixels: of values by head, and of factors.
+    """Add a block to the weighted sums over pixels of values (per head) and of factors.
 
     Args:
         sums: (H * T, width): values, factors, and the columns of `pixel_weights`.
-        w, scaled: weights (H * T, P), and weights for the values.
+        w, scaled: weights (H * T, P) for the factors, and for the values.
         values: (H, P, depth).
         e_t: (P, factors).
     """
@@ -224,7 +224,7 @@ def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, 
 @compiled
 @no_type_check
 def pixels_first(e, e_t, rows, padded, pixels):
-    """Transpose factors (rows, P), with zeros in the columns that only fill up."""
+    """Transpose factors (rows, P), with zeros in the padding columns."""
     for r in range(0, padded, WIDTH):
         for p in range(0, pixels, WIDTH):
             transpose(e, r * pixels + p, pixels, e_t, p * padded + r, padded)
@@ -233,11 +233,11 @@ def pixels_first(e, e_t, rows, padded, pixels):
 @compiled
 @no_type_check
 def read_image(sizes, rows, keys, values, top, sums):
-    """First attention of tokens to pixels, which are those of the image.
+    """Compute the first attention of tokens to pixels, whose keys and values depend on the image only.
 
     Args:
         sizes: prompts, blocks, H, T, D, P, depth.
-        rows: queries of tokens (prompts, H, T, D), times log2(e).
+        rows: token queries (prompts, H, T, D), times log2(e).
         keys: (blocks, H, D, P).
         values: (blocks, H, P, depth).
         top, sums: as in `pixel_weights`, (prompts, H * T) and (prompts, H * T, depth + 16); overwritten.
@@ -266,7 +266,7 @@ def read_image(sizes, rows, keys, values, top, sums):
 @compiled
 @no_type_check
 def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
-    """Shares of the tokens in each pixel at the first layer (H, T - 1, P)."""
+    """Compute the shares of the tokens in each pixel at the first layer (H, T - 1, P)."""
     _, _, heads, tokens, dim, pixels, _ = sizes
     by_head(
         s, 0, rows, i * heads * tokens * dim, queries, b * heads * dim * pixels, heads, tokens, dim, pixels,
@@ -278,7 +278,7 @@ def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
 @compiled
 @no_type_check
 def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, e):
-    """Shares at the second layer, in the rows of `e` after those of the first layer."""
+    """Compute the shares at the second layer into the rows of `e` after those of the first layer."""
     _, _, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     base = b * heads * dim * pixels
@@ -300,12 +300,12 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
 
     Args:
         sizes: as in `read_image`.
-        b, i: block and prompt.
+        b, i: indices of block and prompt.
         image: `FirstLayer` or `SecondLayer`; `u` scales its keys and values.
         prompt: `FirstPrompts` or `SecondPrompts`.
         u, v: scales of the pixels (P), as in `pixel_weights`.
-        e: factors (padded, P), of which the first `factors` rows count.
-        e_t, k, s, scaled: room for transposed factors, keys, scores and weights; overwritten.
+        e: factors (padded, P); only the first `factors` rows are used.
+        e_t, k, s, scaled: buffers for transposed factors, keys, scores and weights; overwritten.
         top, sums: as in `pixel_weights`.
     """
     _, _, heads, tokens, dim, pixels, depth = sizes
@@ -334,15 +334,15 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
 @compiled
 @no_type_check
 def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out, e_out):
-    """Attention of pixels to tokens at the first layer, its layer norm, and the second attention of tokens.
+    """Compute the first attention of pixels to tokens, its layer norm, and the second attention of tokens.
 
     Args:
         sizes: as in `read_image`.
-        channels, eps: of the layer norm.
+        channels, eps: parameters of the layer norm.
         image: `FirstLayer`.
         prompt: `FirstPrompts`.
         top, sums: as in `pixel_weights`; sums (prompts, H * T, depth + padded + 16); overwritten.
-        s1_out: scale of each pixel by the layer norm (prompts, blocks, P).
+        s1_out: layer norm scale of each pixel (prompts, blocks, P).
         e_out: factors times that scale (prompts, blocks, padded, P).
     """
     number, blocks, heads, tokens, dim, pixels, _ = sizes
@@ -391,13 +391,13 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
 @compiled
 @no_type_check
 def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top, sums, s2_out, e_out):
-    """The same at the second layer, and the final attention of tokens.
+    """Compute the second attention of pixels to tokens, its layer norm, and the final attention of tokens.
 
     Args:
         image: `SecondLayer`.
         prompt: `SecondPrompts`.
-        s1_in, e_in: what `update_and_read_first` returns.
-        s2_out: scale by this layer norm (prompts, blocks, P).
+        s1_in, e_in: outputs of `update_and_read_first`.
+        s2_out: scale of each pixel by this layer norm (prompts, blocks, P).
         e_out: factors of both layers times this scale (prompts, blocks, padded, P).
     """
     number, blocks, heads, tokens, dim, pixels, _ = sizes
@@ -451,7 +451,7 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
             for c in range(0, pixels, WIDTH):
                 p = b * pixels + c
                 scale = load(s1, c)
-                # square[i]: of the part that the first scale multiplies, of both parts, of the other part
+                # square: |a|^2, a b and |b|^2; the first scale multiplies a, but not b
                 total = load(image.square, p) + load_same(prompt.square, 3 * i)
                 total = total + two * (load(image.cross_first, p) + load(last, c))
                 total = total * scale
@@ -475,7 +475,7 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
 @compiled
 @no_type_check
 def gelu(x):
-    """x times the normal distribution's integral up to x, within 1e-6 (Abramowitz and Stegun 7.1.26)."""
+    """Return x times the normal CDF at x, within 1e-6 (Abramowitz and Stegun 7.1.26)."""
     size = larger(x, lanes(ZERO) - x)
     t = reciprocal(lanes(ONE) + lanes(np.float32(0.3275911 / 2**0.5)) * size)
     tail = lanes(np.float32(0.5 * 1.061405429)) * t + lanes(np.float32(0.5 * -1.453152027))
@@ -491,7 +491,7 @@ def gelu(x):
 def rebuild_factors(
     sizes, queries, scaled_queries, fixed_queries, keys0, keys1, low, offset, s1_in, s2_in, e_out
 ):
-    """Compute `e_out` of `update_and_read_second` again, from the scales that it returned."""
+    """Recompute `e_out` of `update_and_read_second` from the scales that it returned."""
     number, blocks, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     both = 2 * factors
@@ -517,16 +517,16 @@ def rebuild_factors(
 @compiled
 @no_type_check
 def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, padded, grid_width, out):
-    """Logits of masks, from the factors of both layers.
+    """Compute mask logits from the factors of both layers.
 
     Args:
-        fine: all logits, four by four for each pixel of the image side; else the first of them only.
-        eps: of the layer norm between the two upscalings.
+        fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first of them.
+        eps: epsilon of the layer norm between the two upscalings.
         weights: `Upscaling`.
         image: `MaskImage`.
         prompt: `MaskPrompts`.
         e_in, padded: factors times their scales (prompts, blocks, padded, P).
-        grid_width: pixels of a row of the image side.
+        grid_width: width of the image side, pixels.
         out: (prompts, masks, rows, columns), flat.
     """
     number, blocks, heads, tokens, _, pixels, _ = sizes

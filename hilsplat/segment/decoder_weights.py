@@ -1,4 +1,4 @@
-"""Read the mask decoder of an ONNX export: weights by module, and parts of its network."""
+"""Read the mask decoder of an ONNX export: weights by module, and subgraphs."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,13 +15,13 @@ from hilsplat.segment import decoder_kernels as kernels
 
 LAYER = "mask_decoder/transformer/layers.0"
 TOKENS = f"{LAYER}/self_attn/q_proj"
-"""Module whose input is the tokens of each prompt."""
+"""Module whose input is the prompt tokens."""
 
 IMAGE_SIDE = (f"{LAYER}/cross_attn_token_to_image/v_proj", f"{LAYER}/cross_attn_token_to_image/k_proj")
-"""Modules whose inputs are the image side, and the image side with positions."""
+"""Modules whose inputs are the image features, without and with positions."""
 
 EPS = 1e-6
-"""Of layer norms in exports that take them apart, as in transformers."""
+"""Epsilon of layer norms that the export splits into basic operators; the default of transformers."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Linear:
 
     @cached_property
     def _packed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weights and bias as `decoder_kernels.linear` takes them."""
+        """Weights and bias in the layout of `decoder_kernels.linear`."""
         more = -len(self.bias) % WIDTH
         weight = np.pad(self.weight, ((0, more), (0, 0)))
         panels = weight.reshape(-1, WIDTH, weight.shape[1]).transpose(0, 2, 1)
@@ -63,7 +63,7 @@ class Norm:
 
 @dataclass(frozen=True)
 class Attention:
-    """The four projections of an attention."""
+    """The four projections of an attention block."""
 
     q: Linear
     k: Linear
@@ -72,13 +72,13 @@ class Attention:
 
 
 class DecoderGraph:
-    """The graph of a decoder exported from transformers, whose nodes are named after its modules.
+    """Graph of a decoder exported from transformers; its nodes are named after the modules.
 
     Args:
         path: the `.onnx` file.
 
     Raises:
-        ModelError: the graph has other nodes, or weights that are not float32.
+        ModelError: if the graph lacks expected nodes, or weights are not float32.
     """
 
     def __init__(self, path: Path) -> None:
@@ -92,7 +92,7 @@ class DecoderGraph:
         self._aliases = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "Identity"}
 
     def linear(self, module: str) -> Linear:
-        """Return a linear layer; bias and weight are constants of its product and sum."""
+        """Return a linear layer from the constants of its MatMul and Add nodes."""
         product, total = self._node(f"{module}/MatMul"), self._node(f"{module}/Add")
         (bias,) = [value for name in total.input if (value := self._constant(name)) is not None]
         weight = self._constant(product.input[1])
@@ -101,12 +101,12 @@ class DecoderGraph:
         return Linear(np.ascontiguousarray(weight.T), bias)
 
     def attention(self, module: str) -> Attention:
-        """Return an attention."""
+        """Return the projections of an attention block."""
         out = "out" if self._find(f"{module}/out_proj/MatMul") is not None else "o"  # SAM, SAM 2
         return Attention(*(self.linear(f"{module}/{part}_proj") for part in ("q", "k", "v", out)))
 
     def perceptron(self, module: str) -> list[Linear]:
-        """Return the layers of a small network, in order."""
+        """Return the linear layers of a perceptron, in order."""
         names = ["proj_in", *(f"layers.{number}" for number in range(8)), "proj_out", "lin1", "lin2"]
         found = [name for name in names if self._find(f"{module}/{name}/MatMul") is not None]
         if not found:
@@ -121,7 +121,7 @@ class DecoderGraph:
         return Norm(scale, shift, eps[0] if eps else EPS)
 
     def parameter(self, name: str) -> Float32[np.ndarray, "..."]:
-        """Return a parameter that the export left as it was, by its path with slashes."""
+        """Return a parameter that the export left unchanged; `name` is its path with slashes."""
         ending = name.replace("/", ".")
         found = [each for each in [*self._initializers, *self._aliases] if each.endswith(ending)]
         value = self._constant(found[0]) if found else None
@@ -130,11 +130,11 @@ class DecoderGraph:
         return value
 
     def has(self, module: str, operator: str) -> bool:
-        """Return whether a module has a node of an operator."""
+        """Return whether a module has a node of the given operator type."""
         return any(f"{module}/" in name and node.op_type == operator for name, node in self._nodes.items())
 
     def until(self, *modules: str) -> bytes:
-        """Return the part of the network, serialised, whose outputs are the inputs of modules."""
+        """Return the serialised subgraph whose outputs are the inputs of the given modules."""
         import onnx
 
         part = onnx.ModelProto()

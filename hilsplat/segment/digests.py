@@ -1,7 +1,7 @@
-"""The digest of each view's masks: an artifact computed from masks records it, and its readers compare it.
+"""Digests of each view's masks, recorded by artifacts computed from masks and checked by their readers.
 
-Rows of CLIP vectors, contributions, coverage trees, nodes and codes refer to masks by number, so they belong
-together only if they were computed from the same masks in the same order.
+CLIP vectors, contributions, coverage trees, nodes and codes refer to masks by row number. They may be
+combined only if they were computed from the same masks in the same order.
 """
 
 import itertools
@@ -18,7 +18,7 @@ MASKS_SHA256 = "masks_sha256"
 
 
 def digest_of(masks: HierarchicalMasks) -> str:
-    """Return the SHA-256 of all arrays of a view's masks: their order, sizes, pixels, levels and scores."""
+    """Return the SHA-256 of all arrays of a view's masks: sizes, pixels, levels and scores, in row order."""
     arrays = masks.arrays().items()
     return sha256_of_bytes(
         *(
@@ -30,21 +30,21 @@ def digest_of(masks: HierarchicalMasks) -> str:
 
 
 def pixel_digests(masks: HierarchicalMasks) -> list[str]:
-    """Return the SHA-256 of each mask's pixels, whatever its level and its place among the others."""
+    """Return the SHA-256 of each mask's pixels, independent of its level and row."""
     ends = masks.offsets.tolist()
     return [sha256_of_bytes(masks.runs[start:end].tobytes()) for start, end in itertools.pairwise(ends)]
 
 
 def index_entry(masks: HierarchicalMasks) -> dict[str, int | str]:
-    """Return the index entry of a view's masks: their number per level, and their digest."""
+    """Return the index entry of a view's masks: their number per level and their digest."""
     return {**{level.label: len(masks.rows_of(level)) for level in LEVELS}, MASKS_SHA256: digest_of(masks)}
 
 
 def digests_in(folder: Path) -> dict[str, str]:
-    """Return the digest of each view's masks, as recorded by masks or by an artifact computed from them.
+    """Return the digest of each view's masks, as recorded by masks or an artifact computed from them.
 
     Raises:
-        ArtifactError: the artifact is missing or incomplete, or another version of the program wrote it.
+        ArtifactError: if the artifact is missing, incomplete or of another version of the program.
     """
     digests: dict[str, str] = {}
     for view, entry in read_full_index(folder, "views")["views"].items():
@@ -61,15 +61,15 @@ def digests_in(folder: Path) -> dict[str, str]:
 
 
 def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> HierarchicalMasks:
-    """Read a view's masks and check their digest; 48 views of 300 masks at 800 x 600 take 0.03 s more.
+    """Read a view's masks and check their digest, which adds 0.03 s for 48 views of 300 masks at 800 x 600.
 
     Args:
         folder: masks artifact.
-        view: its name.
+        view: name of the view.
         digests: the digest that each view's masks must have (`digests_in`).
 
     Raises:
-        MisalignedArtifactError: the masks have another digest.
+        MisalignedArtifactError: if the masks have another digest.
     """
     path = Path(folder) / f"{view}.npz"
     masks = HierarchicalMasks.load(path)
@@ -78,14 +78,14 @@ def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> Hierarchi
 
 
 def require_same_masks(folder: Path, other: Path) -> list[str]:
-    """Refuse two artifacts that were computed from different masks; one of them may be the masks artifact.
+    """Require that two artifacts were computed from the same masks; one may be the masks artifact.
 
     Returns:
-        The views in the order of `other`.
+        View names in the order of `other`.
 
     Raises:
-        MisalignedArtifactError: the digests of a view differ, or only one of the artifacts has the view.
-        ArtifactError: an artifact is incomplete, or another version of the program wrote it.
+        MisalignedArtifactError: if the digests of a view differ, or only one artifact contains the view.
+        ArtifactError: if an artifact is incomplete or of another version of the program.
     """
     found, expected = digests_in(folder), digests_in(other)
     what = f"{folder} and {other} belong to different masks"

@@ -1,21 +1,21 @@
-"""SAM's mask decoder for many prompts on one image, with exact algebra (docs/benchmarks.md has the times).
+"""SAM's mask decoder for many prompts on one image, factored exactly (timings in docs/benchmarks.md).
 
-The plain decoder projects every pixel of the image side ten times per prompt. But prompts differ only in a
-few tokens. Before its layer norm, the image side after layer 1 is
+The plain decoder projects every pixel of the image side ten times per prompt, although prompts differ only
+in a few tokens. Before its layer norm, the image side after layer 1 is
 
-    X + b + F^T B        X: of the image alone, channels x pixels
+    X + b + F^T B        X: depends on the image alone, channels x pixels
                          F: softmax weights of H heads x T tokens in each pixel, H (T - 1) rows
-                         B: values of the tokens through the output projection, H (T - 1) x channels
+                         B: values of the tokens after the output projection, H (T - 1) x channels
 
-since the weights of a head sum to 1, so that its last token goes into the vector b and the others count by
-their difference from it. A layer norm of that is one scale per pixel, which follows from |X|^2, from products
-of X that all prompts share, and from B's Gram matrix. Every later projection of the image side thus splits
-into one of X, made once per image, and one of few factors. After layer 2 there are 2 H (T - 1) factors.
-No array of channels x pixels is computed before a mask is. Results differ from the network's by rounding;
-`SamModel` compares a few prompts before it uses this class.
+The weights of a head sum to 1, so its last token contributes the constant b and the others contribute their
+difference from it. The layer norm is then one scale per pixel, computed from |X|^2, from products of X that
+all prompts share, and from B's Gram matrix. Every later projection of the image side is the sum of a
+projection of X, computed once per image, and one of few factors: 2 H (T - 1) after layer 2. Masks are the
+first arrays as large as the image side. Results differ from the network's only by rounding; `SamModel`
+compares a few prompts before it uses this class.
 
-The two attentions of a layer, its layer norm and the next attention run block by block of pixels, for several
-prompts (`decoder_kernels`). What concerns tokens alone is plain numpy here.
+The two attentions of a layer, its layer norm and the next attention process one block of pixels at a time
+for several prompts (`decoder_kernels`). Operations on tokens alone are plain numpy here.
 """
 
 from collections.abc import Mapping
@@ -32,28 +32,28 @@ from hilsplat.segment import decoder_kernels as kernels
 from hilsplat.segment.decoder_weights import IMAGE_SIDE, TOKENS, DecoderGraph, Linear
 
 LOG2_E = np.float32(1 / np.log(2))
-"""Scores are to the base 2."""
+"""Factor that converts scores to base 2."""
 
 BLOCK = 64
-"""Pixels of a block at most. Its arrays fit into a core's second-level cache; 128 and 256 are 2 % slower."""
+"""Maximum pixels per block. Its arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
 
 PROMPTS = 16
-"""Prompts of a call. They visit a block one after the other, which then is in the cache."""
+"""Prompts per call. They process each block one after the other while it is in the cache."""
 
 HEADS_PER_ATTENTION = 8
-"""Heads of an attention if the model's configuration names no number."""
+"""Heads per attention if the model's configuration doesn't specify them."""
 
 
 class FirstLayer(NamedTuple):
-    """What the kernels read of an image at the first layer, block by block.
+    """Image arrays that the kernels read at the first layer, block by block.
 
     Attributes:
-        queries: of the attention of pixels to tokens.
-        before: products of the image side with the output projection of a value.
+        queries: queries of the attention of pixels to tokens.
+        before: products of the pixels' features with the output projection of the values.
         square: squared length of each pixel's features.
-        cross: products of the pixels' features with the constant that is added to them.
+        cross: products of the pixels' features with the bias that is added to them.
         scaled_keys, fixed_keys: keys of the attention of tokens to pixels; the layer norm scales the first.
-        values: of that attention, before the scale.
+        values: values of that attention, before the layer norm's scale.
     """
 
     queries: np.ndarray
@@ -66,17 +66,17 @@ class FirstLayer(NamedTuple):
 
 
 class FirstPrompts(NamedTuple):
-    """What the kernels read of prompts at the first layer.
+    """Prompt arrays that the kernels read at the first layer.
 
     Attributes:
         update_keys: keys of the attention of pixels to tokens.
-        twice_changes: twice the values of its tokens, as differences from the last token's.
-        gram: products of the differences after the output projection (`doubled_below`).
+        twice_changes: twice the difference between the values of its tokens and the last token's.
+        gram: products of these differences after the output projection (`doubled_below`).
         last: values of the last token.
-        square: squared length of what the last token adds to every pixel.
-        linear: twice the products of that with the differences.
-        queries: of the attention of tokens to pixels.
-        low, offset: products of these with the keys' part of the factors, and of what every pixel gets.
+        square: squared length of the constant that the last token and the bias add to every pixel.
+        linear: twice the products of that constant with the differences.
+        queries: queries of the attention of tokens to pixels.
+        low, offset: products of `queries` with the keys of the factors, and of that constant.
     """
 
     update_keys: np.ndarray
@@ -91,9 +91,9 @@ class FirstPrompts(NamedTuple):
 
 
 class SecondLayer(NamedTuple):
-    """What the kernels read of an image at the second layer; names as in `FirstLayer`.
+    """Image arrays that the kernels read at the second layer; names as in `FirstLayer`.
 
-    Queries and products come in two parts, for the values of the first and of the second layer.
+    Queries and products have two parts, for the values of the first and of the second layer.
     """
 
     scaled_queries: np.ndarray
@@ -109,7 +109,7 @@ class SecondLayer(NamedTuple):
 
 
 class SecondPrompts(NamedTuple):
-    """What the kernels read of prompts at the second layer; names as in `FirstPrompts`."""
+    """Prompt arrays that the kernels read at the second layer; names as in `FirstPrompts`."""
 
     update_keys: np.ndarray
     update_low: np.ndarray
@@ -125,7 +125,7 @@ class SecondPrompts(NamedTuple):
 
 
 class Upscaling(NamedTuple):
-    """Weights of the two upscalings: layer norm between them, bias of the first, the second."""
+    """Weights of the two upscalings and of the layer norm between them."""
 
     norm_scale: np.ndarray
     norm_shift: np.ndarray
@@ -135,7 +135,7 @@ class Upscaling(NamedTuple):
 
 
 class MaskImage(NamedTuple):
-    """What masks read of an image: the image side upscaled once, and the finer features of a SAM 2."""
+    """Image arrays for mask logits: the upscaled image side, and the finer features of SAM 2."""
 
     scaled: np.ndarray
     detail: np.ndarray
@@ -143,13 +143,13 @@ class MaskImage(NamedTuple):
 
 
 class MaskPrompts(NamedTuple):
-    """What masks read of prompts.
+    """Prompt arrays for mask logits.
 
     Attributes:
-        masks: number per prompt.
-        factors: the factors' way through the first upscaling.
-        both_scales, second_scale: the same of what every pixel gets at the first and second layer.
-        combine: weights of the channels in each mask.
+        masks: masks per prompt.
+        factors: factors after the first upscaling.
+        both_scales, second_scale: constants of the first and second layer after the first upscaling.
+        combine: channel weights of each mask.
     """
 
     masks: int
@@ -161,12 +161,12 @@ class MaskPrompts(NamedTuple):
 
 @dataclass(frozen=True)
 class ImageTerms:
-    """What the decoder computes once per image.
+    """Arrays that the decoder computes once per image.
 
     Attributes:
         grid_hw: height and width of the image side.
-        keys, values: of the first attention of tokens to pixels (see `decoder_kernels.read_image`).
-        first, second, masks: for later attentions and for masks.
+        keys, values: inputs of the first attention of tokens to pixels (see `decoder_kernels.read_image`).
+        first, second, masks: inputs of the later attentions and of the masks.
     """
 
     grid_hw: tuple[int, int]
@@ -178,18 +178,18 @@ class ImageTerms:
 
 
 Kept = Mapping[str, np.ndarray]
-"""What all logits of previewed prompts are computed from, arrays with a row per prompt."""
+"""Arrays from which all logits of previewed prompts are computed, one row per prompt."""
 
 
 class FactoredDecoder:
-    """The mask decoder of a SAM or SAM 2.
+    """Factored mask decoder of a SAM or SAM 2.
 
     Args:
         graph: the exported decoder.
-        heads: of every attention.
+        heads: heads of every attention.
 
     Raises:
-        ModelError: the decoder is built otherwise.
+        ModelError: if the decoder has another architecture.
     """
 
     def __init__(self, graph: DecoderGraph, heads: int = HEADS_PER_ATTENTION) -> None:
@@ -210,7 +210,7 @@ class FactoredDecoder:
         ]
         self._tokens, self._image_side = _session(graph.until(TOKENS)), _session(graph.until(*IMAGE_SIDE))
         self.inner = len(self._reads[0].q.bias)
-        # tokens depend on the shapes of features only
+        # tokens depend only on the shapes of the features
         self._blank = {
             each.name: np.zeros([side if isinstance(side, int) else 1 for side in each.shape], np.float32)
             for each in self._tokens.get_inputs()
@@ -218,16 +218,16 @@ class FactoredDecoder:
         }
         one, other = (_run(self._tokens, self._blank, np.full((1, 2), place))[0] for place in (0.0, 9.0))
         same = (one == other).all(axis=-1).reshape(-1)
-        self._iou_token = int(np.argmin(same)) - 5  # SAM 2 has a token before it, for the object's score
+        self._iou_token = int(np.argmin(same)) - 5  # SAM 2 has a token for the object score before it
         self.dim = self.inner // heads
         self._fold(graph, layers)
 
     def _fold(self, graph: DecoderGraph, layers: list[str]) -> None:
-        """Multiply weights with each other, in float64."""
+        """Multiply consecutive weight matrices, in float64."""
         norms = [graph.norm(f"{layer}/layer_norm4") for layer in layers]
         self._eps = self._upscale_eps = norms[0].eps
         (g1, b1), (g2, b2) = ((wide(norm.scale), wide(norm.shift)) for norm in norms)
-        # values' way to the image side (inner, channels): as they come there, and after the next layer norm
+        # output projections of values (inner, channels): before and after the next layer norm
         out0, out1 = (centred(wide(each.out.weight).T, 1) for each in self._updates)
         scaled = out0 * g1
         both = np.concatenate([centred(scaled, 1), out1])
@@ -247,7 +247,7 @@ class FactoredDecoder:
             single(wide(read2.k.weight) @ finer.T),
             single(finer @ read2.v.weight.T),
         )
-        # the upscalings; rows (dy, dx, channel), centred, so that the mean of their layer norm is 0
+        # rows are (dy, dx, channel) and centred, so that the mean in the upscaling's layer norm is 0
         weight = wide(graph.parameter("mask_decoder/upscale_conv1/weight"))
         bias = np.tile(centred(wide(graph.parameter("mask_decoder/upscale_conv1/bias"))), 4)
         upscale = centred(weight.transpose(2, 3, 1, 0), 2).reshape(-1, len(weight))
@@ -262,13 +262,13 @@ class FactoredDecoder:
         )
 
     def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
-        """Compute what all prompts of an image share.
+        """Compute the terms that all prompts of an image share.
 
         Args:
-            features: what the encoder returns, by name, float32.
+            features: encoder outputs by name, float32.
 
         Raises:
-            ModelError: the image side cannot be cut into blocks.
+            ModelError: if the image side cannot be cut into blocks.
         """
         sides = _run(self._image_side, features, np.zeros((1, 2)))
         x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
@@ -343,12 +343,12 @@ class FactoredDecoder:
         """Decode prompts.
 
         Args:
-            image: of `image`.
+            image: output of `image`.
             points_xy: one foreground point per prompt, px of the network's input.
-            fine: all logits, four by four for each pixel of the image side; else the first of each.
+            fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first of them.
 
         Returns:
-            predicted IoUs, logits, and what `logits` needs.
+            predicted IoUs, logits, and the arrays that `logits` needs.
         """
         pe = _run(self._tokens, self._blank, points_xy)[0]
         pe = pe.reshape(len(points_xy), *pe.shape[-2:])
@@ -424,7 +424,7 @@ class FactoredDecoder:
         iou = _layers(self._iou_head, q[:, self._iou_token])[:, 1:]
         if self._iou_sigmoid:
             iou = 1 / (1 + np.exp(-iou))
-        first_mask = self._iou_token + 2  # the first of four masks is for prompts without ambiguity
+        first_mask = self._iou_token + 2  # the first of four masks is for unambiguous prompts
         kept = {
             "keys0": keys0,
             "keys1": keys1,
@@ -442,7 +442,7 @@ class FactoredDecoder:
         return single(iou), self._logits(image, kept, e2, fine=fine), kept
 
     def logits(self, image: ImageTerms, kept: Kept) -> Float32[np.ndarray, "P 3 h w"]:
-        """Return all logits of prompts that were previewed."""
+        """Compute all logits of previewed prompts."""
         number, _, tokens, _ = kept["keys0"].shape
         sizes = self._sizes(image, number, tokens)
         e = np.empty(kept["s1"].size * up(2 * self.heads * (tokens - 1)), np.float32)
@@ -453,7 +453,7 @@ class FactoredDecoder:
         return self._logits(image, kept, e, fine=True)
 
     def _logits(self, image: ImageTerms, kept: Kept, e: np.ndarray, *, fine: bool) -> np.ndarray:
-        """Logits from the factors of the image side times their scales."""
+        """Compute logits from the scaled factors of the image side."""
         changes = kept["changes"]
         number, _, others, _ = changes.shape
         through = changes @ self._factor_masks.reshape(2 * self.heads, self.dim, -1)
@@ -475,7 +475,7 @@ class FactoredDecoder:
         return number, pixels // block, self.heads, tokens, self.dim, block, up(self.dim)
 
     def _attend_tokens(self, layer: int, q: np.ndarray, pe: np.ndarray) -> np.ndarray:
-        """The self-attention of a layer; the first one has neither positions nor a residual."""
+        """Apply a layer's self-attention; the first layer uses neither positions nor a residual."""
         attention, norm = self._self[layer], self._norms[layer][0]
         x = q + pe if layer else q
         queries, keys, values = (
@@ -487,30 +487,30 @@ class FactoredDecoder:
         return norm(q + found if layer else found)
 
     def _think(self, layer: int, q: np.ndarray) -> np.ndarray:
-        """The norms of a layer after its attention to the image, and the perceptron between them."""
+        """Apply a layer's norms after its attention to the image, and the perceptron between them."""
         _, norm, last_norm = self._norms[layer]
         q = norm(q)
         return last_norm(q + _layers(self._mlps[layer], q))
 
     def _split(self, x: Float32[np.ndarray, "*n i"]) -> Float32[np.ndarray, "n H T D"]:
-        """Take heads apart: (n, T, H D) -> (n, H, T, D); a vector per prompt (n, H D) counts as one token."""
+        """Split heads: (n, T, H D) -> (n, H, T, D); one vector per prompt (n, H D) counts as one token."""
         if x.ndim < 3:
             x = x.reshape(-1, 1, x.shape[-1])
         return x.reshape(*x.shape[:2], self.heads, -1).swapaxes(1, 2)
 
     def _scores(self, x: Float32[np.ndarray, "n T i"]) -> Float32[np.ndarray, "n H T D"]:
-        """Queries or keys of tokens, scaled so that their products with pixels are scores to the base 2."""
+        """Scale queries or keys of tokens so that their products with pixels are base-2 scores."""
         return self._split(x) * (LOG2_E / np.float32(self.dim**0.5))
 
     def _token_values(self, x: Float32[np.ndarray, "n T i"]) -> tuple[np.ndarray, np.ndarray]:
-        """Values of tokens minus the last token's (n, H, T - 1, D), and the last token's (n, H D)."""
+        """Return tokens' values minus the last token's (n, H, T - 1, D), and the last token's (n, H D)."""
         values = self._split(x)
         return values[:, :, :-1] - values[:, :, -1:], np.ascontiguousarray(x[:, -1])
 
 
 @dataclass(frozen=True)
 class PixelSums:
-    """Sums of an attention of tokens to pixels (`decoder_kernels.pixel_weights`)."""
+    """Running sums of an attention of tokens to pixels (`decoder_kernels.pixel_weights`)."""
 
     sizes: tuple[int, ...]
     factors: int
@@ -519,7 +519,7 @@ class PixelSums:
 
     @staticmethod
     def empty(sizes: tuple[int, ...], factors: int) -> "PixelSums":
-        """Sums of an attention whose pixels have so many factors."""
+        """Allocate the sums of an attention whose pixels have `factors` factors."""
         rows = sizes[0] * sizes[2] * sizes[3]
         width = sizes[6] + up(factors) + WIDTH
         return PixelSums(sizes, factors, np.empty(rows, np.float32), np.empty(rows * width, np.float32))
@@ -527,11 +527,11 @@ class PixelSums:
     def values(
         self, factor_values: np.ndarray | None = None, *scale_values: np.ndarray
     ) -> Float32[np.ndarray, "n H T D"]:
-        """Return the weighted mean of the pixels' values.
+        """Return the weighted means of the pixels' values.
 
         Args:
             factor_values: values of the factors (n, H, F, D).
-            scale_values: of what the pixels' scales multiply (n, H, 1, D).
+            scale_values: values that the pixels' scales multiply (n, H, 1, D).
         """
         number, _, heads, tokens, dim, _, depth = self.sizes
         sums = self.sums.reshape(number, heads, tokens, -1)
@@ -545,7 +545,7 @@ class PixelSums:
 
 
 def _session(network: bytes) -> onnxruntime.InferenceSession:
-    """Open a part of the decoder; a call takes one thread."""
+    """Open a subgraph of the decoder that uses one thread per call."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 3
@@ -557,7 +557,7 @@ def _run(
     features: Mapping[str, np.ndarray],
     points: Float[np.ndarray, "P 2"],
 ) -> list[np.ndarray]:
-    """Outputs of a part of the decoder."""
+    """Run a subgraph of the decoder and return its outputs."""
     feeds = {
         "input_points": points[None, :, None].astype(np.float32),
         "input_labels": np.ones((1, len(points), 1), np.int64),
@@ -568,20 +568,20 @@ def _run(
 
 
 def _layers(layers: list[Linear], x: np.ndarray) -> np.ndarray:
-    """Linear layers with rectifiers between them."""
+    """Apply linear layers with ReLUs between them."""
     for layer in layers[:-1]:
         x = np.maximum(layer(x), 0)
     return layers[-1](x)
 
 
 def _along(changes: Float32[np.ndarray, "n K J D"], vectors: Float32[np.ndarray, "n KD"]) -> np.ndarray:
-    """Product of each change with its head's part of a vector, (n, K, J)."""
+    """Return the product of each change with its head's part of a vector, (n, K, J)."""
     number, heads, _, dim = changes.shape
     return (changes @ vectors.reshape(number, heads, dim, 1))[..., 0]
 
 
 def _low(rows: np.ndarray, base: Float32[np.ndarray, "HD KD"], changes: np.ndarray) -> np.ndarray:
-    """Products of rows with changes, a matrix between them: (n, H, T, D), (n, K, J, D) -> (n, H, T, K, J)."""
+    """Return rows^T base changes for all pairs: (n, H, T, D), (n, K, J, D) -> (n, H, T, K, J)."""
     number, heads, tokens, dim = rows.shape
     kinds = changes.shape[1]
     left = (rows @ base.reshape(heads, dim, -1)).reshape(number, heads, tokens, kinds, dim)
@@ -590,32 +590,32 @@ def _low(rows: np.ndarray, base: Float32[np.ndarray, "HD KD"], changes: np.ndarr
 
 
 def _between(changes: Float32[np.ndarray, "n K J D"], base: Float32[np.ndarray, "KD KD"]) -> np.ndarray:
-    """Products of changes with each other, a matrix between them, (n, K J, K J)."""
+    """Return changes^T base changes for all pairs, (n, K J, K J)."""
     number, heads, others, _ = changes.shape
     return _low(changes, base, changes).reshape(number, heads * others, -1)
 
 
 def _through(changes: np.ndarray, base: Float32[np.ndarray, "KD HD"], heads: int) -> np.ndarray:
-    """Changes times a matrix, taken apart by heads: (n, K, J, D) -> (n, H, K J, D)."""
+    """Multiply changes by a matrix and split heads: (n, K, J, D) -> (n, H, K J, D)."""
     number, kinds, others, dim = changes.shape
     found = changes @ base.reshape(kinds, dim, -1)
     return found.reshape(number, kinds * others, heads, -1).swapaxes(1, 2)
 
 
 def _offsets(rows: np.ndarray, layer: Linear, vectors: list[np.ndarray]) -> np.ndarray:
-    """Products of rows with projections of vectors (n, C): (n, H, T, D) -> (n, H, T, vectors)."""
+    """Return products of rows with projected vectors (n, C): (n, H, T, D) -> (n, H, T, vectors)."""
     number, heads, _, dim = rows.shape
     projected = [(each @ layer.weight.T).reshape(number, heads, dim, 1) for each in vectors]
     return np.concatenate([rows @ each for each in projected], axis=-1)
 
 
 def doubled_below(gram: Float32[np.ndarray, "n F F"]) -> Float32[np.ndarray, "n F F"]:
-    """The lower triangle of symmetric matrices that gives the same quadratic forms."""
+    """Return lower triangular matrices with the same quadratic forms as the symmetric `gram`."""
     return 2 * np.tril(gram, -1) + gram * np.eye(gram.shape[-1], dtype=np.float32)
 
 
 def joined(x: Float32[np.ndarray, "n H T D"]) -> Float32[np.ndarray, "n T HD"]:
-    """Put heads side by side."""
+    """Concatenate the heads."""
     return x.swapaxes(1, 2).reshape(x.shape[0], x.shape[2], -1)
 
 
@@ -635,15 +635,15 @@ def centred(x: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def flat(x: np.ndarray) -> Float32[np.ndarray, " n"]:
-    """Return the numbers as the kernels take them."""
+    """Return a contiguous, flat float32 array, as the kernels expect."""
     return np.ascontiguousarray(x, np.float32).reshape(-1)
 
 
 def up(number: int) -> int:
-    """The next multiple of the lanes."""
+    """Round up to a multiple of the SIMD width."""
     return -(-number // WIDTH) * WIDTH
 
 
 def filled(x: np.ndarray) -> np.ndarray:
-    """Append zeros to the last axis up to a multiple of the lanes."""
+    """Append zeros to the last axis up to a multiple of the SIMD width."""
     return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, up(x.shape[-1]) - x.shape[-1])])

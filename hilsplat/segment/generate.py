@@ -1,10 +1,9 @@
-"""Automatic mask generation: a grid of prompts becomes masks at three levels.
+"""Automatic mask generation: from a grid of prompts to masks at three levels.
 
-Two halves. `candidates.decode_candidates` runs the networks and depends on few settings; what it
-returns is cached. `masks_from_candidates` filters, upscales and suppresses; changing its knobs costs
-no network call. The steps are SAM's automatic generator, run separately for the three heads as in
-LangSplat, then LangSplat's mask suppression. With `generator: official`, each step is as published
-(docs/segment.md lists what differs).
+`candidates.decode_candidates` runs the networks and depends on few settings; its result is cached.
+`masks_from_candidates` filters, upscales and suppresses; changing its settings costs no network call. The
+steps are SAM's automatic generator, run separately for the three heads as in LangSplat, then LangSplat's mask
+suppression. With `generator: official`, each step is as published (docs/segment.md lists the differences).
 """
 
 import numpy as np
@@ -25,14 +24,15 @@ from hilsplat.segment.suppression import (
 from hilsplat.settings import MasksSettings
 
 CROP_EDGE_PX = 20
-"""A mask whose box comes this close to a crop's edge, other than the image's, was cut there (SAM)."""
+"""A crop cut a mask if its box is this close to an edge of the crop that isn't the image's (SAM)."""
 
 
 def masks_from_candidates(
     candidates: Candidates, size_hw: tuple[int, int], model: SamModel, settings: MasksSettings
 ) -> HierarchicalMasks:
-    """Thresholds, upscaling and four suppressions: boxes in a crop, boxes across crops, boxes again after
-    small islands and holes are gone, masks.
+    """Threshold and upscale candidates, remove small holes and islands, and suppress repeats.
+
+    Suppression compares boxes in a crop, boxes across crops, boxes of changed masks, and masks.
 
     Returns:
         masks in `content_order`; a level may be empty.
@@ -40,7 +40,7 @@ def masks_from_candidates(
     thresholds = model.thresholds(settings)
     official = settings.generator == "official"
     boxes, layer_of = crop_boxes(size_hw, settings.crop_layers)
-    # smaller crops saw more detail (SAM); officially the smaller crop wins, here the deeper layer
+    # smaller crops show more detail (SAM): `official` prefers a smaller area, ours a deeper layer
     preferred = 1 / np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) if official else layer_of
     enough = (candidates.predicted_iou > thresholds.predicted_iou_min) | (thresholds.predicted_iou_min == 0)
     enough &= candidates.stability >= thresholds.stability_min
@@ -57,9 +57,9 @@ def masks_from_candidates(
         masks = HierarchicalMasks.concatenate(per_crop, size_hw)
         if settings.crop_layers:
             masks = _suppressed(masks, np.concatenate(ranks), settings)
-        # Mending costs most, so it comes after suppression by boxes, as in SAM.
+        # this is the most expensive step, so it follows the suppression by boxes, as in SAM
         masks, changed = mend_masks(masks, settings.min_area_px, keep_small=official)
-        if changed.any():  # mending moved boxes; masks that needed none are better (SAM)
+        if changed.any():  # boxes have changed; unchanged masks are preferred (SAM)
             masks = _suppressed(masks, (~changed).astype(np.float64), settings)
         streams.append(masks)
     pooled = HierarchicalMasks.concatenate(streams, size_hw)
@@ -74,13 +74,13 @@ def masks_from_candidates(
 def _suppressed(
     masks: HierarchicalMasks, first: Float64[np.ndarray, " M"] | None, settings: MasksSettings
 ) -> HierarchicalMasks:
-    """Masks that repeat no better one by their boxes: higher in `first`, then in predicted IoU."""
+    """Drop masks whose box repeats that of a better mask, by `first`, then by predicted IoU."""
     suppress = suppress_boxes_officially if settings.generator == "official" else suppress_boxes
     return masks.take(suppress(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou, first))
 
 
 def _frame(crop_box: Int32[np.ndarray, " 4"], model: SamModel) -> Frame:
-    """Where a crop was in the network's input."""
+    """Return the position of a crop in the network's input."""
     left, top, right, bottom = (int(number) for number in crop_box)
     return model.frame((bottom - top, right - left))
 
@@ -94,7 +94,7 @@ def _upscale(
     level: Level,
     official: bool,
 ) -> HierarchicalMasks:
-    """Masks of the given candidates in the view, without empty ones and those cut by the crop's edge."""
+    """Upscale candidates to masks of the view, without empty ones and those cut by the crop's edge."""
     low_h, low_w = candidates.low_hw.tolist()
     along_y, along_x = sam.frame_taps((low_h, low_w), frame)
     runs, offsets = upscaled_runs(
@@ -108,7 +108,7 @@ def _upscale(
         int(crop_box[0]),
         *size_hw,
     )
-    # a single run is a mask without pixels
+    # a mask with a single run is empty
     keep = np.flatnonzero(np.diff(offsets) > 1)
     runs, offsets = take_runs(runs, offsets, keep)
     masks = HierarchicalMasks.from_runs(
@@ -126,17 +126,17 @@ def _upscale(
 def mend_masks(
     masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Fill holes and drop islands below `min_area_px` (8-connected), and masks that are small as a whole.
+    """Fill holes and drop islands below `min_area_px` (8-connected), and drop masks below it.
 
-    The largest island of a mask always stays.
+    The largest island of a mask is always kept.
 
     Args:
-        masks: to mend.
-        min_area_px: see above.
-        keep_small: keep masks that are small as a whole, which then count as changed (SAM).
+        masks: masks to change.
+        min_area_px: minimum area of holes, islands and masks.
+        keep_small: keep masks below `min_area_px`, and count them as changed (SAM).
 
     Returns:
-        the masks left, and which of them were changed.
+        the remaining masks, and which of them were changed.
     """
     runs, offsets, changed = mended_runs(masks.runs, masks.offsets, masks.size_hw[1], min_area_px)
     mended = HierarchicalMasks.from_runs(
@@ -152,7 +152,7 @@ def mend_masks(
 def cut_by_crop(
     boxes: Int32[np.ndarray, "M 4"], crop_box: Int32[np.ndarray, " 4"], size_hw: tuple[int, int]
 ) -> Bool[np.ndarray, " M"]:
-    """Which boxes touch an edge of their crop that is not an edge of the image."""
+    """Return which boxes touch an edge of their crop that is not an edge of the image."""
     image_box = np.array([0, 0, size_hw[1], size_hw[0]])
     near_crop = np.abs(boxes - crop_box) <= CROP_EDGE_PX
     near_image = np.abs(boxes - image_box) <= CROP_EDGE_PX

@@ -1,8 +1,8 @@
 """Masks without a model: OpenCV's graph segmentation, merged into three nested scales.
 
-For photographs without SAM weights. It knows nothing about objects: its levels are coarse, middle and
-fine regions of even colour, nested by construction, and its scores say how clearly a region stands
-out. A region that two scales share appears at both levels.
+It is for photographs without SAM weights and has no notion of objects: its levels are coarse, middle and
+fine regions of even colour, nested by construction, and its scores measure how clearly a region stands
+out. A region that is the same at two scales appears at both levels.
 """
 
 import heapq
@@ -16,26 +16,26 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
-"""Images are segmented at this longer side; finer texture is not a part of anything."""
+"""Longer side at which images are segmented; finer texture is not a part of an object."""
 
 BASE_SCALE = 80.0
 """Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
 
 CONTRAST = 6.0
-"""Colour difference (CIELAB units) from all its neighbours that keeps a region of exactly a level's
-least size; larger regions need less, in proportion to their area."""
+"""Colour difference (CIELAB) from all neighbours that keeps a region of exactly a level's least size
+separate; larger regions need less, in inverse proportion to their width."""
 
 THIN_PX = 4.0
-"""A narrower region (at working size) is the seam that blur leaves along a strong edge."""
+"""A region narrower than this (at working size) is a seam that blur leaves along a strong edge."""
 
 THIN_HURRY = 0.01
 """Factor on the cost of merging a seam: seams merge first, into the more similar side."""
 
 LIGHTNESS = 0.6
-"""Weight of lightness beside hue and chroma: shading changes lightness inside one thing."""
+"""Weight of lightness relative to a* and b*: shading changes lightness within an object."""
 
 CLEAR_EDGE = 40.0
-"""Colour difference across a border that counts as fully clear in the predicted IoU."""
+"""Colour difference across a border from which the predicted IoU is 1."""
 
 
 def segment_graph(
@@ -43,23 +43,22 @@ def segment_graph(
 ) -> HierarchicalMasks:
     """Segment a photograph into regions at three nested scales.
 
-    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, the cheapest first. A
-    merge across a colour difference D, the smaller region of area A and perimeter P, costs D times
-    that region's width, `min(sqrt(A), 4 A / P)`: small or thin regions join their most similar
-    neighbour, large ones stay apart even if they differ less. A level of least size s (a share of
-    the image side) is the state in which every remaining merge costs at least
-    `CONTRAST * s * sqrt(image area)`.
+    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, the cheapest first. A merge
+    across a colour difference D costs D times the width of the smaller region, `min(sqrt(A), 4 A / P)` with
+    its area A and perimeter P. Small or thin regions thus join their most similar neighbour, and large ones
+    stay separate even if they differ less. A level of least size s (a share of the image side) is the state
+    in which every remaining merge costs at least `CONTRAST * s * sqrt(image area)`.
 
     Args:
         image: the view.
-        scales: least size at whole, part, subpart; each at most the one before.
-        min_area_px: smaller regions become no mask.
+        scales: least size at whole, part, subpart; none exceeds the one before.
+        min_area_px: smaller regions are omitted.
 
     Returns:
-        one mask per region and level. `predicted_iou` is the mean colour difference along the
-        region's border over `CLEAR_EDGE`, clipped to 1; `stability` is the share of scales,
-        on a logarithmic axis from the level's own to the one where everything is merged, over which
-        the region persists unchanged.
+        one mask per region and level. `predicted_iou` is the mean colour difference along the region's
+        border over `CLEAR_EDGE`, clipped to 1. `stability` is the share of scales over which the region
+        persists unchanged, on a logarithmic axis from the level's own scale to the one where all regions
+        are merged.
     """
     height, width = image.shape[:2]
     small = resize_to_fit(image, WORK_SIDE_PX)
@@ -91,14 +90,14 @@ def segment_graph(
 
 
 Merge = tuple[float, int, int]
-"""Cost at which a merge happens (never falling) and the two regions that merge; the result is a new
+"""Cost of a merge (never decreasing along the list) and the two merged regions; the result is a new
 region, numbered after the base regions in the order of merges."""
 
 
 def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """CIELAB of a slightly smoothed image, with lightness scaled by `LIGHTNESS`.
+    """Smooth an image slightly, against texture of a pixel or two, and convert it to CIELAB.
 
-    Smoothing removes texture of a pixel or two.
+    Lightness is scaled by `LIGHTNESS`.
     """
     smooth = cv2.bilateralFilter(image, d=7, sigmaColor=20, sigmaSpace=3)
     lab = cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
@@ -106,7 +105,7 @@ def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
 
 
 def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.ndarray, "H W"]:
-    """Fine segmentation, labels 0..n-1; regions hold at least a quarter of the finest least size."""
+    """Segment finely, with labels 0..n-1; regions have at least a quarter of the least area at `finest`."""
     least_px = max(4, round((finest**2) * image.shape[0] * image.shape[1] / 4))
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=BASE_SCALE, min_size=least_px)
     labels = graph.processImage(np.ascontiguousarray(image[..., ::-1]))
@@ -116,9 +115,9 @@ def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.n
 def steps_along(
     axis: int, labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> tuple[Int32[np.ndarray, "n m"], Int32[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
-    """Labels of each pair of adjacent pixels along an axis, and the colour difference there.
+    """Return the labels of each pair of adjacent pixels along an axis, and the colour difference there.
 
-    The difference is taken two pixels wider than the pair: a photograph's edge is never one pixel wide.
+    The difference spans one pixel more on each side: edges in photographs are wider than one pixel.
     """
     length = labels.shape[axis]
     first, second = np.arange(length - 1), np.arange(1, length)
@@ -130,7 +129,7 @@ def steps_along(
 def neighbours(
     labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """Sum of colour differences across each border between two regions, and the border's length, px."""
+    """Return the sum of colour differences across each border of two regions, and its length, px."""
     pairs, contrasts = [], []
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)
@@ -147,7 +146,7 @@ def neighbours(
 
 
 def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, " n"]:
-    """Mean colour difference between adjacent pixels inside each region: its texture."""
+    """Return the texture of each region: the mean colour difference between its adjacent pixels."""
     total, count = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)
@@ -158,11 +157,11 @@ def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"])
 
 
 def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> list[Merge]:
-    """Merge until one region is left, the cheapest pair first (equal costs: lower numbers first).
+    """Merge the cheapest pair until one region is left; on equal costs, the lower numbers first.
 
-    The colour difference of a pair is the mean of two: between mean colours, and across their
-    border in excess of their own texture. It is halved if the smaller region is enclosed by the
-    larger one, and nearly zero if it is a seam (`THIN_PX`).
+    The colour difference of a pair is the mean of two differences: between their mean colours, and across
+    their border beyond their own texture. The cost is halved if the smaller region is enclosed by
+    the larger one, and nearly zero if it is a seam (`THIN_PX`).
     """
     flat = labels.reshape(-1)
     area = np.bincount(flat).astype(np.float64).tolist()
@@ -225,10 +224,10 @@ def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 
 def cut(
     labels: Int32[np.ndarray, "H W"], merges: list[Merge], threshold: float
 ) -> tuple[Int32[np.ndarray, "H W"], Float[np.ndarray, " n"]]:
-    """Regions after all merges cheaper than `threshold`.
+    """Return the regions after all merges cheaper than `threshold`.
 
     Returns:
-        labels 0..n-1, and the cost at which each region merges further (infinity for the last one).
+        labels 0..n-1, and the cost at which each region merges next (infinity for the last one).
     """
     num_base = int(labels.max()) + 1
     owner = np.arange(num_base + len(merges))
@@ -237,7 +236,7 @@ def cut(
         dies[[a, b]] = price
         if price < threshold:
             owner[[a, b]] = num_base + step
-    # A region's owner has a higher number: walk down from the top.
+    # an owner has a higher number than its region, so going down resolves all chains
     for region in range(len(owner) - 1, -1, -1):
         owner[region] = owner[owner[region]]
     roots, new = np.unique(owner[labels], return_inverse=True)
@@ -247,7 +246,7 @@ def cut(
 def border_contrast(
     labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Mean colour difference along the whole border of each region; 0 if it has none."""
+    """Return the mean colour difference along the whole border of each region; 0 if it has no border."""
     total, length = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
     for (a, b), (contrast, count) in neighbours(labels, lab).items():
         total[[a, b]] += contrast

@@ -1,7 +1,7 @@
 """Compiled loops over run lengths.
 
-Masks are run lengths over the flattened image (see `masks.encode_runs`), so that nothing here holds an
-image per mask. Every loop is sequential: results do not depend on threads.
+Masks are run lengths over the flattened image (`masks.encode_runs`), so no loop needs an image per mask.
+Loops are sequential, so results do not depend on the number of threads.
 """
 
 from typing import no_type_check
@@ -11,7 +11,7 @@ import numpy as np
 from hilsplat.base.compiled import compiled
 
 BAND_WORDS = 2**17
-"""64-bit words of masks that `shared_pixels` holds at once: 1 MiB stays in a core's cache."""
+"""64-bit words per band of packed masks in `shared_pixels`: 1 MiB stays in a core's cache."""
 
 
 @compiled
@@ -31,26 +31,26 @@ def _push(out, count, length):
 def upscaled_runs(
     logits, offsets, windows, rows, first_y, weight_y, first_x, weight_x, top, left, height, width
 ):
-    """Run lengths of masks from windows of low-resolution logits, enlarged by weights along each axis.
+    """Upscale windows of low-resolution logits by weights along each axis, and encode the masks.
 
     Pixel (y, x) of a crop at (top, left) of the image is in the mask if
-    `sum_ij weight_y[y, i] weight_x[x, j] low[first_y[y] + i, first_x[x] + j] > 0`; low is the lowest
-    logit outside the window. The weights are convex, so a pixel whose logits have one sign has that
-    sign, and only pixels near a change of sign are computed.
+    `sum_ij weight_y[y, i] weight_x[x, j] low[first_y[y] + i, first_x[x] + j] > 0`, where `low` is the lowest
+    logit outside the window. The weights are convex, so a pixel whose logits all have one sign has that
+    sign. Only pixels near a change of sign are computed.
 
     Args:
         logits, offsets, windows: all windows, as in `candidates.Candidates`.
-        rows: which of them.
+        rows: windows to upscale.
         first_y, weight_y: first low-resolution row and weights of each row of the crop.
         first_x, weight_x: the same along x.
         top, left, height, width: position of the crop in the image, and the image's size.
 
     Returns:
-        runs and offsets (`masks.encode_runs`); a mask without pixels is one run.
+        runs and offsets (`masks.encode_runs`); an empty mask is one run.
     """
     num_y, taps_y = weight_y.shape
     num_x, taps_x = weight_x.shape
-    # first column of the crop that reads each low-resolution column, or one after it
+    # first column of the crop that reads each low-resolution column, or a later one
     low_w = first_x[-1] + taps_x
     reader = np.searchsorted(first_x, np.arange(low_w + 1))
     out, count = np.empty(max(1024, 64 * len(rows)), np.uint32), 0
@@ -60,7 +60,7 @@ def upscaled_runs(
         x0, y0, x1, y1 = windows[row]
         wide = x1 - x0
         window = logits[offsets[row] : offsets[row + 1]].reshape(y1 - y0, wide)
-        line = np.full(wide + 2 * taps_x, np.float32(-127))  # a blended row, with the outside on both sides
+        line = np.full(wide + 2 * taps_x, np.float32(-127))  # a blended row, padded with outside logits
         middle = line[taps_x : taps_x + wide]
         origin = x0 - taps_x  # low-resolution column of line[0]
         # windows reach into the padding beside the image, which no pixel of the crop reads
@@ -90,8 +90,8 @@ def upscaled_runs(
                 ends = at == len(line)
                 if not ends and (line[at] > 0) == sign:
                     continue
-                # up to the first pixel that reads line[at], the sign stays; then, as long as line[at - 1]
-                # is read too, each pixel is computed
+                # pixels before the first that reads line[at] keep the sign; later pixels are computed
+                # as long as they also read line[at - 1]
                 stop = end if ends else min(end, reader[min(max(0, origin + at), low_w)])
                 mixed = stop if ends else min(stop, reader[min(max(0, origin + at - taps_x + 1), low_w)])
                 mixed = max(x, mixed)
@@ -123,7 +123,7 @@ def upscaled_runs(
 @compiled
 @no_type_check
 def areas_and_boxes(runs, offsets, width):
-    """Pixels and box (xyxy, end exclusive) of each run-length coded mask; both 0 for an empty one."""
+    """Return the area and box (xyxy, end exclusive) of each run-length encoded mask; 0 for empty masks."""
     number = len(offsets) - 1
     area, boxes = np.zeros(number, np.int64), np.zeros((number, 4), np.int32)
     for k in range(number):
@@ -159,7 +159,7 @@ def _root(parent, node):
 @compiled
 @no_type_check
 def _region_areas(row, start, stop, value, of, parent, area):
-    """8-connected regions of the segments whose value is `of`: roots in `parent`, areas at the roots."""
+    """Find the 8-connected regions of segments whose value is `of`: roots in `parent`, areas at the roots."""
     number = len(row)
     previous = 0  # first segment of the row above
     first = 0  # first segment of this row
@@ -193,10 +193,10 @@ def _region_areas(row, start, stop, value, of, parent, area):
 @compiled
 @no_type_check
 def mended_runs(runs, offsets, width, min_area):
-    """Fill holes and drop islands below `min_area` (8-connected); the largest island always stays.
+    """Fill holes and drop islands below `min_area` (8-connected); always keep the largest island.
 
     Returns:
-        runs and offsets of the mended masks, and which of them changed.
+        runs and offsets of the result, and which masks changed.
     """
     number = len(offsets) - 1
     out, count = np.empty(max(1024, len(runs)), np.uint32), 0
@@ -255,7 +255,7 @@ def mended_runs(runs, offsets, width, min_area):
 @compiled
 @no_type_check
 def _bits_set(word):
-    """Ones of a 64-bit word."""
+    """Count the ones in a 64-bit word."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -282,9 +282,9 @@ def _set_bits(words, start, stop):
 @compiled
 @no_type_check
 def shared_pixels(runs, offsets, boxes, height, width):
-    """Pixels that each pair of masks shares, int64 (M, M): ones of the conjunction of packed masks.
+    """Count the pixels that each pair of masks shares, int64 (M, M), as set bits of packed masks.
 
-    Masks are packed in bands of a few image rows; of a pair, only words and rows in both boxes are read.
+    Masks are packed in bands of a few image rows; for a pair, only words and rows in both boxes are read.
     """
     number = len(offsets) - 1
     shared = np.zeros((number, number), np.int64)
@@ -338,7 +338,7 @@ def shared_pixels(runs, offsets, boxes, height, width):
 @compiled
 @no_type_check
 def paint_runs(runs, offsets, order, canvas):
-    """Write each row number of `order` into the flat canvas at the pixels of its mask; later ones win."""
+    """Write each row number of `order` to the pixels of its mask in the flat canvas; later rows win."""
     for row in order:
         at = np.int64(0)
         for place in range(offsets[row], offsets[row + 1]):
@@ -351,7 +351,7 @@ def paint_runs(runs, offsets, order, canvas):
 @compiled
 @no_type_check
 def window_of_runs(runs, width, box):
-    """A mask inside a box (xyxy), as booleans."""
+    """Decode the part of a mask inside a box (xyxy)."""
     x0, y0, x1, y1 = box
     out = np.zeros((y1 - y0, x1 - x0), np.bool_)
     at = np.int64(0)

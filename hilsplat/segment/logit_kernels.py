@@ -1,4 +1,4 @@
-"""Compiled loops over the decoder's logits; sequential, so that results do not depend on threads."""
+"""Compiled loops over decoder logits; sequential, so results do not depend on the number of threads."""
 
 from typing import no_type_check
 
@@ -10,11 +10,11 @@ from hilsplat.base.compiled import compiled
 @compiled
 @no_type_check
 def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
-    """Round logits to steps, and measure what stability and box of a mask need.
+    """Quantise logits, and compute each mask's box and the areas for its stability.
 
     Args:
         logits: float32 (K, h, w).
-        per_unit: steps in a logit of 1.
+        per_unit: steps per unit of logit.
         upper, lower: the two stability thresholds, whole steps.
         valid_h, valid_w: rows and columns that hold the image.
 
@@ -58,17 +58,17 @@ def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
 @compiled
 @no_type_check
 def edge_windows(steps, rows, boxes, reach):
-    """The part of each mask's logits that says where its edge is, flat wherever no edge is near.
+    """Extract each mask's logits near its edge, flattened to +-127 elsewhere.
 
     Args:
         steps: int8 or float32 (K, h, w).
         rows: masks to take; none is empty.
-        boxes: box (xyxy) of the pixels above 0 of every mask.
-        reach: pixels on either side of a change of sign that keep their value; all others become
-            127 or -127. The window is the box with this margin, inside the picture.
+        boxes: box (xyxy) of the positive pixels of every mask.
+        reach: distance from a change of sign within which pixels keep their value; all others become
+            127 or -127. The window is the box with this margin, clipped to the image.
 
     Returns:
-        values of all windows one after the other, in the type of `steps`; offsets, windows (xyxy).
+        concatenated values of all windows, in the type of `steps`; offsets; windows (xyxy).
     """
     _, height, width = steps.shape
     windows = np.empty((len(rows), 4), np.int32)
@@ -88,7 +88,7 @@ def edge_windows(steps, rows, boxes, reach):
         mask = steps[rows[place]]
         x0, y0, x1, y1 = windows[place]
         high, wide = y1 - y0, x1 - x0
-        # pixels above 0 among the (2 reach + 1)^2 around each pixel: sums along x, then along y
+        # positive pixels among the (2 reach + 1)^2 around each pixel: sums along x, then along y
         along = np.zeros((high, wide), np.int32)
         for y in range(high):
             total = 0

@@ -1,4 +1,4 @@
-"""Overlapping masks of one view at three levels, run-length coded."""
+"""Overlapping masks of one view at three levels, run-length encoded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -16,16 +16,16 @@ from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels,
 
 MAX_SIDE_PX = 2**15
 LIMITS = {"level": (1, 3), "predicted_iou": (-1, 2), "stability": (0, 1)}
-"""Of what a file may hold. SAM predicts IoUs a little outside of [0, 1]."""
+"""Ranges of values accepted from a file. SAM's predicted IoUs are slightly outside [0, 1]."""
 
 
 def encode_runs(
     masks: Bool[np.ndarray, "M H W"],
 ) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M+1"]]:
-    """Run lengths of each mask, row by row, starting with a run of False (possibly 0 long).
+    """Encode each mask as run lengths, row by row, starting with a run of False (possibly of length 0).
 
     Returns:
-        all runs one after the other, and the M + 1 offsets at which each mask's runs begin.
+        concatenated runs, and the M + 1 offsets of each mask's runs.
     """
     runs: list[np.ndarray] = []
     offsets = np.zeros(len(masks) + 1, dtype=np.int64)
@@ -44,7 +44,7 @@ def encode_runs(
 def take_runs(
     runs: UInt32[np.ndarray, " R"], offsets: Int64[np.ndarray, " M_and_1"], rows: Int64[np.ndarray, " m"]
 ) -> tuple[UInt32[np.ndarray, " r"], Int64[np.ndarray, " m_and_1"]]:
-    """Run lengths and offsets of the given rows, in the given order."""
+    """Return the run lengths and offsets of the given rows, in the given order."""
     pieces = [runs[offsets[row] : offsets[row + 1]] for row in rows]
     taken = np.zeros(len(rows) + 1, dtype=np.int64)
     taken[1:] = np.cumsum([len(piece) for piece in pieces])
@@ -54,9 +54,9 @@ def take_runs(
 def runs_of_labels(
     labels: Int[np.ndarray, "H W"], chosen: Int[np.ndarray, " M"]
 ) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M_and_1"]]:
-    """Run lengths of the regions of a label map, one mask per chosen label, each present in the map.
+    """Encode the regions of a label map, one mask per chosen label; each must occur in the map.
 
-    The same as `encode_runs` of `labels == label` for each label, in one pass.
+    The result equals `encode_runs` of `labels == label` for each label, but takes one pass.
     """
     flat = labels.reshape(-1)
     borders = np.concatenate(([0], np.flatnonzero(flat[1:] != flat[:-1]) + 1, [flat.size]))
@@ -74,11 +74,11 @@ def runs_of_labels(
 
 
 def join_rows(parts: Sequence[Any], ragged: str, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Fields of several tables, at least one, with their rows one after the other.
+    """Concatenate the rows of several tables (at least one), field by field.
 
     Args:
         parts: tables with `offsets` into the field `ragged`.
-        ragged: field whose values each row has its own number of.
+        ragged: field with a variable number of values per row.
         names: the other fields to join, with one entry per row.
     """
     starts = np.cumsum([0, *(len(getattr(part, ragged)) for part in parts)])
@@ -93,9 +93,9 @@ class HierarchicalMasks:
 
     Attributes:
         runs: run lengths of all masks (see `encode_runs`).
-        offsets: where each mask's runs begin, and where the last ones end.
+        offsets: start of each mask's runs, and the end of the last ones.
         level: `Level` of each mask as the segmenter gave it.
-        predicted_iou: the segmenter's own estimate of each mask's quality; SAM's may exceed 1 a little.
+        predicted_iou: quality of each mask as estimated by the segmenter; SAM's may slightly exceed 1.
         stability: stability of each mask under a changed threshold, in [0, 1].
         area_px: pixels of each mask.
         box_xyxy: box of each mask, px, end exclusive.
@@ -124,7 +124,7 @@ class HierarchicalMasks:
         """Pack boolean masks.
 
         Raises:
-            EmptyMaskError: a mask has no pixel.
+            EmptyMaskError: if a mask has no pixel.
         """
         runs, offsets = encode_runs(masks)
         size_hw = (int(masks.shape[1]), int(masks.shape[2]))
@@ -139,10 +139,10 @@ class HierarchicalMasks:
         stability: Float32[np.ndarray, " M"],
         size_hw: tuple[int, int],
     ) -> "HierarchicalMasks":
-        """Masks from their run lengths; areas and boxes follow from these.
+        """Build masks from run lengths; areas and boxes are computed.
 
         Raises:
-            EmptyMaskError: a mask has no pixel.
+            EmptyMaskError: if a mask has no pixel.
         """
         area_px, boxes = areas_and_boxes(runs, offsets, size_hw[1])
         if not area_px.all():
@@ -162,7 +162,7 @@ class HierarchicalMasks:
         )
 
     def dense(self, rows: Int64[np.ndarray, " m"] | None = None) -> Bool[np.ndarray, "m H W"]:
-        """Unpack all masks, or the given rows, to booleans."""
+        """Decode all masks, or the given rows, to booleans."""
         rows = np.arange(len(self)) if rows is None else np.asarray(rows)
         height, width = self.size_hw
         masks = np.empty((len(rows), height * width), dtype=bool)
@@ -172,16 +172,16 @@ class HierarchicalMasks:
         return masks.reshape(len(rows), height, width)
 
     def window(self, row: int, box_xyxy: tuple[int, int, int, int]) -> Bool[np.ndarray, "h w"]:
-        """One mask inside a box of the view (xyxy, end exclusive)."""
+        """Decode one mask inside a box of the view (xyxy, end exclusive)."""
         runs = self.runs[self.offsets[row] : self.offsets[row + 1]]
         return window_of_runs(runs, self.size_hw[1], box_xyxy)
 
     def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
-        """Pixels that each pair of masks shares; counted exactly."""
+        """Return the exact number of pixels that each pair of masks shares."""
         return shared_pixels(self.runs, self.offsets, self.box_xyxy, *self.size_hw)
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "HierarchicalMasks":
-        """The given rows, in the given order."""
+        """Return the given rows, in the given order."""
         return HierarchicalMasks(
             *take_runs(self.runs, self.offsets, rows),
             self.level[rows],
@@ -194,7 +194,7 @@ class HierarchicalMasks:
 
     @staticmethod
     def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
-        """Rows of all parts, one after the other; `size_hw` is the view's size, px."""
+        """Concatenate the rows of all parts; `size_hw` is the view's size, px."""
         empty = HierarchicalMasks.from_dense(
             np.zeros((0, *size_hw), bool),
             np.zeros(0, np.uint8),
@@ -205,10 +205,10 @@ class HierarchicalMasks:
         return HierarchicalMasks(size_hw=size_hw, **join_rows([empty, *parts], "runs", names))
 
     def content_order(self) -> Int64[np.ndarray, " M"]:
-        """Rows sorted by what they hold: level, large to small, box, predicted IoU, runs.
+        """Return the rows sorted by content: level, decreasing area, box, predicted IoU, stability, runs.
 
-        The order does not depend on row numbers, so a segmenter that ends with it writes the same file
-        whatever the order of its prompts.
+        The order does not depend on row numbers, so a segmenter that sorts by it writes the same file for any
+        order of prompts.
         """
         keys = [
             (
@@ -224,14 +224,14 @@ class HierarchicalMasks:
         return np.array(sorted(range(len(self)), key=keys.__getitem__), dtype=np.int64)
 
     def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
-        """Rows of a level, in order."""
+        """Return the rows of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
-        """Paint a level's masks, or all with None, large to small, so that small ones stay visible.
+        """Paint the masks of a level (None: all), large to small, so that small ones stay visible.
 
         Returns:
-            row of the mask at each pixel, -1 where there is none. Of two equally large masks the
+            row of the mask at each pixel, or -1 where there is none. Of two equally large masks the
             lower row is painted last.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
@@ -245,7 +245,7 @@ class HierarchicalMasks:
         write_npz(path, **self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All fields as plain arrays."""
+        """Return all fields as plain arrays."""
         return {
             "runs": self.runs,
             "offsets": self.offsets,
@@ -259,17 +259,17 @@ class HierarchicalMasks:
 
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> "HierarchicalMasks":
-        """Inverse of `arrays`."""
+        """Build masks from the result of `arrays`."""
         fields = dict(arrays)
         height, width = fields.pop("size_hw")
         return HierarchicalMasks(**fields, size_hw=(int(height), int(width)))
 
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
-        """Read `<view>.npz`, and check that its masks are whole.
+        """Read `<view>.npz` and validate it.
 
         Raises:
-            ArtifactError: it is missing or damaged, or its arrays contradict each other.
+            ArtifactError: if it is missing or damaged, or its arrays contradict each other.
         """
         arrays = read_npz(path, *(field.name for field in fields(HierarchicalMasks)))
         size = arrays["size_hw"]

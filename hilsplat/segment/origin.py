@@ -1,4 +1,4 @@
-"""The name, in rows and titles, of what made the masks of a scene."""
+"""Label of the source of a scene's masks, for table rows and titles."""
 
 from pathlib import Path
 from typing import Any
@@ -7,21 +7,21 @@ from hilsplat.base.artifacts import read_index
 
 
 def masks_label(masks_folder: Path) -> str:
-    """What made the masks, as rows name it.
+    """Return the label of the masks' source.
 
-    The model folder's name, or the segmenter's if it has no model; masks made from true labels have a
-    label that also names their faults.
+    It is the name of the model folder, or of the segmenter if it uses no model. Masks made from true labels
+    have a label that also names their faults.
     """
     return label_of_index(read_index(masks_folder))
 
 
 def label_of_index(index: dict[str, Any]) -> str:
-    """The same, from the index of a masks artifact."""
+    """Return the label from the index of a masks artifact."""
     if "label" in index:
         return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]
 
 
 def made_from_truth(masks: str) -> bool:
-    """Whether masks with this label were made from true labels: a diagnostic, not a result."""
+    """Return whether masks with this label were made from true labels: a diagnostic, not a result."""
     return masks.startswith("truth-perturbed")

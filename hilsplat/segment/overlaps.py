@@ -1,4 +1,4 @@
-"""How well masks fit the regions of a label image."""
+"""Overlap of masks with the regions of a label image."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int64
@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float32, Int, Int64
 def region_ious(
     labels: Int[np.ndarray, "H W"], masks: Bool[np.ndarray, "M H W"]
 ) -> tuple[Int64[np.ndarray, " R"], Int64[np.ndarray, " R"], Float32[np.ndarray, "R M"]]:
-    """IoU of every region with every mask.
+    """Return the IoU of every region with every mask.
 
     Args:
         labels: id per pixel, negative where there is no region.

@@ -1,4 +1,4 @@
-"""Pictures of masks, for looking at what a segmenter found."""
+"""Pictures of masks, for inspecting the output of a segmenter."""
 
 import colorsys
 from pathlib import Path
@@ -18,14 +18,14 @@ from hilsplat.segment.digests import require_same_masks
 from hilsplat.segment.masks import HierarchicalMasks
 
 GOLDEN = 0.6180339887498949
-"""Step of the hue from one row to the next: neighbouring rows never look alike."""
+"""Hue step between rows, the golden ratio: consecutive rows have clearly different colours."""
 
 UNCOVERED = 0.35
 """Brightness of pixels without a mask."""
 
 
 def row_colours(number: int) -> UInt8[np.ndarray, "n 3"]:
-    """A colour per row, the same in every picture."""
+    """Return one colour per row, the same in every picture."""
     colours = [
         colorsys.hsv_to_rgb(
             (row * GOLDEN) % 1.0, 0.55 + 0.4 * ((row // 3) % 2), 0.95 - 0.25 * ((row // 7) % 2)
@@ -38,10 +38,10 @@ def row_colours(number: int) -> UInt8[np.ndarray, "n 3"]:
 def paint_level(
     image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, level: Level
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A view with its masks of one level tinted and outlined; pixels without a mask are dark grey."""
+    """Tint and outline a level's masks in a view; pixels without a mask are dark grey."""
     labels = masks.label_map(level)
     grey = np.repeat(image.mean(axis=2, keepdims=True), 3, axis=2)
-    palette = np.concatenate([row_colours(len(masks)), np.zeros((1, 3), np.uint8)])  # -1 reads the last
+    palette = np.concatenate([row_colours(len(masks)), np.zeros((1, 3), np.uint8)])  # -1 selects the last
     tinted = 0.35 * grey + 0.65 * palette[labels]
     painted = np.where((labels == NONE)[..., None], UNCOVERED * grey, tinted)
     edge = np.zeros(labels.shape, dtype=bool)
@@ -54,7 +54,7 @@ def paint_level(
 def masks_picture(
     image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, min_side_px: int = 384
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A view and its three levels side by side, with the number of masks of each."""
+    """Draw a view and its three levels side by side, with the number of masks of each."""
     factor = max(1, -(-min_side_px // max(image.shape[:2])))
     panels = [("photo", image)]
     panels += [
@@ -70,7 +70,7 @@ def masks_picture(
 
 
 THUMB_PX = 56
-"""Side of a mask in the picture of a tree."""
+"""Side of a mask's crop in the tree picture."""
 
 
 def tree_picture(
@@ -79,15 +79,15 @@ def tree_picture(
     parent: Int32[np.ndarray, " M"],
     max_leaves: int = 12,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The coverage trees of a view that hold the most masks: roots at the left, children to the right.
+    """Draw the largest coverage trees of a view: roots at the left, children to the right.
 
-    A mask is shown as its crop, dimmed outside and framed in its colour from `masks_picture`.
+    A mask is shown as its crop, dimmed outside and framed in its colour in `masks_picture`.
 
     Args:
         image: the view.
         masks: its masks.
         parent: row of each mask's parent, or `NONE`.
-        max_leaves: rows of the picture; trees that no longer fit are left out.
+        max_leaves: rows of the picture; trees that don't fit are omitted.
     """
     children: dict[int, list[int]] = {}
     for row, above in enumerate(parent.tolist()):
@@ -113,7 +113,7 @@ def tree_picture(
     palette = row_colours(len(masks))
 
     def draw(row: int, depth: int, top: int) -> int:
-        """Draw a subtree from the given leaf on; returns the top of its root's crop, px."""
+        """Draw a subtree whose first leaf is in row `top`; return the top of its root's crop, px."""
         below, at = [], top
         for child in children.get(row, []):
             below.append(draw(child, depth + 1, at))
@@ -143,21 +143,21 @@ def masks_overview(
     view: str | None = None,
     tree_folder: Path | None = None,
 ) -> str:
-    """Write a picture of one view: the photograph and its masks at three levels, and its trees.
+    """Write a picture of one view with its masks at three levels, and optionally one of its trees.
 
     Args:
         scene_folder: the `Scene` artifact.
-        masks_folder: what the masks stage wrote.
-        out_png: file to write; the trees go beside it as `<name>_tree.png`.
-        view: view name; None takes the middle one of the views that have masks.
-        tree_folder: what the coverage_tree stage wrote; None draws no trees.
+        masks_folder: output of the masks stage.
+        out_png: file to write; the trees are written beside it as `<name>_tree.png`.
+        view: view name; None selects the middle one of the views that have masks.
+        tree_folder: output of the coverage_tree stage; None draws no trees.
 
     Returns:
-        the view's name.
+        name of the view.
 
     Raises:
-        ArtifactError: the view has no masks.
-        MisalignedArtifactError: the trees belong to other masks.
+        ArtifactError: if the view has no masks.
+        MisalignedArtifactError: if the trees were computed from other masks.
     """
     tree_png = out_png.with_name(f"{out_png.stem}_tree.png")
     for path in (out_png, *([tree_png] if tree_folder else [])):

@@ -1,7 +1,7 @@
-"""Segment Anything in onnxruntime: one image in, three masks per point prompt out.
+"""Segment Anything in onnxruntime: three masks per point prompt on an image.
 
-Images are resized and masks restored as by SamProcessor of the transformers library, whose ONNX
-exports are read here. The rounding of logits (`read_logits`) is ours.
+Resizing of images and restoring of masks follow SamProcessor of the transformers library, whose ONNX
+exports are read. The rounding of logits (`read_logits`) is ours.
 """
 
 import logging
@@ -36,23 +36,23 @@ from hilsplat.settings import MasksSettings
 logger = logging.getLogger(__name__)
 
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
-"""What the decoder's three outputs mean, in its order: fine to coarse."""
+"""Levels of the decoder's three outputs, in their order: fine to coarse."""
 
 LOGIT_STEP = 1 / 8
-"""Logits are rounded to this step and clipped to +-127 steps, so that the candidates of a view fit in a few
-MB of cache. A border moves by less than a hundredth of a low-resolution pixel if the logit changes by 5 per
-pixel, as it does at SAM's borders."""
+"""Logits are rounded to this step and clipped to +-127 steps, so that a view's candidates take a few MB of
+cache. Borders move by less than 0.01 low-resolution pixels where the logit changes by 5 per pixel, as is
+typical for SAM."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """How an image sits in the network's square input.
+    """Position of an image in the network's square input.
 
     Attributes:
-        original_hw: the image, px.
-        resized_hw: its size in the input, at the top left, px.
-        padded_hw: the whole input, px.
-        stretched: the image fills the input, and masks are enlarged in one step (SAM 2).
+        original_hw: size of the image, px.
+        resized_hw: its size in the input, where it is at the top left, px.
+        padded_hw: size of the whole input, px.
+        stretched: whether the image fills the input, and masks are upscaled in one step (SAM 2).
     """
 
     original_hw: tuple[int, int]
@@ -63,12 +63,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Encoded:
-    """One image after the vision encoder.
+    """Output of the vision encoder for one image.
 
     Attributes:
-        features: what the encoder hands to the decoder, by name, float32 (1, C, h, w).
-        frame: how the image sits in the input.
-        terms: what the factored decoder computes once per image, if the model has one.
+        features: inputs of the decoder by name, float32 (1, C, h, w).
+        frame: position of the image in the input.
+        terms: per-image arrays of the factored decoder, if the model has one.
     """
 
     features: Mapping[str, np.ndarray]
@@ -77,13 +77,13 @@ class Encoded:
 
 
 Prompts = Mapping[str, np.ndarray]
-"""Prompts of an image, arrays with a row per prompt: `points` (x, y, px of the image), or, once they are
-previewed, what the factored decoder keeps of them."""
+"""Prompts of an image, arrays with one row per prompt: `points` (x, y, px of the image) or, for previewed
+prompts, the arrays that the factored decoder keeps."""
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Settings of `masks` whose best value depends on the model, resolved (`SamModel.thresholds`)."""
+    """Resolved settings of `masks` whose best value depends on the model (`SamModel.thresholds`)."""
 
     predicted_iou_min: float
     stability_min: float
@@ -92,41 +92,41 @@ class Thresholds:
 
 
 REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
-"""LangSplat's thresholds for a released SAM. A call of ViT-B takes 60 MB per prompt, and calls of more than 8
-prompts are no faster."""
+"""LangSplat's thresholds for a released SAM. A ViT-B call takes 60 MB per prompt, and calls of more than 8
+prompts are no faster per prompt."""
 
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
-"""Prompts by which the factored decoder is compared with the network, and the largest difference allowed."""
+"""Prompts on which the factored decoder is compared with the network, and the largest difference allowed."""
 
 OWN = "mask_generation"
-"""Key of `config.json` under which a model names its own `Thresholds`."""
+"""Key of `config.json` under which a model specifies its own `Thresholds`."""
 
 
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
-    """Height and width whose longer side is `longest_edge`; halves are rounded up, as in SamProcessor.
+    """Return the height and width whose longer side is `longest_edge`, halves rounded up as in SamProcessor.
 
-    Departs: neither becomes 0, however thin the image is.
+    Departs: neither becomes 0 for very thin images.
     """
     scale = longest_edge / max(original_hw)
     return max(1, int(original_hw[0] * scale + 0.5)), max(1, int(original_hw[1] * scale + 0.5))
 
 
 def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
-    """Centres of a grid of squares over the unit square, as (x, y), row by row."""
+    """Return the cell centres of a grid on the unit square, as (x, y), row by row."""
     centres = (np.arange(points_per_side) + 0.5) / points_per_side
     x, y = np.meshgrid(centres, centres)
     return np.stack([x.reshape(-1), y.reshape(-1)], axis=1)
 
 
 class SamModel:
-    """A SAM folder, ready to run.
+    """A SAM model folder, opened for inference.
 
     Attributes:
-        own: thresholds that come with the model.
-        stretches: whether pictures are stretched to a square, as for SAM 2, or padded, as for SAM.
+        own: default thresholds of the model.
+        stretches: whether images are stretched to a square (SAM 2) or padded (SAM).
         previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
-        factored: the decoder with the same results in a fraction of the time, if the model allows it.
-        as_exported: whether the encoder or the decoder runs as it was exported, which takes more memory.
+        factored: the equivalent, much faster decoder, if the model's graph can be factored.
+        as_exported: whether the encoder or the decoder runs as exported, which takes more memory.
         precision: "fp32" or "int8", of the encoder.
     """
 
@@ -156,7 +156,7 @@ class SamModel:
         else:
             self.padded_hw = (side_px(padded, self.longest_edge),) * 2
         self.resample = Image.Resampling(preprocessing.get("resample", Image.Resampling.BILINEAR))
-        # transformers' defaults if a key is missing: ImageNet statistics, values in 0..1
+        # defaults of transformers for missing keys: ImageNet statistics, values in 0..1
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.229, 0.224, 0.225)), dtype=np.float32)
         self.rescale = np.float32(preprocessing.get("rescale_factor", 1 / 255))
@@ -167,13 +167,13 @@ class SamModel:
     def choose_precision(
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
-        """Use int8 if the settings say so, or if masks of these images agree with those by float32.
+        """Use int8 if the settings require it, or if its masks of these images agree with those of float32.
 
         Args:
             precision: `masks.precision`.
             images: photographs of the scene.
             cache: folder of the caches.
-            threads: images at once.
+            threads: images processed in parallel.
         """
         if precision == "fp32" or not may_be_int8(self.model):
             return
@@ -205,7 +205,7 @@ class SamModel:
         return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
 
     def seconds(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network) -> dict[str, float]:
-        """Measure an encoder and a call of the decoder: seconds per image, preview and prompt's masks."""
+        """Measure the seconds per image of an encoder, and per prompt of the decoder's masks and preview."""
         self.encode(image, encoder)  # the first call allocates memory
         start = time.perf_counter()
         encoded = self.encode(image, encoder)
@@ -214,14 +214,14 @@ class SamModel:
         points = np.tile(np.array(image.shape[1::-1]) / 2, (prompts, 1))
         for name, decode in (("masks", self.decode), ("preview", self.preview)):
             if name == "masks" or self.previews:
-                decode(encoded, points)  # compiled, and weights in the caches
+                decode(encoded, points)  # compiles, and loads weights into the caches
                 start = time.perf_counter()
                 decode(encoded, points)
                 found[name] = (time.perf_counter() - start) / prompts
         return found
 
     def _rowwise_encoder(self) -> bytes | None:
-        """Change a ViT's global attentions for the CPU; None if the encoder is another, or a GPU runs it."""
+        """Rewrite a ViT's global attentions for the CPU; None for other encoders or on a GPU."""
         vision = self.model.config.get("vision_config")
         if (
             self.stretches
@@ -240,7 +240,7 @@ class SamModel:
         return graph
 
     def _factor(self) -> FactoredDecoder | None:
-        """Factor the decoder and check it against the network; None if its graph is a different one."""
+        """Factor the decoder and check it against the network; None if that fails."""
         heads = self.model.config.get("mask_decoder_config", {}).get(
             "num_attention_heads", HEADS_PER_ATTENTION
         )
@@ -264,28 +264,28 @@ class SamModel:
         """Open a model folder.
 
         Args:
-            folder: in a layout of `models.layouts`.
-            variant: ending of the networks' names, such as `fp16`.
+            folder: folder in a layout of `models.layouts`.
+            variant: suffix of the networks' names, such as `fp16`.
 
         Raises:
-            ModelError: it is missing, incomplete or not a SAM.
+            ModelError: if it is missing, incomplete or not a SAM.
         """
         way_out = "set masks.segmenter: graph, which needs no model"
         return SamModel(open_model_folder(folder, "sam", variant=variant, fix=way_out))
 
     def thresholds(self, settings: MasksSettings) -> Thresholds:
-        """The settings' thresholds; those that are `auto` come with the model."""
+        """Return the settings' thresholds, with the model's own in place of `auto`."""
         chosen = {name: getattr(settings, name) for name in vars(self.own)}
         return replace(self.own, **{name: value for name, value in chosen.items() if value != "auto"})
 
     def frame(self, original_hw: tuple[int, int]) -> Frame:
-        """Where an image of this size is in the network's input."""
+        """Return the position of an image of this size in the network's input."""
         if self.stretches:
             return Frame(original_hw, self.padded_hw, self.padded_hw, stretched=True)
         return Frame(original_hw, resized_size(original_hw, self.longest_edge), self.padded_hw)
 
     def prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
-        """Resize, normalise, pad with zeros at the right and bottom."""
+        """Resize and normalise an image, and pad it with zeros at the right and bottom."""
         original = (image.shape[0], image.shape[1])
         frame = self.frame(original)
         resized = frame.resized_hw
@@ -298,14 +298,14 @@ class SamModel:
         return padded, frame
 
     def encode(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network | None = None) -> Encoded:
-        """Run the vision encoder, or a version of it."""
+        """Run the vision encoder, or another version of it."""
         pixels, frame = self.prepare(image)
         names = self.encoder.spec.outputs
         features = dict(zip(names, (encoder or self.encoder)(pixel_values=pixels), strict=True))
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
     def prompts_per_call(self, wanted: int, asked: int) -> int:
-        """Prompts of one decoder call: the number the network fixes, if any, else at most `asked`."""
+        """Return the prompts per decoder call: fixed by the decoder, or at most `asked`."""
         if self.factored:
             return PROMPTS
         return self.decoder.fixed_axis("input_points", 1) or min(wanted, asked)
@@ -313,10 +313,10 @@ class SamModel:
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-        """Three masks for each foreground point of the original image (px).
+        """Decode three masks for each foreground point of the original image (px).
 
         Returns:
-            predicted IoUs and low-resolution logits; heads as in `HEADS`.
+            predicted IoUs and low-resolution logits, in the order of `HEADS`.
         """
         if self.factored and encoded.terms:
             iou, logits, _ = self.factored.decode(
@@ -330,20 +330,20 @@ class SamModel:
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
     ) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, "3 h w"]]:
-        """Three masks for several points of one thing (px), inside it or outside."""
+        """Decode three masks for several points (px) inside or outside one object."""
         points = in_input(points_xy, encoded.frame)[None]
         iou, logits = ask_network(self.decoder, encoded.features, points, inside[None].astype(np.float64))
         return iou[0], logits[0]
 
     @property
     def previews(self) -> bool:
-        """Whether the model has masks at a lower resolution, in less time."""
+        """Whether the model can decode faster at a lower resolution."""
         return self.previewer is not None or self.factored is not None
 
     def preview(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 low_h low_w"], Prompts]:
-        """Decode prompts at a lower resolution; `finish` takes the third result. Only if `previews`."""
+        """Decode prompts at a lower resolution, if `previews`; `finish` takes the third result."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
@@ -354,7 +354,7 @@ class SamModel:
     def finish(
         self, encoded: Encoded, prompts: Prompts
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-        """`decode` prompts that may have been previewed."""
+        """Decode prompts that may have been previewed, at full resolution."""
         if "points" in prompts:
             return self.decode(encoded, prompts["points"])
         assert self.factored is not None and encoded.terms is not None
@@ -362,7 +362,7 @@ class SamModel:
 
 
 def in_input(points_xy: Float[np.ndarray, "P 2"], frame: Frame) -> Float[np.ndarray, "P 2"]:
-    """Points of an image in the network's input, px."""
+    """Convert points of an image to points of the network's input, px."""
     (height, width), (resized_h, resized_w) = frame.original_hw, frame.resized_hw
     return points_xy * np.array([resized_w / width, resized_h / height])
 
@@ -373,9 +373,9 @@ def ask_network(
     points_xy: Float[np.ndarray, "P K 2"],
     labels: Float[np.ndarray, "P K"],
 ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-    """Predicted IoUs and logits of a decoder network for prompts of K points of its input.
+    """Run a decoder on prompts of K points of its input, and return predicted IoUs and logits.
 
-    Labels are 1 for points inside the thing and 0 for points outside.
+    Labels are 1 for points inside the object and 0 for points outside.
     """
     scores, logits = decoder(
         input_points=points_xy[None],
@@ -388,12 +388,12 @@ def ask_network(
 
 
 def one_point_each(points_xy: Float[np.ndarray, "P 2"]) -> tuple[np.ndarray, np.ndarray]:
-    """Points as prompts of one point inside each: points and labels of `ask_network`."""
+    """Return points and labels of `ask_network` for prompts of one foreground point each."""
     return points_xy[:, None], np.ones((len(points_xy), 1))
 
 
 def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndarray, "K H W"]:
-    """Masks of the size of the image from low-resolution logits, resized as by SamProcessor."""
+    """Upscale low-resolution logits as SamProcessor does, and return the masks at the image's size."""
     height, width = frame.original_hw
     found = []
     for each in logits:
@@ -405,17 +405,17 @@ def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndar
 
 
 def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
-    """Compare the factored decoder with the network on an image and prompts drawn at random.
+    """Compare the factored decoder with the network on a random image and random prompts.
 
     Args:
-        factored, decoder: of the same model.
-        side_px: of the network's input.
+        factored, decoder: decoders of the same model.
+        side_px: side of the network's input.
 
     Returns:
         the largest difference of predicted IoUs, and of logits relative to the largest logit above 1.
 
     Raises:
-        ModelError: the network doesn't declare the shapes of its inputs.
+        ModelError: if the network doesn't declare the shapes of its inputs.
     """
     rng = np.random.default_rng(0)
     features = {}
@@ -433,10 +433,10 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
 
 
 def own_thresholds(model: ModelFolder) -> Thresholds:
-    """Thresholds that a model folder names in its `config.json`, else `REAL_SAM`.
+    """Return the thresholds in a model folder's `config.json`, or `REAL_SAM`.
 
     Raises:
-        ModelError: it names something else, or a value out of range.
+        ModelError: if it has an unknown key or a value out of range.
     """
     own: Any = model.config.get(OWN, {})
     known = vars(REAL_SAM)
@@ -445,14 +445,14 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
             raise ValueError(f"known keys are {', '.join(known)}")
         read = MasksSettings(**own)
         return replace(REAL_SAM, **{name: getattr(read, name) for name in own})
-    except ValueError as error:  # pydantic's is one too
+    except ValueError as error:  # includes pydantic's ValidationError
         raise ModelError(
             f"{model.folder / 'config.json'}: {OWN} cannot be used: {error}", fix="correct or remove it"
         ) from error
 
 
 def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, int]:
-    """Rows and columns of the low-resolution masks that touch the image; the rest is padding."""
+    """Return the number of low-resolution rows and columns that overlap the image; the rest is padding."""
     return (
         -(-frame.resized_hw[0] * low_hw[0] // frame.padded_hw[0]),
         -(-frame.resized_hw[1] * low_hw[1] // frame.padded_hw[1]),
@@ -462,22 +462,22 @@ def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, in
 def read_logits(
     logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
 ) -> tuple[Int8[np.ndarray, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
-    """Round logits, and measure the stability and the box of each mask.
+    """Round logits, and compute the stability and the box of each mask.
 
-    Stability is the IoU of the masks at logit thresholds +offset and -offset; 0 if the larger one
+    Stability is the IoU of the masks at logit thresholds +offset and -offset, or 0 if the larger one
     is empty. Departs: SAM counts pixels of the full-size mask (`full_stability`); we count low-resolution
-    ones, which saves the upscaling of masks that are dropped.
+    ones, so that dropped masks need no upscaling.
 
     Returns:
         logits in steps of `LOGIT_STEP`, clipped to +-127 steps; stability; box (xyxy, low-resolution
-        px, end exclusive) of what is above 0, all 0 if nothing is.
+        px, end exclusive) of the positive logits, all 0 if there are none.
     """
     height, width = valid_low_resolution((logits.shape[1], logits.shape[2]), frame)
     steps = offset / LOGIT_STEP
     rounded, small, large, boxes = quantise_logits(
         np.ascontiguousarray(logits),
         np.float32(1 / LOGIT_STEP),
-        math.floor(steps),  # a whole number exceeds another number if it exceeds its floor
+        math.floor(steps),  # an integer exceeds x exactly if it exceeds floor(x)
         math.floor(-steps),
         height,
         width,
@@ -488,7 +488,7 @@ def read_logits(
 def full_stability(
     logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
 ) -> Float32[np.ndarray, " K"]:
-    """Stability counted at the size of the image, on logits that are not rounded, as SAM does."""
+    """Return the stability at the image's size, from unrounded logits, as in SAM."""
     number, height, width = logits.shape
     along_y, along_x = frame_taps((height, width), frame)
     areas = []
@@ -511,7 +511,7 @@ def full_stability(
 def frame_taps(
     low_hw: tuple[int, int], frame: Frame
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """How the image's rows and columns are blended from low-resolution ones (`taps`)."""
+    """Return the taps from low-resolution rows and columns to those of the image (`taps`)."""
     padded, resized = (low_hw, low_hw) if frame.stretched else (frame.padded_hw, frame.resized_hw)
     along_y, along_x = (
         taps(low_hw[axis], padded[axis], resized[axis], frame.original_hw[axis]) for axis in (0, 1)
@@ -523,13 +523,13 @@ def frame_taps(
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """How each pixel along one axis of the original image is blended from low-resolution pixels.
+    """Return the weights that blend low-resolution pixels to each pixel along one axis of the image.
 
-    Bilinear from `low` to the padded input, cut to the resized image, bilinear to the original size,
-    as SamProcessor does; both steps in one.
+    They combine SamProcessor's steps: bilinear from `low` to the padded input, cropped to the resized image,
+    bilinear to the original size.
 
     Returns:
-        first low-resolution pixel of each pixel of the image, and the weights from there on.
+        first low-resolution pixel of each pixel of the image, and the weights of that and the following ones.
     """
     weights = _bilinear(low, padded)[:resized]
     if resized != original:
@@ -542,7 +542,7 @@ def taps(
 
 
 def _bilinear(source: int, target: int) -> Float[np.ndarray, "target source"]:
-    """Weights of bilinear resizing along one axis; pixel centres correspond, the border is repeated."""
+    """Return the weights of bilinear resizing along one axis; pixel centres align, the border is repeated."""
     at = np.clip((np.arange(target) + 0.5) * source / target - 0.5, 0, source - 1)
     low = np.minimum(at.astype(np.int64), max(0, source - 2))
     weights = np.zeros((target, source))

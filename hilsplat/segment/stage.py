@@ -1,4 +1,4 @@
-"""The stage `masks`: three levels of masks for every training view."""
+"""Stage `masks`: masks at three levels for every training view."""
 
 import logging
 import math
@@ -37,10 +37,10 @@ logger = logging.getLogger(__name__)
 
 
 def train_views(scene: Scene) -> list[str]:
-    """Training views of a scene.
+    """Return the training views of a scene.
 
     Raises:
-        SceneError: there are none.
+        SceneError: if there are none.
     """
     views = scene.views("train")
     if not views:
@@ -64,14 +64,14 @@ def run_masks(
     Args:
         scene_folder: the `Scene` artifact.
         out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
-        cache: folder of the view cache. With SAM it holds the decoder's candidates and the masks: other
-            thresholds run no network, and other levels compute nothing.
-        settings: which segmenter, and how.
-        threads: views worked on at once, if they fit into the memory; the result does not depend on it.
-        memory_mib: memory that the stage may use; None: what is free.
-        key_views: the views to segment; None: every training view.
-        prompts: points (x, y, px) that SAM is prompted at in a view; None: the grid of the settings.
-        finished: output of this stage whose views are taken as they are.
+        cache: folder of the view cache. For SAM it contains the decoder's candidates and the masks, so other
+            thresholds don't rerun the networks, and other levels need no computation.
+        settings: segmenter and its settings.
+        threads: views processed in parallel if they fit into memory; the result does not depend on it.
+        memory_mib: memory that the stage may use; None: all free memory.
+        key_views: views to segment; None: every training view.
+        prompts: returns the points (x, y, px) at which SAM is prompted in a view; None: the settings' grid.
+        finished: output of this stage whose views are reused as they are.
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene) if key_views is None else list(key_views)
@@ -80,7 +80,7 @@ def run_masks(
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model), settings.variant)
-            every = train_views(scene)  # the same ones whichever views are segmented
+            every = train_views(scene)  # independent of the views to segment
             checked = [scene.image(view) for view in every[:: max(1, len(every) // CHECKED_VIEWS)]]
             model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], cache, threads)
             identity: dict[str, str | None] = {
@@ -124,7 +124,7 @@ def run_masks(
 
 
 def at_levels(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
-    """The masks at the levels of the segmenter, or of their tree."""
+    """Return the masks with the segmenter's levels or, depending on the settings, the tree's."""
     if settings.levels == "head":
         return masks
     return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
@@ -138,10 +138,7 @@ def sam_masks(
     settings: MasksSettings,
     points: Float[np.ndarray, "P 2"] | None = None,
 ) -> HierarchicalMasks:
-    """One view's masks by SAM; the networks run only if the view is not in the cache.
-
-    The cache holds candidates and masks: other thresholds run no network, and other levels compute nothing.
-    """
+    """Segment one view with SAM; the networks run only if its candidates are not in the cache."""
     key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings, points)
     size_hw = scene.cameras[view].size_hw
 
@@ -163,7 +160,7 @@ def sam_masks(
 
 
 def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettings) -> HierarchicalMasks:
-    """One view's masks by the graph segmenter."""
+    """Segment one view with the graph segmenter."""
     key = sha256_of_json(
         {
             "image": sha256_of_file(scene.image_path(view)),

@@ -1,4 +1,4 @@
-"""Dropping masks that repeat a better one: by boxes, then by pixels."""
+"""Suppression of masks that repeat a better one: by boxes, then by pixels."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -7,17 +7,17 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 
 BOXES_AT_ONCE = 256
-"""Boxes that are compared with all following ones in one step."""
+"""Boxes compared with all following ones in one step."""
 
 INNER_COVERED = 0.85
-"""Share of a mask inside another one from which on it counts as contained (LangSplat)."""
+"""A mask counts as contained if at least this share of it is inside another mask (LangSplat)."""
 
 INNER_COVERS = 0.5
-"""Share of the container that the contained mask must stay below (LangSplat)."""
+"""A contained mask must cover less than this share of its container (LangSplat)."""
 
 
 def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) -> Float[np.ndarray, "A B"]:
-    """IoU of boxes (xyxy, px, end exclusive); 0 if both are empty."""
+    """Return the IoU of boxes (xyxy, px, end exclusive); 0 if both are empty."""
     shared = np.ones((len(boxes_a), len(boxes_b)))
     for axis in (0, 1):
         low = np.maximum(boxes_a[:, None, axis], boxes_b[None, :, axis])
@@ -30,7 +30,7 @@ def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) ->
 
 
 def last_inside(boxes_xyxy: Int[np.ndarray, "M 4"]) -> Int[np.ndarray, "M 4"]:
-    """Boxes that name the last row and column inside, as SAM's do, instead of the first outside."""
+    """Convert end-exclusive boxes to boxes that end at the last row and column inside, as in SAM."""
     return boxes_xyxy - np.array([0, 0, 1, 1], boxes_xyxy.dtype)
 
 
@@ -40,11 +40,11 @@ def suppress_boxes(
     iou_max: float,
     first: Float[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " k"]:
-    """Greedy suppression, as SAM's automatic generator does it.
+    """Suppress boxes greedily, as SAM's automatic generator does.
 
-    The best box stays and drops every other whose IoU with it exceeds `iou_max`; then the best of
-    the rest, and so on. A box is better by its rank in `first`, if given, then by score. Equal ones go by
-    larger area, then by the box's numbers, then by row.
+    The best box is kept and drops every other whose IoU with it exceeds `iou_max`; then the best of
+    the rest, and so on. Boxes are ranked by `first`, if given, then by score, larger area, the box's
+    coordinates and row.
 
     Returns:
         rows kept, ascending.
@@ -62,9 +62,9 @@ def suppress_boxes_officially(
     iou_max: float,
     first: Float[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " k"]:
-    """`suppress_boxes` as published: on boxes that end at the last pixel inside.
+    """Suppress boxes as published, with boxes that end at the last pixel inside.
 
-    A box is better by `first` alone, if given, else by score; equal ones go by row.
+    Boxes are ranked by `first` alone, if given, otherwise by score; ties by row.
 
     Returns:
         rows kept, the best first.
@@ -80,11 +80,11 @@ def distinct_boxes(
     iou_max: float,
     slack: float,
 ) -> Int64[np.ndarray, " k"]:
-    """Greedy suppression by boxes that holds for any thresholds of score and stability.
+    """Suppress boxes greedily so that the result is valid for any thresholds on score and stability.
 
-    The box of highest score (of equal score: the lower row) stays and drops every other whose IoU with it
+    The box with the highest score (on a tie, the lower row) is kept and drops every other whose IoU with it
     exceeds `iou_max` and whose stability is at most `slack` above its own; then the best of the rest, and so
-    on. What passes a threshold is then dropped by what passes it too, but for the slack.
+    on. Except for the slack, a box that passes a threshold is dropped only by a box that also passes it.
 
     Returns:
         rows kept, the best first.
@@ -99,9 +99,9 @@ def _greedy(
     stability: Float[np.ndarray, " M"] | None = None,
     slack: float = 0.0,
 ) -> Bool[np.ndarray, " M"]:
-    """Which boxes stay if each that stays drops the following ones whose IoU with it exceeds `iou_max`.
+    """Return which boxes are kept if each kept box drops later ones whose IoU with it exceeds `iou_max`.
 
-    With stabilities, it drops only those whose own is at most `slack` above its own.
+    If stabilities are given, it drops only boxes whose stability is at most `slack` above its own.
     """
     alive = np.ones(len(boxes), dtype=bool)
     for start in range(0, len(boxes), BOXES_AT_ONCE):
@@ -123,17 +123,17 @@ def keep_best_masks(
     score_min: float,
     inner: float,
 ) -> Bool[np.ndarray, " M"]:
-    """LangSplat's mask suppression inside one level, for rows that are already in a fixed order.
+    """Return the masks kept by LangSplat's suppression within one level, for rows in a fixed order.
 
     With I shared pixels and areas a, row j is dropped if any of these holds:
     - its score is not above `score_min`, unless that is 0;
-    - a row of better score (of equal score: a lower row) has an IoU with it above `iou_max`;
-    - it sits inside a row i: `I / a_j >= 0.85`, `I / a_i < 0.5` and
+    - a row of better score (on a tie, a lower row) has an IoU with it above `iou_max`;
+    - it is inside a row i: `I / a_j >= 0.85`, `I / a_i < 0.5` and
       `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
       contained mask whichever score is higher (masks then nest between levels only), and
-      `inner = 0` drops none (masks nest inside levels too).
-    As in LangSplat, a row that is dropped itself still drops others. The result follows from three
-    comparisons of matrices, so it does not depend on the order in which rows are visited.
+      `inner = 0` drops none (masks also nest within levels).
+    As in LangSplat, dropped rows still drop others. The result follows from three matrix comparisons, so it
+    does not depend on the order in which rows are visited.
     """
     area_px = np.diagonal(overlap_px)
     union_px = area_px[:, None] + area_px[None, :] - overlap_px
@@ -143,7 +143,7 @@ def keep_best_masks(
     better = rank[:, None] < rank[None, :]
     repeated = (better & (iou > iou_max)).any(axis=0)
     share = overlap_px / area_px[:, None]  # [i, j]: share of i inside j
-    inside = (share.T >= INNER_COVERED) & (share < INNER_COVERS)  # [i, j]: j sits in i
+    inside = (share.T >= INNER_COVERED) & (share < INNER_COVERS)  # [i, j]: j is inside i
     contained = (inside & (share * share.T < inner)).any(axis=0)
     return ((score > score_min) | (score_min == 0)) & ~repeated & ~contained
 
@@ -151,9 +151,9 @@ def keep_best_masks(
 def suppress_masks(
     masks: HierarchicalMasks, *, iou_max: float, score_min: float, inner: float
 ) -> HierarchicalMasks:
-    """Suppress masks inside each level (`keep_best_masks`, score = predicted IoU x stability).
+    """Suppress masks within each level (`keep_best_masks`, score = predicted IoU x stability).
 
-    Rows come back in `content_order`, so shuffled input gives the same result. A level may end empty.
+    The result is in `content_order`, so shuffled input gives the same result. A level may become empty.
     """
     masks = masks.take(masks.content_order())
     kept = []

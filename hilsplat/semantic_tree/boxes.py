@@ -1,4 +1,4 @@
-"""Where a node is: its centroid, its axis-aligned box and its oriented box."""
+"""Centroid, axis-aligned box and oriented box of each node."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from hilsplat.base.levels import Level
 
 BOX_PERCENTILES = (2.0, 98.0)
-"""Extent of a box among the members' centres, so that a few stray Gaussians do not inflate it."""
+"""Percentiles of the members' centres that bound a box, so that a few stray Gaussians do not inflate it."""
 
 Triple = tuple[float, float, float]
 
@@ -19,7 +19,7 @@ class OrientedBox:
 
     Attributes:
         centre: scene units.
-        axes: three orthogonal unit vectors, right-handed, that of the longest side first.
+        axes: three orthogonal unit vectors, right-handed, the longest side's first.
         size: full length along each axis, scene units.
     """
 
@@ -29,12 +29,12 @@ class OrientedBox:
 
     @staticmethod
     def from_array(rows: Float[np.ndarray, "5 3"]) -> "OrientedBox":
-        """From the stored form: centre, three axes, sizes."""
+        """Create a box from its stored form: centre, three axes, sizes."""
         centre, first, second, third, size = ((x, y, z) for x, y, z in np.asarray(rows, np.float64).tolist())
         return OrientedBox(centre, (first, second, third), size)
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
-        """The eight corners."""
+        """Return the eight corners."""
         signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
         return np.asarray(self.centre) + (signs * np.asarray(self.size)) @ np.asarray(self.axes)
 
@@ -42,11 +42,11 @@ class OrientedBox:
 def oriented_box(
     points: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
 ) -> Float32[np.ndarray, "5 3"]:
-    """Box along the principal axes of weighted points, from the 2nd to the 98th percentile of each.
+    """Return the box along the weighted points' principal axes, from their 2nd to their 98th percentile.
 
     Returns:
         centre, three axes (right-handed, longest side first, the largest component of the first two
-        positive) and sizes, as `OrientedBox.from_array` reads them.
+        positive) and sizes, in the form that `OrientedBox.from_array` reads.
     """
     mean = (weight[:, None] * points).sum(axis=0) / weight.sum()
     centred = points - mean
@@ -70,9 +70,9 @@ def node_boxes(
     means: Float[np.ndarray, "N 3"],
     mass: Float[np.ndarray, " N"],
 ) -> tuple[Float32[np.ndarray, "T 3"], Float32[np.ndarray, "T 2 3"], Float32[np.ndarray, "T 5 3"]]:
-    """Centroid and both boxes of every node's members; centroid and axes are weighted by visible mass.
+    """Return each node's centroid, axis-aligned box and oriented box.
 
-    Every node must have a member (`nodes.renumbered_without_empty`).
+    Visible mass weights centroids and axes. Each node must have a member (`nodes.renumbered_without_empty`).
     """
     centroid = np.zeros((len(level), 3), np.float32)
     box = np.zeros((len(level), 2, 3), np.float32)

@@ -1,4 +1,4 @@
-"""Which masks show a node best, each from another side: the clip stage embeds their crops."""
+"""Ranking of the masks that show a node, from different sides; the clip stage embeds the best crops."""
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -6,13 +6,13 @@ from jaxtyping import Float, Float32, Int32
 from hilsplat.base.levels import NONE
 
 APART_DEG = 30.0
-"""Directions at least this far apart don't compete."""
+"""Directions at least this far apart do not lower each other's score."""
 
 LEAST_NEW = 0.1
-"""Share of its score that a crop keeps from a direction that is already shown."""
+"""Share of its score that a crop keeps if a higher-ranked crop has the same direction."""
 
 RANKED = 32
-"""Crops of a node that are ranked."""
+"""Number of crops ranked per node."""
 
 
 def crop_ranks(
@@ -20,9 +20,9 @@ def crop_ranks(
     score: Float32[np.ndarray, " M"],
     directions: Float[np.ndarray, "M 3"],
 ) -> Int32[np.ndarray, " M"]:
-    """Rank the masks of each node: by score, less for directions close to those ranked before.
+    """Rank the masks of each node by score, reduced for directions close to those already ranked.
 
-    Of crops of one score, those from different sides describe a thing better (docs/experiments.md).
+    At equal scores, crops from different sides describe a thing better (docs/experiments.md).
 
     Args:
         node: node that each mask shows, -1 for none.
@@ -30,7 +30,7 @@ def crop_ranks(
         directions: unit vector from the node to the camera.
 
     Returns:
-        rank of each mask among those of its node, 0 for the best; -1 without a node, and beyond `RANKED`.
+        rank of each mask among those of its node, 0 for the best; -1 without a node or beyond `RANKED`.
     """
     rank = np.full(len(node), NONE, np.int32)
     order = np.argsort(node, kind="stable")

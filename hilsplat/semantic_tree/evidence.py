@@ -1,4 +1,4 @@
-"""How far masks of different views agree on the Gaussians that both views see.
+"""Agreement of masks from different views on the Gaussians that both views see.
 
 Everything is sparse: only masks that share Gaussians are compared.
 """
@@ -14,15 +14,15 @@ from jaxtyping import Bool, Float, Float64, Int32
 from hilsplat.base.compiled import compiled
 
 ROWS_AT_A_TIME = 64
-"""Masks that one thread takes at a time."""
+"""Number of masks in one task of a thread."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """How far every two of the M masks of a level agree on the Gaussians that both views see.
+    """Agreement of each pair of the M masks of a level on the Gaussians that both views see.
 
     Attributes:
-        intersection: of pairs a < b that share Gaussians; no pair of one view.
+        intersection: of pairs a < b from different views that share Gaussians.
         union: of the same pairs, in the same order of stored values.
         seen: size of each mask as each of the V views sees it: its full size in its own view, 0 in views
             that see too little of it. A pair that is not stored has intersection 0 and union
@@ -45,26 +45,25 @@ def mask_evidence(
     threads: int = 1,
     device: str = "cpu",
 ) -> Evidence:
-    """Soft intersection and union of every two masks of one level, on the Gaussians that both views see.
+    """Compute the soft intersection and union of each pair of masks, on the Gaussians that both views see.
 
-    With s the share of a Gaussian's visible weight inside a mask and w its importance, the intersection of
-    a and b is the sum of w s_a s_b; the size of a as seen from the view of b is the sum of w s_a^2 over the
+    Let s be the share of a Gaussian's visible weight inside a mask, and w its importance. The intersection of
+    a and b is the sum of w s_a s_b. The size of a as seen from the view of b is the sum of w s_a^2 over the
     Gaussians visible there (Tanimoto). Fitted Gaussians reach across borders and have shares between 0 and 1.
     With squares, the IoU of a region with itself stays 1; with the sum of w s_a as the size it would shrink
     (shares of 0.3 give 0.18).
 
     Two masks of one view are different things, so they are evidence against a link (intersection 0, union
-    both full sizes). Masks that share Gaussians, but whose views each see less than `min_covisible` of the
-    other mask, are no evidence. Of masks that share none, each counts if the other's view sees at least that
-    share of it.
+    both full sizes). Masks that share Gaussians are no evidence if each view sees less than `min_covisible`
+    of the other mask. If masks share none, each counts if the other's view sees at least that share of it.
 
     Args:
-        shares: s, one row per mask; zero if the Gaussian is not visible in the mask's view.
+        shares: s, one row per mask of a level; zero if the Gaussian is not visible in the mask's view.
         importance: w, such as the mean visible mass.
         visible: which Gaussians each view sees.
         view: view of each mask.
         min_covisible: pairs that see a smaller share of each other are dropped.
-        threads: number of threads that share the rows; the bytes do not depend on it.
+        threads: number of threads; the result does not depend on it.
         device: "cpu", or the torch device of the two products (see `cuda_algebra`).
     """
 
@@ -93,12 +92,12 @@ def _evidence_by_loops(
     min_covisible: float,
     threads: int,
 ) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
-    """Pairs a < b that share Gaussians, and `Evidence.seen`.
+    """Return the pairs a < b that share Gaussians, and `Evidence.seen`.
 
     Args:
         shares: s.
         weighted: w s, stored in the same pattern.
-        sizes: what each Gaussian adds to a mask's size, stored in the same pattern.
+        sizes: each Gaussian's contribution to a mask's size, stored in the same pattern.
         visible, view, min_covisible, threads: as in `mask_evidence`.
 
     Returns:
@@ -138,7 +137,7 @@ def _evidence_by_torch(
     min_covisible: float,
     device: str,
 ) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
-    """`_evidence_by_loops` with the products by torch."""
+    """Compute `_evidence_by_loops` with the products in torch."""
     from hilsplat.contributions.cuda_algebra import shared_pairs_on
 
     pairs, everywhere = shared_pairs_on(weighted, shares, sizes, visible, view, device)
@@ -155,14 +154,14 @@ def _evidence_by_torch(
 def _counted(
     seen_everywhere: Float64[np.ndarray, "M V"], view: Int32[np.ndarray, " M"], min_covisible: float
 ) -> Float64[np.ndarray, "M V"]:
-    """Sizes that count as evidence: 0 where a view sees too little of a mask."""
+    """Return the sizes that count as evidence: 0 where a view sees too little of a mask."""
     size = seen_everywhere[np.arange(len(view)), view]
     return np.where(seen_everywhere < min_covisible * size[:, None], 0.0, seen_everywhere)
 
 
 @compiled
 def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
-    """Size of each mask on the Gaussians that each view sees."""
+    """Add up the size of each mask on the Gaussians that each view sees, into `out`."""
     for a in range(begin, end):
         for k in range(indptr[a], indptr[a + 1]):
             g = indices[k]
@@ -174,7 +173,7 @@ def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
 def _shared_pairs(
     begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, seen_everywhere
 ):
-    """Pairs a < b that share Gaussians: row starts, b, intersection and union."""
+    """Return the pairs a < b that share Gaussians: row starts, b, intersection and union."""
     num = len(indptr) - 1
     touched_by = np.full(num, -1, np.int64)
     sums = np.zeros(num)

@@ -1,4 +1,4 @@
-"""Export of the semantic tree: JSON, and a PLY with the nodes of each Gaussian."""
+"""Export of the semantic tree as JSON, and as a PLY with the nodes of each Gaussian."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def readable_nodes(tree: "SemanticTree") -> list[dict]:
-    """One entry per node, for people."""
+    """Return one human-readable entry per node."""
     members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
     return [
         {
@@ -39,7 +39,7 @@ def readable_nodes(tree: "SemanticTree") -> list[dict]:
 def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None:
     """Copy a 3DGS PLY and add three properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
 
-    Viewers of Gaussians ignore them; tools that show scalar fields can colour by them. -1 means no node.
+    Gaussian viewers ignore them; tools that show scalar fields can colour by them. -1 means no node.
 
     Raises:
         MisalignedArtifactError: the tree was made for another PLY.
@@ -67,8 +67,8 @@ def write_selection_ply(
     """Copy some Gaussians of a 3DGS PLY, such as those that answer a query.
 
     Args:
-        labels: of each, from 1; written as the property `label`.
-        names: of the labels; each has a comment `label 1: mug` in the header.
+        labels: label of each Gaussian, from 1; written as the property `label`.
+        names: name of each label; the header gets a comment for each, such as `label 1: mug`.
     """
     from plyfile import PlyData
 
@@ -80,7 +80,7 @@ def write_selection_ply(
     for name in table.dtype.names:
         labelled[name] = table[name]
     labelled["label"] = labels
-    # a header is ASCII, a comment one line
+    # PLY headers are ASCII, and a comment is one line.
     plain = [" ".join(name.split()).encode("ascii", "backslashreplace").decode() for name in names]
     _write(labelled, out, [f"label {number + 1}: {name}" for number, name in enumerate(plain)])
 

@@ -1,4 +1,4 @@
-"""Masks of the views after the key views, prompted once at each node and on the grid only elsewhere."""
+"""Masks of the views after the key views, with one prompt per node and grid prompts only elsewhere."""
 
 from pathlib import Path
 
@@ -33,11 +33,11 @@ def run_guided_masks(
 ) -> None:
     """Segment the training views after the key views, with guided prompts (`segment.stage.run_masks`).
 
-    Departs: SAM and LangSplat prompt a grid in every view (docs/experiments.md has what that gains).
+    Departs: SAM and LangSplat prompt a grid in every view (measured in docs/experiments.md).
 
     Args:
         gaussians_ply: the scene's Gaussians.
-        key_masks_folder: masks of the key views, which are taken as they are.
+        key_masks_folder: masks of the key views, which are kept unchanged.
         semantic_tree_folder: the tree of those masks.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The nodes of one level: masks linked across views, and the Gaussians they win."""
+"""The nodes of one level: masks linked across views, and the Gaussians assigned to them."""
 
 from dataclasses import dataclass
 
@@ -17,10 +17,10 @@ MIN_COVISIBLE = 0.2
 """Pairs of masks whose views see less than this share of each other are no evidence."""
 
 MIN_MEMBER_SHARE = 0.15
-"""A Gaussian joins its best node if that holds more than this share of its weight."""
+"""A Gaussian joins its best node if that node holds more than this share of its weight."""
 
 MIN_FIT = 0.25
-"""A mask shows the node that it fits best, if their IoU in its view is above this."""
+"""A mask shows its best-fitting node if their IoU in the mask's view is above this."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class LevelNodes:
     Attributes:
         of_mask: node that each mask of the level belongs to, -1 for none.
         of_gaussian: node of each Gaussian, -1 for none.
-        membership: share of the Gaussian's visible weight that lies in its node's masks.
-        quality: of each node.
+        membership: share of the Gaussian's visible weight inside its node's masks.
+        quality: pooled IoU of each node.
     """
 
     of_mask: Int64[np.ndarray, " m"]
@@ -40,7 +40,7 @@ class LevelNodes:
     quality: Float64[np.ndarray, " t"]
 
     def joined(self, into: Int64[np.ndarray, " t"]) -> "LevelNodes":
-        """The nodes that `into` numbers alike as one, of the mean quality of their masks."""
+        """Merge nodes with the same number in `into`; the quality is the mean over their masks."""
         into_or_none = np.append(into, NONE)
         masks = np.bincount(self.of_mask[self.of_mask != NONE], minlength=len(into))
         total = np.bincount(into, masks * self.quality)
@@ -62,14 +62,14 @@ def level_nodes(
     settings: SemanticTreeSettings,
     threads: int,
 ) -> LevelNodes:
-    """Link the masks of one level into nodes and give them Gaussians.
+    """Link the masks of one level into nodes and assign Gaussians to them.
 
-    A cluster that loses its Gaussians to others, as duplicates do, could select nothing: it becomes a node
-    only if `min_views` masks fit it best.
+    A cluster whose Gaussians go to other clusters, such as a duplicate, could select nothing. A cluster
+    therefore becomes a node only if at least `min_views` masks fit it best.
 
     Args:
         weights: S of the masks.
-        view: of each mask.
+        view: view of each mask.
         mass: visible mass of each Gaussian in each view, px.
         visible: which Gaussians each view sees.
         importance: mean visible mass, px.
@@ -107,7 +107,7 @@ def level_nodes(
     fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
     kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
     of_cluster, node, share = winners(kept)
-    # A node that wins no Gaussian selects nothing, so it is dropped.
+    # A node without Gaussians selects nothing, so it is dropped.
     used = np.unique(node[node >= 0])
     renumber = np.full(len(kept) + 1, NONE, np.int64)
     renumber[used] = np.arange(len(used))
@@ -117,12 +117,12 @@ def level_nodes(
 
 
 def _row_of(matrix: sp.csr_matrix) -> np.ndarray:
-    """Row of every stored value."""
+    """Return the row of each stored value."""
     return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
 def _divide(matrix: sp.csr_matrix, by: np.ndarray) -> sp.csr_matrix:
-    """Divide each stored value (float64); values divided by infinity are dropped."""
+    """Divide each stored value (float64), and drop values divided by infinity."""
     divided = sp.csr_matrix(
         (matrix.data.astype(np.float64) / by, matrix.indices.copy(), matrix.indptr.copy()), shape=matrix.shape
     )

@@ -1,8 +1,7 @@
-"""Link the masks of one level across views: pooled average linkage of their evidence.
+"""Pooled average linkage of the masks of one level across views.
 
 Everything is sparse: only masks that share Gaussians can be joined, and how much two clusters see of each
-other is a sum over the views of their members. The cost grows with the number of pairs that share Gaussians,
-not of all pairs.
+other is a sum over the views of their members. The cost grows with the number of pairs that share Gaussians.
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ from hilsplat.base.compiled import compiled
 from hilsplat.semantic_tree.evidence import Evidence
 
 ROWS_OF_A_BLOCK = 256
-"""The best score of so many rows is remembered, so that the best of all is found without a look at all."""
+"""Rows per block; the best score of each block is stored, so that finding the best row reads few scores."""
 
 
 def pooled_linkage(
@@ -22,7 +21,7 @@ def pooled_linkage(
 
     The IoU of two clusters is the sum of intersections divided by the sum of unions of all their pairs of
     masks. Pooling is reducible (joining never creates a better pair), so one nearest neighbour per cluster
-    suffices. Of equally good pairs, the one with the lowest rows is joined.
+    suffices. On a tie, the pair with the lowest rows is joined.
 
     Returns:
         cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its
@@ -43,9 +42,9 @@ def pooled_linkage(
 
 @compiled
 def _neighbours(indptr, indices, intersection, union, seen, view):
-    """The pool of neighbours that `_link` begins with, and where each mask's run starts and stops in it.
+    """Return the initial pool of neighbours for `_link`, and where each mask's run starts and stops in it.
 
-    There is room for a quarter more than all pairs, both ways.
+    The pool has 25 % more entries than there are pairs, counted in both directions.
     """
     num = len(view)
     start = np.zeros(num + 1, np.int64)
@@ -71,10 +70,10 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
 
 @compiled
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to `first` and beyond; neighbours joined since it was written are summed.
+    """Copy a run of neighbours to `first` and beyond, and sum neighbours joined since it was written.
 
-    Entries already there, from an earlier run of the same cluster, are summed too. Entries that lead to
-    the cluster itself are left out. Returns the end of the run and the two sums of those left out.
+    Entries already there, from an earlier run of the same cluster, are summed too. Entries that refer to
+    the cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
     """
     own_inter, own_extra = 0.0, 0.0
     last = first
@@ -96,7 +95,7 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 @compiled
 def _plus_sizes(total, i, j, seen, members, shown, shows):
-    """`total` plus, over views, the size of each cluster as seen there times the other's members there."""
+    """Add to `total`, for each view, each cluster's size as seen there times the other's members there."""
     num_views = seen.shape[1]
     at_i = at_j = 0
     while at_i < shows[i] or at_j < shows[j]:
@@ -111,9 +110,9 @@ def _plus_sizes(total, i, j, seen, members, shown, shows):
 
 @compiled
 def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown, shows, place_of):
-    """The neighbour with the best pooled IoU in a run that `_merged_run` wrote, -1 for none, and that IoU.
+    """Return the neighbour with the best pooled IoU in a run by `_merged_run`, -1 for none, and that IoU.
 
-    Of equally good ones, the lowest row. Clears the run's marks in `place_of`.
+    On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
     """
     best, score = -1, -1.0
     for k in range(begin, end):
@@ -129,8 +128,9 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown
 
 @compiled
 def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Move the runs of living clusters to the front of the pool, or to a larger one if `needed` more would
-    not fit; updates `start` and `stop`.
+    """Move the runs of living clusters to the front of the pool, and update `start` and `stop`.
+
+    If `needed` more entries would not fit, the runs move to a larger pool.
     """
     living = 0
     for i in range(len(alive)):
@@ -141,7 +141,7 @@ def _compacted(needed, alive, start, stop, neighbour, inter, extra):
         room = 2 * (living + needed)
         to_neighbour, to_inter, to_extra = np.empty(room, np.int32), np.empty(room), np.empty(room)
     used = 0
-    for i in np.argsort(start):  # in the order of the pool: a run moves over none that has yet to move
+    for i in np.argsort(start):  # in pool order, so that no run overwrites one that has not been moved
         if alive[i]:
             begin, start[i] = start[i], used
             for k in range(begin, stop[i]):
@@ -153,7 +153,7 @@ def _compacted(needed, alive, start, stop, neighbour, inter, extra):
 
 @compiled
 def _set_score(i, value, score, block_best):
-    """Set a row's score, and the best of its block."""
+    """Set a row's score and update the best score of its block."""
     score[i] = value
     block = i // ROWS_OF_A_BLOCK
     best = -np.inf
@@ -164,7 +164,7 @@ def _set_score(i, value, score, block_best):
 
 @compiled
 def _best_row(score, block_best):
-    """The lowest row with the best score, -1 without rows."""
+    """Return the lowest row with the best score, -1 without rows."""
     block = np.argmax(block_best)
     for row in range(block * ROWS_OF_A_BLOCK, min((block + 1) * ROWS_OF_A_BLOCK, len(score))):
         if score[row] == block_best[block]:
@@ -174,28 +174,28 @@ def _best_row(score, block_best):
 
 @compiled
 def _link(start, stop, neighbour, inter, extra, seen, view, threshold, root, within):
-    """Merge in place; at the end `root` is the lowest row of each mask's cluster.
+    """Merge clusters in place; afterwards `root` is the lowest row of each mask's cluster.
 
-    A pool holds the clusters' neighbours, one run per cluster: the neighbour, the sum of intersections
+    A pool stores the clusters' neighbours, one run per cluster: the neighbour, the sum of intersections
     (`inter`), and the sum of the differences between the unions of stored pairs and `seen` (`extra`, never
-    positive: sizes count twice what both masks hold). The union of two clusters is `extra` plus, over views,
-    the size of each as seen there times the number of the other's members there. Neighbours joined since a
-    run was written are summed when it is next read. The run of a merged cluster is written at the end of the
-    pool, which is compacted when full.
+    positive, because sizes count the overlap of two masks twice). The union of two clusters is `extra` plus,
+    over views, the size of each as seen there times the number of the other's members there. Neighbours
+    joined since a run was written are summed when it is next read. The run of a merged cluster is written at
+    the end of the pool, which is compacted when full.
     """
     num, num_views = seen.shape
     used = stop[-1] if num else 0
     members = np.zeros((num, num_views))
-    # the views of a cluster's members, in order, and how many
+    # Views of each cluster's members, in order, and their number.
     shown, shows = np.empty((num, num_views), np.int32), np.ones(num, np.int32)
     for i in range(num):
         members[i, view[i]] = 1.0
         shown[i, 0] = view[i]
     alive = np.ones(num, np.bool_)
     best = np.full(num, -1, np.int64)
-    # Merges of each cluster so far, and of its best neighbour when that was found. If those differ, the score
-    # is only an upper bound, since joining never creates a better pair. Only bounds that come out on top are
-    # computed again.
+    # Number of merges of each cluster, and of its best neighbour when that was found. If the neighbour has
+    # merged since, the score is only an upper bound, because joining never creates a better pair. A bound is
+    # recomputed only when it is the best score.
     merges, best_merges = np.zeros(num, np.int64), np.full(num, -1, np.int64)
     score = np.full(num, np.inf)
     block_best = np.full(num // ROWS_OF_A_BLOCK + 1, -np.inf)

@@ -1,4 +1,4 @@
-"""What makes up a node: its Gaussians, its parent, the masks that show it."""
+"""The Gaussians of each node, its parent, and the masks that show it."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,22 +16,22 @@ def gaussian_nodes(
     total_mass: Float64[np.ndarray, " N"],
     min_share: float,
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Give each Gaussian the node that holds the largest share of its visible weight.
+    """Assign each Gaussian to the node that holds the largest share of its visible weight.
 
-    Masks of one view may overlap, and a node may have several there, so a Gaussian counts at most as much as
-    it is visible in the view.
+    Masks of one view may overlap, and a node may have several there, so a Gaussian's weight in a view is
+    capped at its visible mass there.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
         num_nodes: number of nodes.
         weights: S of the masks.
-        view: of each mask.
+        view: view of each mask.
         mass: visible mass of each Gaussian in each view, px.
         total_mass: visible mass of each Gaussian, summed over views, px.
-        min_share: a Gaussian of which no node holds more than this stays without a node.
+        min_share: a Gaussian gets no node unless one holds more than this share of it.
 
     Returns:
-        node of each Gaussian, -1 for none (of equal shares, the lowest node), and its share there.
+        node of each Gaussian, -1 for none (on a tie, the lowest node), and its share there.
     """
     inside = np.flatnonzero(cluster >= 0)
     ones = np.ones(len(inside))
@@ -62,7 +62,7 @@ def node_parents(
     mass: Float[np.ndarray, " N"],
     min_coverage: float,
 ) -> Int32[np.ndarray, " T"]:
-    """Parent of each node: the coarser node that holds more than `min_coverage` of its visible mass.
+    """Return each node's parent: the coarser node that holds more than `min_coverage` of its visible mass.
 
     The next coarser level is searched first, then the one above it, so that a whole may be the direct
     parent of a subpart. Nodes without such a parent are orphans (-1).
@@ -95,19 +95,19 @@ def mask_fits(
     level: UInt8[np.ndarray, " M"],
     linked: Int32[np.ndarray, " M"],
 ) -> tuple[Int32[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
-    """Node that each mask shows: the one whose Gaussians have the best soft IoU with it, in its view.
+    """Return the node that each mask shows: the one with the best soft IoU with it, in its view.
 
     Args:
         node_of_gaussian: node of each Gaussian at each level.
         S: weight of each Gaussian in each mask, px.
         mass: visible mass of each Gaussian in each view, px.
-        view: of each mask.
-        level: of each mask.
+        view: view of each mask.
+        level: level of each mask.
         linked: node that each mask was linked into, -1 for none.
 
     Returns:
-        best node of the mask's level, -1 if it shares no Gaussian with any; IoU with the linked node, 0 for
-        none.
+        best node of the mask's level, -1 if it shares no Gaussian with any; and the IoU with the linked
+        node, 0 for none.
     """
     fits, of_linked = np.full(len(view), NONE, np.int32), np.zeros(len(view))
     for each in LEVELS:
@@ -125,13 +125,13 @@ def level_ious(
     mass: Float32[np.ndarray, "V N"],
     view: Int32[np.ndarray, " m"],
 ) -> sp.csr_matrix:
-    """Soft IoU of each mask of a level with each node (m x nodes) that it shares Gaussians with, in its view.
+    """Return the soft IoU of each mask of a level with each node that it shares Gaussians with, in its view.
 
     Args:
         node_of_gaussian: node of each Gaussian at the level.
         weights: S of the level's masks.
         mass: visible mass of each Gaussian in each view, px.
-        view: of each mask.
+        view: view of each mask.
     """
     has = np.flatnonzero(node_of_gaussian >= 0)
     node = node_of_gaussian[has]
@@ -146,7 +146,7 @@ def level_ious(
 
 
 def best_fits(iou: sp.csr_matrix) -> tuple[Int32[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
-    """Column of the largest value of each row, the lower one of a tie, and the value; -1 and 0 for none."""
+    """Return the column of each row's largest value (lowest on a tie) and the value; -1 and 0 if empty."""
     best, value = np.full(iou.shape[0], NONE, np.int32), np.zeros(iou.shape[0])
     row = np.repeat(np.arange(iou.shape[0]), np.diff(iou.indptr))
     order = np.lexsort((iou.indices, -iou.data, row))
@@ -162,11 +162,11 @@ def nest_nodes(
 ) -> Int32[np.ndarray, "N 3"]:
     """Make every child a subset of its parent, so that the tree is nested by construction.
 
-    A Gaussian of a child joins the parent, and the parent's parent, if no node holds it there; if another
-    node does, it leaves the child. Coarse levels come first.
+    A Gaussian of a child joins the parent and the parent's parent if no other node holds it at their levels;
+    otherwise it leaves the child. Coarse levels are processed first.
 
     Returns:
-        node of each Gaussian; unchanged for all others.
+        node of each Gaussian at each level.
     """
     nested = node_of_gaussian.copy()
     index_of = level.astype(np.int64) - 1
@@ -191,12 +191,12 @@ def nest_nodes(
 def renumbered_without_empty(
     node_of_gaussian: Int32[np.ndarray, "N 3"], num_nodes: int
 ) -> Int32[np.ndarray, " T1"]:
-    """New id of each node, in the old order; NONE for a node without a Gaussian, which selects nothing.
+    """Return each node's new id, in the old order; NONE for a node without Gaussians, which selects nothing.
 
     Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost.
 
     Returns:
-        one entry more than there are nodes: the last is NONE, so that looking up NONE gives NONE.
+        one more entry than there are nodes: the last is NONE, so that indexing with NONE gives NONE.
     """
     used = np.unique(node_of_gaussian[node_of_gaussian >= 0])
     renumber = np.full(num_nodes + 1, NONE, np.int32)
@@ -209,7 +209,7 @@ def node_means(
     level: UInt8[np.ndarray, " T"],
     features: Float32[np.ndarray, "N 3 D"],
 ) -> Float32[np.ndarray, "T D"]:
-    """Mean feature of each node's Gaussians at its level, without those that have none (all zeros)."""
+    """Return the mean feature of each node's Gaussians at its level, ignoring features that are all zeros."""
     sums = np.zeros((len(level), features.shape[2]))
     for each in LEVELS:
         own = node_of_gaussian[:, each.index]

@@ -1,10 +1,9 @@
 """The 3D semantic tree: masks of all views linked by the Gaussians they share.
 
-No mask has an identity across views. Masks of one level in different views are linked by how far they agree
-on the Gaussians that both views see. Clusters of masks become nodes and take their Gaussians; a coarser node
-that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores the crops
-that show each node. The clip stage embeds the best of them, and their average is the node's vector. A query
-ranks the nodes.
+Masks have no identity across views. Masks of one level in different views are linked by how well they agree
+on the Gaussians that both views see. Clusters of masks become nodes, and each Gaussian joins its best node. A
+coarser node that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores
+the crops that show each node. The clip stage embeds the best crops, and their average is the node's vector.
 """
 
 import logging
@@ -50,16 +49,16 @@ MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
 LEAST_IOU = 1e-3
-"""Of a mask with the node that it was linked into, in its `crop_score`."""
+"""Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
 
 NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
-"""A level and the rows of its masks -> its nodes."""
+"""Function from a level and the rows of its masks to its nodes."""
 
 logger = logging.getLogger(__name__)
 
 
 LIMITS = {"level": (1, 3), "quality": (0, 1), "membership": (0, 1 + 1e-5), "views": (0, 2**31 - 1)}
-"""Of the values of a stored tree."""
+"""Valid range of the values of a stored tree."""
 
 
 @dataclass(frozen=True)
@@ -69,26 +68,26 @@ class SemanticTree:
     Attributes:
         level: `Level` of each node.
         parent: row of the coarser node that holds it, -1 for none.
-        clip: unit CLIP vector of each node; empty (C = 0) as the stage writes the tree.
+        clip: unit CLIP vector of each node; empty (C = 0) in the tree that the stage writes.
         centroid: mean of its Gaussians' centres weighted by visible mass, scene units.
         box: axis-aligned box, lower and upper corner, scene units.
         oriented_box: centre, three axes and sizes (see `OrientedBox`), scene units.
         quality: pooled IoU of its masks across views, in [0, 1].
-        views: number of views with masks of it.
+        views: number of views that have masks of it.
         node_of_gaussian: node of each Gaussian at each level, -1 for none.
-        membership: share of the Gaussian's visible weight that lies in its node's masks, in [0, 1]; 0 without
+        membership: share of the Gaussian's visible weight inside its node's masks, in [0, 1]; 0 without
             a node, and for a Gaussian that joined only because a child of the node holds it.
         node_of_mask: node of its level that each mask (row of the contributions) fits best; -1 if it shares
             no Gaussian with any.
         linked_node: node that each mask was linked into, -1 for none.
-        crop_score: how well the crop of each mask shows the node that it was linked into: the root of its
-            area times its IoU with the node in its view, px; 0 without a node.
+        crop_score: how well the crop of each mask shows the node that it was linked into: the square root of
+            its area, times its IoU with the node in its view, px; 0 without a node.
         crop_rank: order in which the crops of a node are embedded (`crops.crop_ranks`), -1 for none.
-        view_area_px: pixels of its masks in each view.
+        view_area_px: area of its masks in each view.
         view_names: the columns of `view_area_px`.
-        gaussians_sha256: digest of the PLY the tree belongs to.
+        gaussians_sha256: digest of the PLY that the tree belongs to.
         cameras_sha256: digest of the scene's cameras.
-        min_weight: the contributions dropped smaller weights; views are drawn with the same limit.
+        min_weight: weights below this are dropped in the contributions and when views are rendered.
     """
 
     level: UInt8[np.ndarray, " T"]
@@ -115,7 +114,7 @@ class SemanticTree:
         return len(self.level)
 
     def _require_whole(self, path: Path) -> None:
-        """Check that rows of nodes exist, and that parents are coarser."""
+        """Raise ArtifactError if a row of a node does not exist, or if a parent is not coarser."""
         most = len(self) - 1
         rows = {"parent": self.parent, "node_of_gaussian": self.node_of_gaussian}
         rows |= {"node_of_mask": self.node_of_mask, "linked_node": self.linked_node}
@@ -132,15 +131,15 @@ class SemanticTree:
             raise ArtifactError(f"{path}: a node's parent is not coarser than it", fix=remake(path))
 
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
-        """Nodes of a level, in order."""
+        """Return the nodes of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def children_of(self, nodes: Int64[np.ndarray, " t"]) -> Int64[np.ndarray, " c"]:
-        """Direct children of any of the nodes."""
+        """Return the direct children of the nodes."""
         return np.flatnonzero(np.isin(self.parent, nodes))
 
     def ancestors(self) -> Int32[np.ndarray, "T 3"]:
-        """The node that holds each node at each level: itself at its own level, -1 for none."""
+        """Return the node that holds each node at each level: itself at its own level, -1 for none."""
         found = np.full((len(self), len(LEVELS)), NONE, np.int32)
         rows, above = np.arange(len(self)), np.arange(len(self), dtype=np.int32)
         while len(rows):
@@ -150,12 +149,10 @@ class SemanticTree:
         return found
 
     def with_vectors(self, vectors: Float32[np.ndarray, "M C"]) -> "SemanticTree":
-        """Return the tree with the vectors of its nodes.
-
-        A node's vector is the average of those of its masks that have one, weighted by their `crop_score`.
+        """Return the tree with node vectors: the normalised sum of the masks' vectors times `crop_score`.
 
         Args:
-            vectors: CLIP vector of each mask, zero where its crop was not embedded.
+            vectors: CLIP vector of each mask, zero if its crop was not embedded.
         """
         sums = np.zeros((len(self), vectors.shape[1]))
         linked = np.flatnonzero(self.linked_node != NONE)
@@ -169,10 +166,10 @@ class SemanticTree:
 
         Args:
             folder: output of the stage.
-            clip_folder: CLIP vectors of the masks; None: the tree's nodes get no vectors.
+            clip_folder: CLIP vectors of the masks; if None, the nodes get no vectors.
 
         Raises:
-            ArtifactError: it is missing, damaged or of another version.
+            ArtifactError: the tree is missing, damaged or of another version.
             MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
         """
         folder = Path(folder)
@@ -211,7 +208,7 @@ def build_tree(
     join_wholes: bool = False,
     nodes_of: NodesOf | None = None,
 ) -> SemanticTree:
-    """Link masks into nodes, give the nodes Gaussians, parents and boxes, and score the crops that show them.
+    """Link masks into nodes, compute their Gaussians, parents and boxes, and score the crops that show them.
 
     Args:
         contributions: rows of the masks.
@@ -221,8 +218,8 @@ def build_tree(
         centres: centres of the cameras, scene units.
         settings: thresholds.
         threads: number of threads for the evidence; results do not depend on it.
-        join_wholes: the masks know no things: wholes are joined from nodes that touch in 3D.
-        nodes_of: finds the nodes of a level; None: linked masks.
+        join_wholes: join wholes from nodes that touch in 3D, for segmenters that detect only colour regions.
+        nodes_of: finds the nodes of a level; None links masks.
     """
     visible = mass > MIN_VISIBLE_PX
     num_visible = visible.sum(axis=0)
@@ -269,11 +266,11 @@ def build_tree(
     np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
     fits, iou = mask_fits(node_of_gaussian, S, mass, contributions.view, contributions.level, cluster_of_mask)
-    # Nesting may leave a node without the Gaussians that its masks show; it still needs a crop.
+    # Nesting may remove from a node the Gaussians that its masks show; the node still needs a crop.
     score = np.sqrt(contributions.area_px) * np.where(
         cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU)
     )
-    if join_wholes:  # a mask of a piece fits no whole well, but shows it
+    if join_wholes:  # the mask of a piece has a low IoU with the joined whole, but shows it
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = cluster_of_mask[pieces]
     linked = cluster_of_mask.astype(np.int32)
@@ -313,11 +310,11 @@ def run_semantic_tree(
 ) -> None:
     """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
 
-    `nodes_of` finds the nodes of a level; None: linked masks.
+    `nodes_of` is as in `build_tree`.
 
     Raises:
         MisalignedArtifactError: the contributions belong to other masks.
-        ArtifactError: the masks do not say what made them.
+        ArtifactError: the masks do not record their segmenter.
     """
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]

@@ -1,8 +1,8 @@
-"""How much of each node a pixel shows: the basis of masks and relevancy maps of a view.
+"""Share of each node in each pixel of a view: the basis of its masks and relevancy maps.
 
-A pixel blends about ten Gaussians, but hardly ever more than two nodes of a level. Summing its weights by
-node once per view makes every later answer in that view several times cheaper than a product with all
-weights, with a fraction of the memory.
+A pixel blends about ten Gaussians, but rarely more than two nodes of a level. Summing its weights by node
+once per view makes each later answer in that view several times cheaper than a product with all weights,
+with a fraction of the memory.
 """
 
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from hilsplat.base.levels import NONE
 
 @dataclass(frozen=True)
 class ViewNodes:
-    """Nodes of one level in one view, pixel by pixel (CSR over P pixels).
+    """Nodes of one level in each pixel of a view (CSR over P pixels).
 
     Attributes:
         indptr: start of the entries of each pixel.
         nodes: rows of the semantic tree.
-        shares: share of the pixel that each node makes up; the remainder to 1 has no node.
+        shares: share of the pixel that each node makes up; the rest has no node.
         covered: whether the Gaussians cover each pixel.
     """
 
@@ -41,11 +41,11 @@ class ViewNodes:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory used, bytes."""
         return sum(each.nbytes for each in (self.indptr, self.nodes, self.shares, self.covered))
 
     def area_px(self, num_nodes: int) -> Int64[np.ndarray, " n"]:
-        """Number of pixels of which each node makes up more than half."""
+        """Return the number of pixels in which each node has a share above 0.5."""
         return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)
 
     def blend(
@@ -56,20 +56,20 @@ class ViewNodes:
     ) -> Float32[np.ndarray, " P"]:
         """Blend one value per node; Gaussians without a node have the value `without`.
 
-        Uncovered pixels get the least value of the covered ones. Writes into `out` if there is one.
+        Uncovered pixels get the lowest value of the covered ones. If `out` is given, the result is in it.
         """
         out = np.empty(len(self.covered), np.float32) if out is None else out
         _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)
         return out
 
     def mask(self, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " P"]:
-        """Pixels of which the chosen nodes make up more than half."""
+        """Return the pixels in which the chosen nodes have a total share above 0.5."""
         out = np.zeros(len(self.covered), np.bool_)
         _mask(self.indptr, self.nodes, self.shares, chosen, out)
         return out
 
     def labels(self, size_hw: tuple[int, int]) -> Int32[np.ndarray, "H W"]:
-        """Node that makes up more than half of each pixel, -1 for none."""
+        """Return the node with a share above 0.5 in each pixel, -1 for none."""
         out = np.full(len(self.covered), NONE, np.int32)
         most = np.flatnonzero(self.shares > 0.5)
         out[np.searchsorted(self.indptr, most, side="right") - 1] = self.nodes[most]

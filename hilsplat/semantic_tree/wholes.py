@@ -1,8 +1,8 @@
-"""Wholes of a segmenter that knows colours but no things: regions that touch in 3D are joined.
+"""Wholes for a segmenter that detects only colour regions: regions that touch in 3D are joined.
 
-In a photograph a coloured part of a thing has as much in common with the wall behind it as with the part
-beside it. In the scene it touches only the latter. Joining what touches, small before large, builds things
-up from their parts before any of them reaches the table, the walls or the floor, which are large.
+In a photograph, a coloured part of a thing borders both the wall behind it and the part beside it. In 3D it
+touches only the latter. Joining touching regions, small before large, builds things from their parts before
+any of them is joined to the table, the walls or the floor, which are large.
 """
 
 import heapq
@@ -14,10 +14,10 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from hilsplat.base.levels import NONE
 
 NEIGHBOURS = 10
-"""Nearest Gaussians, itself included, among which one looks for those of another region."""
+"""Number of nearest Gaussians, itself included, that are searched for neighbours in another region."""
 
 MIN_MASS_PX = 2.0
-"""A Gaussian whose mass in all views together is less is no neighbour: it may float anywhere."""
+"""A neighbouring Gaussian needs more mass than this, summed over views; lighter ones may float anywhere."""
 
 MIN_SHARE = 1e-4
 """A view shows a region if the region makes up more than this share of it."""
@@ -32,17 +32,17 @@ def joined_regions(
 ) -> Int64[np.ndarray, " T"]:
     """Join regions that touch, the cheapest pair first, until every pair costs `most` or more.
 
-    The cost of a pair is `side(both) * sqrt(touch of the smaller / touch of the pair)`. Side is the root of
-    the share of a view that a region makes up, averaged over the views that show it. Touch counts the pairs
-    of neighbouring Gaussians in two regions: of a pair of regions, or of a region with all others. So two
-    regions that only touch each other are joined up to a side of `most`, and others up to a smaller one.
+    The cost of a pair is `side(both) * sqrt(touch of the smaller / touch of the pair)`. Side is the square
+    root of a region's mean share of the views that show it. Touch is the number of pairs of neighbouring
+    Gaussians between a pair of regions, or between a region and all others. Two regions that touch only
+    each other are therefore joined up to a side of `most`, and others up to a smaller one.
 
     Args:
         region_of_gaussian: region of each Gaussian, -1 for none.
         num_regions: T; ids are smaller.
         means: centres of the Gaussians, scene units.
         mass: visible mass of each Gaussian in each view, px.
-        most: largest cost, as a share of the side of a view.
+        most: limit of the cost, as a share of the side of a view.
 
     Returns:
         whole of each region, numbered by first appearance.
@@ -57,10 +57,10 @@ def joined_regions(
 def touching(
     region: Int32[np.ndarray, " n"], num_regions: int, means: Float32[np.ndarray, "n 3"]
 ) -> sp.csr_matrix:
-    """Number of pairs (Gaussian, one of its `NEIGHBOURS` nearest) in every two regions; symmetric."""
-    from scipy.spatial import cKDTree  # takes a fifth of a second, and all who open a tree import this module
+    """Count the pairs (Gaussian, one of its `NEIGHBOURS` nearest) between each two regions; symmetric."""
+    from scipy.spatial import cKDTree  # lazy: takes 0.2 s, and opening any tree imports this module
 
-    near = min(NEIGHBOURS, len(means))  # the nearest of all is the Gaussian itself
+    near = min(NEIGHBOURS, len(means))  # the nearest is the Gaussian itself
     nearest = cKDTree(means).query(means, k=np.arange(1, near + 1))[1] if near else np.zeros((0, 0), np.int64)
     first, second = np.repeat(region, near), region[nearest.ravel()]
     apart = first != second
@@ -70,7 +70,7 @@ def touching(
 
 
 def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float) -> Int64[np.ndarray, " T"]:
-    """`joined_regions` of known touches and shares of views. Of equal costs, the lowest regions go first."""
+    """Compute `joined_regions` from touches and view shares; on a tie, the lowest regions join first."""
     num = len(shares)
     share = list(shares)
     side = [_side(each) for each in share]
@@ -111,6 +111,6 @@ def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float
 
 
 def _side(share: Float64[np.ndarray, " V"]) -> float:
-    """Root of the mean share of the views that show a region; 0 if none does."""
+    """Return the square root of a region's mean share of the views that show it; 0 if none does."""
     shown = share > MIN_SHARE
     return float(np.sqrt(share.sum() / max(shown.sum(), 1)))

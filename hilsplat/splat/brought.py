@@ -1,4 +1,4 @@
-"""Ready-made Gaussians for a scene: read, checked and moved into the scene's coordinates."""
+"""Existing Gaussians for a scene: read, checked and moved into the scene's coordinates."""
 
 import logging
 from pathlib import Path
@@ -23,22 +23,22 @@ FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians 
 def bring_gaussians(
     ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
 ) -> tuple[Gaussians, dict[str, Any]]:
-    """Read a 3DGS PLY in the coordinates of the scene's source poses.
+    """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.
 
-    A PLY written by this package is in the coordinates of its scene instead; it is first moved to the
-    source's, as the JSON file beside it describes. One of nerfstudio is moved as its data parser recorded.
+    A PLY of this package is in its scene's coordinates instead; it is first moved to the source's by the
+    transform in the JSON file beside it. A nerfstudio PLY is moved by the transform of its data parser.
 
     Args:
-        ply: the file.
-        scene: scene that it belongs to.
+        ply: 3DGS PLY to read.
+        scene: scene that the Gaussians belong to.
         dataparser: nerfstudio's `dataparser_transforms.json`, if the PLY is in its training coordinates.
-        transforms: the `transforms.json` with the source's poses, which `dataparser` needs.
+        transforms: `transforms.json` with the source's poses, required by `dataparser`.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.
 
     Raises:
-        ArtifactError: the file cannot be used; the message names it and what is wrong.
+        ArtifactError: if the file cannot be used.
     """
     ply = Path(ply)
     gaussians = load_ply(ply, fix=FIX)
@@ -61,7 +61,7 @@ def bring_gaussians(
     logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
     origin = {
         "kind": "imported",
-        "file": ply.name,  # its folder is in the provenance
+        "file": ply.name,  # its folder is in the provenance record
         "sha256": sha256_of_file(ply),
         "taken_as": moved,
         "scene_from_ply": np.asarray(transform).tolist(),

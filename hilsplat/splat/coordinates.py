@@ -1,4 +1,4 @@
-"""The JSON file beside `gaussians.ply`: how its coordinates relate to those of the scene's source."""
+"""JSON file beside `gaussians.ply` that relates its coordinates to those of the scene's source."""
 
 from pathlib import Path
 from typing import Any
@@ -17,19 +17,19 @@ AXES = "right-handed; cameras in OpenCV axes (x right, y down, z forward)"
 
 
 def coordinates_path(ply: Path) -> Path:
-    """`gaussians.json` beside `gaussians.ply`."""
+    """Return the path of `gaussians.json` beside `gaussians.ply`."""
     return Path(ply).with_suffix(".json")
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
-    """Write how the coordinates of a PLY, which are the scene's, relate to those of the scene's source.
+    """Write the transform between a PLY's coordinates, which are the scene's, and those of its source.
 
-    The source is what the poses came from: an imported COLMAP model or transforms.json, or our own
-    structure from motion, whose coordinates are recorded nowhere else.
+    The source of the poses is an imported COLMAP model or transforms.json, or our own structure from motion,
+    whose coordinates are not recorded elsewhere.
 
     Args:
-        ply: the written file, whose digest is recorded: the JSON applies to no other.
-        origin: where the Gaussians come from, as in the report.
+        ply: the written file, whose digest is recorded: the JSON applies to no other file.
+        origin: origin of the Gaussians, as in the report.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
@@ -56,10 +56,10 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Transform of a PLY that this package wrote to its source's coordinates; None without a JSON for it.
+    """Return the transform of a PLY of this package to its source's coordinates, or None without a JSON file.
 
     Raises:
-        ArtifactError: the JSON belongs to another PLY, or its transform cannot be used.
+        ArtifactError: if the JSON belongs to another PLY, or its transform cannot be used.
     """
     path = coordinates_path(ply)
     if not path.is_file():
@@ -85,11 +85,11 @@ def write_source_ply(ply: Path, out: Path) -> int:
     """Write the Gaussians of a scene in the coordinates of its source, and return their number.
 
     Args:
-        ply: `gaussians.ply` of a scene, beside its JSON file.
+        ply: `gaussians.ply` of a scene, with its JSON file beside it.
         out: 3DGS PLY to write.
 
     Raises:
-        ArtifactError: the PLY or its JSON file is missing or damaged.
+        ArtifactError: if the PLY or its JSON file is missing or damaged.
     """
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:

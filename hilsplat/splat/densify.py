@@ -1,8 +1,8 @@
 """Adaptive density control of 3DGS: clone, split, prune, reset opacities.
 
-The gradient that decides is that of the loss with respect to a Gaussian's projected mean, in the units
-of 3DGS: its x part times half the image width, its y part times half the height (as with normalised
-device coordinates), its length averaged over the steps in which the Gaussian was drawn.
+The criterion is the gradient of the loss with respect to a Gaussian's projected mean, in the units of 3DGS:
+its x component times half the image width and its y component times half the height (as in normalised
+device coordinates), with its length averaged over the steps in which the Gaussian was drawn.
 """
 
 from dataclasses import dataclass
@@ -18,19 +18,19 @@ from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.optimise import Adam
 
 SMALL = 0.01
-"""Largest axis, in units of the extent, up to which a Gaussian is cloned; larger ones are split (3DGS)."""
+"""Gaussians whose largest axis exceeds this, in units of the extent, are split; others are cloned (3DGS)."""
 SPLIT_FACTOR = 1.6
-"""Halves of a split Gaussian are smaller by this factor (3DGS: 0.8 x 2)."""
+"""Factor by which the halves of a split Gaussian are smaller (3DGS: 0.8 x 2)."""
 HUGE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
-opacity reset; here the walls of rooms are flat, wide Gaussians)."""
+opacity reset; here walls of rooms are flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
 
 
 @compiled
 @no_type_check
 def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
-    """Add the lengths of the rows of `means_px`, in half images, to `total` and count them in `seen`."""
+    """Add the lengths of the rows of `means_px`, in half images, to `total`, and count the rows in `seen`."""
     for i in range(len(total)):
         if drawn[i]:
             x, y = half_width * means_px[i, 0], half_height * means_px[i, 1]
@@ -40,11 +40,11 @@ def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
 
 @dataclass
 class ScreenGradients:
-    """Running average, per Gaussian, of the screen-space gradient.
+    """Running average of each Gaussian's screen-space gradient.
 
     Attributes:
-        total: summed lengths.
-        seen: steps in which it was drawn.
+        total: sum of the gradient's lengths.
+        seen: steps in which the Gaussian was drawn.
     """
 
     total: Float64[np.ndarray, " N"]
@@ -52,7 +52,7 @@ class ScreenGradients:
 
     @staticmethod
     def start(n: int) -> "ScreenGradients":
-        """No step yet."""
+        """Return the averages before the first step."""
         return ScreenGradients(np.zeros(n), np.zeros(n, np.int32))
 
     def add(self, means_px: Float32[np.ndarray, "N 2"], drawn: np.ndarray, size_hw: tuple[int, int]) -> None:
@@ -60,7 +60,7 @@ class ScreenGradients:
         _add_lengths(means_px, drawn, size_hw[1] / 2, size_hw[0] / 2, self.total, self.seen)
 
     def mean(self) -> Float64[np.ndarray, " N"]:
-        """Average length; 0 if never drawn."""
+        """Return the average lengths; 0 for Gaussians never drawn."""
         return self.total / np.maximum(self.seen, 1)
 
 
@@ -71,7 +71,7 @@ def densify(
     extent: float,
     generator: np.random.Generator,
 ) -> None:
-    """Clone small and split large Gaussians whose screen gradient is large, largest first up to the cap."""
+    """Clone small and split large Gaussians with large screen gradients, the largest first, up to the cap."""
     mean = gradients.mean()
     wanted = np.flatnonzero(mean > settings.densify_gradient)
     room = max(settings.max_gaussians - len(adam), 0)
@@ -93,7 +93,7 @@ def densify(
 def _offsets(
     log_scales: Float32[np.ndarray, "N 3"], quats: Float32[np.ndarray, "N 4"], generator: np.random.Generator
 ) -> Float32[np.ndarray, "N 3"]:
-    """One random draw from each Gaussian, about its mean."""
+    """Draw one random offset from each Gaussian."""
     local = generator.normal(size=log_scales.shape) * np.exp(log_scales.astype(np.float64))
     return rotate(unit_quaternions(quats), local).astype(np.float32)
 
@@ -110,7 +110,7 @@ def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
 
 
 def reset_opacities(adam: Adam) -> None:
-    """Cap all opacities at RESET_OPACITY, so that only what the images need comes back (3DGS)."""
+    """Cap all opacities at RESET_OPACITY, so that only needed Gaussians become opaque again (3DGS)."""
     logit = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
     np.minimum(adam.parameters["opacity_logits"], logit, out=adam.parameters["opacity_logits"])
     adam.first["opacity_logits"][:] = 0

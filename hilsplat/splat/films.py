@@ -1,4 +1,4 @@
-"""Renders as files: films (H.264 in MP4, which every player shows) and contact sheets."""
+"""Write renders as films (H.264 in MP4, playable everywhere) and contact sheets."""
 
 from collections.abc import Iterable
 from itertools import chain
@@ -9,21 +9,21 @@ import numpy as np
 from jaxtyping import UInt8
 
 MAX_SIDE_PX = 320
-"""Longer side of a picture on a sheet."""
+"""Longer side of a picture on a contact sheet."""
 GAP_PX = 4
 
 OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}
-"""Macroblock-tree rate control gave other bytes each time, also on one thread (x264 in PyAV 18.1)."""
+"""Macroblock-tree rate control is off: its bytes differ between runs, even on one thread (PyAV 18.1)."""
 
 
 def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
-    """Encode frames of one size; the same frames give the same bytes on the same version of PyAV.
+    """Encode frames of one size; equal frames give equal bytes with the same version of PyAV.
 
-    An odd last row or column is cut off: yuv420p needs even sides.
+    An odd last row or column is cropped: yuv420p needs even sides.
 
     Args:
-        path: .mp4, in a temporary folder or file of an atomic writer.
-        frames: at least one; taken one by one, so that a long film needs little memory.
+        path: .mp4 file, in a temporary folder or file of an atomic writer.
+        frames: at least one; consumed one by one, so that a long film needs little memory.
     """
     frames = iter(frames)
     first = next(frames)
@@ -34,7 +34,7 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
         stream.codec_context.flags |= av.codec.context.Flags.bitexact
         for frame in chain([first], frames):
             even = np.ascontiguousarray(frame[:height, :width])
-            # converted here: the encoder's own conversion gives other bytes now and then
+            # the encoder's own conversion occasionally gives other bytes
             picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
             film.mux(stream.encode(picture))
         film.mux(stream.encode())
@@ -43,7 +43,7 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
 def contact_sheet(
     pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int, max_side_px: int = MAX_SIDE_PX
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Pictures on a white sheet, row by row, shrunk by whole factors (averages) to at most `max_side_px`."""
+    """Arrange pictures on a white sheet, row by row, shrunk by whole factors to at most `max_side_px`."""
     cells = [_shrunk(picture, -(-max(picture.shape[:2]) // max_side_px)) for picture in pictures]
     height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
     rows = -(-len(cells) // columns)
@@ -55,7 +55,7 @@ def contact_sheet(
 
 
 def _shrunk(picture: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Averages of blocks of factor x factor pixels; what is left at the border is cut off."""
+    """Average blocks of factor x factor pixels; incomplete blocks at the border are cropped."""
     if factor <= 1:
         return picture
     height, width = (side // factor for side in picture.shape[:2])

@@ -1,4 +1,4 @@
-"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023) on the CPU; the geometry of all later stages."""
+"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023) on the CPU, the geometry of all later stages."""
 
 import logging
 from pathlib import Path
@@ -32,7 +32,7 @@ from hilsplat.splat.views import TrainingView, camera_extent, load_views
 logger = logging.getLogger(__name__)
 
 CURVE_EVERY = 20
-"""Steps between two points of the curves."""
+"""Steps between two points of the training curve."""
 MIN_SIDE_PX = 64
 """Images are not shrunk below this shorter side."""
 
@@ -40,7 +40,7 @@ MIN_SIDE_PX = 64
 def fit_step(
     state: FitState, views: list[TrainingView], settings: GaussiansSettings, extent: float, threads: int
 ) -> None:
-    """One view: render, compare, step; then density control if it is due."""
+    """Take one optimiser step on one view, then control density if due."""
     if not state.order:
         state.order = state.generator.permutation(len(views)).tolist()
     view = views[state.order.pop()]
@@ -78,14 +78,14 @@ def fit_step(
 
 
 def steps_of(settings: GaussiansSettings, num_views: int) -> int:
-    """Steps of a fit to this many training views; a few views overfit long before many are learnt."""
+    """Return the steps of a fit; fits to few views overfit sooner, so they take fewer steps."""
     return min(settings.iterations, settings.steps_per_view * num_views)
 
 
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
-    """Scale of the images, in units of their full size: coarse to fine.
+    """Return the scale of the training images, from coarse to fine, in units of their full size.
 
-    Coarse images cost a fraction, and wide gradients bring Gaussians into place from further away.
+    Coarse images are cheaper, and their wide gradients move Gaussians into place from further away.
 
     Args:
         progress: share of the iterations done, in [0, 1].
@@ -100,7 +100,7 @@ def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> floa
 def control_density(
     state: FitState, settings: GaussiansSettings, progress: float, extent: float, threads: int
 ) -> None:
-    """Add, move and remove Gaussians after a step, as the strategy demands."""
+    """Add, move and remove Gaussians after a step, depending on the strategy."""
     is_mcmc = settings.strategy == "mcmc"
     densify_until = int(settings.densify_until * settings.iterations)
     if settings.densify_from * settings.iterations <= state.step <= densify_until:
@@ -129,18 +129,18 @@ def fit_gaussians(
     """Fit Gaussians to the training views of a scene.
 
     Args:
-        seed: fixes the view order, splits, relocations, noise and random points; the result has the
-            same bytes for any number of threads, and for a fit that was stopped and resumed.
+        seed: determines the view order, splits, relocations, noise and random points; the result has the
+            same bytes for any number of threads, and for a fit that was interrupted and resumed.
         checkpoint: file to which the state is written every `checkpoint_every` steps, and from which
-            a stopped fit resumes; removed at the end.
-        key: digest of everything the fit depends on; the checkpoint of another fit is not used.
+            an interrupted fit resumes; removed at the end.
+        key: digest of all inputs of the fit; checkpoints with another key are ignored.
 
     Returns:
         The Gaussians, along a Morton curve (frozen ones in the order of their points), and the
         training curve: rows of (step, loss, training PSNR, number of Gaussians).
 
     Raises:
-        SceneError: there are no training views, or no Gaussians are left.
+        SceneError: if there are no training views, or no Gaussians are left.
     """
     views = load_views(scene, "train", settings.image_scale)
     if not views:
@@ -191,18 +191,18 @@ def run_gaussians(
     dataparser: Path | None = None,
     transforms: Path | None = None,
 ) -> None:
-    """Stage: fit Gaussians or take ready-made ones; write them, their coordinates and the report.
+    """Fit Gaussians or import existing ones; write them, their coordinates and the report.
 
-    Writes `out_ply` (standard 3DGS), a JSON file of the same name beside it (the way back to the
-    source's coordinates) and the report folder (test PSNR and SSIM, curves, pictures, fly-around).
+    Writes `out_ply` (standard 3DGS), a JSON file of the same name beside it (the transform to the source's
+    coordinates) and the report folder (test PSNR and SSIM, curves, pictures, fly-around).
 
     Args:
         brought: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.
         dataparser, transforms: for a PLY in nerfstudio's training coordinates (`bring_gaussians`).
 
     Raises:
-        SceneError: there are no training views to fit.
-        ArtifactError: `brought` cannot be used.
+        SceneError: if there are no training views to fit.
+        ArtifactError: if `brought` cannot be used.
     """
     scene = Scene.load(scene_folder)
     with stage_log("gaussians", scene.name) as counts:
@@ -210,7 +210,7 @@ def run_gaussians(
             gaussians, origin = bring_gaussians(brought, scene, dataparser, transforms)
             curve = None
         else:
-            # `auto` may choose CUDA once and the CPU later; their sums differ, so a fit stays on one device.
+            # a resumed fit must stay on one device, because sums differ between CPU and CUDA
             settings = settings.model_copy(update={"device": choose_device(settings.device)})
             key = sha256_of_json(
                 [

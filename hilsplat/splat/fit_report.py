@@ -1,4 +1,4 @@
-"""Report of a fit: scores on held-out views, curves, pictures, fly-around."""
+"""Report of a fit: scores on held-out views, curves, pictures and fly-around."""
 
 import logging
 from functools import partial
@@ -23,9 +23,9 @@ from hilsplat.splat.views import load_views
 logger = logging.getLogger(__name__)
 
 MAX_SHOWN = 8
-"""Views on the sheet of test views."""
+"""Maximum number of views on the sheet of test views."""
 ERROR_GAIN = 4
-"""Errors are shown magnified by this factor."""
+"""Factor by which displayed errors are magnified."""
 
 
 def write_report(
@@ -37,15 +37,15 @@ def write_report(
     settings: GaussiansSettings,
     threads: int,
 ) -> dict[str, Any]:
-    """Write the report folder and return report.json's content.
+    """Write the report folder and return the content of report.json.
 
-    It holds `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.mp4`,
+    It contains `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.mp4`,
     `flyaround.png`, `curves.png` after a fit, and the index.
 
     Args:
-        scene: its held-out views are scored, or its training views if none are held out.
+        scene: scene whose held-out views are scored, or its training views if none are held out.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians); None without a fit.
-        origin: where the Gaussians come from.
+        origin: origin of the Gaussians.
     """
     background = {"white": (1.0, 1.0, 1.0)}.get(settings.background, (0.0, 0.0, 0.0))
 
@@ -60,7 +60,7 @@ def write_report(
     flat: list[float] = []
     cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
     for view in views:
-        shown = picture(view.camera)  # scored as the 8-bit image one would save
+        shown = picture(view.camera)  # scored as a saved 8-bit image
         drawn, truth = to_float(shown), to_float(view.image)
         scores[view.name] = {"psnr_db": psnr(drawn, truth), "ssim": ssim(drawn, truth)}
         flat.append(psnr(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth))
@@ -105,7 +105,7 @@ def write_report(
 
 
 def _draw_curves(path: Path, curve: Float[np.ndarray, "S 4"]) -> None:
-    """Loss, training PSNR and number of Gaussians over the steps."""
+    """Plot loss, training PSNR and number of Gaussians over the steps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Smooth camera paths, around what the cameras saw or through given ones; a film and a contact sheet."""
+"""Smooth camera paths around a scene or through given cameras, as a film and a contact sheet."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,17 +19,16 @@ FRAMES = 120
 FRAMES_PER_S = 24
 SHEET_FRAMES = 12
 MAX_STOPS = 80
-"""Upper limit on the cameras that the path visits; of more, it visits every n-th."""
+"""Maximum number of cameras that the path visits; if there are more, it visits every n-th."""
 SMOOTHING = 1 / 40
-"""Width of the smoothing, as a share of the round: it removes the shake of hand-held photographs."""
+"""Width of the smoothing as a share of the tour: it removes the shake of hand-held photographs."""
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Cameras along a closed tour of the given ones, evenly spaced and smoothed.
+    """Return cameras along a closed tour of the given ones, evenly spaced and smoothed.
 
-    The tour visits the cameras in a short round (by position and viewing direction) at even speed;
-    position, viewing direction and up are smoothed along it. Lens and image size are those of the
-    first camera.
+    The tour is short in position and viewing direction, and its speed is constant. Position, viewing
+    direction and up are smoothed along it. Lens and image size are those of the first camera.
 
     Args:
         cameras: at least one; a single one is repeated.
@@ -42,7 +41,7 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     order = short_round(cdist(*[np.concatenate([centres / spread, ahead], axis=1)] * 2))
     poses = np.concatenate([centres, spread * ahead, spread * down], axis=1)[order]
-    # walk at even speed, far more finely than the frames; smooth around the ring; then pick the frames
+    # sample far more finely than the frames at constant speed, smooth cyclically, then pick the frames
     steps = np.linalg.norm(np.diff(poses, axis=0, append=poses[:1]), axis=1) + 1e-9 * spread
     at = np.concatenate([[0], np.cumsum(steps)])
     fine = frames * 8
@@ -54,10 +53,10 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
 
 
 def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Cameras along a smooth curve through the given ones, in their order, from the first to the last.
+    """Return cameras along a smooth curve through the given ones, in their order.
 
-    Position and lens follow a monotone cubic, so that the path does not overshoot; the direction turns
-    evenly between neighbours. Image size is that of the first camera.
+    Position and lens follow a monotone cubic, so that the path does not overshoot; the direction rotates at
+    a constant rate between neighbours. Image size is that of the first camera.
 
     Args:
         cameras: at least two.
@@ -81,10 +80,10 @@ def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
 
 
 def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
-    """Camera from its centre, viewing direction and down direction, which need not be orthogonal."""
+    """Build a camera from its centre, viewing direction and down direction, which need not be orthogonal."""
     forward = row[3:6] / max(np.linalg.norm(row[3:6]), 1e-12)
     down = row[6:] - forward * (row[6:] @ forward)
-    if np.linalg.norm(down) < 1e-9:  # opposite cameras average to nothing: any upright will do
+    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel; any upright will do
         down = like.cam_from_world[1, :3] - forward * (like.cam_from_world[1, :3] @ forward)
     down = down / max(np.linalg.norm(down), 1e-12)
     pose = np.eye(4)
@@ -94,7 +93,7 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
 
 
 def short_round(distances: Float64[np.ndarray, "S S"]) -> list[int]:
-    """Order of a short closed tour: nearest neighbours first, then crossings undone (2-opt)."""
+    """Return a short closed tour: nearest neighbours first, then crossings removed (2-opt)."""
     number = len(distances)
     tour, left = [0], set(range(1, number))
     while left:
@@ -120,12 +119,12 @@ def write_flyaround(
     picture: Callable[[Camera], UInt8[np.ndarray, "H W 3"]],
     threads: int = 1,
 ) -> None:
-    """Write `flyaround.mp4`, and every tenth of its frames as `flyaround.png`.
+    """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 
     Args:
-        cameras: training cameras, which the path visits.
+        cameras: training cameras that the path visits.
         picture: renders a camera.
-        threads: frames rendered at once while others are encoded; the bytes do not depend on it.
+        threads: frames rendered in parallel while others are encoded; the bytes do not depend on it.
     """
     shown: list[UInt8[np.ndarray, "H W 3"]] = []
     path = closed_path(cameras, FRAMES)

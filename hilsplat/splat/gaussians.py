@@ -1,4 +1,4 @@
-"""The Gaussians of a scene, in the unconstrained form we optimise."""
+"""Gaussians of a scene, in the unconstrained form that is optimised."""
 
 from dataclasses import dataclass, fields
 
@@ -35,7 +35,7 @@ class Gaussians:
     @property
     def opacities(self) -> Float32[np.ndarray, " N"]:
         """Peak alphas in (0, 1)."""
-        from scipy.special import expit  # takes a while
+        from scipy.special import expit  # slow import
 
         return expit(self.opacity_logits)
 
@@ -46,4 +46,4 @@ class Gaussians:
 
 
 FIELDS = tuple(field.name for field in fields(Gaussians))
-"""Names of the parameters."""
+"""Field names of the parameters."""

@@ -1,4 +1,4 @@
-"""Spherical harmonics of 3DGS, and how they rotate."""
+"""Spherical harmonics of 3DGS and their rotation."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -6,10 +6,10 @@ from scipy.special import sph_harm_y
 
 
 def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.ndarray, "P K"]:
-    """Real spherical harmonics at unit directions, in the order and with the signs of 3DGS.
+    """Return real spherical harmonics at unit directions, in the order and with the signs of 3DGS.
 
     Within a band, orders run from -l to l; negative orders are the sines. 3DGS keeps the
-    Condon-Shortley sign (-1)^m, which real harmonics often drop.
+    Condon-Shortley sign (-1)^m, which real harmonics often omit.
     """
     x, y, z = directions.T
     polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
@@ -25,11 +25,11 @@ def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.
 
 
 def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np.ndarray, "K K"]:
-    """Matrix that rotates spherical-harmonics coefficients: the colour along R d is what it was along d.
+    """Return the matrix that rotates spherical-harmonics coefficients.
 
-    Rotation keeps each band to itself, so the matrix has a block per band. Each is solved from the
-    harmonics at more directions than the band has members; it is exact up to rounding, because a
-    rotated harmonic lies in its band.
+    The rotated colour along R d is the original colour along d. A rotated harmonic stays in its band, so the
+    matrix has one block per band. Each block is a least-squares solution over more directions than harmonics,
+    exact up to rounding.
     """
     # directions spread over the sphere along a spiral
     number = 64

@@ -1,4 +1,4 @@
-"""The first Gaussians of a fit."""
+"""Initial Gaussians of a fit."""
 
 import logging
 
@@ -17,24 +17,24 @@ logger = logging.getLogger(__name__)
 SH_0 = 0.28209479177387814
 FIRST_OPACITY = 0.1  # 3DGS
 MIN_POINTS = 200
-"""With fewer sparse points, random points that cameras see are added."""
+"""With fewer sparse points than this, random points in front of cameras are added."""
 ADDED_POINTS = 2_000
-"""Random points added to too few sparse ones."""
+"""Number of random points added to too few sparse points."""
 RANDOM_POINTS = 10_000
-"""Random points with `gaussians.initial` "random"."""
+"""Number of random points if `gaussians.initial` is "random"."""
 
 
 def first_gaussians(
     scene: Scene, cameras: list[Camera], settings: GaussiansSettings, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Round Gaussians at the sparse points, as wide as the mean distance to their 3 nearest (3DGS).
+    """Return round Gaussians at the sparse points, as wide as the mean distance to the 3 nearest (3DGS).
 
-    With fewer than MIN_POINTS sparse points, random grey ones in front of random cameras are added;
-    with `settings.initial` "random" they replace all sparse points, with "frozen" every sparse point
-    becomes one Gaussian, however many there are.
+    If there are fewer than MIN_POINTS sparse points, random grey points in front of random cameras are added.
+    If `settings.initial` is "random", random points replace all sparse points. If it is "frozen", every
+    sparse point becomes one Gaussian, regardless of their number.
 
     Raises:
-        SceneError: points to be frozen are missing or not finite.
+        SceneError: if points to be frozen are missing or not finite.
     """
     xyz, rgb = scene.points_xyz.astype(np.float64), to_float(scene.points_rgb)
     finite = np.isfinite(xyz).all(axis=1)
@@ -62,7 +62,7 @@ def first_gaussians(
     n = len(xyz)
     distances = cKDTree(xyz).query(xyz, k=min(4, n))[0].reshape(n, -1)[:, 1:]
     spacing = distances.mean(axis=1) if distances.shape[1] else np.full(n, 0.1)
-    # points in the same place would get no width; points far from all others would fill the view
+    # coincident points would get zero width, and outliers would fill the view
     extent = camera_extent(cameras)
     spacing = np.clip(spacing, 1e-4 * extent, 0.1 * extent)
     sh = np.zeros((n, (settings.sh_degree + 1) ** 2, 3), np.float32)
@@ -79,7 +79,7 @@ def first_gaussians(
 def _random_points(
     cameras: list[Camera], known: np.ndarray, number: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Points seen by random cameras, at depths like those of the known points, or of the cameras' spread."""
+    """Sample points in front of random cameras, at depths of known points, or else of the cameras' extent."""
     extent = camera_extent(cameras)
     depths = []
     for camera in cameras:

@@ -1,8 +1,8 @@
 """3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024): `strategy: mcmc`.
 
-Nothing is cloned, split, pruned or reset. Gaussians that became transparent move onto opaque ones,
-the number grows by a fixed share up to the cap, noise lets transparent Gaussians explore, and two
-regularisers make the unneeded ones transparent and small.
+Gaussians are not cloned, split, pruned or reset. Transparent (dead) Gaussians move onto opaque ones, the
+number grows by a fixed share up to the cap, noise lets transparent Gaussians explore, and two
+regularisers make unneeded Gaussians transparent and small.
 """
 
 from typing import no_type_check
@@ -19,17 +19,17 @@ from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 MAX_TOGETHER = 51
-"""At most this many Gaussians share one place (the paper's code); more would change little."""
+"""Maximum number of Gaussians that share one place (the paper's code); more would change little."""
 MAX_OPACITY = 1 - 1e-6
-"""Opacity 1 has no logit."""
+"""Largest opacity; opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
-"""How fast noise falls with opacity (paper: k = 100): at opacity 0.1 it is down to e^-9.5."""
+"""Rate at which noise decreases with opacity (paper: k = 100): at opacity 0.1 its factor is e^-9.5."""
 LEAST_GATE = 1e-6
-"""A smaller share of the noise is skipped."""
+"""Noise with a smaller factor is skipped."""
 
 
 def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
-    """Opacity of each of `number` equal Gaussians in one place that together cover as one of `opacity` does.
+    """Return the opacity at which `number` coincident Gaussians cover as much as one of `opacity`.
 
     1 - (1 - new)^number = old (paper, Eq. 9).
     """
@@ -39,7 +39,7 @@ def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N
 def scale_factor(
     opacity: Float[np.ndarray, " N"], shared: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]
 ) -> Float[np.ndarray, " N"]:
-    """Factor on the scales of Gaussians that share a place, so that their profile keeps its integral.
+    """Return the factor on the scales of Gaussians that share a place; it preserves their profile's integral.
 
     n Gaussians of opacity o and deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. Its
     integral is sqrt(2 pi) s times the sum over k = 1..n of C(n, k) (-1)^(k-1) o^k / sqrt(k); one
@@ -47,9 +47,9 @@ def scale_factor(
     sum is this one, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
 
     Args:
-        opacity: of the one Gaussian before.
+        opacity: opacity of the original Gaussian.
         shared: `shared_opacity(opacity, number)`.
-        number: how many share the place, 1 to MAX_TOGETHER.
+        number: Gaussians that share the place, 1 to MAX_TOGETHER.
     """
     k = np.arange(1, MAX_TOGETHER + 1)
     signs = np.where(k % 2 == 1, 1.0, -1.0) / np.sqrt(k)
@@ -61,14 +61,14 @@ def scale_factor(
 @compiled(error_model="numpy")
 @no_type_check
 def noise_gate(opacity, dead_below):
-    """Share of the noise that a Gaussian gets: 1/2 at the threshold of the dead, 0 for the opaque (Eq. 8)."""
+    """Return the noise factor of a Gaussian: 1/2 at the threshold of the dead, 0 for opaque ones (Eq. 8)."""
     return 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
 
 
 @compiled(error_model="numpy")
 @no_type_check
 def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
-    """Noise for rows begin..end, in place: weight x gate x covariance x normal, in units of the extent."""
+    """Add noise to rows begin..end: weight x gate x covariance x normal, in units of the extent."""
     turn, local = np.empty((3, 3)), np.empty(3)
     for row in range(begin, end):
         gate = noise_gate(1.0 / (1.0 + np.exp(-np.float64(logits[row]))), dead_below)
@@ -86,8 +86,8 @@ def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below
             for k in range(3):
                 along += turn[k, axis] * normal[row, k]
             local[axis] = along * np.exp(2.0 * np.float64(log_scales[row, axis])) / (extent * extent)
-        square = local[0] ** 2 + local[1] ** 2 + local[2] ** 2  # turning does not change the length
-        # a Gaussian far wider than the scene would jump out of it
+        square = local[0] ** 2 + local[1] ** 2 + local[2] ** 2  # rotation preserves the length
+        # without this limit, a Gaussian far wider than the scene would jump out of it
         factor = extent * weight * gate / max(weight * gate * np.sqrt(square), 1.0)
         for axis in range(3):
             step = turn[axis, 0] * local[0] + turn[axis, 1] * local[1] + turn[axis, 2] * local[2]
@@ -102,11 +102,11 @@ def add_noise(
     generator: np.random.Generator,
     threads: int = 1,
 ) -> None:
-    """Move the means of transparent Gaussians at random, along their own axes (SGLD; paper, Eq. 8).
+    """Move the means of transparent Gaussians randomly along their own axes (SGLD; paper, Eq. 8).
 
-    The step is noise weight x rate of the means x gate x covariance x normal numbers, and at most as
-    long as the extent. The paper's lengths are those of scenes of extent 1; here the covariance is
-    measured in units of the extent, so that the unit of a scene makes no difference.
+    The step is noise weight x rate of the means x gate x covariance x normal numbers, limited to the extent.
+    The paper assumes scenes of extent 1; here the covariance is in units of the extent, so that the result
+    does not depend on the scene's unit.
 
     Args:
         rate_of_means: step size of the means, in units of the extent.
@@ -123,7 +123,7 @@ def add_noise(
 def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:
     """Add the gradients of opacity_weight x mean opacity + scale_weight x mean scale (paper, Eq. 10).
 
-    Scales count in units of the extent.
+    Scales are in units of the extent.
     """
     n = len(adam)
     opacity = expit(adam.parameters["opacity_logits"])
@@ -134,10 +134,10 @@ def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettin
 
 
 def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
-    """Move the dead onto the living, then add Gaussians on the living up to the cap.
+    """Move dead Gaussians onto live ones, then add copies of live ones up to the cap.
 
-    A place is drawn with a probability proportional to its opacity. The Gaussians that then share it
-    cover together what the one covered before.
+    Places are drawn with a probability proportional to their opacity. The Gaussians that then share a place
+    together cover what the original one covered.
     """
     dead = opacities(adam) <= settings.min_opacity
     if dead.any() and not dead.all():
@@ -151,23 +151,23 @@ def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.ran
 
 
 def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
-    """Peak alphas."""
+    """Return the peak alphas."""
     return expit(adam.parameters["opacity_logits"].astype(np.float64))
 
 
 def least_alive_logit(min_opacity: float) -> np.float32:
-    """A float32 logit whose opacity is just above the threshold of the dead.
+    """Return a float32 logit whose opacity is just above the threshold of the dead.
 
-    The float32 nearest to the threshold's logit may lie below it: that of 0.005 has opacity 0.0049999995.
+    The nearest float32 to the threshold's logit may be below it: that of 0.005 has opacity 0.0049999995.
     """
     exact = float(logit(min_opacity))
-    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # rounding changes it by at most 6e-8 of its size
+    return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # float32 rounding is at most 6e-8 of its size
 
 
 def _relocate(
     adam: Adam, dead: Bool[np.ndarray, " N"], settings: GaussiansSettings, generator: np.random.Generator
 ) -> None:
-    """Move each dead Gaussian onto a living one."""
+    """Move each dead Gaussian onto a live one."""
     targets = np.flatnonzero(dead)
     source = _draw(np.where(dead, 0.0, opacities(adam)), len(targets), generator)
     shared = _share(adam, source, settings)
@@ -178,7 +178,7 @@ def _relocate(
 
 
 def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Generator) -> np.ndarray:
-    """Rows drawn with replacement, with a probability proportional to their weights."""
+    """Draw rows with replacement, with a probability proportional to their weights."""
     edges = np.cumsum(weights)
     return np.searchsorted(edges, generator.uniform(0, edges[-1], number), side="right")
 
@@ -186,14 +186,14 @@ def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Ge
 def _share(
     adam: Adam, source: Int[np.ndarray, " M"], settings: GaussiansSettings
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
-    """Give the drawn rows their share of the place; return the copies that join them there."""
+    """Reduce the drawn rows to their share of the place, and return the copies that join them there."""
     p = adam.parameters
     rows, drawn = np.unique(source, return_counts=True)
     number = np.minimum(drawn + 1, MAX_TOGETHER)
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, number)
     p["log_scales"][rows] += np.log(scale_factor(old, new, number)).astype(np.float32)[:, None]
-    # at or below the threshold they would be relocated again in the next round
+    # rows at or below the threshold would be relocated again in the next round
     alive = least_alive_logit(settings.min_opacity)
     p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)
     for name in FIELDS:

@@ -1,4 +1,4 @@
-"""Fused Adam over the parameters of the Gaussians, with the step sizes of 3DGS."""
+"""Fused Adam for the parameters of the Gaussians, with the step sizes of 3DGS."""
 
 from dataclasses import dataclass
 from typing import no_type_check
@@ -15,11 +15,11 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
 
 OPACITY_RATE = 0.05  # 3DGS
 SH_REST_SHARE = 1 / 20
-"""Step size of the harmonics that depend on the view, as a share of that of the constant ones (3DGS)."""
+"""Step size of view-dependent harmonics relative to the constant ones (3DGS)."""
 
 
 def means_rate(settings: GaussiansSettings, progress: float) -> float:
-    """Step size of the means in units of the cameras' extent: falls exponentially from first to last.
+    """Return the step size of the means in units of the cameras' extent; it decreases exponentially.
 
     Args:
         progress: share of the iterations done, in [0, 1].
@@ -30,9 +30,9 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
 @compiled
 @no_type_check
 def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
-    """Adam for chunks begin..end of 16 numbers, in place.
+    """Take an Adam step for chunks begin..end of 16 numbers, in place.
 
-    `rates` repeats: chunk k steps by rates 16 k ... of them, divided by 1 - beta1^t beforehand;
+    `rates` is cyclic: chunk k uses the rates from 16 k on, divided by 1 - beta1^t beforehand;
     `root_of_rest2` is sqrt(1 - beta2^t).
     """
     beta1, rest1 = lanes(np.float32(BETA1)), lanes(np.float32(1.0 - BETA1))
@@ -49,7 +49,7 @@ def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_re
 
 
 def _adam(arrays: list[np.ndarray], rates: list[float], t: int, threads: int) -> None:
-    """Step `t` of Adam for flat arrays (values, gradients, moments), in place; `rates` repeat."""
+    """Take Adam step `t` for flat arrays (values, gradients, moments), in place; `rates` is cyclic."""
     repeated = np.array(WIDTH * rates, np.float32) / np.float32(1 - BETA1**t)
     root_of_rest2 = float(np.sqrt(1 - BETA2**t))
     whole, rest = divmod(len(arrays[0]), WIDTH)
@@ -63,11 +63,11 @@ def _adam(arrays: list[np.ndarray], rates: list[float], t: int, threads: int) ->
 
 @dataclass
 class Adam:
-    """Parameters with the running moments of their gradients (all changed in place).
+    """Parameters and running moments of their gradients, all updated in place.
 
     Attributes:
-        parameters, first, second: arrays keyed by field, rows are Gaussians.
-        steps: steps taken.
+        parameters, first, second: arrays by field, with one row per Gaussian.
+        steps: completed steps.
     """
 
     parameters: dict[str, np.ndarray]
@@ -77,7 +77,7 @@ class Adam:
 
     @staticmethod
     def start(parameters: dict[str, np.ndarray]) -> "Adam":
-        """Moments at zero."""
+        """Return the parameters with zero moments."""
         first, second = (
             {name: np.zeros_like(values) for name, values in parameters.items()} for _ in range(2)
         )
@@ -87,13 +87,13 @@ class Adam:
         return len(self.parameters["means"])
 
     def as_gaussians(self) -> Gaussians:
-        """The current values (shared memory)."""
+        """Return the current values (shared memory)."""
         return Gaussians(**self.parameters)
 
     def step(
         self, gradients: Gradients, settings: GaussiansSettings, rate_of_means: float, threads: int
     ) -> None:
-        """One step.
+        """Take one step.
 
         Args:
             settings: step sizes of scales, quaternions and harmonics.
@@ -101,7 +101,7 @@ class Adam:
         """
         self.steps += 1
         of_rest = SH_REST_SHARE * settings.sh_rate
-        rates: dict[str, list[float]] = {  # of the numbers of one Gaussian; they repeat
+        rates: dict[str, list[float]] = {  # per number of one Gaussian, cyclic
             "means": [rate_of_means],
             "log_scales": [settings.scales_rate],
             "quats": [settings.quats_rate],
@@ -113,7 +113,7 @@ class Adam:
             _adam([array.reshape(-1) for array in arrays], rate, self.steps, threads)
 
     def keep(self, rows: np.ndarray) -> None:
-        """Keep these rows (mask or indices), with their moments."""
+        """Keep the given rows (mask or indices) and their moments."""
         for table in (self.parameters, self.first, self.second):
             for name in FIELDS:
                 table[name] = np.ascontiguousarray(table[name][rows])

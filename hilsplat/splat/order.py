@@ -1,21 +1,21 @@
-"""An order in which neighbours in space are neighbours in memory."""
+"""Order points so that neighbours in space are neighbours in memory."""
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt64
 
 BITS = 21
-"""Of each coordinate: 63 of a key's 64 bits."""
+"""Bits per coordinate; three coordinates use 63 of a key's 64 bits."""
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Order points along a Z-shaped curve (Morton 1966) through their box.
+    """Return the order of points along a Z-shaped curve (Morton 1966) through their box.
 
-    Loops over Gaussians and their neighbours, such as G of the language field, then find most of them
-    in the processor's cache. The box leaves out the farthest hundredth on each side: a few Gaussians
-    far away would otherwise put all others into one cell.
+    Loops over Gaussians and their neighbours, such as G of the language field, then mostly hit the
+    processor's cache. The box excludes the outermost hundredth on each side: otherwise a few Gaussians
+    far away would put all others into one cell.
 
     Returns:
-        the rows, in that order; rows of one cell keep their order.
+        rows in that order; rows of one cell keep their relative order.
     """
     if not len(means):
         return np.zeros(0, np.int64)

@@ -1,7 +1,7 @@
 """Photometric loss of a rendered view, L1 and D-SSIM in one pass with its gradient; PSNR and SSIM.
 
 SSIM is that of 3DGS: an 11x11 Gaussian window of sigma 1.5 px, applied as two 11-tap passes to each
-channel, zeros beyond the border, constants 0.01^2 and 0.03^2 for values in [0, 1].
+channel, with zeros beyond the border and the constants 0.01^2 and 0.03^2 for values in [0, 1].
 """
 
 from typing import no_type_check
@@ -26,10 +26,10 @@ _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 @compiled
 @no_type_check
 def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
-    """SSIM of padded rows begin..end and, in `slopes`, its derivatives.
+    """Compute SSIM and L1 sums of padded rows begin..end and, in `slopes`, SSIM's derivatives.
 
-    `slopes` (3 padded maps, flat) receives dSSIM/dE[x] (means' own part and that of the variances),
-    dSSIM/dE[x^2], dSSIM/dE[x y] of every pixel's window. If it is empty, only values are computed.
+    `slopes` (3 padded maps, flat) receives dSSIM/dE[x] (directly and through the variances), dSSIM/dE[x^2]
+    and dSSIM/dE[x y] of every pixel's window. If it is empty, only values are computed.
     """
     groups = (num + _LANES - 1) // _LANES
     row_length = groups * _LANES + 2 * _SIDE
@@ -78,7 +78,7 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
             value = a1 * a2 * scale
             store(out, 0, value)
             if map_size > 0:
-                # value = a1 a2 / (b1 b2); a2 and b2 hold the means too
+                # value = a1 a2 / (b1 b2); a2 and b2 also depend on the means
                 by_xx = zero - value * b1 * scale
                 by_xt = two * a1 * scale
                 by_mean = two * (t_mean * (a2 - a1) * scale - x_mean * value * (b2 - b1) * scale)
@@ -100,7 +100,7 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
 @compiled
 @no_type_check
 def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ssim_weight, gradient):
-    """dL/dimage of rows begin..end: the slopes spread back over their windows, and the sign for L1."""
+    """Compute dL/dimage of rows begin..end: slopes spread over their windows, and the sign for L1."""
     groups = (num + _LANES - 1) // _LANES
     row_length = groups * _LANES + 2 * _SIDE
     rows = np.zeros(3 * row_length, np.float32)
@@ -138,7 +138,7 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
 
 
 def _padded(image: Float32[np.ndarray, "H W 3"]) -> tuple[np.ndarray, int]:
-    """Rows with zeros around, flat, and their length."""
+    """Return the rows padded with zeros, flat, and their length."""
     height, width, _ = image.shape
     stride = -(-3 * width // _LANES) * _LANES + 2 * _SIDE
     out = np.zeros((height + 2 * RADIUS, stride), np.float32)
@@ -153,11 +153,11 @@ def photometric_loss(
     ssim_weight: float,
     threads: int = 1,
 ) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
-    """(1 - w) mean |image - target| + w (1 - SSIM), and its gradient with respect to `image` (3DGS, Eq. 7).
+    """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7).
 
     Args:
         image, target: RGB in [0, 1].
-        ssim_weight: w; 3DGS takes 0.2.
+        ssim_weight: w; 3DGS uses 0.2.
         threads: the result has the same bytes for any number.
     """
     height, width, _ = image.shape
@@ -176,7 +176,7 @@ def photometric_loss(
 
 
 def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
-    """Mean structural similarity of two RGB images in [0, 1], as 3DGS computes it."""
+    """Return the mean structural similarity of two RGB images in [0, 1], as computed by 3DGS."""
     height, width, _ = image.shape
     x, stride = _padded(image)
     t, _ = _padded(target)
@@ -186,6 +186,6 @@ def ssim(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3
 
 
 def psnr(image: Float32[np.ndarray, "H W 3"], target: Float32[np.ndarray, "H W 3"]) -> float:
-    """Peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal."""
+    """Return the peak signal-to-noise ratio in dB of two RGB images in [0, 1]; infinite if they are equal."""
     error = np.square(image.astype(np.float64) - target).mean()
     return float("inf") if error == 0 else float(-10 * np.log10(error))

@@ -1,4 +1,4 @@
-"""Gaussians as a standard 3DGS PLY, which viewers and other implementations read."""
+"""Read and write Gaussians as a standard 3DGS PLY, which viewers and other implementations read."""
 
 import re
 from pathlib import Path
@@ -11,11 +11,11 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 
 HEADER_BYTES = 2**14
-"""In which a PLY says how many vertices it has."""
+"""Bytes in which the number of vertices of a PLY is searched for."""
 
 
 def _names(num_bases: int) -> list[str]:
-    """Property names in the order of 3DGS; f_rest is stored channel by channel."""
+    """Return the property names in the order of 3DGS; f_rest is stored channel by channel."""
     return [
         *("x", "y", "z", "nx", "ny", "nz"),
         *(f"f_dc_{k}" for k in range(3)),
@@ -27,10 +27,10 @@ def _names(num_bases: int) -> list[str]:
 
 
 def save_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as a binary little-endian 3DGS PLY, atomically; same Gaussians, same bytes.
+    """Write Gaussians as a binary little-endian 3DGS PLY, atomically; equal Gaussians give equal bytes.
 
-    Raw parameters are stored as they are: log scales, opacity logits, quaternions wxyz of any
-    length. Normals are zero, as in 3DGS.
+    Parameters are stored unconverted: log scales, opacity logits, and wxyz quaternions of any length.
+    Normals are zero, as in 3DGS.
     """
     n, sh = len(gaussians), gaussians.sh
     columns = (
@@ -50,7 +50,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def vertex_count(path: Path) -> int | None:
-    """Number of Gaussians by the header of a PLY; None if it cannot be read, which its reader reports."""
+    """Return the number of Gaussians in a PLY's header, or None if unreadable, which readers report."""
     try:
         with Path(path).open("rb") as stream:
             header = stream.read(HEADER_BYTES)
@@ -61,16 +61,16 @@ def vertex_count(path: Path) -> int | None:
 
 
 def load_ply(path: Path, fix: str = "") -> Gaussians:
-    """Read a 3DGS PLY, of this package or another; the number of f_rest columns gives the degree.
+    """Read a 3DGS PLY of this or another package; the number of f_rest columns determines the degree.
 
-    Binary or ASCII, properties in any order and of any number type; normals and properties unknown to
-    3DGS (colours, labels) are ignored.
+    The file may be binary or ASCII, with properties in any order and of any number type. Normals and
+    properties not in 3DGS (colours, labels) are ignored.
 
     Args:
-        fix: advice for a file that cannot be used; "": how to have its stage write it again.
+        fix: fix in errors about a file that cannot be used; "": how to rerun its stage.
 
     Raises:
-        ArtifactError: the file is missing, damaged or not a 3DGS PLY, or holds numbers that are not finite.
+        ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers.
     """
     path = Path(path)
     fix = fix or remake(path)

@@ -1,4 +1,4 @@
-"""Gaussians moved by a similarity, so that every view of them looks the same."""
+"""Similarity transforms of Gaussians that preserve the appearance of every view."""
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -9,14 +9,14 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.harmonics import sh_rotation
 
 TOLERANCE = 1e-5
-"""How far from a rotation times a scale a matrix may be, relative to the scale."""
+"""Largest deviation of a matrix from a scaled rotation, relative to the scale."""
 
 
 def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
-    """Scale, rotation and translation of x -> scale rotation x + translation.
+    """Return the scale, rotation and translation of x -> scale rotation x + translation.
 
     Raises:
-        HilsplatError: the matrix mirrors, shears, projects or holds numbers that are not finite.
+        HilsplatError: if the matrix mirrors, shears or projects, or contains non-finite numbers.
     """
     matrix = np.asarray(similarity, dtype=np.float64)
     linear = matrix[:3, :3]
@@ -33,16 +33,16 @@ def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.n
 
 
 def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -> Gaussians:
-    """Gaussians in other coordinates: a camera moved along with them sees the same image.
+    """Transform Gaussians to other coordinates; a camera transformed with them sees the same image.
 
     Means are mapped, scales multiplied, quaternions rotated, and spherical harmonics rotated band by
-    band, because they are functions of the direction in the world. Opacities stay.
+    band, because they are functions of the direction in the world. Opacities are unchanged.
 
     Args:
         similarity: b_from_a; the Gaussians are given in a and returned in b.
 
     Raises:
-        HilsplatError: `similarity` is not a similarity.
+        HilsplatError: if `similarity` is not a similarity.
     """
     scale, rotation, translation = decompose(similarity)
     means, log_scales, quats, sh = (

@@ -1,4 +1,4 @@
-"""The state of a fit, and its checkpoint."""
+"""State of a fit and its checkpoint."""
 
 import json
 import logging
@@ -17,14 +17,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class FitState:
-    """Everything that the next step depends on, so that a fit resumes as if it had never stopped.
+    """State from which a fit resumes exactly.
 
     Attributes:
         adam: parameters and moments.
         gradients: screen gradients since the last densification.
         generator: source of view order, splits and random backgrounds.
-        order: views still to come in this round, as indices.
-        step: steps done.
+        order: indices of the remaining views of this round.
+        step: completed steps.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians).
     """
 
@@ -56,7 +56,7 @@ class FitState:
 
     @staticmethod
     def load(path: Path, key: str) -> "FitState | None":
-        """Read the checkpoint of this fit; None if there is none, or it is damaged or another fit's."""
+        """Read the checkpoint of this fit; None if it is missing, damaged or of another fit."""
         if not path.is_file():
             return None
         try:

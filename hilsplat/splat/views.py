@@ -1,4 +1,4 @@
-"""Views of a scene at the size they are fitted and scored at."""
+"""Views of a scene at the size at which they are fitted and scored."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from hilsplat.scene.scene import Scene
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One view at the size it is fitted at."""
+    """One view at the size at which it is fitted."""
 
     name: str
     camera: Camera
@@ -20,7 +20,7 @@ class TrainingView:
 
 
 def load_views(scene: Scene, split: str, image_scale: float) -> list[TrainingView]:
-    """Images and cameras of a split, shrunk by `image_scale` (box filter)."""
+    """Load the images and cameras of a split, scaled by `image_scale` (box filter)."""
     views = []
     for name in scene.views(split):
         image, camera = scene.image(name), scene.cameras[name]
@@ -33,7 +33,7 @@ def load_views(scene: Scene, split: str, image_scale: float) -> list[TrainingVie
 
 
 def camera_extent(cameras: list[Camera]) -> float:
-    """1.1 times the largest distance of a camera from their common centre (3DGS); scene units."""
+    """Return 1.1 times the largest distance of a camera from their common centre (3DGS); scene units."""
     centres = np.stack([camera.centre for camera in cameras])
     radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     return float(1.1 * radius) if radius > 0 else 1.0

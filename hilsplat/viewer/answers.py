@@ -1,11 +1,11 @@
-"""Answers as the page reads them: hits, relevancy of every node, doubts, masks, boxes."""
+"""Answers in the format of the page: hits, relevancy of every node, doubts, boxes."""
 
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from typing_extensions import TypedDict  # pydantic describes no other before Python 3.12
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from hilsplat.query.hits import Hit, doubts_of, hits_of
 from hilsplat.query.language_scene import LanguageScene, path_of
@@ -14,7 +14,7 @@ from hilsplat.viewer.server import view_name
 from hilsplat.viewer.wire import Group, Question
 
 LISTED = 24
-"""Most answers to list."""
+"""Maximum number of answers in the list."""
 
 
 class FoundNode(TypedDict):
@@ -28,10 +28,10 @@ class FoundNode(TypedDict):
 
 
 class Answer(TypedDict):
-    """The answers to a text, or what looks like a node or a picture.
+    """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has a number for every node, `total` counts all answers, `hits` lists the best, and `route` is
-    as in `hilsplat.Hit`.
+    `relevancy` has one number per node, `total` is the number of all answers, `hits` lists the best, and
+    `route` is as in `hilsplat.Hit`.
     """
 
     text: str
@@ -46,7 +46,7 @@ class Answer(TypedDict):
 
 
 def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
-    """Query a scene: hits, relevancy of every node to the last text, doubts.
+    """Query a scene, and return hits, each node's relevancy to the last text, and doubts.
 
     Raises:
         SettingsError: the text is empty, or the view does not exist.
@@ -70,7 +70,7 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
 
 
 def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> Answer:
-    """What looks like a node or a picture; `also` are nodes that belong to the answer anyway."""
+    """Return nodes that look like a node or a picture as an answer; nodes in `also` get relevancy 1."""
     relevancy = np.zeros(len(scene.tree))
     relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
     relevancy[list(also)] = 1
@@ -88,7 +88,7 @@ def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[i
 
 
 def described_hit(scene: LanguageScene, hit: Hit) -> FoundNode:
-    """One answer."""
+    """Return one answer in the format of the page."""
     return {
         "node": hit.node,
         "level": hit.level.label,
@@ -99,7 +99,7 @@ def described_hit(scene: LanguageScene, hit: Hit) -> FoundNode:
 
 
 def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
-    """Boxes of nodes, for other programs; a node of several groups has one in each."""
+    """Return the boxes of nodes for other programs; a node of several groups has one in each."""
     tree = scene.tree
     return {
         "format": "hilsplat-boxes-1",

@@ -1,4 +1,4 @@
-"""The page's server: what the page shows, and what it asks."""
+"""HTTP server of the viewer page."""
 
 import base64
 from collections.abc import Callable
@@ -38,14 +38,14 @@ from hilsplat.viewer.witness import StaleSceneError
 
 
 class Viewer:
-    """Answers the page's requests about one scene."""
+    """Request handlers of the viewer page for one scene."""
 
     def __init__(self, shown: ShownScene) -> None:
         self.thread = SceneThread(shown)
         self.pages = Pages("index.html", static_files())
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
-        """The application, guarded; as a page of its own, or as a frame of another."""
+        """Return the guarded application, for a page of its own or a frame in another page."""
         routes = [
             *self.pages.routes(),
             Route("/openapi.json", self.described),
@@ -68,26 +68,26 @@ class Viewer:
         return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409}, embedded=embedded)
 
     async def described(self, request: Request) -> Response:
-        """The OpenAPI description."""
+        """Send the OpenAPI description."""
         return answer_json(description())
 
     # -- the scene --------------------------------------------------------------------------------
 
     async def scene(self, request: Request) -> Response:
-        """Views, counts, and the variants that answer by now."""
+        """Send the views, counts, and the variants that can be queried now."""
         return answer_json(await self.thread.opened_anew())
 
     async def changes(self, request: Request) -> Response:
-        """Whether a page still shows what lies on the disk."""
+        """Send which parts of the scene changed on disk since they were opened."""
         return answer_json(await self.thread.changes())
 
     async def variant(self, request: Request) -> Response:
-        """The outline of a variant."""
+        """Send the outline of a variant."""
         variant = request.path_params["variant"]
         return answer_json(await self.thread.do(request, lambda shown: shown.described_variant(variant)))
 
     async def splats(self, request: Request) -> Response:
-        """A part of the Gaussians as SPZ."""
+        """Send a chunk of the Gaussians as SPZ."""
         chunk = request.path_params["chunk"]
         tag = f'"{await self.thread.do(request, lambda shown: shown.splats_tag)}"'
         if request.headers.get("if-none-match") == tag:
@@ -96,7 +96,7 @@ class Viewer:
         return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
 
     async def nodes(self, request: Request) -> Response:
-        """Nodes of the Gaussians, packed."""
+        """Send the packed nodes of the Gaussians."""
         variant = request.path_params["variant"]
         data = await self.thread.do(
             request, lambda shown: packed_nodes(shown.answering(variant).tree, shown.order)
@@ -104,11 +104,11 @@ class Viewer:
         return plain(data, BYTES)
 
     async def photo(self, request: Request) -> Response:
-        """An undistorted photograph."""
+        """Send an undistorted photograph."""
         return await self._photograph(request, photograph)
 
     async def thumb(self, request: Request) -> Response:
-        """A small photograph."""
+        """Send a thumbnail of a photograph."""
         return await self._photograph(request, thumbnail)
 
     async def _photograph(self, request: Request, send: Callable[[Scene, int], Response]) -> Response:
@@ -119,7 +119,7 @@ class Viewer:
         return await self.thread.do_behind(request, find)
 
     async def crop(self, request: Request) -> Response:
-        """A node as its best photograph shows it."""
+        """Send a crop of a node from the photograph that shows it largest."""
 
         def draw(shown: ShownScene) -> bytes:
             scene = shown.answering(request.path_params["variant"])
@@ -132,7 +132,7 @@ class Viewer:
     # -- answers ----------------------------------------------------------------------------------
 
     async def query(self, request: Request) -> Response:
-        """A text or a path."""
+        """Send the answers to a text or a path."""
         asked = await read(request, wire.Query)
 
         def answer(shown: ShownScene) -> answers.Answer:
@@ -141,7 +141,7 @@ class Viewer:
         return answer_json(await self.thread.do(request, answer))
 
     async def like(self, request: Request) -> Response:
-        """What looks like a node or a picture."""
+        """Send the nodes that look like a node or a picture."""
         asked = await read(request, wire.Like)
 
         def answer(shown: ShownScene) -> answers.Answer:
@@ -156,7 +156,7 @@ class Viewer:
         return answer_json(await self.thread.do(request, answer))
 
     async def field(self, request: Request) -> Response:
-        """The field's relevancy of every Gaussian, a byte each."""
+        """Send the field's relevancy of each Gaussian, one byte each."""
         asked = await read(request, wire.FieldRelevancy)
 
         def answer(shown: ShownScene) -> bytes:
@@ -166,7 +166,7 @@ class Viewer:
         return plain(await self.thread.do(request, answer), BYTES)
 
     async def pick(self, request: Request) -> Response:
-        """What a pixel shows."""
+        """Send the nodes and the 3D point that a pixel shows."""
         asked = await read(request, wire.Pick)
 
         def find(shown: ShownScene) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class Viewer:
         return answer_json(await self.thread.do(request, find))
 
     async def frame(self, request: Request) -> Response:
-        """A picture of the scene."""
+        """Send a rendered picture of the scene."""
         asked = await read(request, wire.Frame)
 
         def draw(shown: ShownScene) -> bytes:
@@ -200,7 +200,7 @@ class Viewer:
         def write(shown: ShownScene) -> dict[str, Any]:
             found, scene = shown.found(asked.variant), shown.answering(asked.variant)
             tree = found.parts.semantic_tree
-            with shown.unchanged():  # or the names of these nodes would be given to another tree's
+            with shown.unchanged():  # otherwise the names could be assigned to nodes of a rebuilt tree
                 names = write_names(found.folder, tree, asked.names, len(scene.tree), version)
             shown.renamed(asked.variant, names)
             return {"version": names.version, "names": dict(names.of_node)}
@@ -228,11 +228,11 @@ def run_view(
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
-        variant: the one that answers first.
-        port: 0: any that is free.
+        variant: the initially selected variant.
+        port: TCP port; 0 for any free port.
         browser: whether to open the page in a browser.
-        threads: number of threads for drawing.
-        told: gets the address, once the page can be opened.
+        threads: number of threads for rendering.
+        told: called with the address once the page can be opened.
 
     Raises:
         ArtifactError: the scene has no Gaussians yet.

@@ -1,4 +1,4 @@
-"""The page of a scene inside a notebook: a server in this process, and a frame that shows it."""
+"""The page of a scene inside a notebook: a server in this process, and a frame."""
 
 import secrets
 import threading
@@ -14,15 +14,15 @@ from hilsplat.viewer.shown import ShownScene
 
 
 class EmbeddedViewer:
-    """A frame with the page of a scene, which notebooks draw; `close` ends its server.
+    """A notebook frame with the page of a scene; `close` stops its server.
 
     Args:
         found: the scene.
-        text: the first query; "": none.
-        height: of the frame, px.
-        proxy: address under which a browser elsewhere reaches a port of this machine, with `{port}` in it;
-            "": the browser runs on this machine.
-        threads: for drawing.
+        text: the first query; "" for none.
+        height: height of the frame, px.
+        proxy: address, containing `{port}`, under which a browser on another machine reaches a port of this
+            machine; "" if the browser runs on this machine.
+        threads: number of threads for rendering.
     """
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
@@ -41,7 +41,7 @@ class EmbeddedViewer:
 
     @property
     def address(self) -> str:
-        """Of the page; whoever has it can see the scene until the server is closed."""
+        """Address of the page; anyone who has it can see the scene until the server is closed."""
         base = self.proxy.format(port=self.port) if self.proxy else f"http://127.0.0.1:{self.port}/"
         asked = f"#{urlencode({'q': self.text})}" if self.text else ""
         return f"{base}?{urlencode({'token': self.token, 'embedded': 1})}{asked}"
@@ -53,6 +53,6 @@ class EmbeddedViewer:
         )
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         self.server.should_exit = True
         self.thread.join(timeout=10)

@@ -1,4 +1,4 @@
-"""Files that the page offers: Gaussians, boxes, masks of all views, films, crops."""
+"""Files that the page can export: Gaussians, masks of all views, films, crops."""
 
 import io
 import json
@@ -26,18 +26,18 @@ from hilsplat.viewer.wire import Film, Group
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
-"""A GIF has every other picture of the flight, or it would be far larger than the film."""
+"""Frame step of each format: a GIF has every second frame, or it would be far larger than the MP4."""
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
-"""A pixel that Gaussians cover by less belongs to no node; small things are enlarged, so gaps open."""
+"""Lower bound of alpha when a crop's pixels are assigned to the node; enlarging small things opens gaps."""
 DIMMED, GROUND = 0.2, 110.0
-"""Outside the node, a crop keeps this share of the photograph, on this grey."""
+"""Weight of the photograph outside the node of a crop, and the grey value that it is blended with."""
 
 Steps = Generator[tuple[int, int], None, bytes]
-"""A file that is made step by step: how many of how many are done, first 0, and at the end the file.
+"""A file made in steps: yields (steps done, total), starting with 0, and finally returns the file.
 
-Between two steps the thread of the scene draws what a person waits for.
+Between steps, the scene thread can handle interactive requests.
 """
 
 
@@ -45,9 +45,9 @@ class Groups:
     """The Gaussians of groups of nodes.
 
     Attributes:
-        rows: of the Gaussians of any group, ascending.
-        labels: of each of them, its group from 1; of several, the one with the fewest Gaussians.
-        names: of the groups.
+        rows: rows of the Gaussians of any group, ascending.
+        labels: group of each of these Gaussians, from 1; the smallest group if it is in several.
+        names: names of the groups.
     """
 
     def __init__(self, scene: LanguageScene, groups: Sequence[Group]) -> None:
@@ -61,7 +61,7 @@ class Groups:
 
 
 def selection_ply(gaussians_ply: Path, groups: Groups) -> bytes:
-    """The Gaussians of groups as a 3DGS PLY, with their labels."""
+    """Return the Gaussians of groups as a 3DGS PLY, with their labels."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
         write_selection_ply(gaussians_ply, groups.rows, out, groups.labels, groups.names)
@@ -72,9 +72,9 @@ def selection_ply(gaussians_ply: Path, groups: Groups) -> bytes:
 
 
 def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
-    """Masks of nodes in all views: a PNG per node and view that shows it, and one COCO file.
+    """Make a ZIP with masks of nodes in all views: a PNG per node and view that shows it, and one COCO file.
 
-    Groups are the categories of COCO; a node of several groups has an annotation in each.
+    Groups are the COCO categories; a node of several groups has an annotation in each.
     """
     nodes = sorted({node for group in groups for node in group.nodes})
     yield 0, len(scene.views)
@@ -116,7 +116,7 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
 
 
 def coco_counts(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """COCO's uncompressed run lengths: column by column, beginning with the zeros."""
+    """Return COCO's uncompressed run lengths: column by column, starting with zeros."""
     flat = mask.T.ravel()
     edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     runs = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
@@ -133,9 +133,9 @@ def _png(mask: Bool[np.ndarray, "H W"]) -> bytes:
 
 
 def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
-    """A square of the photograph that shows a node largest, with the rest of it fading into grey.
+    """Return a square crop of the photograph that shows a node largest, with the rest dimmed towards grey.
 
-    Only the square is drawn: a camera whose picture is the square sees which of its pixels are the node's.
+    To find the node's pixels, only the square is rendered, with a camera whose image is the square.
     """
     tree = scene.tree
     view = tree.view_names[int(tree.view_area_px[node].argmax())]
@@ -156,19 +156,19 @@ def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray,
 
 
 def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float) -> np.ndarray:
-    """The square (x, y, side) of an image at `CROP_PX` px; black beyond its borders."""
-    shrink = max(1.0, side / CROP_PX)  # warping does not average areas: shrink first
+    """Return the square (x, y, side) of an image at `CROP_PX` px; black beyond its borders."""
+    shrink = max(1.0, side / CROP_PX)  # warping does not average areas, so shrink first
     if shrink > 1:
         image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
     scale = CROP_PX * shrink / side
-    # pixel centres are at .5 here, at 0 in OpenCV
+    # Pixel centres are at 0.5 here, and at 0 in OpenCV.
     move = np.array([[scale, 0, -scale * x / shrink], [0, scale, -scale * y / shrink]])
     move[:, 2] += 0.5 * scale - 0.5
     return cv2.warpAffine(image, move, (CROP_PX, CROP_PX), flags=cv2.INTER_LINEAR)
 
 
 def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, float]:
-    """Left, top and side of a square around most of some points, px."""
+    """Return left, top and side of a square around most of the points, px."""
     local = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     local = local[local[:, 2] > 0.01]
     height, width = camera.size_hw
@@ -187,7 +187,7 @@ def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, fl
 
 
 def flight(asked: Film, scene: Scene) -> list[Camera]:
-    """One camera for each picture of a film: along its path, or around what the training cameras saw."""
+    """Return one camera per frame of a film: along its path, or around what the training cameras saw."""
     if len(asked.path) > 1:
         path = open_path([camera.camera() for camera in asked.path], asked.frames)
     else:
@@ -209,15 +209,15 @@ def film(
     threads: int = 1,
     told: Callable[[int], None] = lambda drawn: None,
 ) -> bytes:
-    """A flight in the colours of a style.
+    """Render a film in the colours of a style.
 
     Args:
-        gaussians: what is flown around.
-        cameras: one for each picture, of even sizes.
+        gaussians: the Gaussians to render.
+        cameras: one per frame, of even sizes.
         paint: the style; None: the scene's own colours.
-        kind: "mp4" or "gif", which has every other picture.
-        threads: for drawing.
-        told: gets the number of pictures drawn, after each; what it raises ends the film.
+        kind: "mp4", or "gif", which has every second frame.
+        threads: number of threads for rendering.
+        told: called with the number of rendered frames after each; an exception that it raises ends the film.
     """
 
     def pictures() -> Iterator[np.ndarray]:
@@ -235,10 +235,10 @@ def film(
 
 
 def write_gif(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """A GIF that repeats, with 256 colours chosen from the whole film.
+    """Write a repeating GIF with 256 colours chosen from the whole film.
 
-    Without dithering: that took a synthetic table from 41 dB to 35 and from 2.5 MB to 3.6 (with 128 colours),
-    and strewed dots over the answer.
+    Dithering is off: on a synthetic table (128 colours) it lowered the quality from 41 dB to 35 dB, increased
+    the size from 2.5 MB to 3.6 MB, and scattered dots over the answer.
     """
     kept = [Image.fromarray(frame) for frame in frames]
     sheet = Image.new("RGB", (kept[0].width, kept[0].height * min(len(kept), 8)))

@@ -1,6 +1,6 @@
-"""Pictures painted by the pipeline's own rasteriser, where the browser has no WebGL worth the name.
+"""Pictures rendered by the pipeline's own rasteriser, for browsers without usable WebGL.
 
-It is also what films and stills are made with, and what a test compares the page's WebGL with.
+Films and stills use it too, and a test compares the page's WebGL with it.
 """
 
 from dataclasses import dataclass, replace
@@ -16,19 +16,19 @@ from hilsplat.viewer.wire import Style
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 TINT = np.float32(0.35)
-"""Brightness of grey that `tint` leaves to what was not chosen. The page's shader has the same numbers."""
+"""Brightness of the grey of unselected Gaussians in `tint`. The page's shader has the same numbers."""
 GHOST = np.float32(0.08)
-"""Share of its opacity that `ghost` leaves to what was not chosen."""
+"""Share of their opacity that `ghost` leaves to unselected Gaussians."""
 
 
 @dataclass(frozen=True)
 class Paint:
-    """A style, Gaussian by Gaussian.
+    """A style, resolved for each Gaussian.
 
     Attributes:
         rgb: colour that is mixed in.
-        share: how much of it, in [0, 1]; 0: not chosen.
-        mode: what becomes of those not chosen.
+        share: share of that colour, in [0, 1]; 0 means unselected.
+        mode: how unselected Gaussians are painted.
     """
 
     rgb: Float32[np.ndarray, "N 3"]
@@ -43,13 +43,13 @@ class Paint:
         relevancy: UInt8[np.ndarray, " N"] | None = None,
         count: int = 0,
     ) -> "Paint":
-        """Look a style up: the finest used level whose node has an alpha above 0 decides.
+        """Resolve a style: the finest used level whose node has an alpha above 0 sets a Gaussian's colour.
 
         Args:
-            style: as the page sends it.
-            node_of_gaussian: of the tree; None: the scene has none yet.
-            num_nodes: of the tree.
-            relevancy: of every Gaussian in steps of 1/255; needed if the style has a ramp.
+            style: the style that the page sent.
+            node_of_gaussian: nodes in the tree; None if the scene has no tree yet.
+            num_nodes: number of nodes in the tree.
+            relevancy: relevancy of each Gaussian in steps of 1/255; required if the style has a ramp.
             count: number of Gaussians, for a scene without a tree.
 
         Raises:
@@ -63,7 +63,7 @@ class Paint:
             return Paint(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), "plain")
         table = style.rgba(num_nodes).astype(np.float32) / 255
         found = np.zeros((len(node_of_gaussian), 4), np.float32)
-        for level in range(3):  # coarse to fine: a finer one replaces what is there
+        for level in range(3):  # coarse to fine, so that finer levels override coarser ones
             if style.use[level]:
                 own = table[node_of_gaussian[:, level] + 1]
                 found = np.where(own[:, 3:] > 0, own, found)
@@ -73,10 +73,10 @@ class Paint:
 def painted(
     gaussians: Gaussians, camera: Camera, paint: Paint | None = None, threads: int = 1
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A view over black, as `render` draws it, in the colours of a style.
+    """Render a view over black, as `render` does, in the colours of a style.
 
-    A chosen Gaussian's colour c becomes c (1 - share) + rgb share. Others: `plain` leaves them, `tint` makes
-    them dark grey, `ghost` nearly transparent, `isolate` invisible.
+    A selected Gaussian's colour c becomes c (1 - share) + rgb share. Unselected ones are unchanged with
+    `plain`, dark grey with `tint`, nearly transparent with `ghost`, and invisible with `isolate`.
     """
     degree = min(gaussians.sh_degree, 3)
     if paint is None:

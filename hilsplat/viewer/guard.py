@@ -1,9 +1,9 @@
-"""Who may talk to the page's server: a browser on this machine that was given the printed address.
+"""Access control of the page's server: only a browser on this machine that opened the printed address.
 
-Loopback alone keeps nobody out: other users of the machine reach it, and so does any web page that the same
-browser shows. So every request needs a cookie that only the printed address sets, a Host that names this
-machine (against DNS rebinding), and, if it sends something, the page's own Origin and a content type that no
-form can send.
+Loopback alone is no protection: other users of the machine can reach it, and so can any web page open in the
+same browser. Every request therefore needs a cookie that only the printed address sets and a Host that names
+this machine (against DNS rebinding). Requests with a body also need the page's own Origin and a content type
+that no form can send.
 """
 
 import hmac
@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 MAX_BODY_BYTES = 1 << 20
 MAX_PATH = 500
-"""Most characters of a path: Python refuses to read numbers of thousands of digits."""
+"""Maximum number of characters in a path; Python cannot parse numbers of thousands of digits."""
 CONTENT_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; worker-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -32,15 +32,15 @@ HEADERS = {
 
 
 class Guard:
-    """ASGI middleware that lets the owner's page in and nothing else.
+    """ASGI middleware that accepts requests from the owner's page only.
 
     Args:
-        app: what is guarded.
-        token: secret of the printed address.
-        max_body: most bytes that the page may send at once.
-        embedded: the page is a frame of another one, such as a notebook, perhaps behind a proxy. Browsers
-            give it no cookie, so each of its requests has the token in its address; no other site knows it,
-            and its host and origin are those of the other page. Scripts and styles are no secret.
+        app: the application to guard.
+        token: secret in the printed address.
+        max_body: maximum size of a request body, bytes.
+        embedded: the page is a frame in another page, such as a notebook, possibly behind a proxy. Browsers
+            send no cookie for it, so each of its requests has the token, which no other site has, in its
+            address. Host and Origin are those of the other page. Scripts and styles need no token.
     """
 
     def __init__(
@@ -51,10 +51,10 @@ class Guard:
         self.headers = dict(HEADERS)
         if embedded:
             self.headers["content-security-policy"] = CONTENT_POLICY + "frame-ancestors *"
-        self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies: a name for each server
+        self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies, so names differ per server
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 403, 413 or 414, or pass the request on and add the headers to the answer."""
+        """Send 403, 413 or 414, or forward the request and add the headers to the response."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -91,7 +91,7 @@ class Guard:
         await self.app(scope, receive, send_with_headers)
 
     def _refusal(self, method: str, headers: dict[str, str], is_opening: bool) -> str:
-        """Why a request is refused; empty if it is not."""
+        """Return why a request is refused; empty if it is accepted."""
         host = headers.get("host", "")
         name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
         if name not in LOCAL_NAMES:

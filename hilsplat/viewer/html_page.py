@@ -1,7 +1,7 @@
-"""A scene as one HTML file with its answers to some texts: no server, for papers and talks.
+"""A scene with answers to some queries as one HTML file that needs no server, for papers and talks.
 
-The file is the page itself: its scripts as data addresses in an import map, `offline.js` in the place of
-`api.js`, and Gaussians, nodes, crops and small photographs as text. It asks the network for nothing.
+The file is the page itself: its scripts are data URLs in an import map, with `offline.js` instead of
+`api.js`. Gaussians, nodes, crops and small photographs are text. It sends no network requests.
 """
 
 import base64
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PHOTO_PX = 320
 MAX_CROPS = 400
-"""A larger tree has crops of its wholes and of the answers alone."""
+"""Maximum number of nodes for crops of all nodes; a larger tree gets crops of its wholes and the answers."""
 
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data: blob:; style-src 'unsafe-inline'; "
@@ -28,16 +28,16 @@ POLICY = (
 
 
 def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> exports.Steps:
-    """The page of a scene, crop by crop; 8 MB for 60,000 Gaussians.
+    """Make the page of a scene, with one step per crop; 8 MB for 60,000 Gaussians.
 
     Args:
         shown: the scene.
-        asked: variant, the queries of the page, and where its camera begins.
+        asked: variant, queries of the page, and initial camera.
         static: files of the page by name.
 
     Raises:
-        SettingsError: a text is empty, or the variant cannot answer.
-        StaleSceneError: a part of the scene was written anew before or meanwhile.
+        SettingsError: a text is empty, or the variant cannot be queried.
+        StaleSceneError: a part of the scene was rewritten since it was opened.
     """
     scene = shown.answering(asked.variant)
     questions = [*asked.kept, *([asked.last] if asked.last else [])]
@@ -91,12 +91,12 @@ def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> e
 
 
 def _by_name(script: str) -> str:
-    """A module that imports its neighbours by name, because data addresses have no neighbours."""
+    """Return a script with relative imports replaced by names, because data URLs have no relative paths."""
     return re.sub(r'from "\./', 'from "hilsplat/', script)
 
 
 def _inert(text: str) -> str:
-    """Text that cannot end the element it stands in; JSON reads it as before."""
+    """Escape a text so that it cannot end the element that contains it; as JSON it stays the same."""
     return text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
 
 

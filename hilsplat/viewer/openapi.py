@@ -1,4 +1,4 @@
-"""The OpenAPI description of the requests that a script may send; docs/viewer.md has an example."""
+"""OpenAPI description of the requests that scripts can send; docs/viewer.md has an example."""
 
 from functools import cache
 from typing import Any
@@ -32,14 +32,14 @@ SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
     ("post", "/api/export/spz", "The Gaussians of nodes as SPZ", wire.Selection, BYTES),
     ("post", "/api/export/boxes", "Boxes of nodes", wire.Selection, JSON),
 )
-"""Method, path, what it gives, what must be sent, and the type of the answer."""
+"""Method, path, summary, request model, and content type of the response."""
 
 ANSWERS = ("/api/query", "/api/like")
 
 
 @cache
 def description() -> dict[str, Any]:
-    """The description, as OpenAPI 3.1."""
+    """Return the description, as OpenAPI 3.1."""
     schemas: dict[str, Any] = {}
 
     def schema_of(kind: Any) -> dict[str, Any]:

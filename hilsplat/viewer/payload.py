@@ -1,4 +1,4 @@
-"""What the page gets once: the scene as JSON, Gaussians in chunks and their nodes."""
+"""Data that the page loads once: the scene as JSON, Gaussians in chunks, and their nodes."""
 
 import gzip
 from typing import Any
@@ -16,16 +16,16 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.order import morton_order
 
 CHUNK = 65_536
-"""Gaussians that a browser gets at once: 32 rows of its textures."""
+"""Gaussians per chunk: 32 rows of the page's textures."""
 
 MAX_NODES = 65_534
-"""Nodes are numbered from 1 in 16 bits; 0 is none."""
+"""Maximum number of nodes, which are numbered from 1 in 16 bits; 0 is none."""
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
-    """The order in which a browser gets Gaussians: chunks that show less and less, each along a curve.
+    """Return the order in which the page loads Gaussians: most visible first, chunks in Morton order.
 
-    A first picture of the first chunk shows a scene in outline.
+    The first chunk alone shows the outline of the scene.
     """
     scales = np.sort(gaussians.log_scales, axis=1)
     shows = np.argsort(-(scales[:, 1] + scales[:, 2] + np.log(gaussians.opacities + 1e-12)), kind="stable")
@@ -34,7 +34,7 @@ def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
 
 
 def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
-    """RGBA16UI texel per Gaussian: its node at each level, from 1; 0 is none. The fourth channel is spare."""
+    """Pack each Gaussian's nodes (from 1; 0 is none) as a gzipped RGBA16UI texel, one level per channel."""
     assert len(tree) <= MAX_NODES, f"{len(tree)} nodes"
     texels = np.zeros((len(order), 4), np.uint16)
     texels[:, :3] = tree.node_of_gaussian[order] + 1
@@ -42,7 +42,7 @@ def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
 
 
 def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
-    """Views with their cameras, and where a visitor stands: what to look at, and which way is up."""
+    """Describe the scene: views with their cameras, the initial focus point and the up direction."""
     cameras = scene.cameras
     up, focus = upright(cameras), crossing(cameras)
     centres = np.stack([cameras[name].centre for name in cameras.names])
@@ -69,16 +69,16 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
 
 
 def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
-    """Mean of the directions that are up in the photographs."""
+    """Return the mean up direction of the photographs."""
     up = -cameras.cam_from_world[:, 1, :3].mean(axis=0)
     length = np.linalg.norm(up)
     return up / length if length > 1e-6 else -cameras.cam_from_world[0, 1, :3]
 
 
 def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
-    """The point nearest to all optical axes in the least-squares sense, kept in front of the first camera.
+    """Return the point nearest to all optical axes (least squares), in front of the first camera.
 
-    Parallel axes have no such point: a small pull towards one unit ahead of the mean camera decides then.
+    Parallel axes have no such point, so a small pull towards a point ahead of the mean camera decides.
     """
     rotation, translation = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centres = -np.einsum("vji,vj->vi", rotation, translation)
@@ -94,7 +94,7 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
 
 
 def described_nodes(scene: LanguageScene) -> dict[str, Any]:
-    """The outline: one entry per node, in row order."""
+    """Describe the outline: one entry per node, in row order."""
     tree, names, naming = scene.tree, scene.names, scene.naming
     members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
     return {
@@ -121,10 +121,10 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
 
 
 def box_corners(rows: np.ndarray) -> list[list[float]]:
-    """The eight corners of a stored oriented box."""
+    """Return the eight corners of a stored oriented box."""
     return np.round(OrientedBox.from_array(rows).corners(), 5).tolist()
 
 
 def as_steps(relevancy: np.ndarray) -> UInt8[np.ndarray, " N"]:
-    """Relevancies in [0, 1] as bytes."""
+    """Convert relevancies in [0, 1] to bytes."""
     return (np.clip(relevancy, 0, 1) * 255 + 0.5).astype(np.uint8)

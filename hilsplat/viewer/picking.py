@@ -1,4 +1,4 @@
-"""What a pixel of the page's picture shows: its Gaussians, their nodes at every level, the point in 3D."""
+"""Picking: the Gaussians, nodes and 3D point that a pixel of the page's picture shows."""
 
 from dataclasses import dataclass
 
@@ -14,17 +14,17 @@ from hilsplat.splat.rasterise.project import MIN_ALPHA
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 SEEN = 0.05
-"""A pixel that Gaussians cover by less shows nothing."""
+"""Minimum alpha of a pixel that shows something."""
 
 
 @dataclass(frozen=True)
 class Picked:
-    """What a pixel shows.
+    """Content of a pixel.
 
     Attributes:
-        alpha: how far Gaussians cover it.
-        point: where they are on average, weighted by what each adds to the pixel; scene units.
-        nodes: per level, the node that makes up most of the pixel (-1: none) and its share of alpha.
+        alpha: accumulated alpha of the Gaussians.
+        point: mean position of the Gaussians, weighted by their blending weights; scene units.
+        nodes: per level, the node with the largest share of the pixel (-1 for none) and its share of alpha.
     """
 
     alpha: float
@@ -35,9 +35,9 @@ class Picked:
 def weights_at(
     gaussians: Gaussians, camera: Camera, x: int, y: int, threads: int = 1
 ) -> tuple[Int64[np.ndarray, " g"], Float64[np.ndarray, " g"]]:
-    """Gaussians of one pixel, nearest first, and their blending weights: a row of `pixel_weights`.
+    """Return the Gaussians of one pixel, nearest first, and their blending weights: a row of `pixel_weights`.
 
-    The whole view is projected, because the Jacobian depends on the picture's borders; but only this pixel is
+    The whole view is projected, because the Jacobian depends on the picture's borders; only this pixel is
     blended.
     """
     view = project_gaussians(gaussians, camera, 0, threads)
@@ -63,7 +63,7 @@ def pick(
     y: float,
     threads: int = 1,
 ) -> Picked | None:
-    """What the pixel at (x, y) shows; None outside the picture or where Gaussians cover less than `SEEN`."""
+    """Return what the pixel at (x, y) shows; None outside the picture or if alpha is below `SEEN`."""
     height, width = camera.size_hw
     if not (0 <= x < width and 0 <= y < height):
         return None

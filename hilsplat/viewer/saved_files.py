@@ -1,7 +1,7 @@
-"""Files that the page lets people keep.
+"""Files that users can save from the page.
 
-Films take long and read only arrays, so they have a thread of their own. What takes long on the thread of
-the scene is made in steps, and the page can be used meanwhile. All are sent as lines of JSON, then the file:
+Films take long and read only arrays, so they have their own thread. Other slow files are made in steps on the
+scene thread, so that the page stays usable. All of these are sent as lines of JSON, then the file:
 `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 
@@ -27,14 +27,14 @@ from hilsplat.viewer.shown import ShownScene
 
 
 class SavedFiles:
-    """Makes them on request."""
+    """Request handlers that make these files."""
 
     def __init__(self, thread: SceneThread, static: dict[str, bytes]) -> None:
         self.thread, self.static = thread, static
         self.films = ThreadPoolExecutor(1, thread_name_prefix="film")
 
     def routes(self) -> list[Route]:
-        """Where they are."""
+        """Return the routes of the files."""
         return [
             Route("/api/export/ply", self.ply, methods=["POST"]),
             Route("/api/export/spz", self.spz, methods=["POST"]),
@@ -45,7 +45,7 @@ class SavedFiles:
         ]
 
     async def ply(self, request: Request) -> Response:
-        """Gaussians of nodes."""
+        """Send the Gaussians of nodes as PLY."""
         asked = await read(request, wire.Selection)
 
         def make(shown: ShownScene) -> bytes:
@@ -57,7 +57,7 @@ class SavedFiles:
         return plain(await self.thread.do(request, make), BYTES)
 
     async def spz(self, request: Request) -> Response:
-        """Gaussians of nodes, compressed."""
+        """Send the Gaussians of nodes as SPZ."""
         asked = await read(request, wire.Selection)
 
         def make(shown: ShownScene) -> bytes:
@@ -68,7 +68,7 @@ class SavedFiles:
         return plain(await self.thread.do(request, make), BYTES)
 
     async def boxes(self, request: Request) -> Response:
-        """Boxes of nodes."""
+        """Send the boxes of nodes."""
         asked = await read(request, wire.Selection)
 
         def make(shown: ShownScene) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class SavedFiles:
         return answer_json(await self.thread.do(request, make))
 
     async def masks(self, request: Request) -> Response:
-        """Masks of nodes in all views."""
+        """Send the masks of nodes in all views."""
         asked = await read(request, wire.Selection)
 
         def begin(shown: ShownScene) -> exports.Steps:
@@ -88,7 +88,7 @@ class SavedFiles:
         return await self._in_steps(request, begin)
 
     async def film(self, request: Request) -> Response:
-        """A flight in the colours of the page."""
+        """Send a film in the colours of the page."""
         asked = await read(request, wire.Film)
 
         def prepared(shown: ShownScene) -> Callable[..., bytes]:
@@ -125,19 +125,19 @@ class SavedFiles:
                 return
             yield _line(bytes=len(data))
             yield data
-        finally:  # also if the page was left, or its film cancelled
+        finally:  # also if the user left the page or cancelled the film
             left.set()
             making.cancel()
 
     async def page(self, request: Request) -> Response:
-        """The scene as one HTML file, with its answers to some texts."""
+        """Send the scene as one HTML file, with its answers to some queries."""
         asked = await read(request, wire.Page)
         return await self._in_steps(request, lambda shown: html_page(shown, asked, self.static))
 
     async def _in_steps(self, request: Request, begin: Callable[[ShownScene], exports.Steps]) -> Response:
         def first(shown: ShownScene) -> tuple[exports.Steps, tuple[int, int]]:
             steps = begin(shown)
-            return steps, next(steps)  # refuses before the answer begins
+            return steps, next(steps)  # raises errors before the response starts
 
         return _streamed(self._stepped(*await self.thread.do(request, first)))
 
@@ -155,7 +155,7 @@ class SavedFiles:
 
 
 def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
-    """How far a file is after its next step, or the file."""
+    """Run the next step; return the progress, or the finished file."""
     try:
         return next(steps)
     except StopIteration as made:
@@ -172,10 +172,10 @@ def _line(**told: int | str) -> bytes:
 
 
 def node_of(scene: LanguageScene, node: int) -> int:
-    """A node that the page named.
+    """Return a node that the page requested.
 
     Raises:
-        SettingsError: there is none.
+        SettingsError: it does not exist.
     """
     if node >= len(scene.tree):
         raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
@@ -183,7 +183,7 @@ def node_of(scene: LanguageScene, node: int) -> int:
 
 
 def checked(scene: LanguageScene, groups: list[wire.Group]) -> list[wire.Group]:
-    """Groups of nodes that exist."""
+    """Return the groups, or raise SettingsError if a node does not exist."""
     for group in groups:
         for node in group.nodes:
             node_of(scene, node)

@@ -1,7 +1,7 @@
-"""The one thread that touches the scene, and which state of the scene a page shows.
+"""The only thread that accesses the scene, and the check that a page shows the current state of the scene.
 
-`ViewStore` and the known texts of a `LanguageScene` are not made for threads, so everything that reads the
-scene runs on one worker; its loops release the interpreter, and the server stays responsive meanwhile.
+`ViewStore` and the text cache of a `LanguageScene` are not thread-safe, so all code that reads the scene runs
+on one worker. Its loops release the GIL, so the server stays responsive.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ Made = TypeVar("Made")
 
 
 class SceneThread:
-    """A scene, and the thread that everything which reads it runs on."""
+    """A scene and the thread on which all code that reads it runs."""
 
     def __init__(self, shown: ShownScene) -> None:
         self.shown = shown
@@ -26,18 +26,18 @@ class SceneThread:
         self.behind = asyncio.Lock()
 
     async def do_behind(self, request: Request, work: Callable[[ShownScene], Made]) -> Made:
-        """As `do`, one after the other, so that whatever a person waits for is behind one of them at most.
+        """Run as `do`, but one at a time, so that interactive requests wait for at most one of these.
 
-        An outline asks for a hundred crops as the page begins.
+        For example, the outline requests a hundred crops when the page opens.
         """
         async with self.behind:
             return await self.do(request, work)
 
     async def do(self, request: Request, work: Callable[[ShownScene], Made]) -> Made:
-        """Run on the thread of the scene, for a page that shows the scene as it is here.
+        """Run on the scene thread if the page shows the current state of the scene.
 
-        A page names the state that it was loaded with as `of`, so that its cameras, nodes and Gaussians never
-        meet those of another; who names none asks for what is here.
+        A page sends the state that it was loaded with as `of`, so that its cameras, nodes and Gaussians are
+        never mixed with those of another state. Without `of`, the current state is used.
 
         Raises:
             StaleSceneError: the page was loaded with another state.
@@ -52,7 +52,7 @@ class SceneThread:
         return await self.run(run)
 
     async def opened_anew(self) -> dict[str, Any]:
-        """The scene's description, for a page that begins; what was written anew is opened again."""
+        """Return the scene's description for a newly opened page, after reopening a changed scene."""
 
         def run() -> dict[str, Any]:
             if self.shown.changed():
@@ -62,7 +62,7 @@ class SceneThread:
         return await self.run(run)
 
     async def changes(self) -> dict[str, Any]:
-        """What is here, which parts of it were written anew meanwhile, and who answers by now."""
+        """Return the current state, its parts that were rewritten since, and the variants to query."""
 
         def run() -> dict[str, Any]:
             shown = self.shown
@@ -71,5 +71,5 @@ class SceneThread:
         return await self.run(run)
 
     async def run(self, work: Callable[[], Made]) -> Made:
-        """Run on the thread of the scene, whatever state the scene is in."""
+        """Run on the scene thread, regardless of the scene's state."""
         return await asyncio.get_running_loop().run_in_executor(self.worker, work)

@@ -1,4 +1,4 @@
-"""What the pages' servers share: static files, answers, errors, photographs, a socket on this machine."""
+"""Shared code of the page servers: static files, responses, errors, photographs, a local socket."""
 
 import json
 import secrets
@@ -29,7 +29,7 @@ Sent = TypeVar("Sent", bound=BaseModel)
 
 
 def static_files(package: str = "hilsplat.viewer") -> dict[str, bytes]:
-    """Files of a page by name: nothing else can be asked for."""
+    """Return the files of a page by name; no other file can be requested."""
     folder = files(package) / "static"
     return {each.name: each.read_bytes() for each in folder.iterdir() if each.name.endswith(tuple(TYPES))}
 
@@ -41,15 +41,15 @@ class Pages:
         self.first, self.static = page, static
 
     def routes(self) -> list[Route]:
-        """Where they are."""
+        """Return the routes of the page and its files."""
         return [Route("/", self.page), Route("/static/{name}", self.static_file)]
 
     async def page(self, request: Request) -> Response:
-        """The page."""
+        """Send the page."""
         return plain(self.static[self.first], TYPES["html"])
 
     async def static_file(self, request: Request) -> Response:
-        """A script or style of the page."""
+        """Send a script or style of the page."""
         name = request.path_params["name"]
         if name not in self.static:
             return plain(b"no such file", "text/plain", 404)
@@ -64,7 +64,7 @@ def guarded(
     *,
     embedded: bool = False,
 ) -> Guard:
-    """The application: errors become text for the page, some of them with a status of their own."""
+    """Return the guarded application, which sends errors as text; `statuses` sets some HTTP statuses."""
     handlers: dict[Any, Any] = {
         **{error: _told(status) for error, status in statuses.items()},
         HilsplatError: _told(422),
@@ -77,28 +77,28 @@ def guarded(
 
 
 def as_json(value: Any) -> bytes:
-    """JSON as the page reads it."""
+    """Encode a value as compact JSON."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
 
 
 async def read(request: Request, kind: type[Sent]) -> Sent:
-    """What the page sent, checked."""
+    """Return the validated body of a request."""
     return kind.model_validate_json(await request.body())
 
 
 def answer_json(value: Any) -> Response:
-    """A value for the page."""
+    """Return a JSON response."""
     return plain(as_json(value), "application/json")
 
 
 def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
-    """Bytes for the page."""
+    """Return a response of bytes."""
     lasting = "private, max-age=3600" if cached else "no-store"
     return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
 
 
 def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
-    """A handler that sends the error to the page, as text."""
+    """Return a handler that sends the error's text to the page."""
 
     async def tell(request: Request, error: Exception) -> Response:
         if isinstance(error, ValidationError):
@@ -115,10 +115,10 @@ def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
 
 
 def view_name(scene: Scene, number: int) -> str:
-    """The view with this number: no name comes from the page.
+    """Return the view with this number; the page sends numbers instead of file names.
 
     Raises:
-        SettingsError: there is none.
+        SettingsError: it does not exist.
     """
     names = scene.cameras.names
     if not 0 <= number < len(names):
@@ -127,20 +127,20 @@ def view_name(scene: Scene, number: int) -> str:
 
 
 def photograph(scene: Scene, number: int) -> Response:
-    """An undistorted photograph."""
+    """Return an undistorted photograph as a response."""
     path = scene.image_path(view_name(scene, number))
     kind = "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
     return plain(path.read_bytes(), kind, cached=True)
 
 
 def thumbnail(scene: Scene, number: int) -> Response:
-    """A small photograph."""
+    """Return a small photograph as a response."""
     small = resize_to_fit(scene.image(view_name(scene, number)), THUMB_PX)
     return plain(encoded(small), "image/jpeg", cached=True)
 
 
 def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int = 80) -> bytes:
-    """An image as the bytes of a JPEG or PNG."""
+    """Encode an image as JPEG or PNG."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
     made, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
     assert made
@@ -151,12 +151,12 @@ def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int
 
 
 def listening_at(port: int) -> socket.socket:
-    """A socket that listens on this machine alone; 0: at any free port.
+    """Return a socket that listens on the loopback address only; port 0 uses any free port.
 
     Raises:
         SettingsError: the port is taken.
     """
-    # Named as TCP, or asyncio leaves Nagle's algorithm on, and answers wait 40 ms for an acknowledgement.
+    # Without IPPROTO_TCP, asyncio leaves Nagle's algorithm on, which delays responses by 40 ms.
     made = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -166,7 +166,7 @@ def listening_at(port: int) -> socket.socket:
         raise SettingsError(
             f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
         ) from error
-    made.listen()  # before the address is printed: whoever connects at once waits instead of being refused
+    made.listen()  # before the address is printed, so that early connections wait and are not refused
     return made
 
 
@@ -176,11 +176,11 @@ def serve(
     """Serve an application on this machine until Ctrl-C.
 
     Args:
-        app: makes it, given the token that opens it.
-        about: what the page shows, for the printed line.
-        port: 0: any that is free.
+        app: creates the application from its access token.
+        about: description of the page for the printed line.
+        port: TCP port; 0 for any free port.
         browser: whether to open the page in a browser.
-        told: gets the address, once the page can be opened.
+        told: called with the address once the page can be opened.
 
     Raises:
         SettingsError: the port is taken.

@@ -1,4 +1,4 @@
-"""A scene's folder as the page shows it: Gaussians at once, each variant's answers when they exist."""
+"""A scene's folder as the page shows it: Gaussians at once, and each variant once it can be queried."""
 
 import logging
 import secrets
@@ -29,24 +29,24 @@ from hilsplat.viewer.wire import Style
 from hilsplat.viewer.witness import Witness
 
 VIEWS_MIB = 256.0
-"""Memory for what is kept of views, such as their compositing weights."""
+"""Memory limit for cached results of views, such as their compositing weights."""
 
 KEPT_RELEVANCIES = 8
-"""Field relevancies that are kept, of as many texts, levels and variants; a byte per Gaussian each."""
+"""Number of cached field relevancies (one per variant, text and level), of one byte per Gaussian."""
 
 MAX_GAUSSIANS = 4_000_000
-"""More do not fit textures of 2048 x 8192 texels, nor a server of a few GiB."""
+"""Maximum number of Gaussians; more do not fit textures of 2048 x 8192 texels or a server of a few GiB."""
 
 logger = logging.getLogger(__name__)
 
 
 class ShownScene:
-    """What exists of a scene. Not made for threads: one thread calls it, and everything it returns.
+    """The existing parts of a scene. Not thread-safe: use it and all objects it returns on one thread.
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
-        variant: the one that answers first; it may not exist yet.
-        threads: number of threads for drawing.
+        variant: the initially selected variant; it may not exist yet.
+        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene has no poses or no Gaussians yet, or too many to show.
@@ -56,7 +56,7 @@ class ShownScene:
         self.folder, self.first, self.threads = Path(folder), variant, threads
         self.opened, self.witness = Opened(), Witness()
         self.state = secrets.token_hex(4)
-        """Names what was opened here; another opening has another name."""
+        """Identifier of this opening of the scene."""
         ply = self.folder / "gaussians.ply"
         if not self.folder.is_dir():
             raise ArtifactError(
@@ -85,24 +85,24 @@ class ShownScene:
         self._relevancy: dict[tuple[str, str, str], np.ndarray] = {}
         self._painted: tuple[Any, Paint] | None = None
 
-    # -- what is written meanwhile ----------------------------------------------------------------
+    # -- changes on disk --------------------------------------------------------------------------
 
     def changed(self) -> list[str]:
-        """Opened parts that were written anew, or are gone; the page shows what was opened nevertheless."""
+        """Return opened parts that were rewritten or deleted; the page still shows what was opened."""
         return sorted({path.name for path in self.witness.changed()})
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Around whatever reads the disk: it must read what belongs to what was opened before.
+        """Guard disk reads: fail if files changed since the scene was opened.
 
         Raises:
-            StaleSceneError: a part was written anew before or meanwhile.
+            StaleSceneError: a part was rewritten before or during the read.
         """
         with self.witness.unchanged(self.scene.name):
             yield
 
     def opened_again(self) -> "ShownScene":
-        """The scene as it is on the disk now.
+        """Open the scene again, as it is on disk now.
 
         Raises:
             ArtifactError: as in the constructor.
@@ -113,21 +113,21 @@ class ShownScene:
 
     @property
     def variants(self) -> list[str]:
-        """Variants that answer by now, that of the start first."""
+        """Variants that can be queried now, the initially selected one first."""
         names = finished_variants(self.folder)
         return sorted(names, key=lambda name: (name != self.first, name != "default", name))
 
     def answering(self, variant: str) -> LanguageScene:
-        """The answers of a variant, opened at its first use, and again when its field has been made.
+        """Return a variant, opened at its first use and reopened once its field exists.
 
         Raises:
-            SettingsError: the variant does not exist, or not yet.
-            StaleSceneError: it must be opened, and what was opened before was written anew.
+            SettingsError: the variant does not exist (yet).
+            StaleSceneError: the variant must be opened, but a part opened before was rewritten.
             HilsplatError: its parts cannot be opened.
         """
         before = self._variants.get(variant)
         if before is None or (before.language is None and self._has_field(variant)):
-            if variant not in self.variants:  # never a path: only what the folder lists
+            if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
                     f"variant {variant!r} cannot answer here",
                     expected=", ".join(self.variants) or "none yet: the run goes on",
@@ -147,12 +147,12 @@ class ShownScene:
         return (self.folder / variant / "field.safetensors").exists()
 
     def found(self, variant: str) -> FinishedScene:
-        """Paths of the parts of a variant."""
+        """Return the paths of the parts of a variant."""
         self.answering(variant)
         return self._found[variant]
 
     def renamed(self, variant: str, names: Any) -> LanguageScene:
-        """Let new names answer, in every variant with the same tree."""
+        """Use new names in every variant with the same tree."""
         tree = self.found(variant).parts.semantic_tree.resolve()
         for each, opened in list(self._variants.items()):
             if self._found[each].parts.semantic_tree.resolve() == tree:
@@ -162,7 +162,7 @@ class ShownScene:
     # -- descriptions -----------------------------------------------------------------------------
 
     def described(self) -> dict[str, Any]:
-        """The scene, and which variants answer by now."""
+        """Describe the scene and the variants that can be queried now."""
         return {
             **payload.described_scene(self.scene, self.gaussians),
             "variants": self.variants,
@@ -171,7 +171,7 @@ class ShownScene:
         }
 
     def described_variant(self, variant: str) -> dict[str, Any]:
-        """The outline of a variant, and what made its masks and vectors."""
+        """Describe the outline of a variant, and the models of its masks and vectors."""
         scene, parts = self.answering(variant), self.found(variant).parts
         with self.unchanged():
             clip, masks = Path(read_index(parts.clip)["model"]).name, masks_label(parts.masks)
@@ -186,7 +186,7 @@ class ShownScene:
 
     @cached_property
     def order(self) -> np.ndarray:
-        """Rows of the Gaussians in the order in which the browser has them."""
+        """Rows of the Gaussians in the order in which the page loads them."""
         return payload.arrival_order(self.gaussians)
 
     @cached_property
@@ -195,14 +195,14 @@ class ShownScene:
 
     @property
     def num_chunks(self) -> int:
-        """In how many parts the browser gets the Gaussians."""
+        """Number of chunks in which the page loads the Gaussians."""
         return -(-len(self.gaussians) // payload.CHUNK)
 
     def chunk(self, number: int) -> bytes:
-        """A part of the Gaussians as SPZ.
+        """Return a chunk of the Gaussians as SPZ.
 
         Raises:
-            SettingsError: there is none of this number.
+            SettingsError: it does not exist.
         """
         if number >= self.num_chunks:
             raise SettingsError(f"chunk {number} does not exist", expected=f"0 to {self.num_chunks - 1}")
@@ -210,7 +210,7 @@ class ShownScene:
         return self.spz(rows)
 
     def spz(self, rows: np.ndarray) -> bytes:
-        """Some Gaussians as SPZ."""
+        """Return Gaussians as SPZ."""
         return spz_bytes(self.gaussians, rows, self._bits)
 
     @cached_property
@@ -222,7 +222,7 @@ class ShownScene:
     # -- painting ---------------------------------------------------------------------------------
 
     def field_relevancy(self, variant: str, text: str, level: str) -> np.ndarray:
-        """The field's relevancy of every Gaussian to a text, as bytes; of all levels, the best.
+        """Return each Gaussian's field relevancy to a text as bytes; level "auto" is the maximum over levels.
 
         Gaussians without a latent get 0.
         """
@@ -235,7 +235,7 @@ class ShownScene:
         return self._relevancy[key]
 
     def paint(self, variant: str, style: Style) -> Paint | None:
-        """A style, Gaussian by Gaussian; the last one is kept. None: the scene's own colours.
+        """Resolve a style for each Gaussian; None for the scene's own colours. The last result is cached.
 
         Raises:
             SettingsError: the style does not fit the tree.
@@ -254,7 +254,7 @@ class ShownScene:
         return self._painted[1]
 
     def warm_up(self) -> None:
-        """Compile the loops of drawing, picking and masks: nobody waits for them once the page is open."""
+        """Compile the loops of rendering, picking and masks before the page opens."""
         from hilsplat.contributions.compositing import normalised_weights
         from hilsplat.semantic_tree.view_nodes import ViewNodes
         from hilsplat.splat.rasterise.api import pixel_weights
@@ -265,10 +265,10 @@ class ShownScene:
         painted(self.gaussians, camera, None, self.threads)
         pick(self.gaussians, None, camera, 4.0, 4.0, self.threads)
         weights = pixel_weights(self.gaussians, camera, min_weight=0.0, threads=self.threads)
-        node = np.zeros(len(self.gaussians), np.int32)  # all of one, as the tree may not be there yet
+        node = np.zeros(len(self.gaussians), np.int32)  # one node, because the tree may not exist yet
         ViewNodes.of(normalised_weights(weights), node).mask(np.ones(1, np.bool_))
         if self.first in self.variants:
             try:
                 self.answering(self.first)
-            except HilsplatError as error:  # the Gaussians can still be looked at; the page shows why
+            except HilsplatError as error:  # the page can still show the Gaussians, and the error
                 logger.warning("no answers: %s", error)

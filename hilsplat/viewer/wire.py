@@ -1,4 +1,4 @@
-"""What the page may send: shapes, sizes and finiteness are checked here, before anything is computed."""
+"""Request models of the page; shapes, sizes and finiteness are checked here, before any computation."""
 
 import base64
 import binascii
@@ -20,7 +20,7 @@ Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
 
 
 class Message(BaseModel):
-    """Any message: unknown keys, NaN and infinity are refused."""
+    """Base of all request models; unknown keys, NaN and infinity are rejected."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -48,18 +48,18 @@ class WireCamera(Message):
         return value
 
     def camera(self) -> Camera:
-        """The camera."""
+        """Return the camera."""
         return Camera("page", np.array(self.cam_from_world), np.array(self.K), self.size_hw)
 
 
 class Style(Message):
-    """How Gaussians are painted, by the node that they belong to; see `frames.painted`.
+    """Colours of Gaussians by the node that they belong to; see `frames.painted`.
 
     Attributes:
         table: base64 of RGBA bytes, row 0 for Gaussians without a node, row n + 1 for node n.
-        use: which levels are looked up; the finest with an alpha above 0 decides.
-        mode: what becomes of Gaussians whose alpha is 0.
-        ramp: base64 of 256 RGB bytes; if given, Gaussians are painted by the field's relevancy to `text` at
+        use: levels that are used; the finest with an alpha above 0 sets the colour.
+        mode: how Gaussians whose alpha is 0 are painted.
+        ramp: base64 of 256 RGB colours; if given, Gaussians are painted by the field's relevancy to `text` at
             `level` instead.
     """
 
@@ -77,7 +77,7 @@ class Style(Message):
         return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
-        """The table, (nodes + 1, 4); an empty one leaves every Gaussian as it is.
+        """Return the table, (nodes + 1, 4); an empty one leaves every Gaussian unchanged.
 
         Raises:
             ValueError: it has another number of rows.
@@ -85,7 +85,7 @@ class Style(Message):
         return _rows(self.table, 4, num_nodes + 1)
 
     def colours(self) -> UInt8[np.ndarray, "256 3"]:
-        """The ramp."""
+        """Return the ramp."""
         return _rows(self.ramp, 3, 256)
 
 
@@ -102,13 +102,13 @@ def _rows(text: str, width: int, count: int) -> np.ndarray:
 
 
 class Asked(Message):
-    """A question to one variant of the scene."""
+    """Base of requests about one variant of the scene."""
 
     variant: Annotated[str, Field(max_length=100)] = "default"
 
 
 class Question(Message):
-    """A text or a path; only answers from a threshold up, or that a photograph shows."""
+    """A text or a path, optionally with a minimum score, and limited to what a photograph shows."""
 
     text: Text
     level: LevelName = "auto"
@@ -117,20 +117,20 @@ class Question(Message):
 
 
 class Query(Asked, Question):
-    """A question to a variant's tree or field."""
+    """A query of a variant's tree or field."""
 
     answerer: Literal["tree", "field"] = "tree"
 
 
 class Like(Asked):
-    """What looks like a node, or like a picture (base64 of an image file)."""
+    """A search for nodes that look like a node, or like a picture (base64 of an image file)."""
 
     node: Annotated[int, Field(ge=0)] | None = None
     picture: Annotated[str, Field(max_length=900_000)] = ""
 
 
 class FieldRelevancy(Asked):
-    """The field's relevancy of every Gaussian to a text, in the order of the PLY or of the page's chunks."""
+    """The field's relevancy of each Gaussian to a text, in the order of the PLY or of the page's chunks."""
 
     text: Text
     level: LevelName = "auto"
@@ -146,7 +146,7 @@ class Pick(Asked):
 
 
 class Frame(Asked):
-    """A picture painted by the server."""
+    """A picture rendered by the server."""
 
     camera: WireCamera
     style: Style = Style()
@@ -155,7 +155,7 @@ class Frame(Asked):
 
 
 class Film(Asked):
-    """A flight: around what the cameras saw, or along a path of cameras."""
+    """A film: around what the cameras saw, or along a path of cameras."""
 
     style: Style = Style()
     format: Literal["mp4", "gif"] = "mp4"
@@ -165,14 +165,14 @@ class Film(Asked):
 
 
 class Group(Message):
-    """Nodes that belong together: the answers to a query, or what was chosen."""
+    """Nodes that belong together: the answers to a query, or a selection."""
 
     name: Annotated[str, Field(max_length=MAX_TEXT)]
     nodes: Nodes
 
 
 class Selection(Asked):
-    """Some nodes, in groups that may overlap."""
+    """Groups of nodes, which may overlap."""
 
     groups: Annotated[list[Group], Field(min_length=1, max_length=40)]
 
@@ -184,9 +184,9 @@ class Names(Asked):
 
 
 class Page(Asked):
-    """A scene as one HTML file with the answers to kept queries, each in its colour, and to the last."""
+    """A scene as one HTML file with the answers to kept queries, each in its colour, and the last query."""
 
     kept: Annotated[list[Question], Field(max_length=40)] = []
     last: Question | None = None
     start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
-    """The camera that the page begins with, as in its address; empty: that of the first photograph."""
+    """Initial camera of the page, in the format of its address; empty for the first photograph's camera."""

@@ -1,4 +1,4 @@
-"""Whether what was opened is still what lies on the disk."""
+"""Detection of artifacts that changed on disk since they were opened."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -11,38 +11,38 @@ State = tuple[int, int, int] | None
 
 
 class StaleSceneError(ArtifactError):
-    """A part of the scene was written anew since it was opened."""
+    """A part of the scene was rewritten since it was opened."""
 
 
 class Witness:
-    """Artifacts as they were before they were opened.
+    """States of artifacts from before they were opened.
 
-    Every writer replaces its output whole, so a file that was written anew is another one: `stat` tells,
-    without reading it. Of a folder its index tells, which is written last.
+    Writers always replace the whole file, so `stat` detects a rewritten file without reading it. A folder's
+    state is that of its index, which is written last.
     """
 
     def __init__(self) -> None:
         self._seen: dict[Path, State] = {}
 
     def note(self, paths: Iterable[Path]) -> None:
-        """Remember artifacts as they are now, except for those that were noted before."""
+        """Record the current state of artifacts, except those recorded before."""
         for path in paths:
             self._seen.setdefault(Path(path), _state(Path(path)))
 
     def changed(self) -> list[Path]:
-        """Those that are no longer what they were, or gone."""
+        """Return the recorded artifacts that changed or were deleted."""
         return [path for path, seen in self._seen.items() if _state(path) != seen]
 
     @contextmanager
     def unchanged(self, scene: str, *parts: Path) -> Iterator[None]:
-        """Around whatever reads the disk: it must read what belongs to what was opened before.
+        """Guard disk reads: fail if files changed since the scene was opened.
 
         Args:
-            scene: its name, for the error.
-            parts: those that must be unchanged; without any, all that were noted.
+            scene: name of the scene, for the error.
+            parts: artifacts that must be unchanged; by default, all recorded ones.
 
         Raises:
-            StaleSceneError: a part was written anew before or meanwhile.
+            StaleSceneError: a part was rewritten before or during the read.
         """
         self._require_unchanged(scene, parts)
         yield

@@ -1,4 +1,4 @@
-"""`hilsplat doctor`: what works on this machine, and what to do about what does not."""
+"""`hilsplat doctor`: checks of this machine's installation, with a fix for each problem."""
 
 import importlib.metadata
 import os
@@ -25,18 +25,18 @@ from hilsplat.workflow.resources import COSTS, JobResources
 PACKAGE = "hilsplat"
 
 RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
-"""Rules whose memory and disk are compared with the machine's."""
+"""Rules whose memory and disk space are compared with the machine's."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found.
+    """Result of a check.
 
     Attributes:
-        check: its name.
-        state: "ok"; "note": something is missing that not everybody needs; "fault": runs fail or are wrong.
-        found: what there is.
-        fix: what to do; empty if nothing.
+        check: name of the check.
+        state: "ok"; "note" if something optional is missing; "fault" if runs fail or give wrong results.
+        found: what was found.
+        fix: how to fix it; empty if no action is needed.
     """
 
     check: str
@@ -46,16 +46,16 @@ class Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """Run every check; one that fails unexpectedly is a fault and does not stop the others."""
+    """Run every check; an unexpected exception is reported as a fault and does not stop the others."""
     for check in CHECKS:
         try:
             yield from check()
-        except Exception as error:  # whatever a broken installation raises
+        except Exception as error:  # a broken installation can raise anything
             yield Finding(check.__name__, "fault", f"{type(error).__name__}: {error}", "read the message")
 
 
 def python() -> Iterator[Finding]:
-    """The version of Python."""
+    """Check the version of Python."""
     wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     found = platform.python_version()
     if SpecifierSet(wanted).contains(found):
@@ -65,7 +65,7 @@ def python() -> Iterator[Finding]:
 
 
 def libraries() -> Iterator[Finding]:
-    """Versions of the libraries that the package requires."""
+    """Check the versions of the libraries that the package requires."""
     wrong, number = [], 0
     for text in importlib.metadata.requires(PACKAGE) or ():
         requirement = Requirement(text)
@@ -73,7 +73,7 @@ def libraries() -> Iterator[Finding]:
             continue
         number += 1
         if requirement.name == "onnxruntime" and is_installed("onnxruntime-gpu"):
-            continue  # it takes its place
+            continue  # onnxruntime-gpu replaces onnxruntime
         try:
             found = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
@@ -89,7 +89,7 @@ def libraries() -> Iterator[Finding]:
 
 
 def onnx() -> Iterator[Finding]:
-    """Where onnxruntime runs networks, and whether two builds of it overwrite each other."""
+    """Report onnxruntime's providers, and whether two builds of it overwrite each other."""
     import onnxruntime
 
     if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
@@ -105,7 +105,7 @@ def onnx() -> Iterator[Finding]:
 
 
 def cuda() -> Iterator[Finding]:
-    """Whether torch and gsplat can use CUDA, and draw what the CPU draws."""
+    """Check whether torch and gsplat can use CUDA, and whether they render what the CPU renders."""
     from hilsplat.splat.rasterise.device import cuda_problem
     from hilsplat.splat.rasterise.parity import cuda_disagreement
 
@@ -119,7 +119,7 @@ def cuda() -> Iterator[Finding]:
 
 
 def kernels() -> Iterator[Finding]:
-    """Compile the rasteriser's loops, or load them, and draw a small scene."""
+    """Compile or load the rasteriser's loops, and render a small scene."""
     from hilsplat.splat.rasterise.parity import disagreement
 
     begin = time.monotonic()
@@ -132,7 +132,7 @@ def kernels() -> Iterator[Finding]:
 
 
 def video() -> Iterator[Finding]:
-    """Whether PyAV reads and writes the usual videos."""
+    """Check whether PyAV reads H.264 and HEVC and writes H.264."""
     import av
 
     needed: tuple[tuple[str, Literal["r", "w"]], ...] = (("h264", "r"), ("hevc", "r"), ("libx264", "w"))
@@ -149,7 +149,7 @@ def video() -> Iterator[Finding]:
 
 
 def models() -> Iterator[Finding]:
-    """Run each model that photographs use, on each of onnxruntime's providers."""
+    """Run each model for photographs on each of onnxruntime's providers."""
     from hilsplat.embed.model_check import check_model, provider_disagreement
     from hilsplat.models.network import execution_providers
 
@@ -177,7 +177,7 @@ def models() -> Iterator[Finding]:
 
 
 def space() -> Iterator[Finding]:
-    """Free disk and memory against what the configured scenes need."""
+    """Compare free disk space and memory with the needs of the configured scenes."""
     try:
         plan = Plan(merged_config([]))
     except HilsplatError as error:
@@ -213,7 +213,7 @@ def space() -> Iterator[Finding]:
 
 
 def writing() -> Iterator[Finding]:
-    """Folders that are written to."""
+    """Check that the folders to which hilsplat writes are writable."""
     kernels_folder = Path(__file__).resolve().parents[1] / "__pycache__"
     for what, folder in (
         ("working folder", Path.cwd()),
@@ -247,7 +247,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 
 
 def _existing(folder: Path) -> Path:
-    """Return the folder, or the nearest one above it that exists."""
+    """Return the folder, or its nearest existing parent."""
     return next(path for path in (folder, *folder.resolve().parents) if path.exists())
 
 

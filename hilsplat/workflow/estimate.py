@@ -1,4 +1,4 @@
-"""Estimate what a run will take from the jobs of a dry run, as a table."""
+"""Table that estimates the time, memory and disk space of a run from the jobs of a dry run."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,9 +8,9 @@ from types import SimpleNamespace
 from hilsplat.workflow.resources import START_S, JobResources
 
 GPU_GAIN = {"gaussians": 30, "masks": 27, "clip": 60}
-"""Rule -> one core's time divided by that of a 24 GB GPU (RTX 3090), from published times: 3DGS takes 25
-minutes for 30,000 steps, SAM ViT-H's generator 4 s per picture, CLIP B/16 5 ms per crop. Not measured here.
-Other rules are counted as if they ran on the CPU."""
+"""Rule -> speed of a 24 GB GPU (RTX 3090) relative to one core, from published times: 3DGS takes 25 minutes
+for 30,000 steps, SAM ViT-H's generator 4 s per picture, CLIP B/16 5 ms per crop. Not measured here. Other
+rules are assumed to run on the CPU."""
 
 OTHERS = "tables"
 """Name of the row for jobs without a scene."""
@@ -52,7 +52,7 @@ class RunEstimate:
         self._totals = defaultdict[str, Totals](Totals)
 
     def add(self, rule: str, wildcards: Mapping[str, str], memory_mb: int) -> None:
-        """Add a job."""
+        """Add a job to the totals of its data set."""
         job = SimpleNamespace(**wildcards)
         of_scene = "scene" in wildcards
         core_s = self.resources.core_seconds(rule, job) if of_scene else START_S

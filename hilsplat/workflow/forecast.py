@@ -1,4 +1,4 @@
-"""How long photographs take until they answer, from one measurement of their SAM and CLIP on this machine."""
+"""Forecast of the time until a scene of photographs accepts queries, from one timing of SAM and CLIP."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ KEPT_PROMPTS = 0.3
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:
-    """Predict the times of scenes of photographs that a real SAM and CLIP still have to work on.
+    """Predict the times of scenes of photographs that a full-size SAM and CLIP have not yet processed.
 
     Returns:
         a line per scene.
@@ -40,7 +40,7 @@ def _is_real(stages: StageSettings) -> bool:
 def _forecast(
     plan: Plan, resources: JobResources, row: SceneRow, job: Any, stages: StageSettings, cores: int
 ) -> str:
-    """Return the line of one scene."""
+    """Return the forecast of one scene."""
     from hilsplat.embed.model_check import seconds_of  # onnxruntime takes a while to import
 
     files = plan.data.image_files(job)

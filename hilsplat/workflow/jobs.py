@@ -1,4 +1,4 @@
-"""Types and texts that rules and plan share."""
+"""Types and text helpers shared by rules and plan."""
 
 import re
 from collections.abc import Collection
@@ -29,5 +29,5 @@ def any_of(names: Collection[str] | Any) -> str:
 
 
 def inert(text: str) -> str:
-    """Return the same JSON without `<`: Snakemake copies parameters unescaped into a script of its report."""
+    """Return the same JSON without `<`; Snakemake copies parameters unescaped into a script in its report."""
     return text.replace("<", "\\u003c")

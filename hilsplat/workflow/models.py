@@ -1,4 +1,4 @@
-"""Models and devices of a run: checks before the first job, and what the models are good for."""
+"""Models and devices of a run: checks before the first job, and descriptions of the models."""
 
 import functools
 from pathlib import Path
@@ -12,7 +12,7 @@ from hilsplat.scene.sheet import PHOTOS
 
 
 def check_models(stages: StageSettings, where: str) -> None:
-    """Refuse a model folder that is missing or holds another kind of model.
+    """Raise an error if a model folder is missing or contains another kind of model.
 
     Args:
         stages: settings without `auto` (`StageSettings.with_models`).
@@ -32,7 +32,7 @@ def check_models(stages: StageSettings, where: str) -> None:
 
 
 def check_device(stages: StageSettings, where: str) -> None:
-    """Refuse `device: cuda` if this machine has no usable CUDA device.
+    """Raise an error if a setting is `device: cuda` and this machine has no usable CUDA device.
 
     Raises:
         HilsplatError: the message names the setting.
@@ -60,7 +60,7 @@ def _require_model(folder: Path, kind: str, variant: str) -> None:
 
 
 def describe_models(stages: StageSettings, features: Path | None = None) -> str:
-    """Name the segmenter and the CLIP of settings without `auto`, or LangSplat's files in place of both."""
+    """Describe the segmenter and CLIP of settings without `auto`, or LangSplat's files in place of both."""
     if features is not None:
         return f"masks and their vectors from {features}; text queries by {Path(stages.clip.model).name}"
     masks = {
@@ -72,7 +72,7 @@ def describe_models(stages: StageSettings, features: Path | None = None) -> str:
 
 
 def doubt_about_photographs(stages: StageSettings) -> str:
-    """Return why answers about photographs are meaningless with these settings, or an empty text."""
+    """Return why answers about photographs are meaningless with these settings; empty if they are not."""
     clip = read_model(Path(stages.clip.model))
     return meaningless(clip.folder.name) if clip is not None and clip.embedded else ""
 
@@ -81,12 +81,12 @@ def models_of_photographs(config: Path, scene: str, features: Path | None = None
     """Return lines about the models that a scene of photographs will use.
 
     Args:
-        config: configuration of the project; if there is none, the installed one counts.
+        config: configuration of the project; the installed one is used if it does not exist.
         scene: name of the scene.
         features: LangSplat's files in place of SAM and CLIP.
 
     Raises:
-        SettingsError: the configuration cannot be used.
+        SettingsError: the configuration is invalid.
     """
     run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
     stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()

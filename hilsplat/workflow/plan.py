@@ -1,7 +1,7 @@
 """The plan of a run: its scenes, and the settings, shared inputs and parameters of each job.
 
-A *job* is anything with the attributes `dataset` and `scene`, and `variant` in the stages of a variant, such
-as the wildcards of a rule.
+A *job* is any object with the attributes `dataset` and `scene`, and in the stages of a variant `variant`,
+such as the wildcards of a rule.
 """
 
 import difflib
@@ -36,7 +36,7 @@ from hilsplat.workflow.scene_data import SceneData, truth_argument
 from hilsplat.workflow.stages import stage_code
 
 LEAST_PHOTOGRAPHS = 16
-"""Scenes of fewer photographs have no key views: half of them would link few masks."""
+"""Minimum number of photographs of a scene with key views; half of fewer would link too few masks."""
 
 
 class Plan:
@@ -45,16 +45,16 @@ class Plan:
     Attributes:
         run: the validated configuration.
         results: results folder.
-        rows: every scene of the sheet, and those on disk of data sets whose scenes differ between users.
-        scenes: scenes that are run.
-        absent: chosen scenes that are skipped -> the reason.
+        rows: scenes in the sheet, and scenes on disk of data sets whose scenes differ between users.
+        scenes: scenes to run.
+        absent: skipped scene -> reason.
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         """Validate a configuration and read the scene sheet.
 
         Raises:
-            HilsplatError: a setting, a method or a line of the sheet cannot be used, or no scene is left.
+            HilsplatError: a setting, a method or a line of the sheet is invalid, or no scene is left.
         """
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
@@ -84,7 +84,7 @@ class Plan:
                 ),
                 fix="name a scene (hilsplat run photos/desk) or other groups, or set data_root",
             )
-        # A thousand scenes have tens of thousands of jobs: settings are resolved and folders are read once.
+        # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
         self._seeded = functools.cache(run.seeded)
         self._section = functools.cache(self._section_of)
@@ -93,13 +93,13 @@ class Plan:
             self.data.require_no_braces(row)
 
     def require_usable(self, *, devices: bool) -> None:
-        """Check that models exist, and that this machine has the devices of the settings.
+        """Check that the models exist, and that this machine has the devices in the settings.
 
         Args:
             devices: check devices too; False if other machines run the jobs.
 
         Raises:
-            HilsplatError: the message names the setting, and a scene and variant that have it.
+            HilsplatError: the message names the setting, and a scene and variant that use it.
         """
         if self.results.exists() and not self.results.is_dir():
             raise SettingsError(
@@ -123,7 +123,7 @@ class Plan:
         """Return the regular expression of the wildcard `variant`.
 
         Args:
-            by_baseline: True for variants with a field by a baseline, False for ours, None for all.
+            by_baseline: True for variants whose field a baseline computes, False for ours, None for all.
         """
         return any_of(
             name
@@ -144,12 +144,12 @@ class Plan:
         return getattr(job, "variant", "default"), self.scopes(self.row(job))
 
     def _section_of(self, section: str, variant: str, scopes: tuple[str, ...]) -> tuple[str, dict[str, Any]]:
-        """Return a section's settings as JSON and as the values in it."""
+        """Return a section's settings as JSON and as values."""
         settings = getattr(self.stages_of(variant, scopes), section)
         return inert(settings.model_dump_json()), settings.model_dump(mode="json")
 
     def settings(self, section: str) -> Callable[[Job], str]:
-        """Parameter: a section's settings as JSON."""
+        """Return the parameter function for a section's settings as JSON."""
         return lambda job: self._section(section, *self.which(job))[0]
 
     def values(self, section: str, job: Job) -> dict[str, Any]:
@@ -161,7 +161,7 @@ class Plan:
         return self._seeded(variant, self.scopes(row))
 
     def seed(self, job: VariantJob) -> int:
-        """Parameter: seed of a variant's networks."""
+        """Return the seed of a variant's networks."""
         return self.run.seed_of(job.variant)
 
     def code(
@@ -169,16 +169,16 @@ class Plan:
         stage: str | Callable[[Any], str],
         plugins: Callable[[Any], tuple[str, ...]] = lambda job: (),
     ) -> Callable[[Any], str]:
-        """Parameter: digest of a stage's code, with the readers or the baseline that a job uses."""
+        """Return the parameter function for the digest of a stage's code and of its readers or baseline."""
         return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
 
     def vocabulary(self, job: Job) -> list[str]:
-        """Input of names: the user's own vocabulary."""
+        """Return the input of names: the user's own vocabulary, if any."""
         named = self.stages(job).query.vocabulary
         return [] if named == AUTO else [named]
 
     def model(self, section: str) -> Callable[[Job], str]:
-        """Parameter: digest of the model folder that a stage reads, or "none"."""
+        """Return the parameter function for the digest of a section's model folder, or "none"."""
 
         def digest(job: Job) -> str:
             stages = self.stages(job)
@@ -189,7 +189,7 @@ class Plan:
         return digest
 
     def model_lines(self) -> list[str]:
-        """Return which models each scene uses, and warnings about models that don't fit photographs."""
+        """Return lines about the models of each scene, with warnings about models unfit for photographs."""
         scenes: dict[tuple[str, str], list[str]] = {}
         for row in self.scenes:
             stages = self.stages_of("default", self.scopes(row))
@@ -204,19 +204,19 @@ class Plan:
         ]
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
-        """Input: a stage's output, from the first variant with the same settings up to that stage.
+        """Return the input function for a stage's output, from the first variant with equal settings.
 
         A sweep over Omega thus fits only fields, and shares masks, trees and embeddings with `default`.
-        Variants that are in no table count too, so that shared files keep their place when tables change.
+        Variants that are in no table are included, so that shared files do not move when tables change.
         """
         return lambda job: self.path(job, self.shared_variant(stage, job), path)
 
     def compared(self, stage: str, path: str) -> Callable[[Job], list[str]]:
-        """Input: a stage's output for every variant of the main tables."""
+        """Return the input function for a stage's output for every variant in the main tables."""
         return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
 
     def compared_scores(self, job: Job) -> list[str]:
-        """Input: the scores of every variant of the main tables."""
+        """Return the input: every variant's scores in the main tables."""
         return [self.path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
 
     def _main_jobs(self, job: Job) -> list[SimpleNamespace]:
@@ -242,7 +242,7 @@ class Plan:
         return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
-        """Return the stage of the masks: imported ones, key views and the diagnostic have their own."""
+        """Return the stage of the masks; imported masks, key views and the diagnostic have their own."""
         masks = self.stages(job).masks
         if masks.segmenter == "truth-perturbed":
             return "truth_masks"
@@ -253,19 +253,19 @@ class Plan:
         return "guided_masks" if masks.prompts == "guided" and self.first_answer(job) else "masks"
 
     def key_gaussians(self, job: VariantJob) -> list[str]:
-        """Input of masks: the Gaussians that choose the key views, or that prompts are projected by."""
+        """Return the input of masks: the Gaussians that key views or projected prompts need, if any."""
         needed = self.masks_stage(job) in ("key_masks", "guided_masks")
         return [self.path(job, "gaussians.ply")] if needed else []
 
     def key_parts(self, job: VariantJob, stage: str) -> list[str]:
-        """Input of masks: masks or semantic tree of the key views, if they guide the prompts."""
+        """Return the input of masks: masks or semantic tree of the key views, if they guide the prompts."""
         own = SimpleNamespace(dataset=job.dataset, scene=job.scene, variant=KEY_VIEWS)
         return [self.shared(stage, stage)(own)] if self.masks_stage(job) == "guided_masks" else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
-        """Input of masks that is not read: what must answer before the masks of all views are computed.
+        """Return an input of masks that only orders jobs: what must exist before all views are segmented.
 
-        It is the variant `key-views` of a scene of photographs whose masks take a real SAM minutes.
+        It is the CLIP output of `key-views`, for photographs whose masks take a full-size SAM minutes.
         """
         row, masks = self.row(job), self.stages(job).masks
         if (
@@ -283,7 +283,7 @@ class Plan:
         return [self.shared("clip", "clip")(own)]
 
     def masks_truth(self, job: VariantJob) -> list[str]:
-        """Input of masks: the true labels, for the diagnostic segmenter only.
+        """Return the input of masks: the true labels, for the diagnostic segmenter only.
 
         Raises:
             SettingsError: it is chosen for a scene without true labels.
@@ -300,7 +300,7 @@ class Plan:
         return self.data.truth(job)
 
     def masks_option(self, job: VariantJob, input: Any) -> str:
-        """Options of key views, imported masks or the diagnostic segmenter, if they are chosen."""
+        """Return the options of masks for key views, imported masks or the diagnostic segmenter."""
         if self.masks_stage(job) == "langsplat":
             return self.data.features_option(job)
         if input.gaussians:
@@ -316,12 +316,12 @@ class Plan:
         return f"{truth_argument(input)} --perturb {shlex.quote(faults)}"
 
     def crops_tree(self, job: VariantJob) -> list[str]:
-        """Input of clip: the semantic tree whose nodes choose the crops; empty if every mask is embedded."""
+        """Return the input of clip: the semantic tree that selects crops; empty if all masks are embedded."""
         by_node = self.stages(job).clip.crops == "nodes" and not self.row(job).features
         return [self.shared("semantic_tree", "semantic_tree")(job)] if by_node else []
 
     def crops_tree_option(self, job: VariantJob, input: Any) -> str:
-        """Option of clip for `crops_tree`, or for imported vectors."""
+        """Return the option of clip for `crops_tree`, or for imported vectors."""
         if self.row(job).features:
             return self.data.features_option(job)
         return f"--semantic-tree {shlex.quote(str(input.semantic_tree))}" if input.semantic_tree else ""
@@ -331,12 +331,12 @@ class Plan:
         return "feature_tree" if self.stages(job).semantic_tree.evidence == "features" else "semantic_tree"
 
     def tree_parents(self, job: VariantJob) -> list[str]:
-        """Input of semantic_tree: the coverage trees, if features are trained for it."""
+        """Return the input of semantic_tree: the coverage trees, if it clusters features."""
         by_features = self.tree_stage(job) == "feature_tree"
         return [self.shared("coverage_tree", "coverage_tree")(job)] if by_features else []
 
     def tree_option(self, job: VariantJob, input: Any) -> str:
-        """Options of semantic-tree for `tree_parents`."""
+        """Return the options of semantic-tree for `tree_parents`."""
         if not input.coverage_tree:
             return ""
         field = shlex.quote(self._section("field", *self.which(job))[0])
@@ -344,13 +344,13 @@ class Plan:
         return f"--coverage-tree {tree} --field-settings {field} --seed {self.seed(job)}"
 
     def rendered(self, job: VariantJob) -> list[str]:
-        """Input of field: scene, Gaussians and masks, if the literal trainer renders them."""
+        """Return the input of field: scene, Gaussians and masks, if the literal trainer renders them."""
         if self.stages(job).field.trainer != "literal":
             return []
         return [self.path(job, "scene"), self.path(job, "gaussians.ply"), self.shared("masks", "masks")(job)]
 
     def first_field(self, job: VariantJob) -> list[str]:
-        """Input of field: LangSplat's field on the same masks and code, if it starts from that.
+        """Return the input of field: LangSplat's field on the same masks and code, if it starts from that.
 
         Raises:
             SettingsError: no variant makes one.
@@ -372,51 +372,51 @@ class Plan:
         )
 
     def field_option(self, job: VariantJob, input: Any) -> str:
-        """Options of field for `rendered` and `first_field`."""
+        """Return the options of field for `rendered` and `first_field`."""
         named = dict(zip(("scene", "gaussians", "masks"), input.rendered, strict=False))
         if input.start:
             named["start"] = input.start
         return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
 
     def field_seed(self, job: VariantJob) -> int:
-        """Parameter: seed of a field in which something is random; 0 for others, which so stay the same."""
+        """Return the seed of a field; 0 if nothing in it is random, so that other seeds do not rerun it."""
         return self.seed(job) if self.stages(job).field.is_random else 0
 
     def clip_stage(self, job: VariantJob) -> str:
-        """Return the stage that makes the CLIP vectors."""
+        """Return the stage that computes or imports the CLIP vectors."""
         return "langsplat" if self.row(job).features else "clip"
 
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
-        """The baseline that computes a variant's field."""
+        """Return the baseline that computes a variant's field."""
         return (METHODS.places[self.stages(job).method.name],)
 
     def main_variants(self) -> str:
-        """Parameter: the variants of the main tables, as JSON."""
+        """Return the variants in the main tables as JSON."""
         return json.dumps(self.run.main_variants)
 
     def names(self, _: object) -> str:
-        """Parameter: variant -> its name in tables and figures, as JSON; Snakemake would expand a text."""
+        """Return variant -> its name in tables and figures as JSON; Snakemake would expand a plain text."""
         return inert(json.dumps(dict(self.run.labels)))
 
     def queries(self, job: Job) -> str:
-        """Parameter: texts for the panel of a scene without labels on images, as JSON."""
+        """Return the queries for the panel of a scene without labels on images, as JSON."""
         of_dataset = self.run.queries.get(job.dataset, ())
         return inert(json.dumps(self.run.queries.get(f"{job.dataset}/{job.scene}", of_dataset)))
 
 
 def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
-    """Refuse a misspelt scene in `overrides`, `queries` or `sweep_scenes`.
+    """Raise an error for a misspelt scene in `overrides`, `queries` or `sweep_scenes`.
 
     Args:
         run: the configuration.
-        rows: the sheet, and that of the default configuration, whose scenes another sheet need not have.
+        rows: scenes of the sheet and of the default sheet, because settings for the latter are allowed too.
 
     Raises:
-        SettingsError: the message has the name that was probably meant.
+        SettingsError: the message suggests the closest name.
     """
     datasets = {row.dataset for row in rows} | {PHOTOS}
     scenes = [row.name for row in rows]
-    # a scene of the sheet may be taken out of it, and its settings stay
+    # Settings of a scene that was removed from the sheet may stay in the configuration.
     named = [key for key in (*run.overrides, *run.queries) if "/" in key]
     gone = [key for key in named if key.partition("/")[0] in datasets]
     require_known("overrides", run.overrides, [*GROUPS, *scenes, *gone])
@@ -436,11 +436,11 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
 
 
 def scopes_of(row: SceneRow) -> tuple[str, str]:
-    """Keys of `overrides` that apply to a scene, the general one first."""
+    """Return the keys of `overrides` that apply to a scene, the general one first."""
     return (row.group, f"{row.dataset}/{row.scene}")
 
 
 def some(names: list[str]) -> str:
-    """The first three of some names, and how many more there are."""
+    """Return the first three names, and the number of further ones."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more

@@ -1,7 +1,7 @@
-"""Progress of a run: a line per finished stage, and on a terminal a last line with the time left.
+"""Progress of a run: a line per finished stage, and on a terminal a status line with the time left.
 
-This module reads only attributes of log records; `snakemake_logger_plugin_hilsplat` connects this
-module to Snakemake. Warnings and errors are shown in full.
+This module reads only attributes of log records; `snakemake_logger_plugin_hilsplat` connects it to Snakemake.
+Warnings and errors are printed in full.
 """
 
 import logging
@@ -31,7 +31,7 @@ TARGETS = ("all", "everything", "tables", "total")
 """Entries of the job counts that are not jobs."""
 
 SELECTING = "Select jobs to execute..."
-"""A message before every job; it has no event."""
+"""Message that Snakemake logs before every job, without an event."""
 
 LOOPS = {
     "world": "rendered views",
@@ -42,19 +42,19 @@ LOOPS = {
     "evaluate": "views scored",
     "comparison": "methods compared",
 }
-"""Rule -> the loop (`base.progress.track`) that takes nearly all of its time."""
+"""Rule -> the loop (`base.progress.track`) that takes almost all of its time."""
 
 
 @dataclass(frozen=True)
 class RunningJob:
-    """A job that runs.
+    """A running job.
 
     Attributes:
         rule: name of its rule.
-        wildcards: their values by name.
+        wildcards: values of its wildcards by name.
         threads: number of cores.
         log: its log, or None.
-        start_s: when it began, on the clock of the run.
+        start_s: start time on the run's clock.
     """
 
     rule: str
@@ -65,7 +65,7 @@ class RunningJob:
 
     @property
     def name(self) -> str:
-        """Scene, variant unless it is the default one, and stage."""
+        """Scene, variant unless it is the default, and stage."""
         places = [self.wildcards.get(name, "") for name in ("dataset", "scene", "variant")]
         scene = "/".join(filter(None, places[:2]))
         variant = "" if places[2] == "default" else places[2]
@@ -79,7 +79,7 @@ class RunningJob:
 
 
 class Estimates:
-    """Core seconds of jobs: estimates by rule, scaled by what jobs took so far.
+    """Core seconds of jobs: estimates by rule, scaled by the measured times of finished jobs.
 
     Args:
         resources: estimates of the plan's jobs; None if there is no plan.
@@ -91,14 +91,14 @@ class Estimates:
         self._means: dict[str, float] = {}
 
     def learn(self, rule: str, wildcards: Mapping[str, str], core_s: float) -> None:
-        """Add what a job took."""
+        """Add the measured core seconds of a job."""
         estimate = self._estimate(rule, SimpleNamespace(**wildcards)) if "scene" in wildcards else START_S
         for key in (rule, ""):
             self._measured[key] += core_s
             self._estimated[key] += estimate
 
     def learn_from_benchmarks(self) -> None:
-        """Add what the jobs of earlier runs took, from Snakemake's benchmark files."""
+        """Add the times of earlier runs' jobs from Snakemake's benchmark files."""
         if self.resources is None:
             return
         for row in self.resources.plan.rows:
@@ -108,7 +108,7 @@ class Estimates:
                 try:
                     last = parse_json(file.read_text(encoding="utf-8").splitlines()[-1])
                     self.learn(file.stem, job, max(float(last["cpu_time"]), float(last["s"])))
-                except (OSError, ValueError, KeyError, IndexError, TypeError):  # a job is writing it
+                except (OSError, ValueError, KeyError, IndexError, TypeError):  # a job may be writing it
                     continue
 
     def seconds(self, rule: str) -> float:
@@ -127,11 +127,11 @@ class Estimates:
 
 
 estimates = Estimates()
-"""Estimates of this process's run; the Snakefile sets `estimates.resources` once it has read the plan."""
+"""Estimates of this process's run; the Snakefile sets `estimates.resources` after it has read the plan."""
 
 
 class RunProgress:
-    """Jobs of a run that wait, run and are done, and the time left.
+    """Waiting, running and finished jobs of a run, and the time left.
 
     Args:
         clock: monotonic clock, s.
@@ -147,13 +147,13 @@ class RunProgress:
         self._refined: set[str] = set()
 
     def begin(self, jobs: Mapping[str, int]) -> None:
-        """Start a run with so many jobs of each rule."""
+        """Start a run with the given number of jobs of each rule."""
         self.waiting = Counter({rule: number for rule, number in jobs.items() if rule not in TARGETS})
         self.total = self.waiting.total()
         estimates.learn_from_benchmarks()
 
     def start(self, number: int, job: RunningJob) -> None:
-        """Start a job, perhaps not for the first time."""
+        """Start a job, or restart a failed one."""
         if job.rule in TARGETS:
             return
         if self.waiting[job.rule] > 0:
@@ -179,13 +179,13 @@ class RunProgress:
         return [*warnings, f"{job.name}: {seconds:.0f} s ({self.counts()})", *self._hint(job)]
 
     def counts(self) -> str:
-        """Return how many jobs are done, and the time left."""
+        """Return the number of finished jobs and the time left, as text."""
         failed = f", {self.failed} failed" if self.failed else ""
         left = f", {duration(self.seconds_left())} left" if self.running or self.waiting.total() else ""
         return f"{self.done} of {self.total} done{failed}{left}"
 
     def line(self) -> str:
-        """Return the last line of the terminal; empty if nothing runs."""
+        """Return the status line of the terminal; empty if nothing runs."""
         jobs = [self._describe(self.running[number]) for number in sorted(self.running)]
         return f"{self.counts()} | {', '.join(jobs)}" if jobs else ""
 
@@ -197,23 +197,23 @@ class RunProgress:
         return f"{job.name}{loop} {progress[1]} of {progress[2]}"
 
     def seconds_left(self) -> float:
-        """Return the core seconds left divided by the cores, but at least those of the longest job."""
+        """Return the core seconds left divided by the cores, but at least the longest job's seconds."""
         waiting = sum(number * estimates.seconds(rule) for rule, number in self.waiting.items() if number)
         running = [(self._left(job), job.threads) for job in self.running.values()]
         spread = (waiting + sum(left * threads for left, threads in running)) / self.cores
         return max([spread, *(left for left, _ in running)])
 
     def _left(self, job: RunningJob) -> float:
-        """Return the seconds that a running job still takes; its own progress counts once it has any."""
+        """Return the seconds left of a running job, from its own progress if it has reported any."""
         elapsed, progress = self.clock() - job.start_s, job.progress()
         if progress is not None and progress[1] and progress[0] == LOOPS.get(job.rule):
             return elapsed * (progress[2] / progress[1] - 1)
         return max(estimates.seconds(job.rule) / job.threads - elapsed, 0.1 * elapsed)
 
     def _hint(self, job: RunningJob) -> list[str]:
-        """Return the query commands when the nodes of a scene's tree have vectors; once in a run.
+        """Return a line when a scene is ready to query, with the query commands once per run.
 
-        Key views answer first; the line after the rest is shorter.
+        If key views made it ready first, the line for all photographs is shorter.
         """
         variant = job.wildcards.get("variant")
         needed = {"clip": "semantic_tree", "semantic_tree": "clip"}.get(job.rule)
@@ -235,10 +235,10 @@ class RunProgress:
 
 
 class ProgressDisplay:
-    """Writes progress, warnings and errors to a terminal or a file.
+    """Output of progress, warnings and errors to a terminal or a file.
 
     Args:
-        stream: where to write.
+        stream: output stream.
         text: formats other log records.
         run: the progress.
     """
@@ -284,7 +284,7 @@ class ProgressDisplay:
         self._line.refresh()
 
     def close(self) -> None:
-        """Remove the last line."""
+        """Remove the status line."""
         self._line.stop()
 
     def _draw(self) -> Text:
@@ -292,7 +292,7 @@ class ProgressDisplay:
 
 
 def duration(seconds: float) -> str:
-    """Return a time as text, no more exact than an estimate is."""
+    """Return a time as text, rounded to the accuracy of an estimate."""
     if seconds < 10:
         return "less than 10 s"
     if seconds < 55:

@@ -1,7 +1,7 @@
-"""Check artifacts against their provenance, and the provenance against the plan of a run.
+"""Comparison of artifacts with their provenance, and of the provenance with the plan of a run.
 
-Snakemake compares times and its own metadata. Both miss a file that was deleted inside a folder, an output
-that a killed job left, and everything once the metadata is lost.
+Snakemake compares times and its own metadata. It does not detect a file that was deleted inside a folder or
+an unfinished output of a killed job, and it detects nothing if its metadata is lost.
 """
 
 import shlex
@@ -24,7 +24,7 @@ from hilsplat.workflow.stages import stage_code
 from hilsplat.workflow.targets import tables
 
 IMPORTED = "langsplat"
-"""Stage of artifacts that a user imported in place of a stage's output: no settings of a plan made them."""
+"""Stage of artifacts imported in place of a stage's output, to which no settings of the plan apply."""
 
 SHARED = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder", "field")
 """Stages whose outputs variants share."""
@@ -39,9 +39,9 @@ class Expected:
     Attributes:
         output: one of the outputs that its rule declares, if it is not the artifact itself.
         stage: key of `STAGES`.
-        settings: as its provenance should record them.
-        seed: as its provenance should record it; None if nothing is random.
-        plugins: readers or baselines that its code digest covers.
+        settings: settings expected in its provenance.
+        seed: seed expected in its provenance; None if nothing is random.
+        plugins: readers or baselines that are part of its code digest.
     """
 
     stage: str
@@ -52,7 +52,7 @@ class Expected:
 
 
 def expected_artifacts(plan: Plan) -> dict[str, Expected]:
-    """Return how the plan makes each artifact that the run may write, by path."""
+    """Return how the plan makes each artifact that the run can write, by path."""
     found: dict[str, Expected] = {}
     for row in plan.scenes:
         scene = SimpleNamespace(dataset=row.dataset, scene=row.scene)
@@ -108,9 +108,9 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
 
 
 def outdated(plan: Plan) -> dict[str, str]:
-    """Return the existing outputs that must be made again, with the reason.
+    """Map each existing output that must be rebuilt to the reason.
 
-    Contents are compared only after a job that did not finish; otherwise sizes are.
+    Contents are compared only if a job did not finish; otherwise, sizes are compared.
     """
     expected = expected_artifacts(plan)
     records = Records(plan.results, every_byte=False)
@@ -126,8 +126,8 @@ def outdated(plan: Plan) -> dict[str, str]:
 def verify(results: Path) -> tuple[str, bool]:
     """Read every byte of a results folder and compare it with the provenance.
 
-    An artifact is damaged if its files are not what was written. It is stale if other code made it or its
-    inputs have changed. Inputs outside the folder that no longer exist are ignored.
+    An artifact is damaged if its files differ from what was written. It is stale if other code made it or its
+    inputs have changed. Missing inputs outside the folder are ignored.
 
     Args:
         results: the results folder, or a copy of it anywhere.
@@ -136,7 +136,7 @@ def verify(results: Path) -> tuple[str, bool]:
         A report that ends with the Snakemake command that repairs the folder, and whether all is whole.
 
     Raises:
-        ArtifactError: the folder holds no artifact.
+        ArtifactError: the folder contains no artifact.
     """
     results = Path(results)
     paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
@@ -163,11 +163,11 @@ def verify(results: Path) -> tuple[str, bool]:
 
 
 class Records:
-    """The provenance of artifacts, compared with their files.
+    """Comparison of artifacts' provenance with their files.
 
     Args:
-        results: results folder. Provenance names its files as `results/...`, wherever it is now.
-        every_byte: compare contents; otherwise sizes.
+        results: results folder. Provenance records paths in it as `results/...`, even after it was moved.
+        every_byte: compare contents instead of sizes.
     """
 
     def __init__(self, results: Path, *, every_byte: bool) -> None:
@@ -180,7 +180,7 @@ class Records:
 
         Args:
             artifact: file or folder.
-            expected: how the plan makes it; None compares only with the current code.
+            expected: how the plan makes it; None compares only code and inputs.
         """
         try:
             record = read_provenance(artifact)
@@ -195,7 +195,7 @@ class Records:
         return (STALE, reason) if reason else (WHOLE, "")
 
     def _damage(self, artifact: Path, record: Provenance) -> str | None:
-        """Return which file is missing or not as it was written."""
+        """Return the first file that is missing or differs from what was written, or None."""
         lock = lock_path(artifact)
         unfinished = lock.is_file() and lock.stat().st_size > 0
         for name, written in record.outputs.items():
@@ -214,7 +214,7 @@ class Records:
         return None
 
     def _differences(self, record: Provenance, expected: Expected | None) -> Iterator[str]:
-        """Yield how an artifact was made differently from now, and which of its inputs changed."""
+        """Yield differences between how an artifact was made and the plan, and its changed inputs."""
         stage, plugins = record.stage, record.plugins
         if expected is not None and stage != IMPORTED:
             if stage != expected.stage:
@@ -229,7 +229,7 @@ class Records:
             stage, plugins = expected.stage, expected.plugins
         try:
             code = stage_code(stage, plugins)
-        except HilsplatError:  # a stage or a reader that this version does not have
+        except HilsplatError:  # this version does not have the stage or reader
             code = ""
         if code != record.code:
             yield "other code made it"
@@ -244,7 +244,7 @@ class Records:
                     yield f"its input {name} {'is missing' if known is None else 'has changed'}: {path}"
 
     def _digest(self, path: Path) -> str | None:
-        """Return the digest of a file or folder, or None if there is none."""
+        """Return the digest of a file or folder, or None if it does not exist or cannot be read."""
         if path not in self._digests:
             try:
                 self._digests[path] = sha256_of_path(path)
@@ -253,7 +253,7 @@ class Records:
         return self._digests[path]
 
     def _known_digest(self, name: str, path: Path) -> str | None:
-        """Return the recorded digest of an artifact, or a model's; None if only Snakemake watches it."""
+        """Return the recorded digest of an artifact, or a model's; None if only Snakemake tracks it."""
         if name == "model" and path.is_dir():
             return model_digest(path, self.results / ".cache")
         return self._digests.get(path)

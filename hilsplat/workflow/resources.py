@@ -1,12 +1,12 @@
 """Threads, memory, time and GPUs of a job, from the size of its scene and its settings.
 
-`resources.tsv` has, for each rule, core seconds per megapixel of all views and the parts of its memory in
+`resources.tsv` lists for each rule the core seconds per megapixel of all views and the terms of its memory in
 megabytes: a base, per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel of one view
-(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians; then megabytes on disk, caches included,
-per megapixel of all views and per thousand Gaussians (of a field: and channel of a latent). The memory is
+(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on disk with
+caches, per megapixel of all views and per thousand Gaussians (for fields: and latent channel). The memory is
 above the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and
 `train_models` were not measured). Times were measured on the benchmark scenes and can be wrong by a factor of
-three elsewhere. A job that is killed is tried again with twice as much of everything.
+three elsewhere. A killed job is retried with twice the memory and time limit.
 """
 
 import csv
@@ -35,23 +35,23 @@ with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
 COSTS = {row.pop("rule"): {name: float(value) for name, value in row.items()} for row in _rows}
 
 MP_PER_THREAD = 2.0
-"""Megapixels of all views that keep a thread busy."""
+"""Megapixels of all views per thread."""
 
 RUNNER_MB = 700
-"""Memory of the two Snakemakes that a cluster job starts before its stage."""
+"""Memory of the two Snakemake processes that a cluster job starts before its stage."""
 
 COMPARED_MB = (450, 4)
-"""Memory of `comparison` for each method: base, and per thousand Gaussians."""
+"""Memory of `comparison` per method: base, and per thousand Gaussians."""
 
 TIME_FACTOR, LEAST_MINUTES = 6, 10
 """Time limit of a job divided by its estimate, and the lowest limit."""
 
 START_S = 2.0
-"""Seconds that every job takes to start Python, load libraries and read."""
+"""Seconds that each job takes to start Python, load libraries and read its inputs."""
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
-"""Core seconds per step of the fit, for each megapixel that it sees and for each Gaussian of the limit; core
-seconds per megapixel in the graph segmenter."""
+"""Core seconds per fit step, for each megapixel of the view and for each Gaussian of the limit; core seconds
+per megapixel in the graph segmenter."""
 
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
@@ -60,19 +60,19 @@ NETWORK_S = 10.0
 """Core seconds to train an autoencoder."""
 
 EMBEDDED_S = {"masks": 1.5, "clip": 0.1}
-"""Core seconds per view of the embedded models."""
+"""Core seconds of the embedded models per view."""
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
-"""Part of a SAM's name -> core seconds to encode a picture; those of SAM 2.1 small (docs/benchmarks.md)."""
+"""Part of a SAM's name -> core seconds to encode a picture; others: SAM 2.1 small (docs/benchmarks.md)."""
 
 PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
 """Core seconds per SAM prompt, per picture between logits and masks, and per crop in CLIP B/16."""
 
 PREVIEWED, GUIDED = 0.65, 0.25
-"""Cost of a prompt that a preview may drop, and share of the grid's prompts that guided views take."""
+"""Relative cost of a prompt with preview, and share of the grid's prompts that guided views use."""
 
 MASKS, NODES = 230, 400
-"""Masks of a photograph, and nodes of a room: those of `plush_bedroom` (docs/benchmarks.md)."""
+"""Typical numbers of masks of a photograph and nodes of a room, from `plush_bedroom` (docs/benchmarks.md)."""
 
 UNTRAINED = ("lifted", "occam", "dr_splat")
 """Baselines without training."""
@@ -92,10 +92,10 @@ class JobResources:
     """Resources of the jobs of a plan, as functions of wildcards that Snakemake calls.
 
     Args:
-        plan: of the run.
-        cores: of this machine, if it runs the jobs: they get one thread each where there are jobs for all
-            cores. On a cluster nothing may depend on the machine, because a job computes its resources again
-            on its node.
+        plan: the plan of the run.
+        cores: cores of this machine if it runs the jobs; they get one thread each if there are jobs for all
+            cores. None on a cluster, where resources must not depend on the machine, because a job recomputes
+            them on its node.
     """
 
     def __init__(self, plan: Plan, cores: int | None = None) -> None:
@@ -108,16 +108,16 @@ class JobResources:
         self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
-        """Return as many threads as the scene's pixels keep busy, within its share of the cores."""
+        """Return a number of threads proportional to the scene's pixels, within its share of the cores."""
         views, view_mp = self.size(self.plan.row(wildcards))
         return int(min(max(1, math.ceil(views * view_mp / MP_PER_THREAD)), self._per_scene))
 
     def variant_threads(self, wildcards: Job) -> int:
-        """Return the threads of a rule with many short jobs per scene, which run side by side."""
+        """Return the threads of a rule with many short jobs per scene, which run in parallel."""
         return int(min(self.threads(wildcards), self._per_variant))
 
     def memory_mb(self, rule: str) -> Callable[..., int]:
-        """Resource `mem_mb` of a rule."""
+        """Return the function for the resource `mem_mb` of a rule."""
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
             cost = COSTS[rule]
@@ -135,7 +135,7 @@ class JobResources:
         return needed
 
     def minutes(self, rule: str) -> Callable[..., int]:
-        """Resource `runtime` of a rule."""
+        """Return the function for the resource `runtime` of a rule."""
 
         def needed(wildcards: Any, threads: int, attempt: int) -> int:
             seconds = self.core_seconds(rule, wildcards) / threads if hasattr(wildcards, "scene") else 0.0
@@ -145,7 +145,7 @@ class JobResources:
         return needed
 
     def gpus(self, section: str) -> Callable[[Job], int]:
-        """Resource `gpu` of a rule: 1 for `device: cuda`, and for networks of onnxruntime's GPU build."""
+        """Return the function for the resource `gpu`: 1 for `device: cuda` and for onnxruntime-gpu."""
 
         def needed(wildcards: Any) -> int:
             settings = getattr(self.plan.stages(wildcards), section)
@@ -157,7 +157,7 @@ class JobResources:
         return needed
 
     def disk_mb(self, rule: str, job: Job) -> float:
-        """Return the megabytes that a scene's job writes, caches included."""
+        """Return the megabytes that a scene's job writes, including caches."""
         row, cost = self.plan.row(job), COSTS.get(rule, {})
         views, view_mp = self.size(row)
         of_gaussians = cost.get("disk_thousand", 0.0) * self.gaussians(row) / 1000
@@ -214,13 +214,13 @@ class JobResources:
         return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
     def _gaussians(self, row: SceneRow) -> int:
-        """Return the number of Gaussians: of the PLY that replaces the fit, or the limit of the fit."""
+        """Return the number of Gaussians in the PLY that replaces the fit, or the limit of the fit."""
         known = vertex_count(row.gaussians) if row.gaussians is not None else None
         job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
         return known or self.plan.stages(job).gaussians.max_gaussians
 
     def _model_mb(self, rule: str, wildcards: Job, threads: int) -> int:
-        """Return the memory of a model with one view per thread; the stage uses less if less is free."""
+        """Return the memory of a model with one view per thread, MB; the stage uses less if less is free."""
         settings = getattr(self.plan.stages(wildcards), rule) if rule in EMBEDDED_S else None
         if settings is None or getattr(settings, "segmenter", "sam") != "sam":
             return 0
@@ -233,7 +233,7 @@ def _trained_s(s_per_mp: float, steps: int, mp: float) -> float:
 
 
 def _sam_s(masks: MasksSettings) -> float:
-    """Return the core seconds that a full-size SAM takes for a view and its crops."""
+    """Return the core seconds of a full-size SAM for a view and its crops, times the share of key views."""
     picture_s = next((cost for word, cost in SAM_S.items() if word in masks.model), OTHER_SAM_S)
     pictures = sum(4**layer for layer in range(masks.crop_layers + 1))
     share = 1.0 if masks.generator == "official" else PREVIEWED
@@ -247,7 +247,7 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
         try:
             with Image.open(image) as opened:
                 width, height = opened.size
-        except OSError:  # labels, sheets and other files beside the images
+        except OSError:  # labels, sheets and other files next to the images
             continue
         return width * height * min(1.0, max_side_px / max(width, height)) ** 2 / 1e6
     return UNKNOWN_MP
@@ -255,7 +255,7 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
 
 @functools.cache
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
-    """Return the memory of a stage with a model; 0 if the folder cannot be read, which the stage reports."""
+    """Return the memory of a stage with a model, MB; 0 if the folder is unreadable (the stage reports it)."""
     from hilsplat.models.folder import open_model_folder
     from hilsplat.models.memory import MIB, needs_of  # onnxruntime takes a while to import
     from hilsplat.segment.sam import own_thresholds

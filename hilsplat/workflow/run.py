@@ -1,7 +1,7 @@
-"""`hilsplat run`: Snakemake with the checks and options that people would otherwise type.
+"""`hilsplat run`: Snakemake with the checks and options that users would otherwise type.
 
-It recovers from a killed run, has artifacts that don't match their provenance made again, and starts
-Snakemake in this process. Plain `snakemake --cores 2` gives the same bytes.
+It recovers from a killed run, rebuilds artifacts that don't match their provenance, and starts Snakemake in
+this process. Plain `snakemake --cores 2` gives the same bytes.
 """
 
 import argparse
@@ -36,31 +36,31 @@ from hilsplat.workflow.records import outdated
 logger = logging.getLogger(__name__)
 
 STATE = Path(".hilsplat")
-"""Folder of locks and markers, in the working folder."""
+"""Folder for locks and markers, in the working folder."""
 
 UNREGISTERED = "HILSPLAT_UNREGISTERED"
-"""Environment variable of a Snakemake that takes no lock of ours, such as the one that unlocks."""
+"""Environment variable of a Snakemake process that takes no lock of ours, such as the one that unlocks."""
 
 TARGET_RULES = ("all", "tables", "efficiency", "train_models")
-"""Rules that can be targets: the others have wildcards."""
+"""Rules that can be targets; all others have wildcards."""
 
 ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
-"""Options of Snakemake after which cores and threads are not set here."""
+"""Snakemake options with which cores and threads are not set here."""
 
 
 _marks: list[TextIOWrapper] = []
-"""The marker of this process's run, if one is going on."""
+"""The marker of this process's run, if one is in progress."""
 
 
 def prepare_process() -> TextIOWrapper | None:
     """Prepare a process that reads the Snakefile: the interpreter and end of its jobs, and a lock.
 
     Jobs use the interpreter that runs Snakemake, whether or not its environment is activated, and end with
-    Snakemake. The lock is shared and is taken before Snakemake's own locks, which name no owner: without a
-    process that holds it, Snakemake's locks are left from a dead run.
+    Snakemake. The lock is shared and is taken before Snakemake's own locks, which record no owner. If no
+    process holds it, Snakemake's locks are left over from a dead run.
 
     Returns:
-        The locked file, to keep until the process ends; None in a folder that is read-only.
+        The locked file, to keep until the process ends; None in a read-only folder.
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     jobs_end_with_this_process()
@@ -72,7 +72,7 @@ def prepare_process() -> TextIOWrapper | None:
 
 
 def mark_run() -> None:
-    """Write a marker of this process's run and lock it; a run that is killed leaves it unlocked."""
+    """Write a marker of this process's run and lock it; a killed run leaves it unlocked."""
     if not _marks:  # `hilsplat run` and the Snakefile share a process
         stream = _locked(f"run-{secrets.token_hex(4)}", fcntl.LOCK_EX)
         stream.write(socket.gethostname())
@@ -83,7 +83,7 @@ def mark_run() -> None:
 def unmark_run() -> None:
     """Remove the marker of this process's run, and cancel the timers that Snakemake leaves running.
 
-    Its limit of jobs per timespan starts one after every scheduling; the process would wait for all of them.
+    Snakemake's job rate limit starts a timer after every scheduling, and the process would wait for them all.
     """
     timers = (thread for thread in threading.enumerate() if isinstance(thread, threading.Timer))
     for timer in timers:
@@ -107,10 +107,10 @@ def _locked(name: str, kind: int) -> TextIOWrapper:
 
 
 def start_project(folder: Path) -> list[Path]:
-    """Copy the default configuration and scene sheet into a folder, where they win over the installed ones.
+    """Copy the default configuration and scene sheet into a folder, where they override the installed ones.
 
     Raises:
-        HilsplatError: one of them is there already; none is then written.
+        HilsplatError: one of them already exists; no file is then written.
     """
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:
@@ -133,7 +133,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         Snakemake's exit status.
 
     Raises:
-        HilsplatError: another run is going on in this folder, or the configuration cannot be used.
+        HilsplatError: another run is in progress in this folder, or the configuration is invalid.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", "-C", nargs="*", action="extend", default=[])
@@ -184,13 +184,13 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         mark_run()
         status = _start(command, plan, targets, scenes)
         if status != 0:
-            remove_leftovers(plan.results)  # of jobs that were killed
+            remove_leftovers(plan.results)  # of killed jobs
         unmark_run()
         return status
 
 
 def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str) -> None:
-    """Refuse a target that is neither a scene nor a rule and cannot be a file of the results."""
+    """Raise an error for a target that is neither a scene nor a rule and cannot be a results file."""
     known = [*TARGET_RULES, *(name for row in rows for name in (row.scene, row.name))]
     for target in targets:
         near = difflib.get_close_matches(target, known, n=1)
@@ -202,7 +202,7 @@ def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str)
 
 
 def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Sequence[str]) -> int:
-    """Start Snakemake in this process; artifacts that don't match their provenance are made again."""
+    """Start Snakemake in this process, and rebuild artifacts that don't match their provenance."""
     files = [target for target in targets if target not in scenes]
     ending = ["--", *files] if files else []
     wrong = outdated(plan)
@@ -212,7 +212,7 @@ def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Seque
         wrong = {output: reason for output, reason in wrong.items() if output in needed}
     for output, reason in wrong.items():
         logger.warning("%s is made again: %s", output, reason)
-    logging.getLogger().handlers.clear()  # Snakemake's records would be printed twice
+    logging.getLogger().handlers.clear()  # otherwise Snakemake's records would be printed twice
     sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *ending]
     try:
         runpy.run_module("snakemake", run_name="__main__", alter_sys=True)
@@ -222,14 +222,14 @@ def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Seque
 
 
 def _snakemake(command: Sequence[str], *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a Snakemake that starts no job and doesn't count as a process of this folder."""
+    """Run a Snakemake command that starts no job and takes no lock in this folder."""
     environment = {**os.environ, UNREGISTERED: "1"}
     command = [sys.executable, "-m", *command, *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def _snakefile(configs: Sequence[Path]) -> Path:
-    """Return the Snakefile beside the configuration, or else the installed one."""
+    """Return the Snakefile next to the configuration, otherwise the installed one."""
     beside = [
         folder for path in (CONFIG, *configs) if path.is_file() for folder in path.resolve().parents[:2]
     ]
@@ -258,10 +258,10 @@ def _all_cores() -> int:
 
 
 def _recover(command: Sequence[str], results: Path) -> None:
-    """Remove what a killed run left: unfinished files and, if no process is alive, Snakemake's locks.
+    """Remove leftovers of a killed run: unfinished files and, if no process is alive, Snakemake's locks.
 
     Raises:
-        HilsplatError: a run is alive. Snakemake would remove its locks at the end of this one.
+        HilsplatError: another run is alive; Snakemake would remove that run's locks at the end of this one.
     """
     markers = sorted(STATE.glob("run-*"))
     if not markers:

@@ -1,6 +1,6 @@
-"""What the jobs of a scene read from outside the run: photographs, Gaussians and labels.
+"""External files that the jobs of a scene read: photographs, Gaussians and labels.
 
-Labels are given to evaluation and figures alone.
+Only evaluation and figures get labels.
 """
 
 import functools
@@ -38,29 +38,29 @@ class SceneData:
         """
         self.data_root, self.path = data_root, path
         self._row_of = {(row.dataset, row.scene): row for row in rows}
-        # a thousand scenes have tens of thousands of jobs: folders are read once
+        # A thousand scenes have tens of thousands of jobs, so folders are read once.
         self.absence = functools.cache(lambda row: absence(row.source, data_root))
         self._folder_files = functools.cache(self._files_of)
         self._labels = functools.cache(lambda row: label_sets(row.source, data_root, row.name))
 
     def row(self, job: Job) -> SceneRow:
-        """Row of the scene sheet."""
+        """Return a scene's row of the sheet."""
         return self._row_of[job.dataset, job.scene]
 
     def images(self, job: Job, input: Sequence[str]) -> str:
-        """Parameter of poses: the folder of the images."""
+        """Return the parameter of poses: the folder of the images."""
         row = self.row(job)
         return input[0] if row.world or is_exported(row.source) else str(row.folder)
 
     def image_files(self, job: Job) -> str | list[str]:
-        """Input of poses: a folder that a rule writes, or each file of a folder of photographs."""
+        """Return the input of poses: a folder that a rule writes, or all files in a folder of photographs."""
         row = self.row(job)
         if row.world:
             return self.path(job, "world/images")
         return self.path(job, "source") if is_exported(row.source) else self._folder_files(row)
 
     def _files_of(self, row: SceneRow) -> list[str]:
-        """Files of a folder of photographs, without labels and what other programs trained."""
+        """Return the files in a folder of photographs, without labels and other programs' trained output."""
         assert row.folder is not None, row.name  # scenes without data were skipped
         labels = set(self._label_files(row))
         files = [
@@ -75,14 +75,14 @@ class SceneData:
         return sorted({*files, *(str(path) for path in named if path.is_file())})
 
     def poses_option(self, job: Job) -> str:
-        """Options of poses: whether the images are renders, and poses that the sheet names."""
+        """Return the options of poses: whether the images are renders, and poses given in the sheet."""
         row = self.row(job)
         if row.world:
             return "--render"
         return "--no-render" + (f" --poses {shlex.quote(str(row.poses))}" if row.poses else "")
 
     def require_no_braces(self, row: SceneRow) -> None:
-        """Refuse files in whose names Snakemake would see wildcards; it knows no way to quote them."""
+        """Raise an error for file names with braces, which Snakemake reads as wildcards and cannot quote."""
         job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
         files = self.image_files(job) if row.folder is not None else []
         files = [files] if isinstance(files, str) else files
@@ -94,19 +94,19 @@ class SceneData:
                 )
 
     def source_files(self, job: Job) -> list[str]:
-        """Input of source: files of a data set with the images and poses."""
+        """Return the input of source: files of a data set with the images and poses."""
         return [str(path) for path in image_files(self.row(job).source, self.data_root)]
 
     def source_name(self, job: Job) -> str:
-        """Parameter of source: data set and scene."""
+        """Return the parameter of source: data set and scene."""
         return self.row(job).source.removeprefix(DATA_PREFIX)
 
     def source_reader(self, job: Job) -> tuple[str, ...]:
-        """The reader of the data set that a scene's images are exported from."""
+        """Return the reader of the data set from which a scene's images are exported."""
         return readers_of([self.source_name(job)])
 
     def brought(self, job: Job) -> list[str]:
-        """Input: a PLY that replaces the fit, and files about its coordinates; usually nothing."""
+        """Return the input: a PLY that replaces the fit, and files about its coordinates; usually empty."""
         ply = self.row(job).gaussians
         if ply is None:
             return []
@@ -115,7 +115,7 @@ class SceneData:
         return [str(path) for path in (ply, *described)]
 
     def brought_option(self, job: Job) -> str:
-        """Options that name such a PLY and nerfstudio's files for it, if there are any."""
+        """Return the options for such a PLY and nerfstudio's files for it, if any."""
         ply = self.row(job).gaussians
         if ply is None:
             return ""
@@ -123,7 +123,7 @@ class SceneData:
         return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
 
     def _nerfstudio(self, job: Job) -> dict[str, Path]:
-        """Files that relate the coordinates of nerfstudio's PLY to those of the poses, by option."""
+        """Return files that relate the coordinates of nerfstudio's PLY to those of the poses, by option."""
         row = self.row(job)
         if row.gaussians is None or row.folder is None:
             return {}
@@ -135,39 +135,39 @@ class SceneData:
         return {name: path for name, path in files.items() if path is not None}
 
     def features(self, job: Job) -> list[str]:
-        """Input of masks and clip: LangSplat's files that replace SAM and CLIP; usually nothing."""
+        """Return the input of masks and clip: LangSplat's files that replace SAM and CLIP; usually empty."""
         folder = self.row(job).features
         return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
     def features_option(self, job: Job) -> str:
-        """Option that names their folder, if there is one."""
+        """Return the option for the folder of LangSplat's files, if there is one."""
         folder = self.row(job).features
         return f"--features {shlex.quote(str(folder))}" if folder is not None else ""
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
-        """Labels of a scene, as `data set/scene`: published ones and your own annotations."""
+        """Return the labels of a scene, as `data set/scene`: published ones and your own annotations."""
         return () if row.world else self._labels(row)
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
-        """The readers of a scene's labels."""
+        """Return the readers of a scene's labels."""
         return readers_of(self.labels(self.row(job)))
 
     def _label_files(self, row: SceneRow) -> list[str]:
-        """Files that only evaluation reads: editing one reruns nothing before it."""
+        """Return the label files, which only evaluation reads, so that editing one reruns no other stage."""
         return [
             str(path.resolve()) for labels in self.labels(row) for path in label_files(labels, self.data_root)
         ]
 
     def truth(self, job: Job) -> list[str]:
-        """Input: the annotations of a synthetic scene; nothing for others."""
+        """Return the input with the annotations of a synthetic scene; empty for others."""
         return [self.path(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:
-        """Input of evaluate: the annotations of a synthetic scene, or the label files of a published one."""
+        """Return the input of evaluate: the annotations of a synthetic scene, or label files of others."""
         return self.truth(job) or self._label_files(self.row(job))
 
     def truth_option(self, job: Job, input: Any) -> str:
-        """Options of evaluate: the truth or labels that a scene is scored against."""
+        """Return the options of evaluate: the truth or labels against which a scene is scored."""
         row = self.row(job)
         if row.world:
             return f"{truth_argument(input)} --kind {row.world[0]}"
@@ -175,7 +175,7 @@ class SceneData:
         return " ".join([*options, self._data_root_option()])
 
     def figure_truth_option(self, job: Job, input: Any) -> str:
-        """Options of figures: the truth or labels that give queries and outlines, if there are any."""
+        """Return the options of figures: the truth or labels for queries and outlines, if any."""
         row = self.row(job)
         if row.world:
             return truth_argument(input)
@@ -189,5 +189,5 @@ class SceneData:
 
 
 def truth_argument(input: Any) -> str:
-    """Return the option that names the input `truth`: the path of the job, which a module may prefix."""
+    """Return the option for the input `truth`, with the job's own path, because a module may prefix it."""
     return f"--truth {shlex.quote(str(input.truth if isinstance(input.truth, str) else input.truth[0]))}"

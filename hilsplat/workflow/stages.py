@@ -1,4 +1,4 @@
-"""The function of each stage."""
+"""Registry of the function of each stage."""
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest
@@ -34,15 +34,15 @@ STAGES: dict[str, str] = {
     "tree_truth": "hilsplat.evaluate.diagnostics.tree_truth:run_tree_truth",
     "label_fits": "hilsplat.evaluate.diagnostics.label_fits:run_label_fits",
 }
-"""Stage -> the function that its command calls; a module means all of its functions."""
+"""Stage -> the function that its command calls; a module stands for all of its functions."""
 
 
 def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
-    """Digest of the code that a stage runs.
+    """Return the digest of the code that a stage runs.
 
     Args:
         stage: key of `STAGES`.
-        plugins: places of the readers or baselines that this run of it uses (see `base.plugins`).
+        plugins: readers or baselines that the stage uses in this run (see `base.plugins`).
 
     Raises:
         HilsplatError: there is no such stage.

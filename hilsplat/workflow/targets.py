@@ -1,4 +1,4 @@
-"""The targets of a run: tables, the scores that they are built from, and pictures."""
+"""Targets of a run: tables, their scores, and pictures."""
 
 import shlex
 from pathlib import Path
@@ -12,7 +12,7 @@ from hilsplat.workflow.plan import Plan, some
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
-    """Return the score files of a table, or files beside them; sweeps use the scenes configured for them."""
+    """Return the score files of a table, or files next to them; sweeps use the scenes configured for them."""
     kind = TABLES[table]
     rows = [row for row in labelled(plan) if data_of(row) in kind.data]
     if kind.is_sweep and plan.run.sweep_scenes:
@@ -26,7 +26,7 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
 
 
 def absent_options(plan: Plan, table: str) -> str:
-    """Options that say which scenes of a table's data sets were not measured."""
+    """Return the options that list the scenes of a table's data sets that were not measured."""
     by_dataset: dict[str, list[tuple[str, str]]] = {}
     for row in plan.rows:
         reason = plan.data.absence(row)
@@ -47,12 +47,12 @@ def absent_options(plan: Plan, table: str) -> str:
 
 
 def labelled(plan: Plan) -> list[SceneRow]:
-    """Scenes with annotations or labels to be scored against."""
+    """Return the scenes with annotations or labels, which can be scored."""
     return [row for row in plan.scenes if row.world or plan.data.labels(row)]
 
 
 def data_of(row: SceneRow) -> str:
-    """A scene's data as tables name it: its kind of synthetic scene, or its published data set."""
+    """Return a scene's data as named in tables: its kind of synthetic scene, or its published data set."""
     if row.world:
         return row.world[0]
     place = published(row.source)
@@ -60,8 +60,7 @@ def data_of(row: SceneRow) -> str:
 
 
 def tables(plan: Plan) -> list[str]:
-    """Every table that has variants to compare, measured on the scenes that there are; all have the
-    paper's rows."""
+    """Return every table with variants to compare; all have the paper's rows besides measured ones."""
     return [
         f"{plan.run.results}/tables/{name}.csv"
         for name, kind in TABLES.items()
@@ -70,10 +69,10 @@ def tables(plan: Plan) -> list[str]:
 
 
 def default(plan: Plan) -> list[str]:
-    """Pictures of every scene, scores of those that you annotated, and tables and plots if the run has a
-    scene of theirs.
+    """Return the pictures of all scenes, the scores of scenes that you annotated, and tables and plots.
 
-    A run of photographs would otherwise replace a benchmark's tables by ones of reported rows alone.
+    Tables and plots need a benchmark scene in the run. A run of photographs would otherwise replace a
+    benchmark's tables by tables with reported rows only.
     """
     plots = [
         f"{plan.run.results}/figures/sweep-{name}.png"
@@ -89,7 +88,7 @@ def default(plan: Plan) -> list[str]:
 def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
     """Return the score files of a scene with your own labels, by the variant's name in tables.
 
-    A scene of LangSplat's features is compared with LangSplat on the same Gaussians, masks and vectors.
+    A scene with LangSplat's features is compared with LangSplat on the same Gaussians, masks and vectors.
     """
     variants = ["default"]
     if row.features:
@@ -116,8 +115,7 @@ def summary(plan: Plan) -> list[str]:
 
 
 def figures(plan: Plan) -> list[str]:
-    """The panel of every scene and the names of its nodes, masks against the truth if it is known, and a
-    comparison of methods for the scenes of the sweeps."""
+    """Return panels, node names, masks against known truth, and method comparisons (for sweep scenes)."""
     found = []
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes

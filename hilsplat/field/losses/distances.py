@@ -1,7 +1,7 @@
-"""Shared by the instance and part losses: softened distances, ancestors, cosines, and their gradients.
+"""Softened distances, ancestors and cosines of the instance and part losses, with their gradients.
 
-The losses see a few dozen masks at a time, so their gradients are written out in NumPy: torch takes longer to
-start than a solve spends on them. Autograd is their reference in the tests.
+The losses compare a few dozen masks at a time, so their gradients are written in NumPy: torch takes longer to
+start than a solve takes to compute them. The tests compare them with autograd.
 """
 
 from collections.abc import Callable
@@ -21,14 +21,14 @@ SHORTEST = 1e-6
 def log_distance_loss(
     means: Float[np.ndarray, "M D"], log_wanted: Float[np.ndarray, "M M"]
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
+    """Return the mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
 
-    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from products: M x M numbers
-    instead of M x M x D. In float64 the cancellation error is far below the softening.
+    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from dot products: M x M
+    instead of M x M x D numbers. In float64 the cancellation error is far below the softening.
 
     Args:
         means: at least two rows.
-        log_wanted: natural logarithm of the distance that each pair should have.
+        log_wanted: natural logarithm of the target distance of each pair.
     """
     rows = len(means)
     centred = means - means.mean(axis=0)
@@ -45,7 +45,7 @@ def log_distance_loss(
 
 
 def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, "M M"]:
-    """Depth of the deepest common ancestor of every two masks of one view's coverage tree.
+    """Return the depth of the deepest common ancestor of every pair of masks in one view's coverage tree.
 
     A mask counts as its own ancestor and roots have depth 1; 0 means that two masks are unrelated. The value
     for a mask and its child is the depth of the mask; for two children of a root it is 1.
@@ -64,28 +64,28 @@ def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, 
             break
         is_ancestor[has, current[has]] = 1
     # Common ancestors of two masks form a chain from the root down, so their number is the depth.
-    # float32 counts exactly and multiplies fast.
+    # float32 counts exactly, and its products are fast.
     chains = is_ancestor.astype(np.float32)
     return (chains @ chains.T).astype(np.int64)
 
 
 Pullback = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Gradient by the similarities (A, B) -> gradients by anchors (A, D) and others (B, D)."""
+"""Function from gradients of similarities (A, B) to gradients of anchors (A, D) and others (B, D)."""
 
 
 def similarity_without_parent(
     anchors: Float[np.ndarray, "A D"], others: Float[np.ndarray, "B D"], parent: Float[np.ndarray, "A D"]
 ) -> tuple[Float64[np.ndarray, "A B"], Pullback]:
-    """s_p of Eq. 4: cosine of two mask means after the anchor's parent mean is subtracted from both.
+    """Compute s_p of Eq. 4: cosine of two mask means after subtracting the anchor's parent mean from both.
 
-    Departs: Eq. 4 prints index j twice in the denominator; we take i and j, so that s_p is a cosine. We
-    read its parent mean, which has no index, as the anchor's, for positives and negatives alike. The
+    Departs: Eq. 4 prints index j twice in the denominator; we use i and j, so that s_p is a cosine. We
+    interpret its parent mean, which has no index, as the anchor's, for positives and negatives alike. The
     parent gets no gradient: parts move relative to their whole, not the whole relative to its parts.
     """
     own = anchors - parent
     square = np.square(own).sum(axis=1, keepdims=True) + SHORTEST**2
     along = own @ others.T - (own * parent).sum(axis=1, keepdims=True)
-    # |other - parent|^2 from products: A x B numbers instead of A x B x D.
+    # |other - parent|^2 from dot products: A x B instead of A x B x D numbers
     far = np.square(others).sum(axis=1) - 2 * parent @ others.T + np.square(parent).sum(axis=1, keepdims=True)
     softened = np.maximum(far, 0) + SHORTEST**2
     scale = 1 / np.sqrt(square * softened)

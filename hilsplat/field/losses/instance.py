@@ -1,4 +1,4 @@
-"""The instance-wise loss L_ins (paper, Eq. 3) in two readings, with its gradient."""
+"""The instance-wise loss L_ins (paper, Eq. 3) in two variants, with its gradient."""
 
 import math
 
@@ -11,10 +11,10 @@ from hilsplat.field.losses.distances import log_distance_loss
 def instance_loss_literal(
     means: Float[np.ndarray, "M D"], level: Int[np.ndarray, " M"], omega: float
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """L_ins as printed (Eq. 3): the distance of two masks should be Omega^-|l_i - l_j|.
+    """Compute L_ins as printed (Eq. 3): the target distance of two masks is Omega^-|l_i - l_j|.
 
-    This pushes masks of the same level to distance 1, related or not, which more than D + 1 masks cannot
-    all satisfy. Departs only in the softened distance.
+    This pushes all masks of the same level to distance 1, related or not, which is impossible for more than
+    D + 1 masks. Departs only in the softened distance.
 
     Args:
         means: mean rendered feature of each mask of one view, all levels; at least two.
@@ -30,11 +30,11 @@ def instance_loss_literal(
 def instance_loss_tree(
     means: Float[np.ndarray, "M D"], depth: Int[np.ndarray, "M M"], omega: float
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """L_ins by relation instead of level: the distance should be Omega^-depth.
+    """Compute L_ins by relation instead of level: the target distance is Omega^-depth.
 
-    Departs: the depth of the deepest common ancestor in the coverage tree replaces |l_i - l_j| of Eq. 3, so
-    that unrelated masks go to distance 1, parts of one object to 1 / Omega, and subparts of one part to
-    1 / Omega^2: the nesting that the text describes.
+    Departs: the depth of the deepest common ancestor in the coverage tree replaces |l_i - l_j| of Eq. 3.
+    Unrelated masks thus have a target distance of 1, parts of one object 1 / Omega, and subparts of one part
+    1 / Omega^2, which is the nesting that the paper's text describes.
 
     Args:
         means: mean rendered feature of each mask of one view, all levels; at least two.

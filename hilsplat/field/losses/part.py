@@ -1,4 +1,4 @@
-"""The part-wise loss L_part (paper, Eq. 4 and 5) in two readings, with its gradient."""
+"""The part-wise loss L_part (paper, Eq. 4 and 5) in two variants, with its gradient."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
@@ -13,14 +13,14 @@ def part_loss_literal(
     parent_means: Float[np.ndarray, "M D"],
     tau: float,
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """L_part of one view and level as printed (Eq. 5): siblings attract, children of others repel.
+    """Compute L_part of one view and level as printed (Eq. 5): siblings attract, children of others repel.
 
-    The denominator holds the negatives alone, as printed. This pulls siblings together ("bear nose" and
-    "bear mouth"), whereas the prose around it says to separate them.
+    The denominator contains only the negatives, as printed. This pulls siblings together ("bear nose" and
+    "bear mouth"), whereas the paper's text says to separate them.
 
     Departs: we read 1 / (L N_p) as the mean, over anchors with at least one positive and one negative, of
-    the mean over their positives. The caller leaves out level l = 1, which has no parents; this function
-    leaves out orphans. An anchor is not its own positive.
+    the mean over their positives. The caller omits level l = 1, which has no parents; this function omits
+    orphans. An anchor is not its own positive.
 
     Args:
         means: mean rendered feature of each mask of the level.
@@ -29,7 +29,7 @@ def part_loss_literal(
         tau: temperature.
 
     Returns:
-        mean over anchors, 0 if there is none; and its gradient by the means.
+        mean over anchors, 0 if there are none; and its gradient with respect to the means.
     """
     similarity, pull_back = similarity_without_parent(means, means, parent_means)
     has_parent = parent != NONE
@@ -55,11 +55,11 @@ def part_loss_disentangle(
     parent_means: Float[np.ndarray, "M D"],
     tau: float,
 ) -> tuple[float, Float64[np.ndarray, "M D"], Float64[np.ndarray, "M D"]]:
-    """L_part of one view and level as its prose describes it: parts of one object are separated.
+    """Compute L_part of one view and level as the paper describes it: parts of one object are separated.
 
     Departs: the positive of a mask is the other random half of its own pixels; negatives are the other
-    halves of all other masks of the level, siblings included; the denominator includes the positive
-    (InfoNCE). The anchor's parent mean is subtracted from all.
+    halves of all other masks of the level, including siblings; the denominator includes the positive
+    (InfoNCE). The anchor's parent mean is subtracted from all features.
 
     Args:
         half: mean feature over a random half of each mask's pixels.
@@ -69,7 +69,7 @@ def part_loss_disentangle(
         tau: temperature.
 
     Returns:
-        mean over anchors, 0 if there is none, or no second mask; and its gradients by the halves.
+        mean over anchors, 0 if there are none or only one mask; and its gradients with respect to the halves.
     """
     by_half = np.zeros(half.shape)
     anchors = np.flatnonzero(has_parent)
@@ -88,7 +88,7 @@ def part_loss_disentangle(
 def log_sum_exp(
     values: Float64[np.ndarray, "A B"],
 ) -> tuple[Float64[np.ndarray, " A"], Float64[np.ndarray, "A B"]]:
-    """Logarithm of each row's sum of exponentials, and its gradient: their shares of the sum."""
+    """Return the log-sum-exp of each row and its gradient, the softmax."""
     most = values.max(axis=1, keepdims=True)
     powers = np.exp(values - most)
     total = powers.sum(axis=1, keepdims=True)

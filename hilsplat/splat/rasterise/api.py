@@ -1,4 +1,4 @@
-"""Rendering Gaussians into a view: images with gradients, feature maps, sparse weights."""
+"""Render Gaussians in a view: images with gradients, feature maps, sparse weights."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from hilsplat.splat.rasterise.device import Device
 
 @dataclass(frozen=True)
 class Rendering:
-    """What one view shows.
+    """One rendered view.
 
     Attributes:
         color: RGB over the background.
@@ -49,37 +49,37 @@ def render(
     threads: int = 1,
     device: Device = "cpu",
 ) -> Rendering:
-    """Render a view; `draw` does the same and has the gradients.
+    """Render a view; `draw` does the same and also computes gradients.
 
-    The conventions are gsplat's, on both devices:
+    The conventions are those of gsplat, on both devices:
 
     - the centre of the top-left pixel is (0.5, 0.5);
     - a Gaussian is projected by the perspective Jacobian at its centre, with the ray clamped to 30 %
       beyond the image, and 0.3 px^2 are added to its variance (`eps2d`), whatever its size;
     - Gaussians nearer than depth 0.01 are not drawn; no Gaussian is too small (`radius_clip` 0);
-    - scales are cut at exp(20) scene units, where a Gaussian covers any view evenly (CPU; gsplat
+    - scales are clipped at exp(20) scene units, where a Gaussian covers any view evenly (CPU only; gsplat
       overflows);
-    - alpha below 1/255 is not drawn, alpha above 0.999 is cut there;
-    - blending goes front to back by the depth of the centres and stops before the Gaussian that
+    - alpha below 1/255 is not drawn, and alpha is clipped at 0.999;
+    - blending runs front to back by the depth of the centres and stops before the Gaussian that
       would leave less than 1e-4 of the light;
     - colour is max(0, 0.5 + spherical harmonics) in the direction from the camera to the centre;
-    - features are premultiplied by alpha, and the background reaches colour alone.
+    - features are premultiplied by alpha, and the background affects only colour.
 
-    So one round Gaussian of scale s and opacity o on the optical axis at depth z has, r px from the
-    principal point, under a camera of focal length f px,
+    A single round Gaussian of scale s and opacity o on the optical axis at depth z, seen by a camera of
+    focal length f px, thus has at a distance of r px from the principal point
 
         alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), if that is at least 1/255.
 
-    Without any Gaussian the background shows.
+    Without Gaussians, the image is the background.
 
     Args:
-        features: further channels to blend in the same pass; any number.
-        sh_degree: degree of the spherical harmonics to use; all of them by default.
+        features: additional channels to blend in the same pass; any number.
+        sh_degree: degree of spherical harmonics to use; default: that of the Gaussians.
         threads: CPU threads; the result has the same bytes for any number.
         device: backend; see `device.choose_device`.
 
     Raises:
-        HilsplatError: parameters are not finite, quaternions are zero, or features have another number
+        HilsplatError: if parameters are not finite, quaternions are zero, or features have another number
             of rows.
     """
     degree = _checked_degree(gaussians, sh_degree)
@@ -97,13 +97,13 @@ def draw(
     threads: int,
     device: Device,
 ) -> Drawn:
-    """Image and alpha of a view, without background, and the gradients on demand.
+    """Draw image and alpha of a view without background, and compute gradients on demand.
 
     Gaussians behind the camera get zero gradient. Gradients are first-order only and do not reach the
     camera.
 
     Args:
-        degree: of the spherical harmonics.
+        degree: degree of spherical harmonics to use.
         features, threads, device: as in `render`.
 
     Raises:
@@ -125,14 +125,14 @@ def draw(
 def pixel_weights(
     gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1, device: Device = "cpu"
 ) -> csr_matrix:
-    """Blending weight alpha_i T_i of each Gaussian at each pixel, as a sparse matrix.
+    """Return the blending weight alpha_i T_i of each Gaussian at each pixel, as a sparse matrix.
 
     Args:
-        min_weight: weights below are dropped; 0 keeps all that are drawn.
+        min_weight: smaller weights are omitted; 0 keeps all that are drawn.
 
     Returns:
-        float32 matrix (H W, N), rows row-major pixels, columns sorted. With min_weight 0 the rows
-        sum to the alpha of the view.
+        float32 matrix (H W, N) with row-major pixels as rows, and sorted columns. With min_weight 0, the
+        rows sum to the alpha of the view.
     """
     if device == "cuda":
         from hilsplat.splat.rasterise import cuda

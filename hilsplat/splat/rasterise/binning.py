@@ -1,4 +1,4 @@
-"""Depth order and tile lists of a view: which Gaussians each 16x16 tile blends, front to back."""
+"""Depth order and tile lists of a view: the Gaussians that each 16x16 tile blends, front to back."""
 
 from dataclasses import dataclass
 from typing import no_type_check
@@ -14,32 +14,32 @@ TILE = 16
 """Side of a tile, px."""
 BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
-"""Centre of the first pixel of each 4x4 block of a tile, from the tile's corner."""
+"""Centre of the first pixel of each 4x4 block, relative to the tile's corner."""
 REACH_SLACK = (1e-2, 1e-6)
-"""A block is left out if the exponent misses the cut by more than this: absolute, and relative to the
-squares that the exponent is the difference of (float32 has 6e-8)."""
+"""A block is skipped if the exponent misses the cut by more than this: absolute, and relative to the
+squared terms of the exponent (float32 has 6e-8)."""
 AHEAD = 16
-"""Gaussians between one that is listed and one whose row is prefetched."""
+"""Number of list entries by which rows are prefetched ahead."""
 MAX_ENTRIES = 2**21
-"""Entries of tile lists held at a time: 8 MiB, and 72 MiB of gradients for 3 channels."""
+"""Maximum number of tile list entries in memory: 8 MiB, and 72 MiB of gradients for 3 channels."""
 
 _SPAN = np.float32(3.0)
-"""From a block's first pixel centre to its last."""
+"""Distance between a block's first and last pixel centre."""
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _SLACK, _RELATIVE = np.float32(REACH_SLACK[0]), np.float32(REACH_SLACK[1])
 
 
 @dataclass(frozen=True)
 class Tiles:
-    """What the tile lists of a view are made from.
+    """Depth order and list sizes from which a view's tile lists are built.
 
-    Tile t of row y and column x has index y * tiles_x + x. Its list holds the Gaussians whose box
-    touches it, front to back; it has tile_start[t + 1] - tile_start[t] entries.
+    Tile t in row y and column x has index y * tiles_x + x. Its list contains Gaussians whose box
+    touches it, front to back, in at most tile_start[t + 1] - tile_start[t] entries.
 
     Attributes:
         tiles_x: tiles per row.
-        order: rows of the Gaussians that are drawn, front to back; equal depths in row order.
-        tile_start: entries of the tiles before.
+        order: rows of the drawn Gaussians, front to back; equal depths in row order.
+        tile_start: number of entries of all preceding tiles.
     """
 
     tiles_x: int
@@ -47,7 +47,7 @@ class Tiles:
     tile_start: Int64[np.ndarray, " num_tiles_plus_1"]
 
     def bands(self, max_entries: int = MAX_ENTRIES) -> list[tuple[int, int]]:
-        """Ranges of tiles that cover all tiles, each with at most `max_entries` entries or one tile."""
+        """Return ranges that cover all tiles, each with at most `max_entries` entries or a single tile."""
         start, out, begin = self.tile_start, [], 0
         while begin < len(start) - 1:
             end = int(np.searchsorted(start, start[begin] + max_entries, side="right")) - 1
@@ -60,7 +60,7 @@ class Tiles:
 @compiled
 @no_type_check
 def _depth_order(rows, keys):
-    """Rows in order of ascending uint32 keys: least-significant-digit radix sort, 3 x 11 bits, stable."""
+    """Return rows by ascending uint32 keys: stable least-significant-digit radix sort, 3 x 11 bits."""
     n = len(rows)
     other_rows, other_keys = np.empty_like(rows), np.empty_like(keys)
     count = np.empty(2048, np.int64)
@@ -86,7 +86,7 @@ def _depth_order(rows, keys):
 @compiled
 @no_type_check
 def _count(box, keys, tiles_x, tiles_y):
-    """Depth order of what is drawn, and where each tile's list begins (summed from corners of boxes)."""
+    """Return the depth order of drawn Gaussians and each tile's list start (summed from corners of boxes)."""
     corners = np.zeros((tiles_y + 1, tiles_x + 1), np.int64)
     rows, drawn_keys = np.empty(len(box), np.int32), np.empty(len(box), np.uint32)
     drawn = 0
@@ -114,7 +114,7 @@ def _count(box, keys, tiles_x, tiles_y):
 @compiled(inline="always")
 @no_type_check
 def _least(a, b, c, u, v):
-    """Lower bound, for rounding, of a u^2 + b u v + c v^2."""
+    """Return a u^2 + b u v + c v^2, lowered to a bound that is safe against rounding."""
     uu, vv = a * u * u, c * v * v
     return uu + b * u * v + vv - lanes(_RELATIVE) * (uu + vv)
 
@@ -122,11 +122,11 @@ def _least(a, b, c, u, v):
 @compiled(inline="always")
 @no_type_check
 def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
-    """Bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
+    """Return the bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
 
-    The least exponent over a block is that at the mean, if the block holds it, else on one of the edges
-    that face the mean: there it is least where its slope along the edge is zero (along_x v and along_y u
-    from the mean), or at the nearer corner.
+    The least exponent over a block is at the mean, if the block contains it. Otherwise it is on an edge
+    that faces the mean: where the slope along the edge is zero (along_x v and along_y u from the mean), or at
+    the nearer corner.
     """
     left, upper = load(BLOCK_X, 0) - lanes(mean_x), load(BLOCK_Y, 0) - lanes(mean_y)
     right, lower = left + lanes(_SPAN), upper + lanes(_SPAN)
@@ -142,9 +142,9 @@ def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
 @compiled
 @no_type_check
 def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaussian, reach, tile_end):
-    """Write the lists of tiles begin..end, and where they end; entry e goes to gaussian[e - base].
+    """Write the lists of tiles begin..end and their ends; entry e is written to gaussian[e - base].
 
-    reach[e - base] has a bit for each block that the Gaussian can reach; without any it is left out.
+    reach[e - base] has a bit for each block that the Gaussian can reach; Gaussians without any are omitted.
     """
     tile_end[begin:end] = tile_start[begin:end]
     for k in range(len(order)):
@@ -170,11 +170,11 @@ def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tu
     """Sort the drawn Gaussians by depth and count them per tile.
 
     Args:
-        box: first and last pixel column, first and last pixel row; last < first is not drawn.
+        box: first and last pixel column, first and last pixel row; last < first: not drawn.
         depths: positive float32 depths.
         size_hw: image size, px.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
-    # The bits of positive floats order as the floats do.
+    # positive floats and their bits have the same order
     keys = np.ascontiguousarray(depths, dtype=np.float32).view(np.uint32)
     return Tiles(tiles_x, *_count(box, keys, tiles_x, tiles_y))

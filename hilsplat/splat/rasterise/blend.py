@@ -1,21 +1,21 @@
-"""Blending of tile lists into pixels, its gradient, and the blending weights themselves.
+"""Blending of tile lists into pixels, its gradient, and the blending weights.
 
 A tile is 16x16 pixels in sixteen 4x4 blocks; a block is one vector of 16 lanes. Lanes outside the image
-begin with no transmittance. A list is taken CHUNK entries at a time: their Gaussians are copied beside
-each other, with a bit for each block that they can reach (the sixteen blocks, too, are one vector).
-Forward, block by block then blends its own Gaussians with its sums in registers; backward, Gaussian by
-Gaussian gathers its gradient over its blocks.
+start with zero transmittance. Lists are processed in chunks of CHUNK entries: their Gaussians are copied to
+contiguous memory; each entry has a bit for every block that it can reach (the sixteen blocks are also one
+vector). The forward pass blends each block's own Gaussians, with the sums in registers. The backward pass
+sums the gradient of each Gaussian over its blocks.
 
-The backward pass runs front to back and replays the forward pass, so its transmittance is exactly
-the forward's. Per pixel it carries one number, R = sum over channels of (what is still to come) x
-(gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each entry of a tile's list has
-its own slot for the sums, so the result does not depend on how tiles are spread over threads.
+The backward pass runs front to back and repeats the forward pass, so its transmittance is exactly
+the forward's. It keeps one number per pixel, R = sum over channels of (contribution of the remaining
+Gaussians) x (gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each list entry has
+its own slot for the sums, so the result does not depend on the distribution of tiles over threads.
 
 Alpha is one more channel, of colour 1: the image's alpha is the sum of the weights.
 
-Arguments that the kernels share: tiles begin..end of a row-major grid with `tiles_x` per row; the
-list of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_start[t + 1] - base]; geometry as
-`project` fills it.
+Arguments shared by the kernels: tiles begin..end of a row-major grid with `tiles_x` per row; the list
+of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geometry as written by
+`project`.
 """
 
 from typing import no_type_check
@@ -46,11 +46,11 @@ from hilsplat.splat.rasterise.binning import AHEAD, BLOCK_X, BLOCK_Y, TILE
 from hilsplat.splat.rasterise.project import MIN_ALPHA, MOMENTS
 
 MAX_ALPHA = 0.999
-"""Alpha of one Gaussian at a pixel is cut here, and passes no gradient beyond (gsplat: 0.999)."""
+"""A Gaussian's alpha at a pixel is clipped here, and passes no gradient beyond (gsplat: 0.999)."""
 MIN_TRANSMITTANCE = 1e-4
 """Blending stops at a pixel before the Gaussian that would leave less light than this (3DGS, gsplat)."""
 CHUNK = 128
-"""Entries of a list that are copied beside each other: with their lists, 40 kB for 3 channels."""
+"""List entries per contiguous copy: with their lists, 40 kB for 3 channels."""
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
 _STOP = np.float32(MIN_TRANSMITTANCE)
@@ -59,20 +59,20 @@ BLOCKS = 16
 LANES = 16
 PIXELS = BLOCKS * LANES
 RECORD = 8
-"""Numbers of a copied Gaussian: mean x, mean y from the tile's corner, a, b, c, log2 of the peak alpha."""
+"""Numbers of a copied Gaussian: mean x and y from the tile's corner, a, b, c, log2 of the peak alpha."""
 GROUP = 4
-"""Channels that are summed in registers at a time."""
+"""Channels that are summed in registers together."""
 
 _NUMBERS = np.arange(LANES, dtype=np.float32)
 _X = np.repeat(BLOCK_X, LANES) + np.tile(_NUMBERS % 4, BLOCKS)
 _Y = np.repeat(BLOCK_Y, LANES) + np.tile(_NUMBERS // 4, BLOCKS)
-"""Centres of all pixels of a tile, block by block."""
+"""Pixel centres of a tile, block by block."""
 
 
 @compiled(inline="always")
 @no_type_check
 def start_tile(tile, tiles_x, height, width, transmittance):
-    """Full transmittance in the pixels inside the image; returns the tile's corner."""
+    """Set full transmittance for the pixels inside the image, and return the tile's corner."""
     x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
     right, bottom = lanes(np.float32(width - x0)), lanes(np.float32(height - y0))
     for block in range(BLOCKS):
@@ -84,7 +84,7 @@ def start_tile(tile, tiles_x, height, width, transmittance):
 @compiled(inline="always")
 @no_type_check
 def unfinished(transmittance):
-    """Bits of the blocks that are unfinished."""
+    """Return a bit for each unfinished block."""
     bits = 0
     for block in range(BLOCKS):
         if any_ge(load(transmittance, block * LANES), lanes(_STOP)):
@@ -95,7 +95,7 @@ def unfinished(transmittance):
 @compiled(inline="always")
 @no_type_check
 def gather(first, count, x0, y0, gaussian, geometry, records):
-    """Copy the Gaussians of entries first..first + count of the band."""
+    """Copy the Gaussians of entries first..first + count of the band to contiguous records."""
     for k in range(count):
         i = gaussian[first + k]
         prefetch(geometry, gaussian[min(first + k + AHEAD, len(gaussian) - 1)] * geometry.shape[1])
@@ -109,7 +109,7 @@ def gather(first, count, x0, y0, gaussian, geometry, records):
 @compiled(inline="always")
 @no_type_check
 def _exponent(records, at, px, py):
-    """Distances of a copied Gaussian to pixel centres, and log2 of its uncut alpha there."""
+    """Return distances of a copied Gaussian to pixel centres, and log2 of its unclipped alpha there."""
     dx, dy = load_same(records, at) - px, load_same(records, at + 1) - py
     slope = load_same(records, at + 3) * dy
     peak = load_same(records, at + 5) - load_same(records, at + 4) * dy * dy
@@ -119,7 +119,7 @@ def _exponent(records, at, px, py):
 @compiled(inline="always")
 @no_type_check
 def _shine(exponent, light):
-    """Uncut alpha, alpha and weight of a Gaussian where `light` is left, and the light behind it."""
+    """Return a Gaussian's unclipped alpha, alpha and weight at transmittance `light`, and the light left."""
     uncut = exp2_negative(exponent)
     alpha = keep_ge(exponent, lanes(_CUT), smaller(uncut, lanes(_TOP)))
     weight = light * alpha
@@ -130,15 +130,15 @@ def _shine(exponent, light):
 @compiled(inline="always")
 @no_type_check
 def weigh(block, first, count, reach, records, shades, width, transmittance, entries, weights):
-    """Weights of the Gaussians of a chunk that reach a block, front to back.
+    """Compute the weights of a chunk's Gaussians that reach a block, front to back.
 
     Args:
-        first, count: the chunk's entries of the band.
-        shades: the channels of Gaussian k begin at k * width.
-        entries, weights: get the Gaussians' places in the chunk, and 16 weights of each.
+        first, count: entries of the chunk in the band.
+        shades: channels; those of Gaussian k start at k * width.
+        entries, weights: outputs: each Gaussian's position in the chunk, and its 16 weights.
 
     Returns:
-        how many were weighed before all pixels were finished, and the sums of the first 4 channels.
+        number of Gaussians processed before all pixels were finished, and the sums of the first 4 channels.
     """
     light = load(transmittance, block * LANES)
     px, py = load(_X, block * LANES), load(_Y, block * LANES)
@@ -180,7 +180,7 @@ def _add_group(sums, at, one, two, three, four):
 @compiled
 @no_type_check
 def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geometry, colours, image, alpha):
-    """Blend tiles: image (H, W, C) gets the premultiplied channels, alpha (H, W) the coverage."""
+    """Blend tiles: write premultiplied channels to image (H, W, C) and coverage to alpha (H, W)."""
     height, width, channels = image.shape
     per_gaussian = (channels + GROUP) // GROUP * GROUP
     stride = LANES * per_gaussian
@@ -246,7 +246,7 @@ def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geom
 @compiled(inline="always")
 @no_type_check
 def _load_gradients(x0, y0, stride, size, flats, grads, to_come):
-    """Gradients of a tile's pixels by block and channel, and R before the first Gaussian."""
+    """Load the gradients of a tile's pixels by block and channel, and compute R before the first Gaussian."""
     height, width, channels = size
     image, alpha, grad_image, grad_alpha = flats
     if x0 + TILE > width or y0 + TILE > height:
@@ -288,10 +288,10 @@ def blend_backward(
     slots,
     columns,
 ):
-    """Gradient of `blend`, into one slot of `columns` numbers per entry of the lists.
+    """Compute the gradient of `blend`, in one slot of `columns` numbers per list entry.
 
-    A slot holds the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; those
-    of entries behind finished pixels are zeros.
+    A slot contains the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; slots
+    behind finished pixels are zero.
     """
     height, width, channels = image.shape
     transmittance = aligned(PIXELS)
@@ -335,7 +335,7 @@ def blend_backward(
                         alive ^= 1 << block
                     at = block * stride
                     shade = load(grads, at)
-                    if channels == 3:  # colour sums in registers: a fifth faster
+                    if channels == 3:  # colour sums in registers: 20 % faster
                         by_red = load(grads, at + LANES)
                         by_green = load(grads, at + 2 * LANES)
                         by_blue = load(grads, at + 3 * LANES)
@@ -376,7 +376,7 @@ def blend_backward(
 def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, columns, sums):
     """Add the slots of Gaussians begin..end to their sums, in the order of the entries.
 
-    Rows of sums are whole vectors: what they hold beyond `columns` numbers means nothing.
+    Rows of sums are whole vectors; numbers beyond `columns` have no meaning.
     """
     flat_sums, width = sums.reshape(-1), sums.shape[1]
     for tile in range(tiles[0], tiles[1]):

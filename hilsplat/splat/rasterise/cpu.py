@@ -1,7 +1,7 @@
-"""The CPU backend: projection, tile lists and blending over threads, on plain arrays.
+"""CPU backend: multi-threaded projection, tile lists and blending on plain arrays.
 
-Threads take ranges of Gaussians or tiles; nothing is summed across threads, so every result has the
-same bytes for any number of them.
+Threads process ranges of Gaussians or tiles; nothing is summed across threads, so every result has the
+same bytes for any number of threads.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, pro
 from hilsplat.splat.rasterise.weights import count_weights, write_weights
 
 RANGES_PER_THREAD = 4
-"""Ranges of work per thread, so that threads finish together."""
+"""Ranges of work per thread, which balances the load."""
 
 
 @cache
@@ -33,7 +33,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *arguments: Any) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for all neighbours in `edges`, on threads; results in order."""
+    """Call `work(begin, end, *arguments)` for neighbouring `edges` on threads; return results in order."""
     if threads <= 1:
         return [work(begin, end, *arguments) for begin, end in pairwise(edges)]
     return list(_pool(threads).map(lambda begin, end: work(begin, end, *arguments), edges[:-1], edges[1:]))
@@ -59,12 +59,12 @@ class Projected:
     Attributes:
         camera: packed camera row.
         size_hw: image size, px.
-        degree: spherical-harmonics degree that was used.
+        degree: degree of spherical harmonics used.
         geometry: see `project.GEOMETRY`.
         box: pixel box of each Gaussian; last < first if it is not drawn.
         colours: RGB in this view.
         tiles: depth order and sizes of the tile lists; `tile_lists` fills them band by band.
-        only_band: the filled lists, once filled, if one band holds them all.
+        only_band: the filled lists, if one band contains them all and they were filled before.
     """
 
     camera: Float64[np.ndarray, " 25"]
@@ -79,7 +79,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class Gradients:
-    """dL/d of each parameter, and of the projected means in pixels."""
+    """Gradients with respect to each parameter, and to the projected means in pixels."""
 
     means: Float32[np.ndarray, "N 3"]
     log_scales: Float32[np.ndarray, "N 3"]
@@ -92,10 +92,10 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One view, drawn by either backend.
+    """One view as drawn by either backend.
 
     Attributes:
-        image: premultiplied RGB, then features; without background.
+        image: premultiplied RGB, then features, without background.
         alpha: coverage.
         drawn: whether a Gaussian reaches a pixel of the view.
         gradients: function from the gradients of image and alpha to those of the parameters.
@@ -108,7 +108,7 @@ class Drawn:
 
 
 def refuse_broken(broken: int, total: int) -> None:
-    """Raise if parameters are not finite or quaternions have length zero."""
+    """Raise an error if parameters are not finite or quaternions have zero length."""
     if broken:
         raise HilsplatError(
             f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
@@ -118,10 +118,10 @@ def refuse_broken(broken: int, total: int) -> None:
 
 
 def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads: int) -> Projected:
-    """Project all Gaussians into a view and list them per tile.
+    """Project all Gaussians into a view, and count them per tile.
 
     Raises:
-        HilsplatError: parameters that are not finite, or quaternions of length zero.
+        HilsplatError: if parameters are not finite, or quaternions have zero length.
     """
     n = len(gaussians)
     groups = (n + WIDTH - 1) // WIDTH
@@ -139,7 +139,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
 
 @dataclass(frozen=True)
 class Band:
-    """The filled lists of tiles begin..end, as the loops take them.
+    """Filled lists of tiles begin..end, as arguments of the kernels.
 
     Attributes:
         lists: base, tiles_x, tile_start, tile_end, gaussian, reach: the list of tile t is
@@ -156,9 +156,9 @@ class Band:
 
 
 def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
-    """Fill the tile lists, a band of tiles at a time so that memory stays bounded.
+    """Fill the tile lists one band of tiles at a time, so that memory is bounded.
 
-    If one band holds all tiles, it is kept for the next pass over the view.
+    If one band contains all tiles, it is kept for the next pass over the view.
     """
     if view.only_band:
         yield view.only_band[0]
@@ -168,9 +168,9 @@ def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
     for begin, end in bands:
         base = int(t.tile_start[begin])
         entries = int(t.tile_start[end]) - base
-        # 64 words of reach are read at a time
+        # reach is read 64 words at a time
         gaussian, reach = np.empty(entries, np.int32), np.empty(entries + 64, np.uint16)
-        # every range reads the whole depth order: one per thread, with as many entries each
+        # every range reads the whole depth order: use one range per thread, with equal numbers of entries
         shares = base + np.linspace(0, entries, max(threads, 1) + 1)
         edges = np.searchsorted(t.tile_start, shares[1:-1]).clip(begin, end).tolist()
         filled = (view.box, view.geometry, gaussian, reach, tile_end)
@@ -184,7 +184,7 @@ def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
 def blend_forward(
     view: Projected, channels: Float32[np.ndarray, "N C"], threads: int
 ) -> tuple[Float32[np.ndarray, "H W C"], Float32[np.ndarray, "H W"]]:
-    """Blend per-Gaussian channels: premultiplied image and alpha."""
+    """Blend channels of Gaussians into a premultiplied image and alpha."""
     image = np.empty((*view.size_hw, channels.shape[1]), np.float32)
     alpha = np.empty(view.size_hw, np.float32)
     for band in tile_lists(view, threads):
@@ -202,11 +202,11 @@ def blend_gradients(
     grad_alpha: Float32[np.ndarray, "H W"],
     threads: int,
 ) -> Gradients:
-    """Gradients of the parameters from those of the premultiplied image and alpha.
+    """Compute the gradients of the parameters from those of the premultiplied image and alpha.
 
     Args:
-        channels: what was blended: the view's colours in the first 3 columns, then features.
-        image, alpha: what `blend_forward` returned.
+        channels: blended channels: the view's colours in the first 3 columns, then features.
+        image, alpha: output of `blend_forward`.
     """
     p, n = gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
@@ -218,7 +218,7 @@ def blend_gradients(
         base, _, tile_start, tile_end, gaussian, _ = band.lists
         slots = aligned(len(gaussian) * columns + WIDTH)
         band.over_tiles(blend_backward, threads, *blended, slots, columns)
-        # every range reads all entries, so there is one per thread
+        # every range reads all entries: use one range per thread
         edges = np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist()
         listed = ((band.begin, band.end), base, tile_start, tile_end, gaussian)
         over_edges(add_slots, edges, threads, *listed, slots, columns, sums)
@@ -241,10 +241,10 @@ def draw(
     features: Float32[np.ndarray, "N D"] | None,
     threads: int,
 ) -> Drawn:
-    """Image, alpha, and the gradients on demand; see `api.draw`.
+    """Draw image and alpha, and compute gradients on demand; see `api.draw`.
 
     Raises:
-        HilsplatError: parameters that are not finite, or quaternions of length zero.
+        HilsplatError: if parameters are not finite, or quaternions have zero length.
     """
     view = project_gaussians(gaussians, camera, degree, threads)
     channels = view.colours
@@ -261,7 +261,7 @@ def draw(
 def sparse_weights(
     view: Projected, min_weight: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blending weights >= min_weight as CSR arrays (row starts, columns, weights), one row per pixel.
+    """Return blending weights >= min_weight as CSR arrays (row starts, columns, weights), one row per pixel.
 
     Rows are row-major pixels; columns ascend within a row. Row starts are int64.
     """

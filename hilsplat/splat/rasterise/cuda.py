@@ -1,10 +1,10 @@
-"""The CUDA backend: gsplat (extra `gpu`) behind the functions and conventions of the CPU backend.
+"""CUDA backend: gsplat (extra `gpu`) with the functions and conventions of the CPU backend.
 
-Written against the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a device yet.
-Tests run it on the CPU with gsplat's reference implementation in torch, and on a device if there is one. Sums
-on CUDA are atomic, so gradients repeat to rounding, not to the bit.
+Written for the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a device yet.
+Tests run it on the CPU with gsplat's reference implementation in torch, and on a device if there is one.
+CUDA sums are atomic, so gradients are reproducible only up to rounding.
 
-gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows there.
+gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows.
 """
 
 from typing import Any, NamedTuple
@@ -22,16 +22,16 @@ from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken
 from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
 
 DEVICE = "cuda"
-"""Tests set it to `cpu`, with gsplat's reference implementation in torch."""
+"""Tests set this to `cpu`, with gsplat's reference implementation in torch."""
 
 TILE = 16
-"""Side of gsplat's tiles, px."""
+"""Side of a gsplat tile, px."""
 EVERYTHING = 2**31 - 1
-"""Past the last batch of any tile."""
+"""A number beyond the last batch of any tile."""
 
 
 class OnDevice(NamedTuple):
-    """Gaussians as float32 tensors on the device; fields as in `Gaussians`."""
+    """Gaussians as float32 tensors on the device, with the fields of `Gaussians`."""
 
     means: Float[Tensor, "N 3"]
     log_scales: Float[Tensor, "N 3"]
@@ -44,7 +44,7 @@ class OnDevice(NamedTuple):
         """Copy Gaussians to the device.
 
         Raises:
-            HilsplatError: parameters are not finite, or quaternions are zero.
+            HilsplatError: if parameters are not finite, or quaternions are zero.
         """
         g = OnDevice(*(torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS))
         broken = (g.quats == 0).all(dim=1)
@@ -57,7 +57,7 @@ class OnDevice(NamedTuple):
 def blend(
     g: OnDevice, camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
-    """Blend channels of Gaussians on the device: premultiplied image, alpha, intermediate results."""
+    """Blend channels of Gaussians on the device into premultiplied image, alpha and intermediate results."""
     import gsplat
 
     height, width = camera.size_hw
@@ -84,7 +84,7 @@ def blend(
 
 
 def colours(g: OnDevice, camera: Camera, degree: int) -> Float[Tensor, "N 3"]:
-    """RGB in a view: max(0, 0.5 + spherical harmonics), on the device."""
+    """Return the colours in a view, max(0, 0.5 + spherical harmonics), on the device."""
     import gsplat
 
     centre = torch.tensor(camera.centre, dtype=torch.float32, device=DEVICE)
@@ -92,9 +92,9 @@ def colours(g: OnDevice, camera: Camera, degree: int) -> Float[Tensor, "N 3"]:
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> csr_matrix:
-    """Blending weights of each Gaussian at each pixel, as `api.pixel_weights` returns them.
+    """Return the blending weight of each Gaussian at each pixel, like `api.pixel_weights`.
 
-    gsplat lists which Gaussians are blended at each pixel; the weights follow from the projected
+    gsplat lists the Gaussians blended at each pixel; their weights are computed from the projected
     Gaussians. The list takes about 60 bytes per entry on the device (some 40 entries per pixel).
     """
     import gsplat
@@ -119,7 +119,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
             notes["isect_offsets"],
             notes["flatten_ids"],
         )
-        # by pixel; the order within a pixel, front to back, is kept
+        # sort by pixel and keep the order within a pixel, front to back
         pixel, order = torch.sort(pixel, stable=True)
         who = who[order]
         dx = notes["means2d"][0, who, 0] - (pixel % width + 0.5)
@@ -141,7 +141,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
 
 
 def _light_before(alpha: Float[Tensor, " E"], count: Tensor) -> Float[Tensor, " E"]:
-    """Product of 1 - alpha over the entries before, within runs of `count` entries."""
+    """Return the product of 1 - alpha over the preceding entries, within runs of `count` entries."""
     log_left = torch.log1p(-alpha)
     log_before = torch.cumsum(log_left, dim=0) - log_left
     begin = (torch.cumsum(count, dim=0) - count)[count > 0]
@@ -151,7 +151,7 @@ def _light_before(alpha: Float[Tensor, " E"], count: Tensor) -> Float[Tensor, " 
 def draw(
     gaussians: Gaussians, camera: Camera, degree: int, features: Float32[np.ndarray, "N D"] | None
 ) -> Drawn:
-    """Image, alpha, and the gradients on demand; see `api.draw`."""
+    """Draw image and alpha, and compute gradients on demand; see `api.draw`."""
     width = 0 if features is None else features.shape[1]
     if len(gaussians) == 0:
         return _nothing(gaussians, camera, width)
@@ -178,7 +178,7 @@ def draw(
 
 
 def _nothing(gaussians: Gaussians, camera: Camera, width: int) -> Drawn:
-    """A view without Gaussians, which gsplat does not take."""
+    """Return a view without Gaussians, which gsplat does not support."""
 
     def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
         by_name = {name: np.zeros_like(getattr(gaussians, name)) for name in FIELDS}

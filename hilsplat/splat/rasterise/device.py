@@ -1,4 +1,4 @@
-"""Which backend draws: the CPU's own, or gsplat on CUDA."""
+"""Choice of the rendering backend: our own on the CPU, or gsplat on CUDA."""
 
 import ctypes
 import logging
@@ -16,8 +16,8 @@ Device = Literal["cpu", "cuda"]
 
 @cache
 def cuda_problem() -> str | None:
-    """Why the CUDA backend cannot be used here; None if it can."""
-    # before torch, which takes a second or two to import
+    """Return why the CUDA backend cannot be used here, or None if it can."""
+    # checked before importing torch, which takes 1.3 to 3 s
     if find_spec("gsplat") is None:
         return "gsplat is not installed"
     if not _has_driver():
@@ -44,16 +44,16 @@ def _has_driver() -> bool:
 
 @cache
 def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
-    """Return the device that a setting stands for on this machine, and log it the first time.
+    """Return the device that a setting selects on this machine, and log it the first time.
 
-    Imports torch (1.3 to 3 s) only if `wanted` is not `cpu`, and gsplat and a driver are installed.
+    Imports torch (1.3 to 3 s) only if `wanted` is not `cpu` and both gsplat and a driver are installed.
 
     Args:
-        wanted: `auto` takes CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with
+        wanted: `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with
             the CPU (`parity`).
 
     Raises:
-        DeviceError: `cuda` was requested and cannot be used. There is no fallback.
+        DeviceError: if `cuda` was requested and cannot be used. There is no fallback.
     """
     problem = None if wanted == "cpu" else cuda_problem()
     if wanted == "cuda" and problem:
@@ -64,7 +64,7 @@ def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
             fix="pip install 'hilsplat[gpu]' on a machine with a CUDA device, or set device: auto or cpu",
         )
     if wanted == "auto" and problem is None:
-        from hilsplat.splat.rasterise.parity import cuda_disagreement  # it draws on both
+        from hilsplat.splat.rasterise.parity import cuda_disagreement  # draws on both devices
 
         problem = cuda_disagreement()
     device: Device = "cuda" if wanted != "cpu" and not problem else "cpu"

@@ -1,4 +1,4 @@
-"""Whether the CUDA backend draws what the CPU draws: a self-test, remembered for this machine."""
+"""Self-test that the CUDA backend draws the same as the CPU, cached for this machine."""
 
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from hilsplat.splat.rasterise import api
 from hilsplat.splat.rasterise.device import Device
 
 LEAST_AGREEMENT = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
-"""Largest difference that is rounding. That of gradients is relative, and taken over all Gaussians."""
+"""Largest differences that rounding explains. That of gradients is relative, and over all Gaussians."""
 
 
 def cuda_disagreement() -> str | None:
-    """Return how CUDA differs from the CPU here, or None; drawn once for each device, library and code."""
+    """Return how CUDA differs from the CPU here, or None; cached per device, library and code version."""
     import gsplat
     import torch
 
@@ -55,7 +55,7 @@ def disagreement(one: Device, other: Device) -> str | None:
 
 
 def _scene() -> tuple[Gaussians, Camera]:
-    """Three hundred Gaussians before a camera of 80 x 60 px, some of them behind it."""
+    """Return 300 Gaussians and a camera of 80 x 60 px, with some of the Gaussians behind it."""
     rng = np.random.default_rng(0)
     number = 300
     arrays = (

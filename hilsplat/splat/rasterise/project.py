@@ -1,11 +1,11 @@
-"""Projection of Gaussians into a view, and its gradient: one pass each over the Gaussians.
+"""Projection of Gaussians into a view, and its gradient, each in one pass over the Gaussians.
 
 Conventions are gsplat's: a pinhole camera whose top-left pixel has its centre at (0.5, 0.5); the
-3D covariance is pushed through the perspective Jacobian at the centre (EWA), with the ray clamped
-to 30 % beyond the image border; 0.3 px^2 are added to the diagonal; colour is
-max(0, 0.5 + spherical harmonics) in the direction from the camera to the mean.
+3D covariance is mapped by the perspective Jacobian at the centre (EWA), with the ray clamped to 30 %
+beyond the image border; 0.3 px^2 are added to the diagonal; colour is max(0, 0.5 + spherical harmonics) in
+the direction from the camera to the mean.
 
-The projected Gaussian is stored for the blending loops, whose exponent is base 2:
+Projected Gaussians are stored for the blending loops, whose exponent is base 2:
 log2 alpha = peak - (a dx^2 + b dx dy + c dy^2), where (dx, dy) = mean - pixel centre.
 """
 
@@ -38,13 +38,13 @@ from hilsplat.scene.cameras import Camera
 NEAR = 0.01
 """Gaussians with a smaller depth are not drawn, scene units (gsplat: 0.01)."""
 LOW_PASS_PX2 = 0.3
-"""Added to the projected variance, px^2 (3DGS, gsplat: 0.3)."""
+"""Variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
 """A smaller alpha is not drawn (3DGS, gsplat: 1 / 255)."""
 MAX_LOG_SCALE = np.float32(20.0)
-"""Scales are cut at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers any
-view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers. float32
-as the scales: with a float64 they would all be computed in float64, and change in their last bits."""
+"""Scales are clipped at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers
+any view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers.
+It is float32, since a float64 would make the scales' whole computation float64 and change their last bits."""
 _LEAST_LOG = np.float32(-60.0)
 LOG2_E, LN_2 = 1.4426950408889634, 0.6931471805599453
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
@@ -56,16 +56,16 @@ _LOG2_1P = tuple(
 """Polynomial for log2(1 + e) / e on [0, 1], constant first."""
 
 GEOMETRY = 16
-"""Columns of a projected Gaussian, one line of the cache: mean x, mean y, a, b, c, log2 of the peak alpha,
-depth, whether it is drawn, colour (3), spare (5)."""
+"""Columns of a projected Gaussian, one cache line: mean x, mean y, a, b, c, log2 of the peak alpha, depth,
+whether it is drawn, colour (3), spare (5)."""
 MOMENTS = 6
 """Leading columns of gradient slots and sums: v, v dx, v dy, v dx^2, v dx dy, v dy^2; v = alpha dL/dalpha."""
 
 LANES = WIDTH
 SH_COLUMN = 16
 ROW = 96
-"""Columns of 16 Gaussians that are projected together: mean, log scales, quaternion, logit; from 16
-harmonics; from 64 geometry; from 80 sums."""
+"""Columns of 16 Gaussians that are projected together: mean, log scales, quaternion, logit; harmonics from
+16; geometry from 64; sums from 80."""
 
 _C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -80,11 +80,11 @@ _C30, _C31, _C32, _C33, _C35 = (
 
 
 def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
-    """A camera as one row.
+    """Return a camera as one row.
 
     In order: rotation (9), translation (3), fx, fy, cx, cy, centre (3), ray limits (4), height, width.
 
-    Ray limits are the range of x/z and y/z inside which the Jacobian is taken: the image widened
+    Ray limits are the range of x/z and y/z to which the Jacobian's ray is clamped: the image widened
     by 0.3 of its half field of view on each side (gsplat).
     """
     height, width = camera.size_hw
@@ -103,7 +103,7 @@ def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
 @compiled(inline="always")
 @no_type_check
 def _sh_basis(x, y, z, degree, basis):
-    """Real spherical harmonics up to `degree` (at most 3) of unit directions, 3DGS order and signs."""
+    """Store real spherical harmonics of unit directions up to `degree` (at most 3), as in 3DGS."""
     one = lanes(np.float32(1))
     store(basis, 0, _C0 * one)
     if degree >= 1:
@@ -130,7 +130,7 @@ def _sh_basis(x, y, z, degree, basis):
 @compiled(inline="always")
 @no_type_check
 def _sh_pull(x, y, z, degree, w):
-    """Gradient of the sum of w[k] times `_sh_basis` with respect to x, y, z as if independent."""
+    """Return the gradient of the sum of w[k] times `_sh_basis` with respect to independent x, y and z."""
     w1, w2, w3 = load(w, 1 * LANES), load(w, 2 * LANES), load(w, 3 * LANES)
     gx, gy, gz = -_C1 * w3, -_C1 * w1, _C1 * w2
     if degree >= 2:
@@ -157,16 +157,16 @@ def _sh_pull(x, y, z, degree, w):
 @compiled(inline="always")
 @no_type_check
 def _read(table, width, first, count, rows, columns, column):
-    """Transpose rows first..first + count of a flat table to columns of 16 lanes, and numbers behind them.
+    """Transpose rows first..first + count of a flat table to columns of 16 lanes.
 
-    Lanes beyond `count` and columns beyond `width` get some numbers.
+    Lanes beyond `count` and columns beyond `width` contain arbitrary numbers.
     """
     blocks = (width + LANES - 1) // LANES
     if (first + LANES - 1) * width + blocks * LANES <= len(table):
         for block in range(blocks):
             at = first * width + block * LANES
             transpose(table, at, width, columns, (column + block * LANES) * LANES, LANES)
-    else:  # a vector would pass the end of the table
+    else:  # a vector load would pass the end of the table
         for k in range(count * width):
             rows[k] = table[first * width + k]
         for block in range(blocks):
@@ -176,9 +176,9 @@ def _read(table, width, first, count, rows, columns, column):
 @compiled(inline="always")
 @no_type_check
 def _write(columns, column, width, rows, table, first, count, last):
-    """The reverse of `_read`, to rows below `last`.
+    """Invert `_read`, for rows below `last`.
 
-    The last block of a row runs into the next row, whose first block is written after it.
+    The last block of a row overlaps the next row, whose first block is written after it.
     """
     blocks = (width + LANES - 1) // LANES
     if (first + LANES - 1) * width + blocks * LANES <= last * width:
@@ -195,7 +195,7 @@ def _write(columns, column, width, rows, table, first, count, last):
 @compiled(inline="always")
 @no_type_check
 def _exp(value):
-    """exp of float32 lanes, cut to [-60, MAX_LOG_SCALE]: exp(-60) is nothing beside the low-pass."""
+    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible beside the low-pass."""
     exponent = wide(smaller(larger(value, lanes(_LEAST_LOG)), lanes(MAX_LOG_SCALE))) * LOG2_E - 32.0
     near = narrow(exponent)
     return wide(exp2_negative(near)) * (1.0 + (exponent - wide(near)) * LN_2) * 2.0**32
@@ -204,7 +204,7 @@ def _exp(value):
 @compiled(inline="always")
 @no_type_check
 def _log2_sigmoid(logit):
-    """log2 of 1 / (1 + exp(-logit)), float32 lanes, absolute error below 1e-6."""
+    """Return log2 of 1 / (1 + exp(-logit)) of float32 lanes, with an absolute error below 1e-6."""
     zero = lanes(np.float32(0))
     e = narrow(_exp(smaller(logit, zero - logit)))
     series = lanes(_LOG2_1P[-1])
@@ -222,7 +222,7 @@ def _wide_column(columns, k):
 @compiled(inline="always")
 @no_type_check
 def _place(columns, camera):
-    """Means of 16 Gaussians in the camera, unit quaternions and the inverse of their lengths."""
+    """Return means in camera space, unit quaternions, unit directions, and the inverse lengths of both."""
     mx, my, mz = _wide_column(columns, 0), _wide_column(columns, 1), _wide_column(columns, 2)
     x = camera[0] * mx + camera[1] * my + camera[2] * mz + camera[9]
     y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
@@ -248,7 +248,7 @@ def _place(columns, camera):
 @compiled(inline="always")
 @no_type_check
 def _axis(camera, scale, i, j, k):
-    """An axis (i, j, k) of Gaussians in the camera, times their scale along it."""
+    """Return an axis (i, j, k) of Gaussians in camera space, times their scale along it."""
     return (
         (camera[0] * i + camera[1] * j + camera[2] * k) * scale,
         (camera[3] * i + camera[4] * j + camera[5] * k) * scale,
@@ -265,13 +265,13 @@ def _clamped(value, low, high):
 @compiled
 @no_type_check
 def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, camera, geometry, box, colours):
-    """Project Gaussians into a view: groups begin..end of 16.
+    """Project Gaussians of groups begin..end of 16 into a view.
 
-    Fills, per Gaussian: geometry (see GEOMETRY), box = first and last pixel column, first and last
-    pixel row where alpha can reach MIN_ALPHA (last < first: not drawn), colours.
+    Writes for each Gaussian: geometry (see GEOMETRY); box, the first and last pixel column and the first and
+    last pixel row where alpha can reach MIN_ALPHA (last < first: not drawn); colours.
 
     Returns:
-        number of Gaussians with a number that is not finite or a zero quaternion.
+        number of Gaussians with a non-finite number or a zero quaternion.
     """
     height, width = int(camera[23]), int(camera[24])
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
@@ -289,13 +289,13 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         _read(tables[2], 4, first, count, rows, columns, 6)
         _read(opacity_logits, 1, first, count, rows, columns, 10)
         _read(tables[3], numbers, first, count, rows, columns, SH_COLUMN)
-        finite = zero  # and not a number if a parameter is not finite
+        finite = zero  # becomes NaN if a parameter is not finite
         for k in range(SH_COLUMN + numbers):
             if k < 11 or k >= SH_COLUMN:
                 finite = finite + load(columns, k * LANES) * zero
         (x, y, z), (qw, qx, qy, qz), norm, towards, _ = _place(columns, camera)
         store(found, 0, z)
-        # a quaternion of length zero has no norm
+        # also NaN if the quaternion has zero length
         store(found, LANES, norm * 0.0 + wide(finite))
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = matrix_entries(qw, qx, qy, qz)
         inverse_z = 1.0 / z
@@ -314,7 +314,7 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         inverse = 1.0 / determinant
         px, py = jx * x + cx, jy * y + cy
         top = _log2_sigmoid(load(columns, 10 * LANES))
-        # The level set alpha = MIN_ALPHA has half-widths sqrt(q cov); slightly more for rounding.
+        # the level set alpha = MIN_ALPHA has half-widths sqrt(q cov), slightly enlarged against rounding
         q = 2.0 * LN_2 * (wide(top) - LOG2_MIN_ALPHA)
         store(found, 2 * LANES, determinant)
         store(found, 3 * LANES, px)
@@ -344,14 +344,14 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         for lane in range(count):
             i = first + lane
             box[i, 0], box[i, 1], box[i, 2], box[i, 3] = 0, -1, 0, -1
-            if found[LANES + lane] != 0.0:  # so is what is not a number
+            if found[LANES + lane] != 0.0:  # includes NaN
                 broken += 1
                 continue
             if not (found[lane] > NEAR and 0.0 < found[2 * LANES + lane] < np.inf):
                 continue
             x, y = found[3 * LANES + lane], found[4 * LANES + lane]
             half_x, half_y = found[5 * LANES + lane], found[6 * LANES + lane]
-            # also false if the peak is below MIN_ALPHA and the widths are roots of negative numbers
+            # also false if the peak is below MIN_ALPHA, where the half-widths are NaN
             if not (x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height):
                 continue
             first_x, last_x = (
@@ -380,12 +380,12 @@ def _where_equal(left, right, value):
 @compiled(inline="always")
 @no_type_check
 def _axis_backward(camera, scale, i, j, k, shared):
-    """Gradients through one column of cov = U U' + low pass, U = J factor (2 x 3), factor = cam_R rot scales.
+    """Backpropagate through a column of cov = U U' + low pass, U = J factor, factor = cam_R rot scales.
 
     dU = 2 dcov U, dJ = dU factor', dfactor = J' dU.
 
     Returns:
-        dL/d of the log scale, of the three entries of rot, and of J (its entries 00, 02, 11, 12).
+        dL/d(log scale), dL/d(three entries of rot), and dL/dJ (entries 00, 02, 11, 12).
     """
     jx, jy, ray_x, ray_y, cov_xx, cov_xy, cov_yy = shared
     f0, f1, f2 = _axis(camera, scale, i, j, k)
@@ -421,10 +421,10 @@ def project_backward(
     grad_sh,
     grad_means_px,
 ):
-    """Gradients of groups begin..end of 16 Gaussians from their moments and dL/dcolours (rows of `sums`).
+    """Compute gradients of groups begin..end of 16 Gaussians from rows of `sums`: moments and dL/dcolours.
 
-    The outputs are overwritten; Gaussians that are not drawn get zeros. `grad_means_px` is dL/d(projected
-    mean), per pixel.
+    The outputs are overwritten, with zeros for Gaussians that are not drawn. `grad_means_px` is
+    dL/d(projected mean), per pixel.
     """
     fx, fy = camera[12], camera[13]
     rows, columns = aligned(LANES * ROW), aligned(LANES * ROW)
@@ -511,7 +511,7 @@ def project_backward(
         store(columns, 11 * LANES, narrow(gpx))
         store(columns, 12 * LANES, narrow(gpy))
 
-        # colour; a channel that is clamped at 0 passes no gradient
+        # a colour channel that is clamped at 0 passes no gradient
         red = keep_gt(load(columns, 72 * LANES), zero, load(columns, 86 * LANES))
         green = keep_gt(load(columns, 73 * LANES), zero, load(columns, 87 * LANES))
         blue = keep_gt(load(columns, 74 * LANES), zero, load(columns, 88 * LANES))

@@ -1,6 +1,6 @@
-"""The blending weights of a view as sparse rows, one per pixel, with ascending columns.
+"""Blending weights of a view as sparse rows, one per pixel, with ascending columns.
 
-A first pass counts, so that every row has its place; a second writes. Pixels, blocks, lanes and arguments are
+The first pass counts the entries of each row; the second writes them. Pixels, blocks, lanes and arguments are
 those of `blend`.
 """
 
@@ -28,7 +28,7 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 @compiled(inline="always")
 @no_type_check
 def _place(pixel):
-    """Column and row of a tile's pixel, counted from its corner."""
+    """Return the column and row of a tile's pixel, relative to the tile's corner."""
     block, lane = pixel // LANES, pixel % LANES
     return (block & 3) * 4 + (lane & 3), (block >> 2) * 4 + (lane >> 2)
 
@@ -38,7 +38,7 @@ def _place(pixel):
 def count_weights(
     begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts
 ):
-    """Number of weights >= `least` of each pixel (row-major) of tiles begin..end."""
+    """Count the weights >= `least` of each pixel (row-major) of tiles begin..end."""
     height, width = size_hw
     transmittance, found = aligned(PIXELS), np.empty(PIXELS, np.int64)
     records = aligned(CHUNK * RECORD)
@@ -84,13 +84,13 @@ def write_weights(
     columns,
     weights,
 ):
-    """Columns and weights of the rows that `count_weights` counted; none is longer than `longest`."""
+    """Write the columns and weights of rows counted by `count_weights`, at most `longest` in each."""
     height, width = size_hw
     transmittance, size_of = aligned(PIXELS), np.empty(PIXELS, np.int64)
     records = aligned(CHUNK * RECORD)
     entries, rows = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int32)
     by_lane = aligned(CHUNK * LANES)
-    room = (longest // LANES + 1) * LANES  # of a pixel's row, and at least one entry more
+    room = (longest // LANES + 1) * LANES  # a pixel's row and at least one more entry
     held, held_weights = np.empty(PIXELS * room, np.float32), np.empty(PIXELS * room, np.float32)
     held_columns, rank = held.view(np.int32), np.empty(room, np.float32)
     for tile in range(begin, end):
@@ -110,7 +110,7 @@ def write_weights(
                 for lane in range(LANES if done else 0):
                     pixel = block * LANES + lane
                     at = pixel * room + size_of[pixel]
-                    for n in range(done):  # without a branch, which the processor could not foresee
+                    for n in range(done):  # branch-free, since a branch would be unpredictable
                         weight = by_lane[n * LANES + lane]
                         held_columns[at], held_weights[at] = rows[n], weight
                         at += np.int64((weight > _ZERO) & (weight >= least))
@@ -130,7 +130,7 @@ def write_weights(
 @compiled(inline="always")
 @no_type_check
 def _rank(held, first, size, rank):
-    """How many columns of a row are smaller than each; read as floats, their bits are in the same order."""
+    """Count the smaller columns of each entry of a row; their bits keep their order as floats."""
     for begin in range(0, size, LANES):
         own, smaller = load(held, first + begin), lanes(_ZERO)
         for k in range(first, first + size):
