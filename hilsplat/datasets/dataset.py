@@ -1,4 +1,4 @@
-"""What is known about a data set before any of its files is read: scenes, layout, licence and reader."""
+"""Description of a data set, available without reading its files: scenes, layout, licence and reader."""
 
 import os
 from collections.abc import Callable
@@ -11,11 +11,11 @@ from hilsplat.base.errors import SceneError
 
 @dataclass(frozen=True)
 class SceneReport:
-    """What the check of one scene found.
+    """Result of checking one scene.
 
     Attributes:
         facts: what was read, in words and numbers: {"labelled views": 4, "texts": 21}.
-        warnings: one sentence for each thing that was reinterpreted or could not be used.
+        warnings: one sentence for each item that was reinterpreted or could not be used.
     """
 
     facts: dict[str, object]
@@ -28,21 +28,21 @@ class Dataset:
 
     Attributes:
         name: key in the registry, and data set in rows and paths.
-        title: as papers write it.
+        title: name as written in papers.
         labels: "images" if their pixels are labelled, "points" if the points of a mesh or a scan are.
         folder: the data set's folder below `data_root`.
         scenes: scenes in the paper's tables.
-        licence: in one line.
-        terms: what the licence asks of a user, in one sentence.
+        licence: licence in one line.
+        terms: obligations of the user under the licence, in one sentence.
         citation: authors, title, venue, year.
-        layout: the expected file tree from `folder` down, for people to read.
+        layout: the expected file tree below `folder`, as user-facing text.
         required: paths that a scene needs, relative to `folder`.
         open: reads a scene, given the data set's folder and the scene's name; returns a `LabelledScene` or a
             `PointScene`.
-        open_part: the same with only some of the images, which is enough for a check; None to use `open`.
-        protocols: names of the protocols it is scored under (`evaluate.protocols.cards`), in addition to
-            those for every labelled image.
-        label_places: glob patterns, below `folder`, of those files of a scene that only evaluation reads.
+        open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
+        protocols: names of the protocols that score it (`evaluate.protocols.cards`), in addition to those for
+            every labelled image.
+        label_places: glob patterns, below `folder`, of a scene's files that only evaluation reads.
     """
 
     name: str
@@ -65,18 +65,18 @@ class Dataset:
         return (self.open_part or self.open)(root, scene).report()
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
-        """Required paths of a scene that are missing below the data set's folder `root`."""
+        """Return the required paths of a scene that are missing below the data set's folder `root`."""
         return tuple(place for place in self.required(scene) if not _at(root, place).exists())
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Known scenes with every required path present."""
+        """Return the known scenes that have all required paths."""
         return tuple(scene for scene in self.scenes if not self.missing(root, scene))
 
     def locate(self, data_root: Path) -> Path:
-        """The data set's folder below `data_root`.
+        """Return the data set's folder below `data_root`.
 
         Raises:
-            SceneError: it is missing, or it is one level too high or too deep.
+            SceneError: it is missing, or is one level too high or too deep.
         """
         data_root = Path(data_root).expanduser()
         root = data_root / self.folder
@@ -112,10 +112,10 @@ class Dataset:
         )
 
     def require(self, root: Path, scene: str) -> None:
-        """Refuse a scene that lacks a required path.
+        """Raise if a scene lacks a required path.
 
         Raises:
-            SceneError: something is missing, for instance because an archive was unpacked only in part.
+            SceneError: a path is missing, for instance because an archive was unpacked only in part.
         """
         missing = self.missing(root, scene)
         if missing:
@@ -128,27 +128,27 @@ class Dataset:
             )
 
     def _has_begun(self, root: Path) -> bool:
-        """Whether a folder contains a required path of any known scene."""
+        """Return whether a folder contains a required path of any known scene."""
         return any(
             _at(root, place).exists()
             for scene in self.scenes
             for place in self.required(scene)
-            if not place.startswith("..")  # what is beside the folder says nothing about it
+            if not place.startswith("..")  # paths outside the folder are no evidence
         )
 
 
 def _at(root: Path, place: str) -> Path:
-    """A path relative to a folder, which need not exist for `..` to lead out of it."""
+    """Return a path relative to a folder; with `..`, the folder need not exist."""
     return Path(os.path.normpath(Path(root) / place))
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Subfolders by name; none if the folder is missing."""
+    """Return the subfolders by name; none if the folder is missing."""
     return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
 
 def _listing(folder: Path) -> str:
-    """The first names in a folder, for messages."""
+    """Return the first names in a folder, for messages."""
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))

@@ -1,7 +1,7 @@
-"""Scenes with labelled images: what every reader of such a data set returns.
+"""Scenes with labelled images, as returned by every reader of such a data set.
 
 Labels, images and poses of a view are keyed by its name in the scene ("frame_00041.png", see
-`scene.view_names.view_name`), so that a label finds its image and its camera whatever else is missing.
+`scene.view_names.view_name`), so that a label matches its image and camera even if other views are missing.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -23,7 +23,7 @@ from hilsplat.scene.importers.known_views import known_views
 from hilsplat.scene.view_names import view_name
 
 ROUNDING_PX = 1.0
-"""A label counts as a scaled copy of its image if their sides differ by no more than rounding."""
+"""A label counts as a scaled copy of its image if their sides differ by rounding only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,14 @@ class LabelledRegion:
     """One region of one view, with the text of its query.
 
     Attributes:
-        text: the query, as the labels spell it.
+        text: the query, spelt as in the labels.
         size_hw: height and width of the label, px.
-        pixels: reads the region at the label's size; called each time the mask is needed.
+        pixels: reads the region at the label's size; called whenever the mask is needed.
         boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
         level: None if the data set has no levels.
-        path: texts from the whole down to this region; just its text if there are no levels.
-        any_grey: reads every pixel of the label that is not black, for protocols that take those as truth;
-            None: the same as `pixels`.
+        path: texts from the whole down to this region; just its text without levels.
+        any_grey: reads all non-black pixels of the label, for protocols that use those as truth; None: the
+            same as `pixels`.
     """
 
     text: str
@@ -52,14 +52,14 @@ class LabelledRegion:
     def mask(
         self, size_hw: tuple[int, int] | None = None, *, any_grey: bool = False
     ) -> Bool[np.ndarray, "H W"]:
-        """The region, at the label's size or resized to another by nearest neighbour."""
+        """Return the region at the label's size, or resized by nearest neighbour."""
         mask = self.any_grey() if any_grey and self.any_grey else self.pixels()
         return mask if size_hw is None else resize_nearest(mask, size_hw)
 
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
-        """Boxes with borders included; the region's own extent if none is annotated.
+        """Return boxes with borders included; the region's own extent if none is annotated.
 
-        At another size each side is scaled and rounded to the pixel that holds it. A region with neither
+        At another size, each side is scaled and rounded to the pixel that contains it. A region with neither
         pixels nor annotated boxes has none.
         """
         boxes = self.boxes_xyxy
@@ -85,9 +85,9 @@ class LabelledScene:
         scene: name of the scene.
         images: image file of each view, for all images of the scene.
         poses: folder in which `scene.known_poses` finds poses; None if the scene has none.
-        views: labelled regions by view, in the order of the labels.
+        views: labelled regions by view, in label order.
         prompts: all texts of the scene, sorted.
-        warnings: one sentence for each thing that was reinterpreted.
+        warnings: one sentence for each item that was reinterpreted.
     """
 
     dataset: str
@@ -100,14 +100,14 @@ class LabelledScene:
 
     @property
     def num_pairs(self) -> int:
-        """Number of pairs of view and text."""
+        """Number of (view, text) pairs."""
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> None:
-        """Check that every labelled view is among the posed ones.
+        """Check that every labelled view has a pose.
 
         Raises:
-            SceneError: labelled views without a pose, by name.
+            SceneError: labelled views have no pose; the message lists them.
         """
         missing = [view for view in self.views if view not in names]
         if missing:
@@ -119,7 +119,7 @@ class LabelledScene:
             )
 
     def report(self) -> SceneReport:
-        """Read every mask and the poses of the scene, and report what is there."""
+        """Read every mask and the poses of the scene, and report what was found."""
         warnings = list(self.warnings)
         empty = [
             f"{view}: {region.text}"
@@ -146,14 +146,14 @@ class LabelledScene:
 
 
 def resize_nearest(mask: Bool[np.ndarray, "H W"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Each new pixel takes the old one under its corner, as public evaluators do (OpenCV's nearest)."""
+    """Resize by the old pixel under each new pixel's corner, as public evaluators do (OpenCV's nearest)."""
     if mask.shape == tuple(size_hw):
         return mask
     return cv2.resize(mask.astype(np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def images_by_view(folder: Path) -> dict[str, Path]:
-    """Image files of a folder by view, sorted by stem.
+    """Return the image files of a folder by view, sorted by stem.
 
     Raises:
         SceneError: the folder is missing or empty, or two images share a stem.
@@ -180,7 +180,7 @@ def images_by_view(folder: Path) -> dict[str, Path]:
 
 
 def image_size_hw(path: Path) -> tuple[int, int]:
-    """Height and width of an image as stored, without reading its pixels.
+    """Return height and width of an image as stored, without reading its pixels.
 
     Raises:
         ImageError: it is missing or not an image.
@@ -197,7 +197,7 @@ def image_size_hw(path: Path) -> tuple[int, int]:
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Foreground of a grey mask file: values of at least `least`.
+    """Return the foreground of a grey mask file: values of at least `least`.
 
     Raises:
         ImageError: it is missing, truncated or not an image.
@@ -219,13 +219,13 @@ def check_label_size(
     """Compare the size of a label with that of its image.
 
     Args:
-        where: the label, as the beginning of a sentence.
-        label_hw: its height and width, px.
-        image_hw: those of its image, px.
-        share: how much heights may differ at equal widths, beyond rounding, as a share of the image's height.
+        where: description of the label that starts the message.
+        label_hw: height and width of the label, px.
+        image_hw: height and width of its image, px.
+        share: tolerated height difference at equal widths, beyond rounding, as a share of the image's height.
 
     Returns:
-        None if they are equal, otherwise a sentence saying that the label is resized.
+        None if they are equal, otherwise a sentence stating that the label is resized.
 
     Raises:
         SceneError: one is not a scaled copy of the other.
@@ -247,8 +247,7 @@ def check_label_size(
 
 
 def unlisted_texts(found: Iterable[str], published: Iterable[str]) -> str | None:
-    """A sentence naming texts missing from the scene's published list; None without any, or if the list is
-    empty."""
+    """Return a sentence naming texts that a non-empty published list lacks, or None."""
     published = set(published)
     new = sorted(set(found) - published)
     if not published or not new:
@@ -257,13 +256,13 @@ def unlisted_texts(found: Iterable[str], published: Iterable[str]) -> str | None
 
 
 def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> str | None:
-    """A sentence naming published frames without `what`, or None."""
+    """Return a sentence naming published frames without `what`, or None."""
     gone = sorted(set(listed) - set(present))
     return f"published frames without {what}: {', '.join(gone)}" if gone else None
 
 
 def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
-    """Posed views of a scene folder by view name, sorted by stem.
+    """Return the posed views of a scene folder by view name, sorted by stem.
 
     Raises:
         SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, so that

@@ -1,5 +1,4 @@
-"""What `hilsplat datasets` prints: the known data sets, the scenes that are present, and whether they can be
-read."""
+"""Output of `hilsplat datasets`: the known data sets, the scenes present, and whether they can be read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,13 +9,12 @@ from hilsplat.datasets.registry import DATASETS
 
 
 def overview(data_root: Path | None) -> str:
-    """All data sets with licence, citation and layout, and the scenes present below a folder if one is
-    given."""
+    """Describe all data sets, with the scenes present below a folder if one is given."""
     return "\n\n".join(describe(dataset, data_root) for dataset in DATASETS.values())
 
 
 def describe(dataset: Dataset, data_root: Path | None) -> str:
-    """Several lines that describe one data set."""
+    """Return several lines that describe one data set."""
     lines = [
         f"{dataset.name}: {dataset.title}, labels on {dataset.labels}",
         f"  citation  {dataset.citation}",
@@ -32,7 +30,7 @@ def describe(dataset: Dataset, data_root: Path | None) -> str:
 
 
 def _presence(dataset: Dataset, data_root: Path) -> list[str]:
-    """The complete scenes of a data set, and what is missing from the others."""
+    """Return lines that list a data set's complete scenes, and what is missing from the others."""
     try:
         root = dataset.locate(data_root)
     except SceneError as error:
@@ -50,7 +48,7 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
 
     Args:
         dataset: the data set.
-        data_root: folder that holds its folder.
+        data_root: folder that contains the data set's folder.
         scenes: scenes to read; by default those that are at least partly present.
 
     Returns:
@@ -84,5 +82,5 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
 
 
 def _own(dataset: Dataset, scene: str) -> tuple[str, ...]:
-    """Required places of a scene inside the data set's own folder."""
+    """Return a scene's required paths inside the data set's own folder."""
     return tuple(place for place in dataset.required(scene) if not place.startswith(".."))

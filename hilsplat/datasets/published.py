@@ -1,13 +1,12 @@
-"""Frames and prompts of the image-labelled data sets, as far as they are published.
+"""Published frames and prompts of the image-labelled data sets.
 
-Labels on disk always win: these lists serve to report what is missing, misspelt or from another release.
+Labels on disk take precedence: these lists only help to report missing, misspelt or mismatched labels.
 
-Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-OVS from third-party
-loaders, bed, bench and lawn from a second repository too; Hi-LERF and Hi-3DOVS from the table of the
-Hi-LSplat paper (its `frame_01` of a 3D-OVS scene is image 01). `PROMPTS`: LERF-OVS from
-yanmin-wu/OpenGaussian, LERF-Mask from lkeab/gaussian-grouping, 3D-OVS bed to sofa from published evaluation
-code; those of blue_sofa, snacks and office_desk from figure captions of the LangSplat supplement, perhaps
-incomplete; covered_desk and table: none.
+Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-OVS from third-party loaders,
+bed, bench and lawn also from a second repository; Hi-LERF and Hi-3DOVS from the table of the Hi-LSplat paper
+(its `frame_01` of a 3D-OVS scene is image 01). `PROMPTS`: LERF-OVS from yanmin-wu/OpenGaussian, LERF-Mask
+from lkeab/gaussian-grouping, 3D-OVS bed to sofa from published evaluation code; blue_sofa, snacks and
+office_desk from figure captions of the LangSplat supplement, perhaps incomplete; covered_desk, table: none.
 """
 
 from hilsplat.scene.view_names import view_name
@@ -59,7 +58,7 @@ FRAMES: dict[str, dict[str, tuple[str, ...]]] = {
         "table": _ovs(0, 2, 14, 26, 30, 31),
     },
 }
-"""Labelled frames by data set and scene, as names of views."""
+"""Labelled frames by data set and scene, as view names."""
 
 PROMPTS: dict[str, dict[str, tuple[str, ...]]] = {
     "lerf_ovs": {
@@ -241,5 +240,5 @@ PROMPTS: dict[str, dict[str, tuple[str, ...]]] = {
 """Prompts by data set and scene, sorted."""
 
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
-"""Pairs of frame and category of LERF-OVS: the smallest counts of which all published localization figures
-are whole fractions (derived)."""
+"""Number of (frame, category) pairs of LERF-OVS, derived: the smallest counts for which all published
+localization figures are whole fractions."""

@@ -1,4 +1,4 @@
-"""The data sets that can be read, by name.
+"""The supported data sets, by name.
 
 A reader's module describes its data set in a constant (see `dataset.Dataset`); one line here adds it.
 """
@@ -26,17 +26,17 @@ DATASETS: Plugins[Dataset] = Plugins(
         "waymo": "hilsplat.datasets.waymo.reader:DATASET",
     }
 )
-"""In the order of the paper's tables."""
+"""Supported data sets in the order of the paper's tables."""
 
 
 def readers_of(labels: Collection[str]) -> tuple[str, ...]:
-    """Places of the readers of some labels, named as in "lerf_ovs/figurines" (see `base.plugins`)."""
+    """Return the places of the readers for labels such as "lerf_ovs/figurines" (see `base.plugins`)."""
     names = {name.partition("/")[0] for name in labels}
     return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
 
 
 def open_labelled(name: str, data_root: Path) -> LabelledScene:
-    """Open a scene with labels on images, named as in "lerf_ovs/figurines".
+    """Open a scene with labels on images, by a name such as "lerf_ovs/figurines".
 
     Raises:
         SceneError: there is no such data set, its labels are on points, or the scene cannot be read.
@@ -54,10 +54,10 @@ def open_labelled(name: str, data_root: Path) -> LabelledScene:
 
 
 def open_labels(name: str, data_root: Path) -> LabelledScene | PointScene:
-    """Open a scene with labels on images or points, named as in "scannet/scene0000_00".
+    """Open a scene with labels on images or points, by a name such as "scannet/scene0000_00".
 
     Raises:
-        SceneError: there is no such data set, no scene is named, or it cannot be read.
+        SceneError: there is no such data set, no scene is named, or the scene cannot be read.
     """
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
@@ -76,7 +76,7 @@ def dataset_of(name: str) -> Dataset:
     """Look up a data set.
 
     Raises:
-        SceneError: there is none of this name.
+        SceneError: there is no data set with this name.
     """
     try:
         return DATASETS[name]

@@ -1,7 +1,6 @@
-"""Rows of the scene sheet that name a published data set: what is present of it, and which files hold its
-labels.
+"""Published data sets named in rows of the scene sheet: which parts are present, and which files are labels.
 
-The workflow uses this module at start-up, so it reads no data and imports nothing heavy at the top.
+The workflow uses this module at start-up, so it reads no data and imports nothing heavy at module level.
 """
 
 from collections.abc import Collection
@@ -15,11 +14,11 @@ LABELS_ON: dict[str, tuple[str, ...]] = {"lerf_ovs": ("hi_lerf",), "3d_ovs": ("h
 """Data sets that label the images of another one, in addition to its own labels."""
 
 LEVELLED = tuple(name for names in LABELS_ON.values() for name in names)
-"""Those data sets; their labels have levels."""
+"""The data sets with levels, from `LABELS_ON`."""
 
 
 def published(source: str) -> tuple[str, str] | None:
-    """Data set and scene of a source such as `data:lerf_ovs/figurines`; None for anything else."""
+    """Return data set and scene of a source such as `data:lerf_ovs/figurines`; None for anything else."""
     from hilsplat.datasets.registry import DATASETS
 
     name, _, scene = source.removeprefix(DATA_PREFIX).partition("/")
@@ -27,10 +26,10 @@ def published(source: str) -> tuple[str, str] | None:
 
 
 def absence(source: str, data_root: str) -> str | None:
-    """Why a `data:` source cannot be used, as one sentence; None if it can.
+    """Return a sentence on why a `data:` source cannot be used; None if it can.
 
     Args:
-        source: of a row of the scene sheet.
+        source: source in a row of the scene sheet.
         data_root: folder of the data sets; empty if not set.
     """
     if not source.startswith(DATA_PREFIX):
@@ -53,10 +52,10 @@ def absence(source: str, data_root: str) -> str | None:
 
 
 def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
-    """Return scenes on disk that no row lists, of data sets whose scenes differ between users (Waymo).
+    """Return scenes on disk that are in no row, for data sets without a fixed list of scenes (Waymo).
 
     Args:
-        sources: of all rows of the scene sheet.
+        sources: sources of all rows of the scene sheet.
         groups: groups that are run; such a data set has the name of its group.
         data_root: folder of the data sets; empty if not set.
     """
@@ -73,12 +72,11 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Labels that a scene can be scored against, as `data set/scene`, its own first; none if the data is
-    missing.
+    """Return labels to score a scene against, as `data set/scene`, its own first; none without the data.
 
     Args:
-        source: of a row of the scene sheet.
-        data_root: folder of the data sets; empty: the working folder, which may hold your own annotations.
+        source: source in a row of the scene sheet.
+        data_root: folder of the data sets; empty for the working folder, which may contain own annotations.
         row: name of the row, `dataset/scene`.
     """
     own = (f"annotated/{row}",) if any((_root(data_root) / "annotated" / row).glob("*.json")) else ()
@@ -102,7 +100,7 @@ def _root(data_root: str) -> Path:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Files of `data set/scene` that only evaluation reads, sorted: editing one reruns nothing else."""
+    """Return the files of `data set/scene` that only evaluation reads, sorted; edits rerun nothing else."""
     from hilsplat.datasets.registry import dataset_of
 
     name, _, scene = labels.partition("/")
@@ -115,8 +113,7 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
 
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
-    """Files from which the images and poses of an exported scene are read, as far as the data set names
-    them."""
+    """Return the files listed by the data set that contain images and poses of an exported scene."""
     from hilsplat.datasets.registry import dataset_of
 
     place = published(source)
@@ -133,8 +130,7 @@ def image_files(source: str, data_root: str) -> tuple[Path, ...]:
 
 
 def is_exported(source: str) -> bool:
-    """Whether images and poses must first be exported from the data set's own files, as with labels on
-    points."""
+    """Return whether images and poses must first be exported, as for data sets with labels on points."""
     place = published(source)
     if place is None:
         return False
@@ -144,21 +140,21 @@ def is_exported(source: str) -> bool:
 
 
 def export_images(name: str, data_root: Path, out: Path) -> int:
-    """Write images and poses of a scene with labelled points as a folder that `poses` imports.
+    """Write images and poses of a scene with labelled points to a folder that `poses` imports.
 
-    The vertices of a labelled mesh are written too, without their labels: Gaussians start there, and may be
-    frozen there. Lidar points are not written, since the sky and everything far away has none.
+    The vertices of a labelled mesh are also written, without labels, as initial (optionally frozen) positions
+    of Gaussians. Lidar points are not written, because the sky and distant objects have none.
 
     Args:
         name: `data set/scene`.
         data_root: folder of the data sets.
-        out: folder with `images/`, `transforms.json` and perhaps `points.ply`.
+        out: folder for `images/`, `transforms.json` and, for a mesh, `points.ply`.
 
     Returns:
-        the number of images.
+        The number of images.
 
     Raises:
-        SceneError: the scene's labels are on images, which need no export, or it cannot be read.
+        SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.
     """
     from hilsplat.datasets.points.labelled_points import PointScene
     from hilsplat.datasets.registry import open_labels
@@ -176,5 +172,5 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
 
 
 def _one_line(error: SceneError) -> str:
-    """A message as one line, for a log or a footnote."""
+    """Return a message as one line, for a log or a footnote."""
     return "; ".join(" ".join(line.split()) for line in str(error).splitlines())

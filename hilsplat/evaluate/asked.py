@@ -1,4 +1,4 @@
-"""Which protocols score a scene: those of its data set, or of the benchmarks it stands in for."""
+"""Protocols that score a scene: those of its data set, or of the benchmarks that it substitutes for."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ STAND_INS: Mapping[str, tuple[str, ...]] = {
     "room": (*SCANNET, *SCANNET200, *REPLICA),
     "street": WAYMO,
 }
-"""Kind of synthetic scene -> protocols it stands in for, besides those of LERF-OVS and of levels."""
+"""Kind of synthetic scene -> protocols that it substitutes for, besides LERF-OVS and the level protocols."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Asked:
 
     @staticmethod
     def of_world(kind: str) -> "Asked":
-        """Protocols of a stand-in; none for kind "".
+        """Return the protocols of a synthetic scene; none for kind "".
 
         Raises:
             SceneError: the kind is unknown.
@@ -55,17 +55,17 @@ class Asked:
 
     @staticmethod
     def of_dataset(name: str) -> "Asked":
-        """Protocols that the data set's own entry names.
+        """Return the protocols listed in the data set's registry entry.
 
         Raises:
             SceneError: the data set is unknown.
-            ArtifactError: it names an unknown protocol.
+            ArtifactError: the entry lists an unknown protocol.
         """
         return _asked(dataset_of(name).protocols, None)
 
     @staticmethod
     def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Asked]":
-        """Data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines".
+        """Return data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines".
 
         Raises:
             SceneError: the data set or scene is unknown or cannot be read.

@@ -1,4 +1,4 @@
-"""Predictions of any program in, `scores.csv` out: the protocols without the pipeline."""
+"""The evaluate-files stage: scores any program's predictions without the pipeline; writes `scores.csv`."""
 
 import difflib
 import logging
@@ -44,10 +44,10 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 METHOD = "files"
-"""Method of the rows; their variant names the program."""
+"""Method in the rows; their variant names the program."""
 
 WORDS = "masks of files"
-"""In brackets after a protocol's name: its rule for maps was not applied, because masks came in."""
+"""Bracketed suffix of a protocol's name: masks were supplied, so its map rule was not applied."""
 
 Masks = Mapping[tuple[str, str], Bool[np.ndarray, "h w"]]
 
@@ -66,29 +66,29 @@ def run_evaluate_files(
     name: str = "",
     min_region_px: int | None = None,
 ) -> None:
-    """Score masks or point labels that any program wrote (`prediction_files` says in which form).
+    """Score masks or point labels written by any program (see `prediction_files` for the format).
 
-    Masks without a level are scored under the protocols of texts, masks with levels under
-    `hierarchy/level-given`, point labels under those protocols of points for which there is a file. A text
-    without a mask counts 0, except under the protocol that leaves it out.
+    Masks without a level are scored under the text protocols, masks with levels under
+    `hierarchy/level-given`, point labels under the point protocols for which there is a file. A text without
+    a mask counts as 0, except under the protocol that omits it.
 
     Args:
         predictions: folder of the predictions.
         out: `scores.csv`; `instances.npz` is written beside it if there are instances.
-        method: name of the program, which becomes the variant of its rows.
+        method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
-        truth: or the truth folder of a synthetic scene.
-        scene: its posed scene, which says which views are tested.
-        kind: its kind, as in `run_evaluate`.
-        dataset: data set of a synthetic scene's rows.
-        name: its name in rows.
-        min_region_px: smaller true regions of a synthetic scene are not scored; None: the settings' default.
+        truth: alternatively, the truth folder of a synthetic scene.
+        scene: posed scene of the truth, which defines the test views.
+        kind: kind of synthetic scene, as in `run_evaluate`.
+        dataset: data set in a synthetic scene's rows.
+        name: scene name in a synthetic scene's rows.
+        min_region_px: smaller true regions of a synthetic scene are not scored; None for the default setting.
 
     Raises:
         ArtifactError: a view has no predictions, or a file cannot be read.
-        MisalignedArtifactError: a prediction has another size than its labels, or is for an unknown text.
-        SettingsError: neither labels nor truth and scene are given, or both.
+        MisalignedArtifactError: a prediction differs in size from its labels, or its text is unknown.
+        SettingsError: neither labels nor truth and scene are given, or both are.
     """
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
         raise SettingsError(
@@ -147,11 +147,11 @@ def _label_truths(known: LabelledScene) -> dict[str, Callable[[], ViewTruth]]:
 def _mask_rows(
     predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], asked: Asked
 ) -> Iterator[tuple[str, Measured]]:
-    """Rows of all views; all are read before the first is scored, so that a missing one is told at once."""
+    """Yield the rows of all views; all are read before scoring, so that a missing one is reported at once."""
     found = {view: read_view_masks(predictions, view) for view in views}
     truths = {view: load() for view, load in views.items()}
     levels = {level for masks in found.values() for level, _ in masks}
-    if not levels:  # every folder is empty: nothing was found anywhere
+    if not levels:  # every folder is empty: nothing was found in any view
         levels = {query.level.label for truth in truths.values() for query in truth.queries if query.level}
         levels.add("")
     texts: dict[str, set[str]] = {}
@@ -170,7 +170,7 @@ def _mask_rows(
 
 
 def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[str]]) -> None:
-    """Sizes and texts of a view's masks, with errors that name the view."""
+    """Check the sizes and texts of a view's masks, with errors that name the view."""
     for (level, text), mask in masks.items():
         where = f"{view}: {level}/{text}" if level else f"{view}: {text}"
         known = sorted(texts.get(level, ()))
@@ -193,7 +193,7 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
 
 
 def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measured]:
-    """Rows of masks without a level: every text under LERF's protocols, then those that the data set asks."""
+    """Yield rows of masks without a level, for all texts under LERF's protocols, then the data set's own."""
     for query in truth.categories:
         for card in (LERF_LANGSPLAT, LERF_OPENGAUSSIAN):
             yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
@@ -201,7 +201,7 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
     queries = [query for query in truth.queries if query.level is asked.level]
     flat = [*truth.categories, *truth.absent] if asked.level is None else queries
     for card in asked.flat:
-        if card is OVS_NODES:  # masks of files are no nodes of a tree
+        if card is OVS_NODES:  # masks from files are not nodes of a tree
             continue
         if card is OVS_ARGMAX:
             yield from _argmax_rows(flat, masks, words, labelled=asked.level is not None)
@@ -215,7 +215,7 @@ def _text_rows(
 ) -> Iterator[Measured]:
     region = query.any_grey_region if card.truth == "any grey" else query.truth
     if not region.any():
-        return  # the view doesn't show it
+        return  # not visible in the view
     metrics = tuple(metric for metric in card.metrics if metric in MASK_METRICS)
     for row in measure_masks(
         replace(card, metrics=metrics), METHOD, {query.text: mask}, {query.text: region}
@@ -227,7 +227,7 @@ def _text_rows(
 def _argmax_rows(
     queries: Sequence[Query], masks: Masks, words: list[str], labelled: bool
 ) -> Iterator[Measured]:
-    """3D-OVS by argmax: a pixel in several masks counts for the first text, one in none is a miss."""
+    """Yield rows of 3D-OVS by argmax: in overlaps the first text wins, a pixel in no mask is a miss."""
     if not queries:
         return
     ordered = sorted(queries, key=lambda query: query.text)
@@ -244,7 +244,7 @@ def _argmax_rows(
 
 
 def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
-    """Rows of masks at levels, and how they nest."""
+    """Yield the rows of masks at levels, and their hierarchical consistency."""
     protocol = LEVEL_GIVEN.labelled([WORDS])
     for query in truth.queries:
         assert query.level is not None
@@ -258,7 +258,7 @@ def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
 
 
 def _files_of(cards: tuple[ProtocolCard, ...]) -> list[str]:
-    """Names, without suffix, of the files that protocols of points read."""
+    """Return the names, without suffix, of the files read under point protocols."""
     names = ["instances"] if INSTANCES in cards else []
     for card in cards:
         if card is not INSTANCES:
@@ -269,7 +269,7 @@ def _files_of(cards: tuple[ProtocolCard, ...]) -> list[str]:
 def _point_rows(
     predictions: Path, truth: Mapping[str, LabelledPoints], asked: Asked
 ) -> Iterator[Measured | InstanceMatches]:
-    """Rows of points under each protocol whose file is there, and the matches of instances."""
+    """Yield the rows of points under each protocol whose file exists, and the matches of instances."""
     scored = []
     for card in asked.points:
         labelling, classes = class_set(card.classes)

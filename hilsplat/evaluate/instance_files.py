@@ -1,6 +1,6 @@
-"""Matches of predicted instances, kept beside `scores.csv` so that scans are evaluated together.
+"""Matches of predicted instances, stored beside `scores.csv` so that scans are evaluated together.
 
-The official average precision pools all scans before it draws a curve; a number per scan is not enough.
+The official average precision pools all scans before computing a curve; one number per scan is not enough.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,7 +16,7 @@ FIELDS = ("class_index", "overlap_index", "confidence", "is_match", "misses", "h
 
 
 def instances_path(scores: Path) -> Path:
-    """Path of the matches that belong to a score file."""
+    """Return the path of the matches that belong to a score file."""
     return Path(scores).with_name("instances.npz")
 
 

@@ -1,4 +1,4 @@
-"""Predictions that another program wrote: masks per view and text, classes and instances of points."""
+"""Readers for predictions of other programs: masks per view and text, classes and instances of points."""
 
 import zipfile
 from collections.abc import Mapping
@@ -19,14 +19,14 @@ LEVEL_FOLDERS = tuple(level.label for level in LEVELS)
 
 
 def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.ndarray, "h w"]]:
-    """Masks of one view by (level, text); the level is "" for masks without one.
+    """Return the masks of one view by (level, text); the level is "" for masks without one.
 
-    `<view>/<text>.png`, `<view>/<level>/<text>.png` with level whole, part or subpart, or `<view>.npz` with
-    an array per text, named "<text>" or "<level>/<text>". A view without a prediction has an empty folder.
+    Files are `<view>/<text>.png`, `<view>/<level>/<text>.png` (level whole, part or subpart), or `<view>.npz`
+    with an array per text, "<text>" or "<level>/<text>". A view without predictions has an empty folder.
 
     Args:
         folder: folder of all predictions.
-        view: its name, such as "frame_00041.png"; folders and files carry it without the suffix.
+        view: view name, such as "frame_00041.png"; folders and files are named without the suffix.
 
     Raises:
         ArtifactError: the view has neither folder nor file, or both, or one of them cannot be used.
@@ -55,11 +55,11 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
 
 
 def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
-    """Class ids of points: ScanNet's text file, one whole number per line; 0 is none.
+    """Read class ids of points from ScanNet's text format, one integer per line; 0 means none.
 
     Raises:
-        ArtifactError: the file is missing or holds something else.
-        MisalignedArtifactError: it has another number of points.
+        ArtifactError: the file is missing or malformed.
+        MisalignedArtifactError: the number of points differs.
     """
     return _of_points(_numbers(path, np.int64), num_points, path)
 
@@ -67,17 +67,17 @@ def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
 def read_point_instances(
     path: Path, num_points: int
 ) -> tuple[Bool[np.ndarray, "M P"], Int64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
-    """Instances in ScanNet's format: lines of mask file, class id and confidence.
+    """Read instances in ScanNet's format: lines of mask file, class id and confidence.
 
-    A mask file has one whole number per point; those that are not 0 belong to the instance. Its path is
-    relative to the folder of `path`.
+    A mask file has one integer per point; non-zero points belong to the instance. Its path is relative to the
+    folder of `path`.
 
     Returns:
         Masks, class ids and confidences.
 
     Raises:
-        ArtifactError: a file is missing or has another form.
-        MisalignedArtifactError: a mask has another number of points.
+        ArtifactError: a file is missing or malformed.
+        MisalignedArtifactError: the number of points in a mask differs.
     """
     path = Path(path)
     masks, classes, confidences = [], [], []

@@ -23,14 +23,14 @@ class Score:
         dataset: data set of the scene.
         scene: scene name.
         variant: named set of settings.
-        masks: what made the masks, such as `sam-tiny`; see `made_from_truth`.
-        method: what answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
+        masks: origin of the masks, such as `sam-tiny`; see `made_from_truth`.
+        method: method that answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
         view: view name.
         query: text; empty if the number describes a whole view.
         level: level label of the annotation; empty if the protocol has no levels.
         metric: a key of `METRICS`.
-        protocol: how the answer was made and compared: a full name, with departures (`protocols.cards`).
-        value: in the metric's bounds.
+        protocol: full name of the protocol, with deviating settings (`protocols.cards`).
+        value: value within the metric's bounds.
         n: number of items that the value averages.
     """
 
@@ -52,7 +52,7 @@ COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
 
 
 def write_scores(path: Path, scores: Iterable[Score]) -> None:
-    """Write sorted rows, values with six decimals: the same rows give the same bytes."""
+    """Write sorted rows, values with six decimals, so that equal rows give identical files."""
     rows = []
     for score in scores:
         assert score.metric in METRICS, score.metric
@@ -66,7 +66,7 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
     """Read score files into one frame.
 
     Raises:
-        ArtifactError: a file is missing or has other columns.
+        ArtifactError: a file is missing or has different columns.
     """
     import pandas as pd
 
@@ -93,11 +93,11 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
 
 
 def score_summary(scene: str, files: Mapping[str, Path]) -> list[str]:
-    """Return a table of mean IoU and localization for people: a line per variant, answerer and protocol.
+    """Return a user-facing table of mean IoU and localization: a line per variant, method and protocol.
 
     Args:
         scene: name of the scene.
-        files: score files, by name of the variant.
+        files: score files, by variant name.
 
     Raises:
         ArtifactError: a file cannot be read.

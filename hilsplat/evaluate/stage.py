@@ -1,4 +1,4 @@
-"""The evaluate stage: a finished scene and its annotations in, `scores.csv` out."""
+"""The evaluate stage: scores a finished scene against its annotations and writes `scores.csv`."""
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,7 +34,7 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 MAX_CAMERA_ERROR_M = 0.1
-"""Above this median camera error scores of points are meaningless, and the log says so."""
+"""Median camera error above which point scores are meaningless; a warning is logged."""
 
 TIMED_TEXTS = 3
 """Number of queries timed, all in one view."""
@@ -66,20 +66,20 @@ def run_evaluate(
 ) -> None:
     """Score every annotated query in every annotated test view, and every labelled point (`protocols`).
 
-    With the labels of a published data set every labelled view is scored, held out or not: most benchmarks
-    train on all views. `times.csv` (seconds per query) and, for instances, `instances.npz` are written beside
-    `scores.csv`.
+    With the labels of a published data set, every labelled view is scored, even if it was used for training,
+    because most benchmarks train on all views. `times.csv` (seconds per query) and, for instances,
+    `instances.npz` are written beside `scores.csv`.
 
     Args:
-        parts: the finished scene; its test views were held out of every earlier stage.
+        parts: the finished scene; its test views were held out from all earlier stages.
         out: `scores.csv`; without truth and labels it holds only the header.
         settings: queries and protocols.
-        dataset: written into every row, as are `scene` and `variant`.
+        dataset: data set in every row, as are `scene` and `variant`.
         scene: scene name.
         variant: named set of settings.
         truth: truth folder of a synthetic scene.
-        kind: kind of synthetic scene, which decides which benchmarks it stands in for (`Asked.of_world`).
-        labels: labels of published data sets, such as "lerf_ovs/figurines", instead of a truth.
+        kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Asked.of_world`).
+        labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
         data_root: folder of the data sets' folders.
         threads: threads for rendering.
 
@@ -122,7 +122,7 @@ def run_evaluate(
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = timed(answers, view, texts, settings)
-                    answers.forget(view)  # memory that is used again need not be cleared again
+                    answers.forget(view)  # reused memory need not be cleared again
                 if isinstance(known, TrueAnnotations) and truths and settings.view_consistency:
                     found = measure_world_consistency(
                         answers, selections, truths, kept, known.folder, settings
@@ -143,7 +143,7 @@ def run_evaluate(
 def known_truths(
     known: Annotations, posed: Scene, settings: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """True regions by view; empty for labels on points."""
+    """Return the true regions by view; empty for labels on points."""
     if isinstance(known, PointScene):
         return {}
     if isinstance(known, LabelledScene):
@@ -162,7 +162,7 @@ def point_rows(
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Score labelled points: rows, and matches of instances; nothing if no protocol scores points."""
+    """Yield rows of labelled points and matches of instances; nothing if no protocol scores points."""
     if not asked.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
@@ -193,7 +193,7 @@ def timed(
     texts: Sequence[str],
     settings: EvaluateSettings,
 ) -> dict[str, float]:
-    """Seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
+    """Return the seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
     rule = rule_of(settings)
 
     def by_field(text: str) -> object:

@@ -13,11 +13,11 @@ from hilsplat.scene.scene import Scene
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Relative difference up to which labels fit a view: undistortion and shrinking round its sides."""
+"""Tolerated relative difference in shape between labels and view: undistortion and shrinking round sides."""
 
 
 def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str, Callable[[], ViewTruth]]:
-    """True regions in each annotated test view, loaded on demand."""
+    """Return the true regions in each annotated test view, loaded on demand."""
     annotations = HierarchyAnnotations.load(truth)
     return {
         view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, min_region_px)
@@ -27,7 +27,7 @@ def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str,
 
 
 def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """True regions in each labelled view of a published data set, loaded on demand.
+    """Return the true regions in each labelled view of a published data set, loaded on demand.
 
     Raises:
         SceneError: a labelled view has no pose, or its labels differ in shape.

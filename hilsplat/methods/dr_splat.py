@@ -1,17 +1,16 @@
-"""Dr. Splat: the mask vectors of the pixels that a Gaussian leads, averaged and stored as a few bytes each.
+"""Dr. Splat: averaged vectors of the masks at pixels that a Gaussian dominates, stored as a few bytes.
 
-For every pixel the published code takes the 45 Gaussians with the largest compositing weights, adds the
+For every pixel the published code selects the 45 Gaussians with the largest compositing weights, adds each
 weight to (Gaussian, mask), averages the masks' unit CLIP vectors with these sums, scales the average to unit
 length and stores its product-quantised bytes (kaist-ami/Dr-Splat `train.py`). No field is trained.
 
 Departs from the published code:
-    - the product quantiser is trained on the scene's own mask vectors; the published index was trained on a
-      general set of images;
-    - a byte for every four numbers of a vector, 128 at 512 numbers; the published index file sets its own;
+    - the product quantiser is trained on the scene's own mask vectors, the published index on general images;
+    - one byte per four elements of a vector (128 bytes for 512); the published index file sets its own;
     - weights of a pixel are divided by its alpha, those below `contributions.min_weight` are dropped, and
-      pixels of alpha below `MIN_ALPHA` are left out;
+      pixels with alpha below `MIN_ALPHA` are ignored;
     - all three levels instead of one (`--feature_level`);
-    - the bytes are decoded for the queries, and rendered like any field, instead of looked up in the index.
+    - for queries, the bytes are decoded and rendered like any field instead of looked up in the index.
 """
 
 import numpy as np
@@ -27,14 +26,14 @@ from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
 PART = 4
-"""Numbers of a CLIP vector that share a byte."""
+"""Elements of a CLIP vector that share a byte."""
 
 UNSEEN = 1e-9
 """Averages shorter than this have no direction."""
 
 
 def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
-    """The `count` largest weights of each row; of equal ones, those of the lower columns."""
+    """Return the `count` largest weights of each row; lower columns win ties."""
     data = weights.data.copy()
     _drop_lighter(weights.indptr, data, count)
     kept = sp.csr_matrix((data, weights.indices.copy(), weights.indptr.copy()), shape=weights.shape)
@@ -45,12 +44,12 @@ def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
 def register(
     inputs: MethodInputs, vectors: Float32[np.ndarray, "M C"], count: int
 ) -> Float32[np.ndarray, "N 3 C"]:
-    """Unit averages of mask vectors, weighted by the pixels that a Gaussian leads; zero if it leads none.
+    """Return unit averages of mask vectors over the pixels that a Gaussian dominates; zero without any.
 
     Args:
         inputs: artifacts of the scene.
-        vectors: one of unit length per mask.
-        count: Gaussians of a pixel that take part.
+        vectors: one unit vector per mask.
+        count: number of Gaussians that dominate a pixel, those with the largest weights.
     """
     contributions = inputs.contributions
     sums = np.zeros((contributions.num_gaussians, len(LEVELS), vectors.shape[1]), np.float32)
@@ -67,7 +66,7 @@ def register(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Register, quantise, decode; Gaussians that lead no pixel of a level get zeros."""
+    """Average, quantise and decode mask vectors; Gaussians that dominate no pixel get zeros."""
     code = inputs.linear_code("dr_splat")
     vectors = code.decode_array(inputs.latents)
     averages = register(inputs, vectors, settings.top_gaussians)

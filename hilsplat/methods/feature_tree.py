@@ -1,14 +1,14 @@
-"""A semantic tree from clustered features: the paper's 3D hierarchical clustering, taken by the letter.
+"""A semantic tree from clustered features: a literal reading of the paper's 3D hierarchical clustering.
 
 1. Every Gaussian learns an identity feature for each level by L = L_h + lambda_1 L_ins + lambda_2 L_part
-   alone (paper, Sec. III-C). No language takes part.
-2. Gaussians are clustered coarse to fine: wholes by their features at level whole, parts inside each whole,
-   subparts inside each part. Two clusters stay apart if they are farther from each other than half the median
-   distance of two masks that share a view and a parent.
-3. A cluster takes the masks of its level that it fits best; their CLIP vectors become its vector, as in
+   alone (paper, Sec. III-C), without language.
+2. Gaussians are clustered coarse to fine: wholes by their features at level whole, then parts inside wholes,
+   subparts inside parts. Clusters closer than half the median distance of two masks that share a view and a
+   parent are merged.
+3. A cluster's vector is computed from the CLIP vectors of the masks of its level that fit it best, as in
    OpenGaussian. Parents follow from containment, as for linked masks.
 
-The paper says "train and cluster point-level features" and no more; the rule of the distance is ours.
+The paper only states "train and cluster point-level features"; the distance threshold is ours.
 """
 
 from pathlib import Path
@@ -32,14 +32,14 @@ from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 
 CENTRES = 256
-"""Most centres of k-means that are then joined."""
+"""Maximum number of k-means centres, which are then merged."""
 
 CENTRE_OF = 4
-"""Least Gaussians for each centre."""
+"""Minimum number of Gaussians per centre."""
 
 KMEANS_ROUNDS = 10
 RIDGE = 1e-3
-"""Weight of the pull towards the random start: it only keeps unseen directions from drifting."""
+"""Weight of the penalty towards the random start, which keeps unobserved directions from drifting."""
 
 
 def identity_features(
@@ -54,16 +54,16 @@ def identity_features(
     """Train features with L alone, from a random start.
 
     Args:
-        contributions: of the scene.
+        contributions: mask weights of the Gaussians.
         parents: per view, the coverage tree's parent of each mask.
         settings: weights and readings of L_h, L_ins and L_part.
         size: D.
-        steps: of L-BFGS.
-        seed: of the start.
-        threads: of the products; the result does not depend on it.
+        steps: L-BFGS steps.
+        seed: seed of the random start.
+        threads: threads for matrix products; the result does not depend on it.
 
     Returns:
-        features, nan for Gaussians that no mask of a level shows; the mean feature of each mask.
+        features, nan for Gaussians in no mask of a level; the mean feature of each mask.
     """
     alone = {"weight_language": 0.0, "ridge": RIDGE, "start": "random", "cg_steps": 0, "lbfgs_steps": steps}
     settings = settings.model_copy(update=alone)
@@ -87,11 +87,11 @@ def identity_features(
 def farthest_alike(
     means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
 ) -> tuple[float, ...]:
-    """Half the median distance of two masks that share a view, a level and a parent, for each level.
+    """Return, per level, half the median distance of two masks that share a view, a level and a parent.
 
     Args:
         means: mean feature of each mask.
-        contributions: rows of the masks.
+        contributions: rows for the masks.
         parents: per view, the coverage tree's parent of each mask, -1 for none.
     """
     found: list[list[float]] = [[] for _ in LEVELS]
@@ -107,7 +107,7 @@ def farthest_alike(
 def joined_clusters(
     features: Float32[np.ndarray, "n D"], farthest: float, seed: int
 ) -> Int64[np.ndarray, " n"]:
-    """Cluster of each row: centres of k-means, joined while their average distance is below `farthest`."""
+    """Return each row's cluster: k-means centres, merged while their average distance is below `farthest`."""
     count = int(np.clip(len(features) // CENTRE_OF, 1, CENTRES))
     _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
@@ -121,7 +121,7 @@ def joined_clusters(
 def nested_clusters(
     features: Float32[np.ndarray, "N 3 D"], farthest: tuple[float, ...], seed: int
 ) -> Int64[np.ndarray, "N 3"]:
-    """Cluster of each Gaussian at each level, -1 where its feature is nan; finer ones lie inside coarser."""
+    """Return each Gaussian's cluster per level, -1 where its feature is nan; clusters nest."""
     found = np.full(features.shape[:2], NONE, np.int64)
     around = np.zeros(len(features), np.int64)
     for level in LEVELS:
@@ -134,7 +134,7 @@ def nested_clusters(
             number += int(own.max()) + 1
         around = np.where(
             has, found[:, level.index], -2 - around
-        )  # Gaussians without one stay with their whole
+        )  # Gaussians without a cluster remain grouped by their whole
     return found
 
 
@@ -148,17 +148,17 @@ def run_feature_tree(
     seed: int,
     threads: int,
 ) -> None:
-    """Write a semantic tree whose nodes are clusters of features that L alone trains.
+    """Write a semantic tree whose nodes are clusters of features trained with L alone.
 
     Args:
         contributions_folder: weights of each Gaussian in each mask, with G.
         masks_folder: masks of the views.
         coverage_folder: coverage trees of the views, for L_ins and L_part.
-        out: folder to write, as `run_semantic_tree`.
-        settings: of the tree.
+        out: output folder, as in `run_semantic_tree`.
+        settings: settings of the tree.
         field_settings: weights and readings of L.
-        seed: of the features' start and of k-means.
-        threads: results do not depend on it.
+        seed: seed of the features' start and of k-means.
+        threads: number of threads; results do not depend on it.
 
     Raises:
         MisalignedArtifactError: an input belongs to other masks.

@@ -1,21 +1,21 @@
-"""Gaussian Grouping: identity codes with a linear classifier, smooth in 3D; an identity has a CLIP vector.
+"""Gaussian Grouping: identity codes with a linear classifier, smooth in 3D; each identity has a CLIP vector.
 
-1. Masks of all views that show the same thing get one identity.
-2. Every Gaussian learns a code of 16 numbers; a linear classifier names the identity of each rendered pixel
-   (cross-entropy), and class probabilities of a Gaussian and its 5 nearest neighbours agree (KL).
-3. A Gaussian has the identity of its largest probability, and the mean CLIP vector of that identity's masks.
+1. Masks of all views that show the same object get one identity.
+2. Every Gaussian learns a code of 16 numbers. A linear classifier predicts the identity of each rendered
+   pixel (cross-entropy), and class probabilities of a Gaussian and its 5 nearest neighbours agree (KL).
+3. A Gaussian gets its most probable identity, and the mean CLIP vector of that identity's masks.
 
 Source: Ye et al., Gaussian Grouping, ECCV 2024; lkeab/gaussian-grouping `train.py`, `utils/loss_utils.py`.
-Authors' values are in the constants, and `steps` 30,000, `rate` 0.0025 (0.0005 for the classifier).
+The authors' values are in the constants, and `steps` 30,000, `rate` 0.0025 (0.0005 for the classifier).
 
 Departs:
-    - identities come from masks linked by the Gaussians they share, as our tree links them, not from a
-      tracker of videos (DEVA): a row shows what codes and classifier add to that;
-    - all in each of our levels separately; the authors use one set of masks;
-    - pixels without an identity are left out; the authors train them to a class of their own;
-    - geometry is frozen, it is not trained together with the codes;
-    - fewer steps, on 4096 pixels of a view; the rate of the classifier is that of the codes;
-    - the KL is taken at every step, not every fifth, with 1000 samples as there;
+    - identities come from masks linked by shared Gaussians, as in our tree, not from a video tracker (DEVA),
+      so that a table row shows what codes and classifier add to that;
+    - each of our levels is trained separately; the authors use one set of masks;
+    - pixels without an identity are ignored; the authors assign them a class of their own;
+    - geometry is frozen instead of trained together with the codes;
+    - fewer steps, on 4096 pixels of a view; classifier and codes share a learning rate;
+    - the KL is computed at every step instead of every fifth, with 1000 samples as there;
     - text selects by the identities' CLIP vectors, not by Grounding-DINO and SAM in a first view.
 """
 
@@ -44,7 +44,7 @@ SAMPLES = 1000
 
 
 def mask_identities(contributions: Contributions, level: Level, threads: int) -> Int64[np.ndarray, " m"]:
-    """Identity of each mask of a level, -1 for none: masks are linked by shared Gaussians, as by default."""
+    """Return each mask's identity at a level, -1 for none, by our default linking via shared Gaussians."""
     mass = contributions.mass()
     visible = mass > MIN_VISIBLE_PX
     importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
@@ -59,7 +59,7 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
 def neighbour_loss(
     logits: Float[Tensor, "s K"], others: Float[Tensor, "s n K"], num_classes: int
 ) -> Float[Tensor, ""]:
-    """Mean KL divergence of class probabilities from those of the neighbours, per class."""
+    """Return the mean KL divergence of class probabilities from those of the neighbours, per class."""
     log_p, log_q = log_softmax(logits, -1)[:, None], log_softmax(others, -1)
     return (log_p.exp() * (log_p - log_q)).sum(-1).mean() / num_classes
 
@@ -75,12 +75,12 @@ def identity_of_gaussians(
     """Train codes and classifier of a level, and classify the Gaussians.
 
     Args:
-        views: pixels.
-        contributions: of the scene.
-        identity: of every mask of the scene at the level, -1 for none.
+        views: labelled pixels.
+        contributions: mask weights of the Gaussians.
+        identity: identity of every mask of the scene at the level, -1 for none.
         level: the level.
         settings: steps and rate.
-        seed: for the first codes and all samples.
+        seed: seed of the first codes and all samples.
     """
     num_classes = int(identity.max()) + 1
     draw = torch.Generator().manual_seed(seed)
@@ -112,9 +112,9 @@ def identity_of_gaussians(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Classify the Gaussians at each level, and give each identity the mean code of its masks.
+    """Classify the Gaussians at each level, and assign each identity the mean code of its masks.
 
-    A level without identities gets 0.
+    A level without identities gets zeros.
     """
     contributions, latents = inputs.contributions, inputs.latents
     views = labelled_views(inputs, settings.pixel_step)

@@ -1,24 +1,24 @@
-"""LaGa: contrastive features that nest by prefix, objects from masks of all views, several descriptors each.
+"""LaGa: contrastive features nested by prefix, objects from masks of all views, several descriptors each.
 
-1. Every Gaussian learns 32 numbers: wholes use the first 16, parts 24, subparts all. Pixels are drawn to the
-   prototype of their mask and away from others; what shares a finer mask must agree in the coarser prefix,
-   what a coarser mask parts must differ in the finer one.
+1. Every Gaussian learns 32 numbers: wholes use the first 16, parts 24, subparts all. Pixels are attracted to
+   the prototype of their mask and repelled from others. Pixels that share a finer mask must agree in the
+   coarser prefix; pixels that a coarser mask separates must differ in the finer one.
 2. Prototypes of masks over all views are clustered by density: each cluster is an object, and a Gaussian
    belongs to the nearest.
-3. The CLIP vectors of an object's masks are clustered to as many descriptors as the silhouette chooses, up to
-   20; a descriptor weighs as much as it agrees with the object's average.
+3. The CLIP vectors of an object's masks are clustered; the silhouette chooses the number of descriptors, up
+   to 20. A descriptor's weight is its agreement with the object's average.
 
 Source: Cen et al., LaGa, ICML 2025; SJTU-DeepVisionLab/LaGa `train_affinity_features.py`, `inference.ipynb`.
-Authors' values are in the constants, and `steps` 30,000, `rate` 0.0025.
+The authors' values are in the constants, and `steps` 30,000, `rate` 0.0025.
 
 Departs:
-    - the descriptors of an object are added by their weights; the authors take for every text the best
-      product of relevancy and weight, but a field here holds one code per Gaussian and level;
-    - a level answers by itself; the authors average the scores of the three and smooth them over neighbours;
-    - density clusters at the authors' radius (DBSCAN*) in place of HDBSCAN with that as the least radius;
-    - one start of k-means per number of descriptors, not ten;
-    - painted masks, fewer steps on 2048 pixels of a view; almost equal first features; prototypes of objects
-      from exact mask means; masks below the same share of the image are left out.
+    - an object's descriptors are summed by weight; for each text the authors take the maximum of relevancy
+      times weight, but a field here holds one code per Gaussian and level;
+    - levels are queried separately; the authors average the three scores and smooth them over neighbours;
+    - density clusters at the authors' radius (DBSCAN*) in place of HDBSCAN with that as the minimum radius;
+    - one k-means start per number of descriptors instead of ten;
+    - painted masks, fewer steps on 2048 pixels of a view; almost equal initial features; prototypes of
+      objects from exact mask means; masks below the same share of the image are ignored.
 """
 
 import numpy as np
@@ -41,24 +41,24 @@ from hilsplat.settings import MethodSettings
 SLICES = (16, 8, 8)
 PREFIX = (16, 24, 32)
 MIN_SHARE = 400 / (988 * 731)
-"""Least share of the image in a mask: 400 px of a view of LERF."""
+"""Minimum share of the image in a mask: 400 px of a LERF view."""
 SAME_IOU = 0.8
 HARD_COSINE = 0.5
 RADIUS = (0.3, 0.2, 0.1)
-"""Of density clusters of whole, part, subpart."""
+"""Radius of density clusters at level whole, part, subpart."""
 LEAST_MASKS = 5
-"""Within the radius of a dense mask; a scene of fewer views asks for as many as it has views."""
+"""Minimum number of masks within the radius of a dense mask, or the number of views if that is smaller."""
 MOST_DESCRIPTORS = 20
 PIXELS = 2048
 
 
 def unit_slices(features: Float[Tensor, "n 32"]) -> Float[Tensor, "n 32"]:
-    """Each of the three slices of length 1."""
+    """Scale each of the three slices to length 1."""
     return torch.cat([unit(part) for part in features.split(SLICES, 1)], 1)
 
 
 def masks_of_pixels(labels: Int32[np.ndarray, "p 3"]) -> list[Bool[np.ndarray, "p _"]]:
-    """Pixels of the masks of each level that take part: large enough, and not a finer mask once more."""
+    """Return the pixels of each level's usable masks: large enough, and not a duplicate of a finer mask."""
     least = max(MIN_SHARE * len(labels), 1)
     every = []
     for label in labels.T:
@@ -78,12 +78,12 @@ def masks_of_pixels(labels: Int32[np.ndarray, "p 3"]) -> list[Bool[np.ndarray, "
 def nested_loss(
     rendered: Float[Tensor, "p 32"], masks: list[Bool[np.ndarray, "p _"]], random: np.random.Generator
 ) -> Float[Tensor, ""]:
-    """Contrast of pixels with mask prototypes in the prefixes, and how far rendered slices are from length 1.
+    """Return the contrast of pixels with mask prototypes per prefix, plus a penalty for slice lengths not 1.
 
     Args:
         rendered: features of pixels.
         masks: pixels of the masks of whole, part, subpart.
-        random: chooses the pixels outside a mask that count: as many as are inside, and the hard ones.
+        random: draws the pixels used outside a mask: as many as inside, besides all hard ones.
     """
     inside = [torch.from_numpy(each) for each in masks]
     last = len(LEVELS) - 1
@@ -114,7 +114,7 @@ def nested_loss(
 def train_features(
     views: list[LabelledView], num_gaussians: int, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N 32"]:
-    """Train the features of Gaussians; the slices are of unit length."""
+    """Return trained features of Gaussians, with slices of unit length."""
     features = alike(num_gaussians, sum(SLICES), seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
@@ -129,13 +129,13 @@ def train_features(
 def objects(
     features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
-    """Object of each Gaussian and of each mask, -1 for none.
+    """Return the object of each Gaussian and of each mask, -1 for none.
 
     Args:
-        features: of the Gaussians, of unit length.
-        prototypes: of the masks, of unit length.
-        radius: of density clusters of prototypes.
-        least: masks within the radius of a dense one, itself among them.
+        features: unit features of the Gaussians.
+        prototypes: unit prototypes of the masks.
+        radius: radius of density clusters of prototypes.
+        least: minimum number of masks within the radius of a dense one, including itself.
     """
     of_mask = density_clusters(prototypes, radius, least)
     num = int(of_mask.max(initial=NONE)) + 1
@@ -149,7 +149,7 @@ def objects(
 
 
 def silhouette(distance: Float[np.ndarray, "n n"], group: Int64[np.ndarray, " n"]) -> float:
-    """Mean of (b - a) / max(a, b): distance a to the own group, b to the next (Rousseeuw 1987); alone: 0."""
+    """Return the mean silhouette (Rousseeuw 1987); a row alone in its group counts as 0."""
     counts = np.bincount(group)
     to_group = distance @ np.eye(len(counts))[group]
     rows = np.arange(len(group))
@@ -162,14 +162,14 @@ def silhouette(distance: Float[np.ndarray, "n n"], group: Int64[np.ndarray, " n"
 
 
 def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[np.ndarray, " n"]:
-    """Weight of each mask's vector in the sum of its object's weighted descriptors.
+    """Return the weight of each mask's vector in the sum of its object's weighted descriptors.
 
-    A descriptor is the centroid c of a cluster of vectors, scaled to unit length; it weighs c.a with the unit
-    average a of all vectors, so that a loose cluster weighs less.
+    A descriptor is the unit centroid c of a cluster of vectors. Its weight is c.a, with the unit average a of
+    all vectors, so that a scattered cluster has less weight.
 
     Args:
-        vectors: CLIP vectors of the masks of one object, of unit length.
-        seed: of the starts of k-means.
+        vectors: unit CLIP vectors of the masks of one object.
+        seed: seed of the k-means starts.
     """
     group, best = np.zeros(len(vectors), np.int64), -1.0
     distance = cdist(vectors, vectors)
@@ -186,9 +186,9 @@ def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[
 def object_latents(
     of_mask: Int64[np.ndarray, " m"], latents: Float32[np.ndarray, "m D"], code: LinearCode, seed: int
 ) -> Float32[np.ndarray, "T D"]:
-    """Code of the weighted sum of each object's descriptors.
+    """Return the code of the weighted sum of each object's descriptors.
 
-    A sum of vectors m + U z with weights w has the direction of the vector whose z is their weighted average.
+    A weighted sum of vectors m + U z has the direction of the vector whose z is their weighted average.
     """
     vectors = as_vectors(latents, code)
     length = np.linalg.norm(vectors, axis=1)
@@ -202,13 +202,13 @@ def object_latents(
 
 
 def large_masks(inputs: MethodInputs, contributions: Contributions) -> Bool[np.ndarray, " M"]:
-    """Masks that some pixels show and that take at least the least share of their view."""
+    """Return whether each mask is visible in some pixels and has at least the minimum share of its view."""
     image = np.array([np.prod(inputs.view_size_hw(view)) for view in contributions.views])
     return (contributions.pixels > 0) & (contributions.area_px > MIN_SHARE * image[contributions.view])
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, find objects at each level, and give each the code of its descriptors."""
+    """Train features, find objects at each level, and assign each the code of its descriptors."""
     contributions, code = inputs.contributions, inputs.linear_code("laga")
     views = labelled_views(inputs, settings.pixel_step)
     features = train_features(views, contributions.num_gaussians, settings, seed)

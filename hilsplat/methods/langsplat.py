@@ -6,16 +6,16 @@ compositing weights, which we compute once per view.
 
 Departs from the published code:
     - fewer steps, and a grid of pixels instead of all (`MethodSettings`);
-    - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, unlabelled
-      ones counting as 0, so the weight of a view's step grows with the area of its masks;
-    - rendered codes are divided by alpha, as a query sees them, and pixels of alpha below `MIN_ALPHA`
-      are left out; LangSplat compares premultiplied codes wherever a mask is painted;
-    - codes of Gaussians are blended without scaling; LangSplat scales each to unit length first;
+    - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, counting
+      unlabelled ones as 0, so a view's step has more weight the larger the area of its masks;
+    - rendered codes are divided by alpha, as in queries, and pixels with alpha below `MIN_ALPHA` are ignored;
+      LangSplat compares premultiplied codes wherever a mask is painted;
+    - Gaussians' codes are blended unscaled; LangSplat first scales each to unit length;
     - weights below `contributions.min_weight` are dropped.
 
-`hilsplat.field.reference_trainer` (loss `l1`) renders at every step, and averages over all pixels as
-LangSplat does. It is a different trainer, not this one with more steps: it draws views with replacement and
-trains the levels in one run. It treats alpha and unit length as this one does.
+`hilsplat.field.reference_trainer` (loss `l1`) renders at every step, and averages over all pixels like
+LangSplat. It also differs in drawing views with replacement and training all levels in one run. It treats
+alpha and unit length like this module.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class LevelPixels:
     """Labelled pixels of one view at one level.
 
     Attributes:
-        weights: their compositing weights (pixels x Gaussians), rows summing to 1.
+        weights: compositing weights (pixels x Gaussians), rows summing to 1.
         targets: code of the mask painted at each pixel.
     """
 
@@ -51,11 +51,11 @@ class LevelPixels:
 class ViewPixels:
     """Covered pixels of one view that are labelled at any level.
 
-    Most are labelled at all levels, so their weights are held once.
+    Most are labelled at all levels, so their weights are stored once.
 
     Attributes:
-        weights: their compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted there at each level, -1 for none.
+        weights: compositing weights (pixels x Gaussians), rows summing to 1.
+        labels: row of the mask painted at each pixel and level, -1 for none.
         latents: code of each mask of the view.
     """
 
@@ -64,11 +64,11 @@ class ViewPixels:
     latents: Float32[np.ndarray, "m D"]
 
     def is_labelled(self, level: Level) -> bool:
-        """Whether any pixel shows a mask of the level."""
+        """Return whether any pixel shows a mask of the level."""
         return bool((self.labels[:, level.index] >= 0).any())
 
     def at(self, level: Level) -> LevelPixels:
-        """Copy the pixels that a level labels, in order."""
+        """Copy the pixels labelled at a level, in order."""
         rows = np.flatnonzero(self.labels[:, level.index] >= 0)
         return LevelPixels(self.weights[rows], self.latents[self.labels[rows, level.index]])
 
@@ -80,14 +80,14 @@ class ViewQueue:
         self._views, self._order, self._queue = views, np.random.default_rng(seed), list[int]()
 
     def next(self) -> ViewPixels:
-        """The view of the next step."""
+        """Return the view of the next step."""
         if not self._queue:
             self._queue = list(self._order.permutation(len(self._views)))
         return self._views[self._queue.pop()]
 
 
 def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
-    """Labelled pixels of the train views that have any, on a grid, and the codes of their masks.
+    """Return the labelled grid pixels of the train views that have any, and the codes of their masks.
 
     Raises:
         ArtifactError: no view has a labelled pixel.
@@ -103,11 +103,11 @@ def train_level(
     """Train by Adam from zero, one random view per step, each once before any is repeated.
 
     Args:
-        views: train views in which the level labels a pixel, at least one.
+        views: train views with labelled pixels at this level, at least one.
         level: the level to train.
         num_gaussians: N.
         settings: steps and rate.
-        seed: for the order of views.
+        seed: seed of the order of views.
     """
     channels = views[0].latents.shape[1]
     wide = channels + -channels % WIDTH
@@ -125,19 +125,19 @@ def train_level(
 
 @compiled
 def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
-    """Write the gradient of the mean absolute difference of rendered and painted codes by the features.
+    """Write the gradient of the mean absolute difference of rendered and painted codes for the features.
 
-    A row of weights is read once for its sum and, while it is in the fastest cache, once for what it passes
-    back. Sums have the order of the products with the matrix and its transpose; there is one thread.
+    A row of weights is read once for its sum and, while it is in the fastest cache, once for its gradient.
+    Sums are in the order of the products with the matrix and its transpose; there is one thread.
 
     Args:
         indptr, indices, data: weights (pixels x Gaussians), CSR.
-        labels: row of the code that is painted at each pixel, -1 for none.
-        codes: float32, flat, `wide` numbers a row.
-        channels: of a code; the numbers after them are 0.
-        wide: numbers of a Gaussian, a multiple of `WIDTH`.
-        features: float32, flat, `wide` numbers a Gaussian.
-        gradient: of the same shape; written.
+        labels: row of the code painted at each pixel, -1 for none.
+        codes: float32, flat, `wide` numbers per row.
+        channels: size of a code; padding after it is 0.
+        wide: numbers per Gaussian, a multiple of `WIDTH`.
+        features: float32, flat, `wide` numbers per Gaussian.
+        gradient: same shape as `features`; written.
     """
     gradient[:] = 0
     labelled = 0
@@ -147,7 +147,7 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
     for p in range(len(labels)):
         if labels[p] < 0:
             continue
-        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])  # unsigned: no look for negative indices
+        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])  # unsigned: skips negative-index checks
         for c in range(0, wide, WIDTH):
             total = zeros()
             for k in range(begin, end):

@@ -1,17 +1,17 @@
 """LangSplatV2: each Gaussian mixes a few entries of a global codebook, and the mixture is splatted directly.
 
 The published code gives each Gaussian 64 logits per level, keeps the largest 4 of their softmax, and renders
-those coefficients; a 64 x 512 codebook, started by k-means on the masks' CLIP vectors and trained along,
-turns them into CLIP vectors without an autoencoder. Loss 1 - cosine, Adam, logits from zero
+those coefficients; a 64 x 512 codebook, initialised by k-means on the masks' CLIP vectors and then trained,
+maps them to CLIP vectors without an autoencoder. Loss 1 - cosine, Adam, logits from zero
 (ZhaoYujie2002/LangSplatV2 `train.py`, `scene/gaussian_model.py`, `utils/vq_utils.py`).
 
 Departs from the published code:
     - fewer and larger steps, and a grid of pixels instead of all (`MethodSettings`);
-    - entries of the codebook are vectors m + U z of the scene's linear code, which mixtures never leave;
-      d = 64 keeps the masks' vectors to a mean cosine of 0.9998 on the development scenes;
+    - codebook entries, and so their mixtures, are vectors m + U z of the scene's linear code; d = 64
+      reproduces the masks' vectors with a mean cosine of 0.9998 on the development scenes;
     - the loss is averaged over the labelled pixels of the grid, rendered mixtures are divided by alpha,
-      thinly covered pixels are left out and small weights dropped, as in `langsplat`;
-    - k-means on all vectors of the level's masks at once instead of mini-batches.
+      thinly covered pixels are ignored and small weights dropped, as in `langsplat`;
+    - k-means on all mask vectors of the level at once instead of mini-batches.
 """
 
 import numpy as np
@@ -28,16 +28,16 @@ from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
 ENTRIES = 64
-"""Entries of the codebook of a level (LangSplatV2)."""
+"""Codebook entries per level (LangSplatV2)."""
 
 KEPT = 4
-"""Coefficients of a Gaussian and level that are not zero (LangSplatV2)."""
+"""Non-zero coefficients per Gaussian and level (LangSplatV2)."""
 
 
 def largest_shares(
     logits: Float32[np.ndarray, "N E"], kept: int = KEPT
 ) -> tuple[Int64[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
-    """The largest entries of each softmax and their shares, which sum to 1; of equal ones, the first."""
+    """Return the largest entries of each softmax and their shares, which sum to 1; the first wins ties."""
     chosen = np.zeros((len(logits), kept), np.int64)
     shares = np.zeros(chosen.shape, np.float32)
     _largest(logits, chosen, shares)
@@ -45,7 +45,7 @@ def largest_shares(
 
 
 def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32[np.ndarray, "B D+1"]:
-    """m + U z in D + 1 coordinates that keep lengths and angles: along U, and along the rest of m."""
+    """Return m + U z in D + 1 coordinates that keep lengths and angles: along U, and along the rest of m."""
     along = code.basis @ code.mean
     rest = np.linalg.norm(code.mean - along @ code.basis)
     return np.column_stack([latents + along, np.full(len(latents), rest)]).astype(np.float32)
@@ -54,7 +54,7 @@ def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32
 def cosine_loss(
     rendered: Float32[np.ndarray, "P C"], targets: Float32[np.ndarray, "P C"]
 ) -> tuple[float, Float32[np.ndarray, "P C"]]:
-    """Mean of 1 - cosine with targets of unit length, and its gradient by the rendered vectors."""
+    """Return the mean of 1 - cosine with unit targets, and its gradient for the rendered vectors."""
     length = np.maximum(np.linalg.norm(rendered, axis=1), 1e-6)[:, None]
     unit = rendered / length
     cosine = (unit * targets).sum(axis=1, keepdims=True)
@@ -67,7 +67,7 @@ def step(
     pixels: LevelPixels,
     code: LinearCode,
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
-    """Loss of the labelled pixels of a view, and its gradients by the logits and the codebook."""
+    """Return the loss of a view's labelled pixels, and its gradients for logits and codebook."""
     chosen, shares = largest_shares(logits)
     weights = pixels.weights
     mixed = np.zeros((weights.shape[0], len(codebook)), np.float32)
@@ -91,16 +91,16 @@ def train_level(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train logits from zero, and the codebook; returns the mixture of every Gaussian.
+    """Train logits (from zero) and codebook; return the mixture of every Gaussian.
 
     Args:
-        views: train views in which the level labels a pixel, at least one.
+        views: train views with labelled pixels at this level, at least one.
         level: the level to train.
         num_gaussians: N.
-        codebook: first entries, at least `KEPT`.
+        codebook: initial entries, at least `KEPT`.
         code: the scene's linear code.
         settings: steps and rate.
-        seed: for the order of views.
+        seed: seed of the order of views.
     """
     logits, entries = np.zeros((num_gaussians, len(codebook)), np.float32), codebook.copy()
     of_logits, of_entries = Adam(logits, settings.rate), Adam(entries, settings.rate)
@@ -114,7 +114,7 @@ def train_level(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train the three levels one after the other; Gaussians in no mask of a level get zeros there."""
+    """Train the three levels one after the other; Gaussians in no mask of a level get zeros."""
     contributions, latents, code = inputs.contributions, inputs.latents, inputs.linear_code("langsplat_v2")
     views = views_of(inputs, settings.pixel_step)
     features = np.zeros((contributions.num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
@@ -161,7 +161,7 @@ def _mix(indptr, indices, data, chosen, shares, out):
 
 @compiled
 def _pull(indptr, indices, data, chosen, shares, by_mixed, by_share, by_logits):
-    """The adjoint of `_mix`, then of the softmax over the entries that are kept."""
+    """Compute the adjoint of `_mix`, then of the softmax over the kept entries."""
     kept = chosen.shape[1]
     for p in range(len(indptr) - 1):
         for j in range(indptr[p], indptr[p + 1]):

@@ -1,25 +1,25 @@
-"""LEGaussians: a code of few numbers and an uncertainty per Gaussian, decoded to an entry of a codebook.
+"""LEGaussians: a small code and an uncertainty per Gaussian, decoded to an entry of a codebook.
 
 1. The CLIP vectors of the masks are quantised to 128 entries, so every pixel has an index.
-2. Every Gaussian learns 8 numbers and an uncertainty; a small network names the entry of each rendered pixel
-   (cross-entropy, less where the uncertainty is high, and -log(1 - uncertainty)).
-3. A network of the position predicts the 8 numbers, and they follow it, more so where they are uncertain.
+2. Every Gaussian learns 8 numbers and an uncertainty; a small network predicts the entry of each rendered
+   pixel (cross-entropy, weighted by 1 - uncertainty, plus -log(1 - uncertainty)).
+3. A network of the position predicts the 8 numbers; they are pulled towards its output, more so where they
+   are uncertain.
 
 Source: Shi et al., Language Embedded 3D Gaussians, CVPR 2024; buaavrcg/LEGaussians `train.py`,
-`scene/index_decoder.py`, `arguments/__init__.py`. Authors' values are in the constants, and `steps` 30,000,
-`rate` 0.001 for codes and networks.
+`scene/index_decoder.py`, `arguments/__init__.py`. The authors' values are in the constants, and `steps`
+30,000, `rate` 0.001 for codes and networks.
 
 Departs:
-    - indices of the masks' CLIP vectors, a codebook by k-means, and all of it in each of our levels; the
-      authors quantise a pyramid of CLIP crops together with DINO, which masks do not have, and train the
-      codebook with balanced loads;
-    - geometry is frozen, it is not trained together with the codes;
-    - fewer steps, on 1024 pixels of a view; almost equal first codes; networks learn at a
-      fifth of the rate; no weight decay (1e-5);
-    - the smoothing is taken at every step on 1000 Gaussians with a tenth of its weight, not at every tenth on
+    - indices of the masks' CLIP vectors and a codebook by k-means, per level; the authors quantise a pyramid
+      of CLIP crops together with DINO, which masks do not have, and train the codebook with balanced loads;
+    - geometry is frozen instead of trained together with the codes;
+    - fewer steps, on 1024 pixels of a view; almost equal initial codes; networks learn at a fifth of the
+      rate; no weight decay (1e-5);
+    - smoothing at every step on 1000 Gaussians with a tenth of its weight, instead of every tenth step on
       all; positions are scaled to a standard deviation of 1;
     - each Gaussian takes the entry of its largest logit, which is then rendered; the authors decode rendered
-      codes at each pixel, to the largest or to a mixture by softmax.
+      codes at each pixel, to the largest or to a softmax mixture.
 """
 
 import itertools
@@ -45,18 +45,18 @@ DECODER_WIDTHS = (128, 256)
 POSITION_WIDTHS = (128,) * 4
 FIRST_UNCERTAINTY = 0.01
 UNCERTAINTY_RATE = 0.05
-"""Of Adam, whatever the rate of the codes is."""
+"""Adam's rate for uncertainties, regardless of the rate of the codes."""
 NETWORK_RATE = 0.2
-"""Times the rate of the codes; the authors' is 1."""
+"""Factor of the codes' rate for the networks; the authors use 1."""
 LEAST_SMOOTHING = 0.1
-"""Weight of the smoothing of a certain Gaussian; an uncertain one has 1."""
+"""Smoothing weight of a certain Gaussian; that of an uncertain one is 1."""
 SMOOTHING = 0.1
 SAMPLES = 1000
 PIXELS = 1024
 
 
 def network(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Linear layers with ReLU between them."""
+    """Return linear layers with ReLU between them."""
     layers: list[nn.Module] = []
     for inward, outward in itertools.pairwise(sizes):
         layers += [nn.Linear(inward, outward), nn.ReLU()]
@@ -66,7 +66,7 @@ def network(sizes: tuple[int, ...]) -> nn.Sequential:
 def index_loss(
     logits: Float[Tensor, "p E"], index: Int64[Tensor, " p"], uncertainty: Float[Tensor, " p"]
 ) -> Float[Tensor, ""]:
-    """Mean cross-entropy, less where the uncertainty is high, and the price -log(1 - u) of uncertainty."""
+    """Return the mean cross-entropy, weighted by 1 - u, plus the penalty -log(1 - u) of uncertainty u."""
     certain = 1 - uncertainty
     return (cross_entropy(logits, index, reduction="none") * certain).mean() - certain.log().mean()
 
@@ -74,7 +74,7 @@ def index_loss(
 def smoothing_loss(
     codes: Float[Tensor, "s 8"], predicted: Float[Tensor, "s 8"], uncertainty: Float[Tensor, " s"]
 ) -> Float[Tensor, ""]:
-    """Squared distance of codes and predictions: predictions follow codes, uncertain codes predictions."""
+    """Return squared distances that pull predictions to codes, and uncertain codes to predictions."""
     weight = LEAST_SMOOTHING + (1 - LEAST_SMOOTHING) * uncertainty.detach()
     follow = (predicted - codes.detach()).square().mean(1).mean()
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
@@ -88,15 +88,15 @@ def entries_of_gaussians(
     settings: MethodSettings,
     seed: int,
 ) -> Int64[np.ndarray, "N 3"]:
-    """Train codes, uncertainties and networks of all levels; returns the entry of each Gaussian.
+    """Train codes, uncertainties and networks of all levels; return the entry of each Gaussian.
 
     Args:
-        views: pixels.
-        entry: index in its level's codebook of every mask of the scene.
+        views: labelled pixels.
+        entry: codebook index of every mask of the scene, at the mask's level.
         of_view: rows of the masks of each view.
-        means: centres of the Gaussians, scene units.
+        means: Gaussian centres, scene units.
         settings: steps and rate.
-        seed: for the first codes and networks, and all samples.
+        seed: seed of the initial codes and networks and all samples.
     """
     num, levels = len(means), len(LEVELS)
     codes = alike(num, levels * CHANNELS, seed)
@@ -140,7 +140,7 @@ def entries_of_gaussians(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Quantise, train, and look the entries up; Gaussians in no mask of a level get zeros there."""
+    """Quantise, train, and look up the entries; Gaussians in no mask of a level get zeros."""
     contributions, latents = inputs.contributions, inputs.latents
     codebooks, entry = [], np.zeros(len(latents), np.int64)
     for level in LEVELS:

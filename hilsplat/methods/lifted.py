@@ -9,7 +9,7 @@ from hilsplat.settings import MethodSettings
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Lift all levels; nothing is trained and nothing is random."""
+    """Lift all levels, without training or randomness."""
     contributions = inputs.contributions
     masks = MaskOperator.of(contributions.matrix("A"), contributions.level)
     pixels = contributions.pixels.astype(np.float32)

@@ -1,7 +1,7 @@
-"""What a baseline is: a function that makes a language field from the same artifacts as ours.
+"""Baseline interface: a function that computes a language field from the same artifacts as our method.
 
-Everything before it (Gaussians, masks, CLIP vectors, the scene's code) and after it (queries, protocols,
-tables) is shared, so that rows of a table differ only by method.
+All other stages (Gaussians, masks, CLIP vectors, the scene's code, queries, protocols, tables) are shared, so
+that rows of a table differ only by method.
 """
 
 from collections.abc import Callable
@@ -35,12 +35,12 @@ class MethodInputs:
     """Artifacts of a scene, read on first use.
 
     Attributes:
-        scene_folder: scene artifact; a method may use its train views only.
+        scene_folder: scene artifact; a method may use only its train views.
         gaussians_ply: 3DGS PLY, frozen.
         masks_folder: masks of the train views.
         contributions_folder: weights of each Gaussian in each mask.
         autoencoder_folder: the scene's code of CLIP vectors.
-        threads: for rasterising; results must not depend on it.
+        threads: rasteriser threads; results must not depend on it.
     """
 
     scene_folder: Path
@@ -57,11 +57,11 @@ class MethodInputs:
 
     @cached_property
     def latents(self) -> Float32[np.ndarray, "M D"]:
-        """Code of each mask's CLIP vector, rows as in the contributions."""
+        """Code of each mask's CLIP vector, in the row order of the contributions."""
         return load_latents(self.autoencoder_folder, self.contributions)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
-        """Compositing weights of a view (pixels x Gaussians), rows summing to 1, empty where uncovered."""
+        """Return a view's compositing weights (pixels x Gaussians), rows summing to 1, empty if uncovered."""
         gaussians, scene = self._loaded
         weights = pixel_weights(
             gaussians,
@@ -72,31 +72,31 @@ class MethodInputs:
         return normalised_weights(weights)
 
     def view_masks(self, view: str) -> HierarchicalMasks:
-        """Return the masks of a view, checked to be those of the contributions."""
+        """Return the masks of a view, checked to match the contributions."""
         return load_masks(self.masks_folder, view, digests_in(self.contributions_folder))
 
     def view_labels(self, view: str) -> Int32[np.ndarray, "P 3"]:
-        """Row of the view's painted mask at each pixel and level, -1 for none."""
+        """Return the row of the view's painted mask at each pixel and level, -1 for none."""
         return label_maps(self.view_masks(view))
 
     def view_size_hw(self, view: str) -> tuple[int, int]:
-        """Height and width of a view, px."""
+        """Return height and width of a view, px."""
         return self.view_camera(view).size_hw
 
     def view_camera(self, view: str) -> Camera:
-        """Camera of a view."""
+        """Return the camera of a view."""
         return self._loaded[1].cameras[view]
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
-        """Whether a mask of the level shows the Gaussian."""
+        """Return whether a mask of the level contains the Gaussian."""
         masks = MaskOperator.of(self.contributions.matrix("A"), self.contributions.level)
         return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
     def linear_code(self, method: str) -> LinearCode:
-        """The scene's code, for a method whose training or averages need CLIP vectors themselves.
+        """Return the scene's code, for a method whose training or averages need CLIP vectors themselves.
 
         Raises:
-            SettingsError: the code is a network, from whose numbers no average of vectors can be read.
+            SettingsError: the code is a network, whose numbers cannot be averaged like vectors.
         """
         code = load_code(self.autoencoder_folder)
         if not isinstance(code, LinearCode):
@@ -124,8 +124,8 @@ class Method:
 
     Attributes:
         name: key in the registry, and value of `method.name` in a variant.
-        title: name for tables.
-        source: repository or paper that it follows, and how it departs from it.
+        title: name in tables.
+        source: repository or paper that it follows, and departures from it.
         fit: maps (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
     """
 

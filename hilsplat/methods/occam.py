@@ -1,13 +1,13 @@
-"""Occam's LGS: each Gaussian takes the mask vector at the pixel of its projected centre, averaged over views.
+"""Occam's LGS: a Gaussian's code averages, over views, the mask vectors at its projected centre.
 
-A view's vector weighs as much as the Gaussian is seen at that pixel, and Gaussians behind others are left out
-(insait-institute/OccamLGS, arXiv 2412.01807). `lifted` has the same idea over all pixels that show a
-Gaussian: a large Gaussian across a border takes one mask per view here, a share of both there.
+A view's weight is the Gaussian's visibility at that pixel, and hidden Gaussians are ignored
+(insait-institute/OccamLGS, arXiv 2412.01807). `lifted` averages over all pixels that show a Gaussian: a large
+Gaussian across a border is assigned one mask per view here, but a share of both there.
 
 Departs from the published code:
-    - codes of the scene's linear code instead of 512 numbers, averaged alike;
+    - codes of the scene's linear code instead of 512 numbers, averaged in the same way;
     - the weight of a Gaussian at its centre's pixel is divided by the pixel's alpha, and weights below
-      `contributions.min_weight` count as not seen; the published kernel returns a weight of its own.
+      `contributions.min_weight` count as invisible; the published kernel returns a different weight.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ from hilsplat.settings import MethodSettings
 
 
 def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " N"]:
-    """Row-major pixel in which each centre lies, -1 behind the camera or outside the image."""
+    """Return the row-major pixel of each centre, -1 behind the camera or outside the image."""
     height, width = camera.size_hw
     seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     in_front = seen[:, 2] > 0
@@ -32,7 +32,7 @@ def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.n
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Lift all levels; Gaussians whose centre no view shows in a mask get zeros."""
+    """Lift all levels; Gaussians whose centre is in no mask of any view get zeros."""
     contributions, latents = inputs.contributions, inputs.latents
     means = contributions.means().astype(np.float64)
     sums = np.zeros((len(means), len(LEVELS), latents.shape[1]), np.float32)

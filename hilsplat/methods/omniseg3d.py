@@ -1,22 +1,22 @@
-"""OmniSeg3D: features contrasted by how many masks two patches of a view share; thresholds give granularity.
+"""OmniSeg3D: features contrasted by the number of masks shared by two patches; thresholds set granularity.
 
-1. Masks of all levels cut a view into patches. Two patches share the masks that hold both: where masks nest,
-   that is the depth of their deepest common ancestor in the coverage tree.
+1. Masks of all levels divide a view into patches. Two patches share the masks that contain both: for nested
+   masks, their number is the depth of the deepest common ancestor in the coverage tree.
 2. Every Gaussian learns one vector of 16 numbers: a rendered pixel is near the prototype of its own patch,
    less near those of patches that share masks with it, and far from the others.
-3. Gaussians are clustered by cosine at three thresholds, one per level; a cluster takes the CLIP vectors of
-   the masks that fit it best in each view.
+3. Gaussians are clustered by cosine at three thresholds, one per level; a cluster is assigned the CLIP
+   vectors of the masks that fit it best in each view.
 
-Source: Ying et al., OmniSeg3D, CVPR 2024; OceanYing/OmniSeg3D-GS `train.py`. Authors' values are in the
+Source: Ying et al., OmniSeg3D, CVPR 2024; OceanYing/OmniSeg3D-GS `train.py`. The authors' values are in the
 constants, and `steps` 10,000, `rate` 0.01.
 
 Departs:
     - a larger mask does not first absorb smaller ones; patches are those of our painted masks;
-    - fewer steps, on 4096 pixels of a view in place of 32,768, and prototypes of at least 3 in place of 20;
-    - vectors start almost alike, not independent of each other (`training.alike` says why);
+    - fewer steps, on 4096 pixels of a view instead of 32,768, and prototypes of at least 3 instead of 20;
+    - vectors are almost equal at the start instead of independent (see `training.alike`);
     - vectors of pixels have length 1 by division, not by a penalty of weight 100;
-    - the authors threshold the cosine with a clicked pixel and know no text: here 256 k-means centres are
-      joined by average cosine down to the threshold.
+    - the authors threshold the cosine with a clicked pixel and don't support text: here 256 k-means centres
+      are merged by average cosine down to the threshold.
 """
 
 import numpy as np
@@ -35,13 +35,13 @@ from hilsplat.settings import MethodSettings
 CHANNELS = 16
 MIN_PATCH_PX = 3
 LEVEL_WEIGHT = 0.2
-"""Weight of a level of sharing, relative to the one before: a fifth."""
+"""Weight of each further step of sharing, relative to the previous one."""
 SPREAD, LEAST_TEMPERATURE, MOST_TEMPERATURE = 10.0, 0.5, 1.0
 THRESHOLDS = (0.5, 0.8, 0.95)
 
 
 def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, "k k"]]:
-    """Patch of each pixel, -1 in patches of few pixels, and how many masks every two patches share.
+    """Return each pixel's patch, -1 in small patches, and the number of masks that each two patches share.
 
     Example:
         >>> patches(np.array([[0, 1, -1]] * 3 + [[0, 2, -1]] * 3, dtype=np.int32))[1]
@@ -60,15 +60,15 @@ def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], 
 def hierarchical_loss(
     rendered: Float[Tensor, "p D"], patch: Int64[Tensor, " p"], shared: Int64[Tensor, "k k"]
 ) -> Float[Tensor, ""]:
-    """Contrast of pixels with prototypes of patches, level of sharing by level.
+    """Return the contrast of pixels with patch prototypes, summed over the steps of sharing.
 
-    A pixel's loss is -log of the softmax over prototypes. At its own patch it counts fully; at patches that
-    share one mask less (two less) it counts a fifth (a 25th), and there it is never below the loss at the
-    level before, so that nearer patches come first. Patches that share no mask are negatives only.
+    A pixel's loss is -log of the softmax over prototypes. Its weight is 1 at the pixel's own patch and 1/5
+    (1/25) at patches that share one mask less (two less). There the loss is at least that of the previous
+    step, so that nearer patches come first. Patches that share no mask are negatives only.
 
     Args:
         rendered: unit features of pixels.
-        patch: of each pixel.
+        patch: patch of each pixel.
         shared: number of masks that two patches share.
     """
     num = len(shared)
@@ -98,7 +98,7 @@ def hierarchical_loss(
 def train_features(
     views: list[LabelledView], num_gaussians: int, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N D"]:
-    """Train the features of Gaussians, of unit length."""
+    """Return trained unit features of Gaussians."""
     features = alike(num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, _: np.random.Generator, __: float) -> Tensor:
@@ -114,10 +114,10 @@ def train_features(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, cluster them at three thresholds, and give the clusters the codes of masks.
+    """Train features, cluster them at three thresholds, and assign the clusters the codes of masks.
 
     Raises:
-        SettingsError: the thresholds do not grow.
+        SettingsError: the thresholds do not increase.
     """
     thresholds = thresholds_of(settings, THRESHOLDS)
     views = labelled_views(inputs, settings.pixel_step)

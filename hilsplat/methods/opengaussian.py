@@ -1,23 +1,23 @@
 """OpenGaussian: instance features without language, a codebook of instances, CLIP by association with masks.
 
-1. Every Gaussian learns a unit vector of 6 numbers: rendered features are smooth inside a mask, means of the
-   masks of a view stay apart.
-2. A coarse codebook groups Gaussians by feature and position, a fine one each coarse group by feature.
-3. A group (an instance) takes the CLIP vectors of the masks that fit it best in each view, by IoU x closeness
-   of features. No language is trained.
+1. Every Gaussian learns a unit vector of 6 numbers: rendered features are smooth inside a mask, and means of
+   a view's masks are kept apart.
+2. A coarse codebook groups Gaussians by feature and position, a fine one divides each group by feature.
+3. A group (an instance) is assigned the CLIP vectors of the masks that fit it best in each view, by IoU times
+   closeness of features. No language is trained.
 
-Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. Authors' values are in the
-constants, `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
+Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. The authors' values are in
+the constants, `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
 
 Departs:
-    - all three in each of our levels separately; the authors use one level, the wholes on LERF;
-    - fewer steps and a larger rate; a step sees 4096 pixels of a view, and exact means of all its masks;
+    - each of our levels is processed separately; the authors use one level, the wholes on LERF;
+    - fewer steps and a larger rate; a step uses 4096 pixels of a view, and exact means of all its masks;
     - features are not trained further towards the codebooks (10,000 and 20,000 steps there);
     - positions are scaled to a standard deviation of 1 in the scene before the weight of 0.5;
-    - Gaussians that no mask of the level shows keep their random features and belong to no instance;
-    - Gaussians are never shrunk at random, and pixels of alpha below 0.5, not 0.7, are left out;
-    - the IoU of an instance and a mask is of visible weights, not of the instance rendered alone;
-    - text selects by relevancy, as for all rows, not the best instance and up to ten alike.
+    - Gaussians in no mask of the level keep their random features and belong to no instance;
+    - Gaussians are never shrunk at random, and pixels with alpha below 0.5, not 0.7, are ignored;
+    - the IoU of an instance and a mask uses visible weights instead of the instance rendered alone;
+    - text selects by relevancy, as for all methods, not the best instance and up to ten similar ones.
 """
 
 import numpy as np
@@ -40,26 +40,26 @@ KMEANS_STEPS = 5
 POSITION = 0.5
 LEAST_WEIGHT, HARD_WEIGHT = 0.1, 0.9
 HARD_FROM = 0.5
-"""Share of the steps after which only the closest pairs count."""
+"""Share of the steps after which only the closest pairs keep their weight."""
 MIN_SCORE = 0.2
 MIN_VIEWS = 2
-"""As for ScanNet; 5 for LERF."""
+"""OpenGaussian's value for ScanNet; its value for LERF is 5."""
 
 
 def smoothing_loss(
     rendered: Float[Tensor, "p D"], means: Float[Tensor, "m D"], label: Int64[Tensor, " p"]
 ) -> Float[Tensor, ""]:
-    """Mean distance of pixels to the mean of their mask, averaged over the masks that have pixels."""
+    """Return the mean distance of pixels to the mean of their mask, averaged over masks with pixels."""
     apart = (rendered - means[label]).square().sum(1, keepdim=True)
     distance, counts = segment_means((apart + 1e-12).sqrt(), label, len(means))
     return distance.sum() / (counts > 0).sum().clamp(min=1)
 
 
 def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]:
-    """Mean of w / (squared distance + 1) over pairs of masks, w = 0.1 + 0.9 rank / (masks - 1).
+    """Return the mean of w / (squared distance + 1) over pairs of masks, w = 0.1 + 0.9 rank / (masks - 1).
 
-    Ranks are those of the other masks by distance from each, from 1 for the farthest to masks - 1, and w = 1,
-    for the closest; after half of the steps, weights below 0.9 become 0.1.
+    The other masks are ranked by distance from each mask, from 1 for the farthest to masks - 1 (w = 1) for
+    the closest. After half of the steps, weights below 0.9 become 0.1.
     """
     num = len(means)
     if num < 2:
@@ -76,7 +76,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
 def instance_features(
     views: list[LabelledView], contributions: Contributions, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Train the instance features of all levels; each is mapped from unit length to [0, 1]."""
+    """Return trained instance features of all levels, mapped from unit length to [0, 1]."""
     num, levels = contributions.num_gaussians, len(LEVELS)
     start = np.random.default_rng(seed).random((num, levels, CHANNELS), dtype=np.float32)
     features = torch.from_numpy(start * 2 - 1).requires_grad_()
@@ -111,13 +111,13 @@ def instances(
     codebook: tuple[int, int],
     seed: int,
 ) -> Int64[np.ndarray, " N"]:
-    """Leaf of the two codebooks that each Gaussian belongs to: coarse group x fine groups + fine group.
+    """Return each Gaussian's group in the two codebooks: coarse group x number of fine groups + fine group.
 
     Args:
         features: instance features of a level.
-        means: centres of the Gaussians, scene units.
-        codebook: number of coarse groups, and of fine groups of each.
-        seed: for the first centres.
+        means: Gaussian centres, scene units.
+        codebook: number of coarse groups, and of fine groups in each.
+        seed: seed of the first centres.
     """
     num_coarse, num_fine = codebook
     placed = np.concatenate([features, np.float32(POSITION) * standardised(means)], axis=1)
@@ -136,7 +136,7 @@ def level_field(
     codebook: tuple[int, int],
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Code of the instance of each Gaussian at a level, 0 where no mask fits the instance."""
+    """Return the code of each Gaussian's instance at a level, 0 where no mask fits the instance."""
     contributions = inputs.contributions
     rows = contributions.rows_of(level)
     A = contributions.matrix("A")[rows]
@@ -166,7 +166,7 @@ def level_field(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train instance features, group Gaussians, and give the groups the codes of masks."""
+    """Train instance features, group Gaussians, and assign the groups the codes of masks."""
     views = labelled_views(inputs, settings.pixel_step)
     features = instance_features(views, inputs.contributions, settings, seed)
     fields = [

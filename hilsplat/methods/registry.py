@@ -27,11 +27,11 @@ METHODS: Plugins["Method"] = Plugins(
 )
 
 OURS: str = MethodSettings().name
-"""The method of this repository; the stage `field` solves its field."""
+"""The method of this repository; the stage `field` computes its field."""
 
 
 def require_method(name: str) -> None:
-    """Refuse a name that is neither ours nor a baseline's.
+    """Raise if a name is neither ours nor a baseline's.
 
     Raises:
         SettingsError: there is no such method.

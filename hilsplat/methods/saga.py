@@ -1,23 +1,23 @@
-"""SAGA: affinity features of Gaussians that a gate turns by scale (GARField's idea in Gaussians).
+"""SAGA: affinity features of Gaussians that a gate adapts to a scale (GARField's idea in Gaussians).
 
-1. Every mask has a 3D scale. Every Gaussian learns 32 numbers, averaged over its neighbours; a gate of the
-   scale multiplies them, so that two pixels can be one group at a large scale and two at a small one.
-2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest mask above
-   it that holds them is the same.
-3. The gated features at the median scale of each level's masks are clustered; a cluster takes the CLIP
+1. Every mask has a 3D scale. Every Gaussian learns 32 numbers, averaged over its neighbours and multiplied by
+   a gate that depends on the scale: two pixels can be one group at a large scale and two at a small one.
+2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest larger
+   mask that contains them is the same.
+3. The gated features at the median scale of each level's masks are clustered; a cluster is assigned the CLIP
    vectors of the masks that fit it.
 
 Source: Cen et al., Segment Any 3D Gaussians, AAAI 2025; Jumpat/SegAnyGAussians `get_scale.py`,
 `train_contrastive_feature.py`; scales and their quantiles from GARField (Kim et al., CVPR 2024,
-chungmin99/garfield). Authors' values are in the constants, and `steps` 10,000, `rate` 0.0025.
+chungmin99/garfield). The authors' values are in the constants, and `steps` 10,000, `rate` 0.0025.
 
 Departs:
-    - the scale of a mask is the spread of the Gaussians it shows, not of unprojected depths;
+    - a mask's scale is the spread of its Gaussians, not of unprojected depths;
     - painted masks, at most three at a pixel; fewer steps, on 256 pixels of a view instead of 1000;
-    - almost equal first features; all 16 neighbours count at every step;
-    - the authors click at a scale that they choose, or cluster by HDBSCAN and know no text: here the scales
-      are the levels' medians, 256 k-means centres are joined by average cosine as for OmniSeg3D, and clusters
-      take CLIP vectors by association.
+    - almost equal initial features; all 16 neighbours are used at every step;
+    - the authors click at a chosen scale or cluster by HDBSCAN, and don't support text: here the scales are
+      the levels' medians, 256 k-means centres are merged by average cosine as for OmniSeg3D, and clusters
+      get CLIP vectors by association.
 """
 
 import numpy as np
@@ -38,16 +38,16 @@ from hilsplat.settings import MethodSettings
 CHANNELS = 32
 NEIGHBOURS = 16
 SCALES = 8
-"""Random scales of a step, besides one below and one above all masks of the view."""
+"""Random scales per step, besides one below and one above all masks of the view."""
 PIXELS = 256
 MOST_WEIGHT = 10.0
 EASY_POSITIVE, HARD_NEGATIVE = 0.75, 0.5
 COSINE = 0.95
-"""Least average cosine of a cluster: at 0.5 parts and subparts of development scenes stay joined."""
+"""Minimum average cosine of a cluster; at 0.5, parts and subparts of development scenes are not separated."""
 
 
 def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
-    """Twice the standard deviation of the Gaussians that a mask shows, scene units; 0 if it shows none."""
+    """Return twice the standard deviation of each mask's Gaussians, scene units; 0 if it has none."""
     A = contributions.matrix("A").astype(np.float64)
     means = contributions.means().astype(np.float64)
     means -= means.mean(axis=0)
@@ -56,7 +56,7 @@ def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
 
 
 def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator) -> Float64[np.ndarray, " s"]:
-    """Scales between neighbouring ones of a view's masks, one below all and one above all."""
+    """Draw scales between neighbouring mask scales of a view, one below all and one above all."""
     ends = np.concatenate([[0.0], np.sort(scales), [2 * scales.max()]])
     between = 1 + random.permutation(len(scales) - 1)[:SCALES]
     chosen = np.concatenate([[0], between, [len(ends) - 2]])
@@ -66,12 +66,12 @@ def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator)
 def together(
     labels: Int32[np.ndarray, "p 3"], scales: Float64[np.ndarray, "p 3"], scale: float
 ) -> Bool[np.ndarray, "p p"]:
-    """Whether two pixels share a mask up to the scale, or the smallest mask above it.
+    """Return whether two pixels share a mask up to the scale, or the smallest mask above it.
 
     Args:
-        labels: mask of the pixel at each level, -1 for none; no mask has two levels.
-        scales: of these masks.
-        scale: at which to ask.
+        labels: mask of each pixel at each level, -1 for none; no mask has two levels.
+        scales: scales of these masks.
+        scale: the scale at which pixels are grouped.
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
@@ -80,7 +80,7 @@ def together(
 
 
 def pair_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p"]:
-    """Weight of each pair of pixels, from 1 to 10: pixels of small masks count more."""
+    """Return the weight of each pair of pixels, from 1 to 10; pixels of small masks have more weight."""
     pairs = np.outer(area_px, area_px)
     weight = pairs.max() / np.maximum(pairs, 1e-12)
     low, high = weight.min(), weight.max()
@@ -94,16 +94,16 @@ def affinity_loss(
     weight: Float32[np.ndarray, "p p"],
     random: np.random.Generator,
 ) -> Float[Tensor, ""]:
-    """Cosines of gated features: high for pixels together at a scale, at most 0 for others; and lengths of 1.
+    """Return a loss that raises gated cosines within groups, lowers positive ones across, keeps length 1.
 
-    Pairs count that the scales disagree about, that are hard at any scale, and as many easy ones.
+    Pairs used are those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
 
     Args:
         rendered: features of pixels.
-        gates: of each scale.
+        gates: gate of each scale.
         same: whether two pixels are together at each scale.
-        weight: of each pair.
-        random: chooses easy pairs.
+        weight: weight of each pair.
+        random: draws easy pairs.
     """
     gated = unit(rendered[None] * gates[:, None])
     cosine = gated @ gated.transpose(1, 2)
@@ -126,7 +126,7 @@ def affinity_loss(
 
 
 def neighbour_mean(means: Float32[np.ndarray, "N 3"]) -> sp.csr_matrix:
-    """The average over each Gaussian and its nearest neighbours, 16 together."""
+    """Return the matrix that averages over each Gaussian and its nearest neighbours, 16 in total."""
     count = min(NEIGHBOURS, len(means))
     near = cKDTree(means).query(means, count)[1].reshape(len(means), count)
     rows = np.repeat(np.arange(len(means)), count)
@@ -142,15 +142,15 @@ def train_features(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "s N 32"]:
-    """Train features and gate; returns the features gated for each scale, of unit length.
+    """Train features and gate; return the unit features gated for each scale.
 
     Args:
-        views: pixels.
-        contributions: of the scene.
-        scales: of all masks.
-        asked: scales.
+        views: labelled pixels.
+        contributions: mask weights of the Gaussians.
+        scales: scales of all masks.
+        asked: scales of the returned features.
         settings: steps and rate.
-        seed: for the first features and gate, and all samples.
+        seed: seed of the initial features and gate and all samples.
     """
     features = alike(contributions.num_gaussians, CHANNELS, seed)
     draw = torch.Generator().manual_seed(seed)
@@ -179,7 +179,7 @@ def train_features(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, cluster them at the median scale of each level, give clusters the codes of masks."""
+    """Train features, cluster them at each level's median scale, and assign clusters the codes of masks."""
     contributions = inputs.contributions
     scales = mask_scales(contributions)
     found = [level for level in LEVELS if len(contributions.rows_of(level))]

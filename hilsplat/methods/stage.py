@@ -1,4 +1,4 @@
-"""The stage that runs a baseline: artifacts of a scene in, `field.safetensors` out."""
+"""The stage that runs a baseline and writes `field.safetensors`."""
 
 from pathlib import Path
 
@@ -21,12 +21,12 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
     Args:
         inputs: artifacts of the scene.
         out: `field.safetensors`.
-        settings: which method, and its knobs.
-        seed: for everything random.
+        settings: name and settings of the method.
+        seed: random seed.
 
     Raises:
         SettingsError: there is no such method.
-        ArtifactError: the method returned features of another shape, or numbers that are not finite.
+        ArtifactError: the method returned features of the wrong shape or non-finite values.
     """
     method = method_of(settings.name)
     contributions = inputs.contributions

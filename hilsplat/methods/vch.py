@@ -1,21 +1,21 @@
-"""View-consistent hierarchy: features whose ultrametric repeats the coverage trees of the views.
+"""View-consistent hierarchy: features whose ultrametric reproduces the coverage trees of the views.
 
-1. Every Gaussian learns a vector. In a view, pixels are joined to their 10 nearest by the distance of their
-   vectors; the ultrametric of two pixels is the longest edge on their path in the minimum spanning tree.
-2. For every mask, two pixels inside are nearer each other than one inside and one outside, but inside its
-   parent: by dot product and by ultrametric.
-3. Gaussians within a distance of their 16 nearest neighbours are connected; components at three distances are
-   nested, and are the levels. A component takes the CLIP vectors of the masks that fit it best in each view.
+1. Every Gaussian learns a vector. Pixels are joined to their 10 nearest in the image by edges as long as the
+   distance of their vectors; the ultrametric is the longest edge between two in the minimum spanning tree.
+2. For every mask, a pixel must be closer to others inside than to ones outside but in the mask's parent, by
+   dot product and by ultrametric.
+3. Gaussians within a distance of their 16 nearest neighbours are connected; components at three distances
+   nest and form the levels. A component is assigned the CLIP vectors of its best-fitting masks in each view.
 
 Source: He et al., View-Consistent Hierarchical 3D Segmentation Using Ultrametric Feature Fields, CVPR 2024;
-hardyho/ultrametric_feature_fields. Authors' values are in the constants, `steps` 20 epochs, `rate` 0.01.
+hardyho/ultrametric_feature_fields. The authors' values are in the constants, `steps` 20 epochs, `rate` 0.01.
 
 Departs:
     - vectors of 16 numbers on frozen Gaussians, not a field of 128 (instant-NGP) with its density;
-    - unit length by division, no penalty of the norm; depth is not smoothed;
-    - parents are those of our coverage tree (inside: 0.9), 0.95 and IoU below 0.9 there;
-    - components of Gaussians, not of voxels of 0.002; Gaussians beyond the 200 largest join the nearest one;
-    - the authors know no text.
+    - unit length by division, without a penalty of the norm; depth is not smoothed;
+    - parents are those of our coverage tree (0.9 inside), not 0.95 inside and IoU below 0.9;
+    - components of Gaussians, not of voxels of 0.002; Gaussians outside the 200 largest join the nearest one;
+    - the authors don't support text.
 """
 
 import numpy as np
@@ -39,10 +39,10 @@ from hilsplat.settings import CoverageTreeSettings, MethodSettings
 CHANNELS = 16
 TEMPERATURE = 0.1
 PAIRS = 64
-"""Of each mask and step."""
+"""Triplets per mask and step."""
 PIXEL_NEIGHBOURS = 10
 BORDER = 10.0
-"""Added, in the choice of the tree, to an edge over a border of masks, per level."""
+"""Added to edges across mask borders, per level, when the spanning tree is chosen."""
 NEIGHBOURS = 16
 LARGEST = 200
 THRESHOLDS = (0.6, 0.5, 0.45)
@@ -50,9 +50,9 @@ THRESHOLDS = (0.6, 0.5, 0.45)
 
 @compiled
 def joining_edges(num, edge_a, edge_b, first, second):
-    """Edge, in the given order, that joins the components of the two pixels of each pair; -1 if none does."""
+    """Return the edge, in the given order, that joins the two pixels of each pair; -1 if none does."""
     top = np.arange(num)  # union-find over pixels
-    node = np.arange(num)  # dendrogram node of a root's component
+    node = np.arange(num)  # dendrogram node of the root's component
     up = np.full(num + len(edge_a), -1, np.int64)
     for k in range(len(edge_a)):
         a, b = edge_a[k], edge_b[k]
@@ -88,13 +88,13 @@ def ultrametric(
     penalty: Float[np.ndarray, " e"],
     pairs: Int64[np.ndarray, "2 k"],
 ) -> Float[Tensor, " k"]:
-    """Longest edge between the pixels of each pair, along the minimum spanning tree; differentiable.
+    """Return the longest edge between each pair of pixels in the minimum spanning tree; differentiable.
 
     Args:
-        vectors: of pixels.
-        edges: of the graph.
-        penalty: added to the length of an edge when the tree is chosen, not in the result.
-        pairs: pixels; pairs that no path joins, and pairs of a pixel with itself, have the distance 2 and 0.
+        vectors: vectors of pixels.
+        edges: edges of the graph.
+        penalty: added to an edge's length when the tree is chosen, not in the result.
+        pairs: pairs of pixels; the distance is 2 without a path and 0 from a pixel to itself.
     """
     num = len(vectors)
     held = vectors.detach().numpy()
@@ -115,7 +115,7 @@ def ultrametric(
 
 
 def neighbouring_pixels(xy: Int64[np.ndarray, "p 2"]) -> Int64[np.ndarray, "2 e"]:
-    """Edges from each pixel to its nearest ones in the image, each once."""
+    """Return the distinct edges from each pixel to its nearest ones in the image."""
     count = min(PIXEL_NEIGHBOURS + 1, len(xy))
     near = cKDTree(xy).query(xy, count)[1].reshape(len(xy), count)
     edges = np.stack([np.repeat(np.arange(len(xy)), count), near.ravel()])
@@ -128,13 +128,13 @@ def triplets(
     parent: Int32[np.ndarray, " m"],
     random: np.random.Generator,
 ) -> Int64[np.ndarray, "3 k"]:
-    """For each mask pixels a and b inside, and c outside but in its parent (anywhere, for a root).
+    """Return, per mask, pixels a and b inside, and c outside but in its parent (anywhere, for a root).
 
     Args:
         labels: row of the mask at each pixel and level, -1 for none.
         level: `Level` of each mask.
         parent: row of each mask's parent, -1 for none.
-        random: draws `PAIRS` of them for a mask.
+        random: draws `PAIRS` triplets per mask.
     """
     found = []
     for mask in np.unique(labels[labels >= 0]):
@@ -156,14 +156,14 @@ def train_features(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train the vectors of Gaussians, of unit length.
+    """Return trained unit vectors of Gaussians.
 
     Args:
-        views: pixels.
-        trees: level and parent of the masks, by number of the view.
+        views: labelled pixels.
+        trees: level and parent of the masks, by view number.
         num_gaussians: N.
         settings: steps and rate.
-        seed: for the first vectors, pixels and triplets.
+        seed: seed of the initial vectors, pixels and triplets.
     """
     features = alike(num_gaussians, CHANNELS, seed)
 
@@ -177,7 +177,7 @@ def train_features(
         pairs = np.concatenate([chosen[[0, 1]], chosen[[0, 2]]], axis=1)
         near, far = ultrametric(vectors, edges, BORDER * borders, pairs).chunk(2)
         dots = (vectors[a] * (vectors[c] - vectors[b])).sum(1)
-        # -log of the softmax of a pair inside against the pair across
+        # -log of the softmax of the pair inside versus the pair across
         return softplus(dots / TEMPERATURE).mean() + softplus((near - far) / TEMPERATURE).mean()
 
     train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
@@ -189,9 +189,9 @@ def components(
     means: Float32[np.ndarray, "N 3"],
     thresholds: tuple[float, float, float],
 ) -> Int64[np.ndarray, "N 3"]:
-    """Component of each Gaussian at every distance, largest first.
+    """Return the component of each Gaussian at every distance, largest first.
 
-    Gaussians beyond the 200 largest components belong to that of the nearest Gaussian inside.
+    Gaussians outside the 200 largest components join that of the nearest Gaussian inside them.
     """
     num = len(means)
     count = min(NEIGHBOURS + 1, num)
@@ -214,10 +214,10 @@ def components(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train vectors, connect Gaussians at three distances, and give components the codes of masks.
+    """Train vectors, connect Gaussians at three distances, and assign components the codes of masks.
 
     Raises:
-        SettingsError: the thresholds do not fall.
+        SettingsError: the thresholds do not decrease.
     """
     thresholds = thresholds_of(settings, THRESHOLDS)
     contributions = inputs.contributions

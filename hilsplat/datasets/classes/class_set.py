@@ -8,11 +8,11 @@ from jaxtyping import Int, Int32
 
 @dataclass(frozen=True)
 class ClassSet:
-    """K classes in a stated order: class k of a prediction is row k - 1 here, 0 is none.
+    """K classes in a fixed order: label k of a prediction is row k - 1 here, 0 means none.
 
     Attributes:
         name: such as `scannet-19`.
-        source: where the list comes from.
+        source: origin of the list.
         ids: label of each class in the data set's own files.
         texts: query of each class.
     """
@@ -26,7 +26,7 @@ class ClassSet:
         return len(self.ids)
 
     def labels(self, file_labels: Int[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-        """Labels 1 .. K of points, from the data set's labels; 0 if the set lacks the class."""
+        """Map the data set's labels of points to 1 .. K; 0 if the set lacks the class."""
         order = np.argsort(self.ids)
         known = np.asarray(self.ids)[order]
         place = np.minimum(np.searchsorted(known, file_labels), len(known) - 1)

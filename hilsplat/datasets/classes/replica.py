@@ -1,8 +1,8 @@
-"""The classes of Replica and the 48 and 51 of them that are evaluated.
+"""The classes of Replica and the evaluated subsets of 48 and 51.
 
 Sources: names and ids from `info_semantic.json` of the release (facebookresearch/Replica-Dataset); the 51
-are those of opennerf/opennerf, in its order; the 48 leave out wall, floor and ceiling
-(aminebdj/OpenYOLO3D) and are the number that the paper names.
+are those of opennerf/opennerf, in its order; the 48 exclude wall, floor and ceiling (aminebdj/OpenYOLO3D),
+which matches the paper's number.
 """
 
 from hilsplat.datasets.classes.class_set import ClassSet
@@ -110,7 +110,7 @@ NAMES: dict[int, str] = {
     100: "bag",
     101: "set-of-clothing",
 }
-"""Class id -> name as the release writes it. Negative ids and 0 are undefined."""
+"""Class id -> name as spelt in the release. Negative ids and 0 are undefined."""
 
 # fmt: off
 EVALUATED_51: tuple[int, ...] = (
@@ -126,11 +126,11 @@ SCENES: tuple[str, ...] = (
     *(f"office_{number}" for number in range(5)),
     *(f"room_{number}" for number in range(3)),
 )
-"""The eight scenes that are evaluated."""
+"""The eight evaluated scenes."""
 
 
 def query_of(name: str) -> str:
-    """A class name as a query: hyphens become spaces. OpenYOLO3D keeps them."""
+    """Return a class name as a query: hyphens become spaces. OpenYOLO3D keeps them."""
     return name.replace("-", " ")
 
 

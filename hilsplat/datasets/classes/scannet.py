@@ -1,7 +1,7 @@
-"""NYU40 labels and the 19, 15 and 10 classes that ScanNet is evaluated on.
+"""NYU40 labels and the sets of 19, 15 and 10 classes evaluated on ScanNet.
 
-They are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`), which the paper lists too. Labels
-are those of `<scan>_vh_clean_2.labels.ply`.
+The sets are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`), also listed in the paper.
+Labels are those of `<scan>_vh_clean_2.labels.ply`.
 """
 
 from hilsplat.datasets.classes.class_set import ClassSet
@@ -48,7 +48,7 @@ NYU40: dict[int, str] = {
     39: "otherfurniture",
     40: "otherprop",
 }
-"""NYU40 id -> query. ScanNet's tsv spells 24 `refridgerator`; the paper writes 28 in two words."""
+"""NYU40 id -> query. ScanNet's tsv spells 24 `refridgerator`; the paper writes 28 as two words."""
 
 OPENGAUSSIAN_SCENES: tuple[str, ...] = tuple(
     f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)
@@ -56,7 +56,7 @@ OPENGAUSSIAN_SCENES: tuple[str, ...] = tuple(
 """The ten scans of OpenGaussian's table. All but the last are in the train split."""
 
 BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
-"""Of ScanNet's own benchmark."""
+"""Classes of ScanNet's own benchmark."""
 
 
 def _classes(name: str, source: str, ids: tuple[int, ...]) -> ClassSet:

@@ -225,7 +225,7 @@ SCANNET200_INSTANCES = ClassSet(
 
 
 def splits_of(classes: ClassSet) -> dict[str, tuple[bool, ...]]:
-    """Which classes of a set belong to head, common and tail, in their order."""
+    """Return which classes of a set are head, common and tail, in the set's order."""
     split_of = {label: split for label, _, split in CLASSES}
     return {
         split: tuple(split_of[label] == split for label in classes.ids)

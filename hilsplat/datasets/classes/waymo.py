@@ -1,7 +1,7 @@
 """The 22 classes of Waymo's 3D semantic segmentation.
 
-Source: waymo-research/waymo-open-dataset `protos/segmentation.proto`; 0 is undefined. The benchmark is not
-queried by text, so the queries are ours: the names in words.
+Source: waymo-research/waymo-open-dataset `protos/segmentation.proto`; 0 is undefined. The benchmark has no
+text queries, so the queries are ours: the names in words.
 """
 
 from hilsplat.datasets.classes.class_set import ClassSet

@@ -1,7 +1,7 @@
-"""Labels of your own scenes: in the format of `hi.py`, as `hilsplat annotate` writes them, or of LERF-OVS.
+"""Labels of your own scenes, in the format of `hi.py` (written by `hilsplat annotate`) or of LERF-OVS.
 
-The photographs are the undistorted ones of the scene itself (`results/<dataset>/<scene>/scene/images`), so
-there is nothing beside the label files; evaluation compares their size with the scene's cameras.
+The photographs are the scene's own undistorted ones (`results/<dataset>/<scene>/scene/images`), so only label
+files are stored here; evaluation compares their size with the scene's cameras.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ annotated/
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the annotations of a scene: one region per object that was drawn or accepted.
 
-    Files whose objects have no level are read as LERF-OVS's: one region per text.
+    Files whose objects have no level are read like LERF-OVS: one region per text.
 
     Args:
         root: the folder `annotated`.
@@ -43,10 +43,10 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 class Annotated(Dataset):
-    """A data set without published scenes: its scenes are those that somebody has annotated."""
+    """A data set without published scenes: its scenes are those that have been annotated."""
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Scenes with a label file below the folder."""
+        """Return the scenes that have a label file below the folder."""
         files = Path(root).glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
 

@@ -1,13 +1,13 @@
 """Hi-LERF and Hi-3DOVS: labels at three levels on images of LERF-OVS and 3D-OVS.
 
-The paper publishes frames and levels but no labels and no format. Our format is the label file of LERF-OVS
+The paper publishes frames and levels but neither labels nor a format. Our format is LERF-OVS's label file
 with three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
 id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` adds
 `origin`: drawn, edited, accepted or proposed. The images are those of the other data set, whose folder is
-beside this one; `annotated.py` has the same format without a published data set.
+beside this one; `annotated.py` reads the same format without a published data set.
 
-A frame without an image or a label, an invalid parent, or a child outside its parent is reported, never
-fatal.
+A frame without an image or a label, an invalid parent, or a child outside its parent causes a warning, never
+an error.
 """
 
 from collections.abc import Mapping
@@ -33,21 +33,21 @@ from hilsplat.datasets.labelled import (
 from hilsplat.datasets.published import FRAMES
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
-"""Folder with the images of each data set, beside its own."""
+"""Folder with the images of each data set, next to its own."""
 
 PROPOSED = "proposed"
-"""`origin` of an object that a program proposed and nobody has accepted: it is no annotation yet."""
+"""`origin` of an object that a program proposed; it is ignored until the user accepts it."""
 
 OUTSIDE_SHARE = 0.01
-"""This share of a child may be outside its parent, because borders are rasterised."""
+"""Tolerated share of a child outside its parent, because borders are rasterised."""
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene: one region per object; several may share a text.
+    """Read the labels of a scene: one region per object; several objects may share a text.
 
     Args:
         dataset: "hi_lerf" or "hi_3dovs".
-        root: the folder of that name; the images' data set is beside it.
+        root: the folder of that name; the folder with the images is next to it.
         scene: such as "figurines".
 
     Raises:
@@ -80,11 +80,11 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
-    """One region per object of a file, except for proposals that nobody has accepted.
+    """Return one region per object of a file, except for unaccepted proposals.
 
     Args:
         labels: a file in our format.
-        warnings: gets a sentence for each thing that was reinterpreted.
+        warnings: extended by a sentence for each item that was reinterpreted.
 
     Raises:
         SceneError: an id or a level cannot be used.
@@ -111,7 +111,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
 
 
 def by_id(labels: IsatFile) -> dict[int, IsatObject]:
-    """Return the objects of a file by `id`; without ids, the pieces of an ISAT group are one object.
+    """Return the objects of a file by `id`; without ids, the pieces of an ISAT group form one object.
 
     Raises:
         SceneError: an id is missing or repeated, or a level is not 1, 2 or 3.
@@ -143,7 +143,7 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
 
 
 def joined(one: IsatObject, other: IsatObject) -> IsatObject:
-    """Return two pieces of an object as one."""
+    """Merge two pieces of an object."""
     low = np.minimum(one.box_xyxy[:2], other.box_xyxy[:2])
     high = np.maximum(one.box_xyxy[2:], other.box_xyxy[2:])
     polygons = (*one.polygons, *other.polygons)
@@ -153,7 +153,7 @@ def joined(one: IsatObject, other: IsatObject) -> IsatObject:
 def parents_of(
     labels: IsatFile, objects: Mapping[int, IsatObject], warnings: list[str]
 ) -> dict[int, int | None]:
-    """Parent id of every object; None if it has none or names one that cannot be its parent."""
+    """Return the parent id of every object; None if it has none or names an invalid one."""
     parents: dict[int, int | None] = {}
     for number, thing in objects.items():
         parent, level = thing.keys.get("parent"), thing.keys["level"]
@@ -174,7 +174,7 @@ def parents_of(
 def nesting_violations(
     labels: IsatFile, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> list[str]:
-    """A sentence for every child of which more than `OUTSIDE_SHARE` is outside its parent."""
+    """Return a sentence for every child with more than `OUTSIDE_SHARE` of its area outside its parent."""
     masks = {number: thing.mask(labels.size_hw) for number, thing in objects.items()}
     sentences = []
     for number, parent in parents.items():
@@ -193,8 +193,7 @@ def nesting_violations(
 def path_of(
     number: int, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> tuple[str, ...]:
-    """Texts from the outermost known ancestor down to an object; each parent is one level higher, so the walk
-    ends."""
+    """Return the texts from the outermost known ancestor down to an object."""
     texts = []
     step: int | None = number
     while step is not None:
@@ -213,7 +212,7 @@ def _layout(folder: str, images: str, frame: str) -> str:
 
 
 def _dataset(name: str, title: str, frame: str) -> Dataset:
-    """The two data sets differ in names only."""
+    """Return one of the two data sets, which differ in names only."""
 
     def open_scene(root: Path, scene: str) -> LabelledScene:
         return open_hi(name, root, scene)

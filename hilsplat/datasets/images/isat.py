@@ -1,8 +1,8 @@
 """Label files of the ISAT annotation tool, the format of LERF-OVS's labels.
 
-`objects` is a list; of each object `category` is the text, `segmentation` one polygon as a list of [x, y] (we
-also read a list of polygons), `bbox` [x1, y1, x2, y2]. `group` does not identify an object: its numbers
-restart and repeat. Unknown keys are ignored.
+`objects` is a list. In each object, `category` is the text, `segmentation` one polygon as a list of [x, y]
+(a list of polygons is also accepted), `bbox` [x1, y1, x2, y2]. `group` does not identify an object: its
+numbers restart and repeat. Unknown keys are ignored.
 """
 
 from collections.abc import Mapping
@@ -18,11 +18,11 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.polygons import fill_polygons, outside_px
 
 LARGEST_SIDE_PX = 20_000
-"""Regions are drawn at the size that a label file states: a wrong number must not take all memory."""
+"""Limit on the size stated in a label file; regions are drawn at it, so a wrong one could exhaust memory."""
 
 SLACK_PX = 1.0
-"""Without a warning, vertices may be this far outside the image and boxes may differ this much from their
-polygons."""
+"""Distance by which vertices may be outside the image, and boxes may differ from their polygons, without a
+warning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +32,8 @@ class IsatObject:
     Attributes:
         category: its text, verbatim.
         polygons: vertices, px; the region is the union of the filled polygons.
-        box_xyxy: annotated box, borders included, whole pixels inside it.
-        keys: all keys of the file.
+        box_xyxy: whole pixels inside the annotated box, borders included.
+        keys: all keys of the object in the file.
     """
 
     category: str
@@ -42,7 +42,7 @@ class IsatObject:
     keys: Mapping[str, Any]
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """Rasterise (see `polygons.fill_polygon`)."""
+        """Rasterise the object (see `polygons.fill_polygon`)."""
         return fill_polygons(self.polygons, size_hw)
 
 
@@ -52,7 +52,7 @@ class IsatFile:
 
     Attributes:
         path: the file.
-        size_hw: size of the image that was annotated, px.
+        size_hw: size of the annotated image, px.
         objects: in the order of the file.
         warnings: one sentence for each irregularity, naming file and object.
     """
@@ -67,8 +67,8 @@ def read_isat(path: Path) -> IsatFile:
     """Read and check one label file.
 
     Raises:
-        SceneError: it is not JSON, a key is missing or has the wrong type, a polygon is entirely outside the
-            image, or a box is [x, y, width, height].
+        SceneError: the file is not JSON, a key is missing or has the wrong type, a polygon is entirely
+            outside the image, or a box is [x, y, width, height].
     """
     path = Path(path)
     try:
@@ -83,10 +83,10 @@ def read_isat(path: Path) -> IsatFile:
 
 
 def parse_isat(path: Path, content: Any) -> IsatFile:
-    """Check the content of a label file; `path` names it in messages.
+    """Check the content of a label file; `path` is used in messages only.
 
     Raises:
-        SceneError: as `read_isat`.
+        SceneError: as in `read_isat`.
     """
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise SceneError(
@@ -151,7 +151,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
 
 
 def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
-    """One polygon, or a list of polygons, of [x, y] pairs."""
+    """Return the polygons, given one or a list of polygons of [x, y] pairs."""
     expected = "a list of [x, y] pairs, or a list of such lists"
     try:
         nested = isinstance(value[0][0], list)
@@ -177,7 +177,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
 def _box(
     where: str, value: Any, polygons: tuple[Float[np.ndarray, "_ 2"], ...], warnings: list[str]
 ) -> Int64[np.ndarray, " 4"]:
-    """Whole pixels of the annotated box [x1, y1, x2, y2]; of the polygon's extent if there is none."""
+    """Return the whole pixels of the box [x1, y1, x2, y2]; of the polygon's extent if there is none."""
     points = np.concatenate(polygons)
     extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
     try:
@@ -199,5 +199,5 @@ def _box(
                 fix="convert the boxes, or remove bbox: the polygon's extent then takes its place",
             )
         warnings.append(f"{where}: bbox {box.tolist()} differs from the polygon's extent {extent.tolist()}")
-    # Evaluation tests x1 <= x <= x2 for whole numbers x, so rounding inwards changes no answer.
+    # Evaluation tests x1 <= x <= x2 for whole numbers x, so rounding inwards changes no result.
     return np.concatenate([np.ceil(box[:2]), np.floor(box[2:])]).astype(np.int64)

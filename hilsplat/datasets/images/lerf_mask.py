@@ -1,7 +1,7 @@
 """LERF-Mask: three scenes of LERF with the masks of Gaussian Grouping.
 
-Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` belongs
-to the first of them, `test_mask/1` to the second. Every mask file is named after its prompt.
+Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` contains
+the masks of the first, `test_mask/1` those of the second. Every mask file is named after its prompt.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ from hilsplat.datasets.labelled import (
 from hilsplat.datasets.published import PROMPTS
 
 FOREGROUND = 129
-"""Lowest grey value of the foreground: the published evaluation takes values above 128."""
+"""Lowest grey value of the foreground: the published evaluation thresholds above 128."""
 
 LAYOUT = """\
 lerf_mask/
@@ -43,7 +43,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
         scene: such as "figurines".
 
     Raises:
-        SceneError: a part of the scene is missing, the folders of masks do not match the test views, or a
+        SceneError: a part of the scene is missing, the mask folders do not match the test views, or a
             prompt has a dot.
     """
     root = Path(root)
@@ -82,7 +82,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def held_out_views(folder: Path) -> tuple[str, ...]:
-    """Posed images that are not in `images_train`, by view name, sorted by stem.
+    """Return the posed images that are not in `images_train`, by view name, sorted by stem.
 
     Raises:
         SceneError: there are none.
@@ -101,10 +101,10 @@ def held_out_views(folder: Path) -> tuple[str, ...]:
 
 
 def prompt_of(path: Path) -> str:
-    """Prompt of a mask file: its name without `.png`.
+    """Return the prompt of a mask file: its name without `.png`.
 
     Raises:
-        SceneError: the prompt has a dot; the published evaluation would cut the prompt there.
+        SceneError: the prompt has a dot, at which the published evaluation would cut it.
     """
     if "." in path.stem:
         raise SceneError(
@@ -117,7 +117,7 @@ def prompt_of(path: Path) -> str:
 
 
 def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
-    """Folder of masks by test view: number i belongs to the i-th."""
+    """Return the mask folder of each test view: number i belongs to the i-th view."""
     places = [place for place in folder.iterdir() if place.is_dir() and not place.name.startswith(".")]
     numbers = sorted((int(place.name), place) for place in places if place.name.isdecimal())
     strange = sorted(place.name for place in places if not place.name.isdecimal())

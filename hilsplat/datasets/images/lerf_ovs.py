@@ -2,8 +2,8 @@
 
 Labels are polygons. Objects of one category in one image form one region with several boxes, and a view is
 queried only for the categories labelled in it. Labels are in `label/<scene>`, beside the scenes. Images are
-found by name, never by position: LangSplat's own evaluation counts renderings, and the count shifts if an
-earlier image was not registered.
+matched by name, never by position: LangSplat's own evaluation uses the index of the rendering, which shifts
+if an earlier image was not registered.
 """
 
 from collections.abc import Sequence
@@ -85,7 +85,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def label_files(folder: Path) -> dict[str, Path]:
-    """Label files of a folder by view.
+    """Return the label files of a folder by view.
 
     Raises:
         SceneError: there are none.
@@ -103,7 +103,7 @@ def label_files(folder: Path) -> dict[str, Path]:
 
 
 def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
-    """One region per category, the union of its objects, with the boxes of all of them."""
+    """Return one region per category: the union of its objects, with all their boxes."""
     objects: dict[str, list[IsatObject]] = {}
     for thing in labels.objects:
         objects.setdefault(thing.category, []).append(thing)
@@ -121,7 +121,7 @@ def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
 
 
 def union_mask(objects: Sequence[IsatObject], size_hw: tuple[int, int]) -> np.ndarray:
-    """Union of objects, rasterised."""
+    """Return the rasterised union of objects."""
     return np.any([thing.mask(size_hw) for thing in objects], axis=0)
 
 

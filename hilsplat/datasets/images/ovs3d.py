@@ -1,8 +1,8 @@
-"""3D-OVS: ten small scenes, five views of each segmented into the classes of the scene.
+"""3D-OVS: ten small scenes with five views each, segmented into the classes of the scene.
 
 `segmentations/classes.txt` names the classes; the class index is the position in the **sorted** list. Each
-test view is a folder with one mask per class. Only the value 255 is foreground, except under
-protocols that take any grey.
+test view is a folder with one mask per class. Only the value 255 is foreground, except under protocols with
+truth `any grey`.
 """
 
 from functools import partial
@@ -28,7 +28,7 @@ FOREGROUND = 255
 """The original loader computes int8(value / 255)."""
 
 SHAPE_TOLERANCE = 0.01
-"""The mask and the photograph of a view differ slightly in aspect ratio."""
+"""Relative tolerance, because mask and photograph of a view differ slightly in aspect ratio."""
 
 LAYOUT = """\
 3d_ovs/
@@ -43,7 +43,7 @@ LAYOUT = """\
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the segmentations of a scene; pixels are read when needed.
 
-    Regions of a view are in the order of the sorted prompts; some may have no pixels.
+    The regions of a view are ordered like the sorted prompts; some may have no pixels.
 
     Args:
         root: the folder `3d_ovs`.
@@ -80,7 +80,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
-    """Prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first).
+    """Return the prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first).
 
     Raises:
         SceneError: it is missing, empty, not a text file, or names a class twice.

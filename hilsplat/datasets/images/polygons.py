@@ -10,11 +10,10 @@ from jaxtyping import Bool, Float, Int
 def fill_polygon(
     points_xy: Float[np.ndarray, "P 2"] | Int[np.ndarray, "P 2"], size_hw: tuple[int, int]
 ) -> Bool[np.ndarray, "H W"]:
-    """Pixels of one polygon: vertices truncated to whole numbers, even-odd fill, border pixels included.
+    """Return the pixels of a polygon: vertices truncated to integers, even-odd fill, border included.
 
-    This is OpenCV's `fillPoly` on int32 vertices, which LangSplat's evaluation uses. Pixel (x, y) is the
-    vertex (x, y) itself: the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. Anything outside the image is
-    clipped.
+    This is OpenCV's `fillPoly` on int32 vertices, used by LangSplat's evaluation. Pixel (x, y) is the vertex
+    (x, y) itself: the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. Anything outside the image is clipped.
     """
     import cv2
 
@@ -26,7 +25,7 @@ def fill_polygon(
 def fill_polygons(
     polygons: Sequence[Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"]], size_hw: tuple[int, int]
 ) -> Bool[np.ndarray, "H W"]:
-    """Union of polygons; nothing for none."""
+    """Return the union of polygons; empty without polygons."""
     union = np.zeros(size_hw, bool)
     for polygon in polygons:
         union |= fill_polygon(polygon, size_hw)
@@ -34,9 +33,9 @@ def fill_polygons(
 
 
 def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]]:
-    """Polygons without common pixels whose union, filled by `fill_polygon`, is the mask, pixel by pixel.
+    """Return disjoint polygons whose union, filled by `fill_polygon`, equals the mask exactly.
 
-    A polygon cannot have a hole, so the mask is cut in two through the middle of each.
+    A polygon cannot have a hole, so the mask is cut vertically through the middle of each hole.
     """
     import cv2
 
@@ -59,7 +58,7 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
 
 
 def outside_px(polygons: Sequence[Float[np.ndarray, "_ 2"]], size_hw: tuple[int, int]) -> float:
-    """How far the vertices of polygons reach beyond the outermost pixels, px; 0 if none does."""
+    """Return how far the vertices of polygons extend beyond the outermost pixels, px; 0 if none does."""
     points = np.concatenate(polygons)
     last = np.array([size_hw[1], size_hw[0]], dtype=np.float64)
     return float(max((-points).max(), (points - last).max(), 0.0))

@@ -1,4 +1,4 @@
-"""Points labelled by a benchmark: vertices of a mesh, or returns of a lidar."""
+"""Points labelled by a benchmark: mesh vertices or lidar returns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
     "replica": (REPLICA_51, REPLICA_48),
     "waymo": (WAYMO_22,),
 }
-"""Meaning of the class ids in a data set's files -> sets of classes that are evaluated on them."""
+"""Meaning of the class ids in a data set's files -> class sets evaluated on them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +29,12 @@ class LabelledPoints:
     """P points with their true classes, in the frame of the scene's cameras.
 
     Attributes:
-        xyz: places, metres.
+        xyz: positions, metres.
         class_id: class number in the data set's files; 0 if undefined.
         instance_id: from 1; 0 for none. Not comparable between files.
-        labelling: what `class_id` means, a key of `LABELLINGS`.
+        labelling: meaning of `class_id`, a key of `LABELLINGS`.
         faces: corners of triangles, rows of `xyz`; None if the points are not a mesh.
-        visible: whether a camera sees the point; None if the files do not say.
+        visible: whether the point is visible to a camera; None if unknown.
     """
 
     xyz: Float[np.ndarray, "P 3"]
@@ -48,10 +48,10 @@ class LabelledPoints:
         return len(self.xyz)
 
     def labels(self, classes: ClassSet) -> Int32[np.ndarray, " P"]:
-        """Labels 1 .. K in the order of a set of classes, 0 for classes that the set lacks.
+        """Return labels 1 .. K in the order of a class set, 0 for classes that the set lacks.
 
         Raises:
-            MisalignedArtifactError: the set is not defined on this data set's ids.
+            MisalignedArtifactError: the set is not defined on this labelling.
         """
         fitting = LABELLINGS[self.labelling]
         if classes not in fitting:
@@ -66,13 +66,13 @@ class LabelledPoints:
 
 @dataclass(frozen=True, eq=False)
 class PointScene:
-    """A scene of a data set whose points are labelled.
+    """A scene of a data set with labelled points.
 
     Attributes:
-        name: as spelt in the data set.
-        images: posed images, without those that cannot be used (frames without a pose).
-        truth: labelled points per labelling. Only `evaluate` may read them.
-        warnings: one sentence for each thing that was skipped or reinterpreted.
+        name: name as spelt in the data set.
+        images: posed images, without unusable frames (those without a pose).
+        truth: labelled points by labelling. Only `evaluate` may read them.
+        warnings: one sentence for each item that was skipped or reinterpreted.
     """
 
     name: str
@@ -81,7 +81,7 @@ class PointScene:
     warnings: tuple[str, ...] = ()
 
     def report(self) -> SceneReport:
-        """What was read, in words and numbers, and what was not."""
+        """Report what was read, in words and numbers, and what was not."""
         facts: dict[str, object] = {"posed images": len(self.images)}
         for labelling, points in self.truth.items():
             facts[f"{labelling} points"] = len(points)

@@ -9,7 +9,7 @@ from hilsplat.datasets.points.point_files import UNPACK_AGAIN
 
 
 def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:
-    """Files sorted by the number in their stem, after a prefix: 2 comes before 10.
+    """Sort files by the number in their stem, after a prefix: 2 comes before 10.
 
     Raises:
         SceneError: a stem is not a number.
@@ -28,7 +28,7 @@ def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]
 
 
 def size_of_image(image: Path) -> tuple[int, int]:
-    """Height and width of an image file, without decoding it.
+    """Return height and width of an image file, without decoding it.
 
     Raises:
         ImageError: it is not an image.

@@ -1,4 +1,4 @@
-"""Readers for the file formats of labelled points, with messages that say what to do."""
+"""Readers for file formats of labelled points."""
 
 from pathlib import Path
 
@@ -12,10 +12,10 @@ UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
 
 
 def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
-    """The path of a file that must exist.
+    """Return the path of a file that must exist.
 
     Raises:
-        SceneError: it is missing; the message lists what is there instead.
+        SceneError: it is missing; the message lists what the folder contains.
     """
     if not path.is_file():
         raise SceneError(f"{path} is missing", found=listing(path.parent), fix=fix)
@@ -23,7 +23,7 @@ def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
 
 
 def listing(folder: Path) -> str:
-    """The first names in a folder, for messages."""
+    """Return the first names in a folder, for messages."""
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir())
@@ -32,7 +32,7 @@ def listing(folder: Path) -> str:
 
 
 def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
-    """Read a JSON object that must have some keys.
+    """Read a JSON object that must have the given keys.
 
     Raises:
         SceneError: it is missing, not JSON, not an object, or lacks a key.
@@ -58,7 +58,7 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
     """Read a text file of numbers, `columns` per line (inf and nan are allowed).
 
     Raises:
-        SceneError: it is missing, or a line does not hold exactly that many numbers.
+        SceneError: it is missing, or a line has a different number of values.
     """
     require_file(path)
     rows = []
@@ -98,7 +98,7 @@ def read_ply(path: Path, corners: int) -> PlyData:
     """Read a mesh whose faces have `corners` corners each.
 
     Raises:
-        SceneError: it is missing, truncated, not a PLY file, or has other faces.
+        SceneError: it is missing, truncated, not a PLY file, or has different faces.
     """
     require_file(path)
     lists = {"face": {"vertex_indices": corners}}
@@ -117,7 +117,7 @@ def read_ply(path: Path, corners: int) -> PlyData:
 
 
 def ply_column(path: Path, content: PlyData, element: str, name: str) -> np.ndarray:
-    """A property of all vertices or faces, by name.
+    """Return a property of all vertices or faces, by name.
 
     Raises:
         SceneError: the file has no such property.
@@ -134,13 +134,13 @@ def ply_column(path: Path, content: PlyData, element: str, name: str) -> np.ndar
 
 
 def ply_places(path: Path, content: PlyData) -> np.ndarray:
-    """Vertices of a mesh, float32 (P, 3)."""
+    """Return the vertices of a mesh, float32 (P, 3)."""
     columns = [ply_column(path, content, "vertex", axis) for axis in "xyz"]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
 def ply_faces(path: Path, content: PlyData) -> np.ndarray:
-    """Corners of all faces, int32 (F, corners).
+    """Return the corners of all faces, int32 (F, corners).
 
     Raises:
         SceneError: a corner is not a vertex.

@@ -32,11 +32,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Layout:
-    """How a sequence stores its frames.
+    """Storage layout of a sequence's frames.
 
     Attributes:
-        colour: folder of the images and prefix of their names.
-        poses: file of poses.
+        colour: image folder and prefix of image names.
+        poses: name of the pose file.
     """
 
     colour: tuple[str, str]
@@ -48,7 +48,7 @@ SEMANTIC_NERF = Layout(("rgb", "rgb_"), "traj_w_c.txt")
 
 
 def layout_of(folder: Path) -> Layout:
-    """The layout of a sequence, recognised by its file of poses.
+    """Return the layout of a sequence, recognised by its pose file.
 
     Raises:
         SceneError: it has neither layout.
@@ -66,16 +66,16 @@ def layout_of(folder: Path) -> Layout:
 
 
 def intrinsics(size_hw: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
-    """K of every rendering of Replica: focal length half the width, centre in the middle.
+    """Return K of every Replica rendering: focal length half the width, principal point in the middle.
 
-    The files' own centre, 599.5 of 1200 px, counts pixel centres from 0.
+    The centre in the files, 599.5 of 1200 px, is relative to the first pixel's centre.
     """
     height, width = size_hw
     return np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
 
 
 def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """K and the size it is for: from `cam_params.json` beside a NICE-SLAM sequence, otherwise Replica's own.
+    """Return K and its image size, from `cam_params.json` beside a NICE-SLAM sequence, else Replica's own.
 
     Raises:
         SceneError: the file is damaged.
@@ -98,8 +98,7 @@ def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tupl
 
 
 def frames_of(folder: Path, part: tuple[str, str]) -> list[tuple[int, Path]]:
-    """Images with exactly the prefix and a number, by number; this leaves out colour visualisations beside
-    them."""
+    """Return images named prefix and number, by number, which excludes colour visualisations."""
     place, prefix = part
     paths = [
         path
@@ -110,15 +109,15 @@ def frames_of(folder: Path, part: tuple[str, str]) -> list[tuple[int, Path]]:
 
 
 def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Posed images of a rendered sequence, by frame number.
+    """Return the posed images of a rendered sequence, by frame number.
 
-    Line n of the poses is frame n; lines without an image are skipped.
+    Line n of the pose file is frame n; lines without an image are skipped.
 
     Returns:
-        The images and a sentence for each thing that was skipped.
+        The images and a sentence for each item that was skipped.
 
     Raises:
-        SceneError: no layout fits, there are frames beyond the last pose, or there are no frames.
+        SceneError: no layout fits, frames exceed the poses, or there are no frames.
     """
     layout = layout_of(folder)
     path = folder / layout.poses
@@ -145,7 +144,7 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
 
 
 def sequence_folder(root: Path, scene: str) -> Path:
-    """The rendered sequence of a scene: `room0/` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`.
+    """Return a scene's rendered sequence: `room0/` (NICE-SLAM), `room_0/imap/00` (vMAP), `room_0/Sequence_1`.
 
     Raises:
         SceneError: none of them exists.
@@ -163,15 +162,15 @@ def sequence_folder(root: Path, scene: str) -> Path:
 
 
 def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
-    """Read a scene: the sequence, and the labels of the original release or, without it, of OpenNeRF.
+    """Read a scene: the sequence, and the labels of the original release or else of OpenNeRF.
 
     Args:
         root: the data set's folder.
-        scene: as spelt in the release, such as room_0.
-        every: take every n-th frame.
+        scene: name as spelt in the release, such as room_0.
+        every: use every n-th frame.
 
     Raises:
-        SceneError: something is missing, damaged or does not fit together.
+        SceneError: a file is missing, damaged or does not match the others.
     """
     habitat, short = Path(root) / scene / "habitat", scene.replace("_", "")
     text = Path(root) / f"semantic_labels_{short}.txt"

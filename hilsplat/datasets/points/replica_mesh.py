@@ -21,14 +21,14 @@ from hilsplat.datasets.points.point_files import (
 )
 
 INSTANCES_PER_CLASS = 1000
-"""In instance files a value is class * 1000 + instance; values below 1000 are not objects."""
+"""Values in instance files are class * 1000 + instance; values below 1000 are not objects."""
 
 
 def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
-    """Class of each object id, from `info_semantic.json`; negative ids (undefined, none) become 0.
+    """Return the class of each object id, from `info_semantic.json`; negative ids (undefined, none) become 0.
 
     Raises:
-        SceneError: the file is damaged, names a class differently from the release, or has an unknown id.
+        SceneError: the file is damaged, names a class not as in the release, or has an unknown id.
     """
     content = read_json_object(path, ("classes", "id_to_label"))
     try:
@@ -55,10 +55,10 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
 def object_of_vertices(
     faces: Int[np.ndarray, "F c"], object_of_face: Int[np.ndarray, " F"], num_vertices: int
 ) -> Int32[np.ndarray, " P"]:
-    """Object to which most faces at each vertex belong; ties go to the smallest id; -1 without a face."""
+    """Return the most frequent object of each vertex's faces, -1 without faces; the lowest id wins ties."""
     corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
     pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
-    # Last of each vertex after sorting: most votes, then the smallest id.
+    # The last entry of each vertex has the most votes and, among ties, the smallest id.
     order = np.lexsort((-pairs[1], votes, pairs[0]))
     vertex, owner = pairs[0][order], pairs[1][order]
     last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True)) if len(vertex) else order
@@ -68,18 +68,18 @@ def object_of_vertices(
 
 
 def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
-    """Two triangles per quad, corners 0 1 2 and 0 2 3; one if corners coincide."""
+    """Split each quad into triangles, corners 0 1 2 and 0 2 3; degenerate ones are dropped."""
     triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     return triangles[(triangles != triangles[:, [1, 2, 0]]).all(axis=1)]
 
 
 def read_semantic_mesh(habitat: Path) -> LabelledPoints:
-    """Vertices of `mesh_semantic.ply` with the class and instance of most of their faces.
+    """Return the vertices of `mesh_semantic.ply` with the class and instance of most of their faces.
 
     The file numbers objects from 0; `instance_id` is that number + 1, and 0 if the class is undefined.
 
     Raises:
-        SceneError: a file is missing or damaged, or they do not belong together.
+        SceneError: a file is missing or damaged, or the files do not belong together.
     """
     path = habitat / "mesh_semantic.ply"
     mesh = read_ply(path, 4)
@@ -101,10 +101,10 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
 
 
 def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]:
-    """Read `semantic_labels_<scene>.txt`: a class id per line, negative ones become 0.
+    """Read `semantic_labels_<scene>.txt`: a class id per line, where negative ones become 0.
 
     Raises:
-        SceneError: it does not hold exactly one known whole number for each vertex.
+        SceneError: the file does not contain exactly one known integer per vertex.
     """
     require_file(path)
     try:
@@ -130,15 +130,15 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
 
 
 def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = None) -> LabelledPoints:
-    """A mesh of the NICE-SLAM package with OpenNeRF's text files of labels per vertex.
+    """Read a mesh of the NICE-SLAM package with OpenNeRF's text files of vertex labels.
 
     Args:
         mesh_path: `<scene>_mesh.ply`, quads or triangles.
         labels: `semantic_labels_<scene>.txt`.
-        instances: `instance_labels_<scene>.txt` (class * 1000 + instance), if there is one.
+        instances: `instance_labels_<scene>.txt` (class * 1000 + instance), if available.
 
     Raises:
-        SceneError: a file is missing or damaged, or they do not belong together.
+        SceneError: a file is missing or damaged, or the files do not belong together.
     """
     try:
         mesh = read_ply(mesh_path, 3)

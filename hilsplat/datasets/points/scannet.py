@@ -1,6 +1,6 @@
 """ScanNet v2 and ScanNet200: exported frames, the evaluated mesh, NYU40 and ScanNet200 labels, instances.
 
-The layout is the one that ScanNet distributes, with the frames exported from `.sens` by its own reader:
+The layout is that of the ScanNet release, with the frames exported from `.sens` by its own reader:
 `color/<n>.jpg`, `pose/<n>.txt` (camera-to-world, OpenCV axes), `intrinsic/intrinsic_color.txt`.
 """
 
@@ -36,15 +36,15 @@ logger = logging.getLogger(__name__)
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 SAME_PLACE_M = 1e-4
-"""The labelled mesh repeats the vertices of the plain one; printed or rounded copies may differ by this."""
+"""Tolerance between vertices of the labelled and the plain mesh, for printed or rounded copies."""
 
 
 @dataclass(frozen=True)
 class LabelTable:
-    """Meaning of raw categories.
+    """Class ids of raw categories.
 
     Attributes:
-        nyu40: raw category -> NYU40 id, 0 if the table gives none.
+        nyu40: raw category -> NYU40 id, 0 if the table has none.
         scannet200: raw category -> id, 0 if it is not one of the 200.
     """
 
@@ -53,10 +53,10 @@ class LabelTable:
 
 
 def scan_folder(root: Path, scan: str) -> Path:
-    """The folder of a scan, `scans/<scan>` below the data set's folder.
+    """Return the folder of a scan, `scans/<scan>` below the data set's folder.
 
     Raises:
-        SceneError: it is missing, one level too deep, or holds an archive of frames not yet exported.
+        SceneError: it is in the wrong place, or contains a `.sens` archive whose frames are not exported.
     """
     folder = Path(root) / "scans" / scan
     for wrong in (folder / scan, Path(root) / scan, Path(root) / "scans" / "scans" / scan):
@@ -80,7 +80,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 def read_label_table(path: Path) -> LabelTable:
     """Read `scannetv2-labels.combined.tsv`.
 
-    `nyu40id` follows from the raw category, not from the id: ids 107 and 188 have rows with two.
+    `nyu40id` is looked up by raw category, because ids 107 and 188 have rows with two.
 
     Raises:
         SceneError: it is missing, lacks one of the three columns, or has an id that is not a number.
@@ -108,14 +108,14 @@ def read_label_table(path: Path) -> LabelTable:
 
 
 def read_scan_info(path: Path) -> dict[str, str]:
-    """Read `<scan>.txt`: lines `key = value`, not every value a number."""
+    """Read `<scan>.txt`: lines `key = value`; some values are not numbers."""
     lines = require_file(path).read_text(encoding="utf-8").splitlines()
     pairs = (line.split(" = ", 1) for line in lines if " = " in line)
     return {key.strip(): value.strip() for key, value in pairs}
 
 
 def axis_alignment(info: dict[str, str], where: str) -> Float[np.ndarray, "4 4"]:
-    """The matrix that turns a scan's walls to the axes.
+    """Return the matrix that aligns a scan's walls with the axes.
 
     Raises:
         SceneError: the scan has none (test scans) or a damaged one.
@@ -133,18 +133,18 @@ def axis_alignment(info: dict[str, str], where: str) -> Float[np.ndarray, "4 4"]
 
 
 def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Posed colour images, by frame number; frames that tracking lost are skipped.
+    """Return posed colour images by frame number, skipping frames that tracking lost.
 
-    ScanNet counts pixel centres from 0 (the depth camera's centre is 319.5 of 640), hence half a pixel
-    is added to the centre of K.
+    ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
+    640), so half a pixel is added to the centre of K.
 
     Args:
-        folder: of the scan.
-        scan: its name.
-        every: take every n-th frame in the order of their numbers, lost ones included in the count.
+        folder: folder of the scan.
+        scan: name of the scan.
+        every: use every n-th frame by number; lost frames are counted.
 
     Returns:
-        The images and a sentence for each thing that was skipped.
+        The images and a sentence for each item that was skipped.
 
     Raises:
         SceneError: a folder is missing, a name is not a number, or no frame has a pose.
@@ -186,7 +186,7 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
 
 
 def _stated_size(folder: Path, scan: str, image: Path) -> tuple[int, int]:
-    """Size that the intrinsics are for: from the scan's text file, or else that of its first image."""
+    """Return the image size of the intrinsics: from the scan's text file, or else of its first image."""
     if (folder / f"{scan}.txt").is_file():
         info = read_scan_info(folder / f"{scan}.txt")
         if "colorHeight" in info and "colorWidth" in info:
@@ -197,10 +197,10 @@ def _stated_size(folder: Path, scan: str, image: Path) -> tuple[int, int]:
 def read_truth(
     folder: Path, scan: str, table: LabelTable
 ) -> tuple[dict[str, LabelledPoints], tuple[str, ...]]:
-    """Labels of the vertices of the evaluated mesh, in NYU40 and ScanNet200 ids, with instances.
+    """Return labels of the evaluated mesh's vertices, in NYU40 and ScanNet200 ids, with instances.
 
     NYU40 ids are those of `.labels.ply`; ScanNet200 ids and instances (objectId + 1) come from the
-    aggregation. A vertex that two groups claim belongs to the later one, as in the official exporter.
+    aggregation. A vertex in two groups belongs to the later one, as in the official exporter.
 
     Raises:
         SceneError: files are missing, damaged or do not belong together.
@@ -236,7 +236,7 @@ def read_truth(
 def _from_aggregation(
     folder: Path, scan: str, table: LabelTable, num_points: int
 ) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter]:
-    """ScanNet200 id and instance of each vertex, and the raw categories without an entry in the table."""
+    """Return ScanNet200 id and instance of each vertex, and raw categories missing from the table."""
     segments_path = folder / f"{scan}_vh_clean_2.0.010000.segs.json"
     segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
     if segments.shape != (num_points,) or segments.dtype.kind != "i":
@@ -275,13 +275,13 @@ def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> P
     """Read a scan.
 
     Args:
-        root: folder with `scans/` and the table of labels.
+        root: folder with `scans/` and the label table.
         scan: such as scene0000_00.
-        every: take every n-th frame.
-        aligned: turn mesh and poses together by the scan's axisAlignment. By default neither is turned.
+        every: use every n-th frame.
+        aligned: rotate mesh and poses by the scan's axisAlignment; by default neither is rotated.
 
     Raises:
-        SceneError: something is missing, damaged or does not fit together.
+        SceneError: a file is missing, damaged or does not match the others.
     """
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
@@ -351,5 +351,5 @@ DATASET = Dataset(
 )
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
-"""The same scans and files with other labels. The paper does not say which scans it scored with 200 classes:
-the ten, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""
+"""The same scans and files with other labels. The paper does not state which scans it scored with 200
+classes: the ten, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

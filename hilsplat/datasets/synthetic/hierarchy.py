@@ -1,11 +1,11 @@
-"""Hierarchical annotations: what each node is, its level, its parent, and its region in each view.
+"""Hierarchical annotations: level, parent and text of each node, and its region in each view.
 
-Our own format for benchmarks like Hi-LERF, whose format is unpublished. A folder holds
+This is our own format for benchmarks like Hi-LERF, whose format is unpublished. A folder contains
 
-    annotations.json          nodes (the tree) and, per view, the nodes that are annotated there
+    annotations.json          nodes (the tree) and the ids of the nodes annotated in each view
     labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is none
 
-Only `evaluate` reads it; no earlier stage may, except the diagnostic segmenter (`truth_masks`).
+Only `evaluate` may read it, besides the diagnostic segmenter (`truth_masks`).
 """
 
 from collections.abc import Iterable, Mapping
@@ -32,8 +32,8 @@ class AnnotatedNode:
         id: row in the list of nodes.
         level: 1 whole, 2 part, 3 subpart.
         parent: id of the node one level up, -1 for a whole.
-        text: the query it answers. Several nodes may share a text; their masks are then united.
-        synonyms: other texts that name it.
+        text: the query that it answers. Nodes with the same text have their masks merged.
+        synonyms: alternative texts.
     """
 
     id: int
@@ -50,7 +50,7 @@ class HierarchyAnnotations:
     Attributes:
         folder: folder with the label images.
         nodes: all nodes, by id.
-        views: annotated node ids per view name (large enough to be scored there).
+        views: ids of the annotated nodes per view name (large enough to be scored there).
     """
 
     folder: Path
@@ -58,7 +58,7 @@ class HierarchyAnnotations:
     views: Mapping[str, tuple[int, ...]]
 
     def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
-        """Node id per pixel, -1 if the level has none.
+        """Return the node id per pixel, -1 where the level has none.
 
         Raises:
             ArtifactError: the label image is missing.
@@ -69,7 +69,7 @@ class HierarchyAnnotations:
         return np.asarray(Image.open(path)).astype(np.int32) - 1
 
     def texts(self, view: str, level: Level) -> dict[str, tuple[int, ...]]:
-        """Texts that are annotated in a view at a level, with the ids of their nodes."""
+        """Return the texts annotated in a view at a level, with the ids of their nodes."""
         texts: dict[str, list[int]] = {}
         for node_id in self.views.get(view, ()):
             node = self.nodes[node_id]
@@ -78,13 +78,13 @@ class HierarchyAnnotations:
         return {text: tuple(ids) for text, ids in texts.items()}
 
     def mask(self, view: str, ids: Iterable[int]) -> Bool[np.ndarray, "H W"]:
-        """Union of the regions of some nodes of one level in a view."""
+        """Return the union of the regions of nodes of one level in a view."""
         ids = tuple(ids)
         level = Level(self.nodes[ids[0]].level)
         return np.isin(self.label_image(view, level), ids)
 
     def path_of(self, node_id: int) -> tuple[str, ...]:
-        """Texts from the whole down to the node: ("bear", "head", "nose")."""
+        """Return the texts from the whole down to the node: ("bear", "head", "nose")."""
         texts: list[str] = []
         while node_id != NONE:
             node = self.nodes[node_id]
@@ -119,7 +119,7 @@ class HierarchyAnnotations:
 
 
 def label_path(folder: Path, view: str, level: Level) -> Path:
-    """File of a view's label image at a level."""
+    """Return the path of a view's label image at a level."""
     return Path(folder) / "labels" / f"{view}.{level.label}.png"
 
 
@@ -132,8 +132,8 @@ def write_hierarchy(
     """Write annotations: label images first, `annotations.json` last.
 
     Args:
-        folder: created if missing.
-        nodes: ids must be 0, 1, 2, ... in order.
+        folder: output folder, created if missing.
+        nodes: nodes with ids 0, 1, 2, ... in order.
         labels: per view and level, node id per pixel, -1 for none.
         views: annotated node ids per view.
     """

@@ -1,4 +1,4 @@
-"""Labelled points of a synthetic scene: what ScanNet, ScanNet200, Replica and Waymo would label in it."""
+"""Labelled points of a synthetic scene, as in ScanNet, ScanNet200, Replica and Waymo."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +15,11 @@ from hilsplat.datasets.synthetic.world_points import replica_id, scannet_ids, wa
 
 
 def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
-    """Points with classes by labelling, in the frame of the world's true cameras, metres.
+    """Return points with classes by labelling, in the frame of the world's true cameras, metres.
 
     Args:
-        world: what the world stage wrote.
-        kind: "room": vertices of the mesh that a camera sees, as a scanner would not know the others;
+        world: output folder of the world stage.
+        kind: "room": mesh vertices visible to a camera, because a scanner wouldn't capture the others;
             labellings nyu40, scannet200 and replica. "street": returns of the lidar; labelling waymo.
 
     Raises:
@@ -52,7 +52,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
 
 
 def _of_nodes(class_of_node: list[int], node: Int32[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-    """Class of each point's node; 0 for points without a node."""
+    """Return the class of each point's node; 0 for points without a node."""
     return np.array([*class_of_node, 0], dtype=np.int32)[node]
 
 

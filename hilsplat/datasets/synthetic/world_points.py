@@ -1,4 +1,4 @@
-"""What ScanNet, Replica and Waymo call the objects of a synthetic room or street."""
+"""Names that ScanNet, Replica and Waymo use for the objects of a synthetic room or street."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from jaxtyping import Int32
 from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
 
 OTHERPROP = 40
-"""NYU40's class for small things without a class of their own."""
+"""NYU40's class for small objects without a class of their own."""
 SCANNET200_NAMES = {"sofa": "couch", "television": "tv", "bear": "stuffed animal", "mug": "cup"}
 REPLICA_NAMES = {
     "bookshelf": "shelf",
@@ -19,8 +19,7 @@ REPLICA_NAMES = {
     "tv stand": "tv-stand",
     "mug": "cup",
 }
-"""Classes of the world -> names in the data set, if they differ. Classes that a data set lacks are undefined
-there."""
+"""Classes of the world -> names in the data set, if different. Classes that it lacks are undefined there."""
 
 WAYMO_CLASSES: dict[str, str] = {
     "car": "car",
@@ -43,7 +42,7 @@ WAYMO_CLASSES: dict[str, str] = {
     "traffic sign pole": "pole",
     "traffic light pole": "pole",
 }
-"""Text of a whole or part of a street -> query of Waymo's class; a part comes before its whole. Fences are
+"""Text of a whole or part of a street -> Waymo class name; a part's class overrides its whole's. Fences are
 undefined: Waymo has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
@@ -51,7 +50,7 @@ COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 
 
 def scannet_ids(text: str) -> tuple[int, int]:
-    """ScanNet200 id (0 for none) and NYU40 id of a class of the world."""
+    """Return the ScanNet200 id (0 for none) and NYU40 id of a class of the world."""
     name = SCANNET200_NAMES.get(text, text)
     fine = dict(zip(scannet200.SCANNET200.texts, scannet200.SCANNET200.ids, strict=True))
     broad = {query: number for number, query in scannet.NYU40.items()}
@@ -59,13 +58,13 @@ def scannet_ids(text: str) -> tuple[int, int]:
 
 
 def replica_id(text: str) -> int:
-    """Replica's class id of a class of the world, 0 for none."""
+    """Return Replica's class id of a class of the world, 0 for none."""
     name = REPLICA_NAMES.get(text, text)
     return {query: number for number, query in replica.NAMES.items()}.get(name, 0)
 
 
 def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> Int32[np.ndarray, "P 2"]:
-    """Instance and Waymo class of points, from the nodes (whole, part, subpart) they belong to."""
+    """Return instance and Waymo class of points, from their nodes (whole, part, subpart)."""
     number = {query: label for label, _, query in waymo.CLASSES}
     of_node = np.array([number.get(WAYMO_CLASSES.get(text, ""), 0) for text in texts] + [0])
     whole, part = of_node[node_ids[:, 0]], of_node[node_ids[:, 1]]

@@ -1,4 +1,4 @@
-"""What Waymo records of one moment, whatever kind of file it came from."""
+"""Lidar frames and camera images of Waymo, independent of the file format."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from hilsplat.datasets.waymo.geometry import WaymoCamera, range_image_points, to
 from hilsplat.scene.posed_images import PosedImage
 
 CAMERAS = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
-"""Numbered from 1 in the files."""
+"""Camera names; numbered from 1 in the files."""
 TOP = 1
-"""The lidar on the roof: the only one with labels and with a pose per pixel."""
+"""The roof lidar, the only one with labels and with a pose per pixel."""
 INSTANCE, CLASS = 0, 1
 """Channels of a label image."""
 
@@ -25,33 +25,33 @@ class LidarReturn:
     """One return of the top lidar.
 
     Attributes:
-        image: range (metres, not positive without a return), intensity, elongation, no-label zone.
+        image: range (metres; zero or negative without a return), intensity, elongation, no-label zone.
         labels: instance and class; None if the frame is not labelled.
-        projection: first camera, x, y, second camera, x, y; camera 0 is none. None if not stored.
+        projection: first camera, x, y, second camera, x, y; camera 0 means none. None if not stored.
     """
 
     image: Float32[np.ndarray, "H W 4"]
-    labels: Int32[np.ndarray, "h w 2"] | None  # h = H, w = W, which `frame_points` checks
-    projection: Int32[np.ndarray, "i j 6"] | None  # likewise
+    labels: Int32[np.ndarray, "h w 2"] | None  # h = H and w = W, checked by `frame_points`
+    projection: Int32[np.ndarray, "i j 6"] | None  # i = H and j = W, checked by `frame_points`
 
 
 @dataclass(frozen=True, eq=False)
 class LidarFrame:
-    """One turn of the top lidar.
+    """One revolution of the top lidar.
 
     Attributes:
-        timestamp_micros: of the frame.
+        timestamp_micros: time stamp of the frame.
         world_from_vehicle: the frame's pose.
         vehicle_from_lidar: pose of the lidar on the vehicle.
-        inclinations: of the rows, radian, highest first.
-        pixel_pose: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel, of both returns.
+        inclinations: inclinations of the rows, radians, highest first.
+        pixel_pose: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel, for both returns.
         returns: first and, if there is one, second return.
     """
 
     timestamp_micros: int
     world_from_vehicle: Float[np.ndarray, "4 4"]
     vehicle_from_lidar: Float[np.ndarray, "4 4"]
-    inclinations: Float[np.ndarray, " h"]  # h = H, which `frame_points` checks
+    inclinations: Float[np.ndarray, " h"]  # h = H, checked by `frame_points`
     pixel_pose: Float32[np.ndarray, "H W 6"]
     returns: tuple[LidarReturn, ...]
 
@@ -61,9 +61,9 @@ class CameraShot:
     """One image.
 
     Attributes:
-        timestamp_micros: of its frame.
-        camera: which camera took it.
-        encoded: jpeg.
+        timestamp_micros: time stamp of its frame.
+        camera: name and calibration of the camera.
+        encoded: JPEG bytes.
         world_from_vehicle: pose of the vehicle when the image was taken, not that of the frame.
     """
 
@@ -74,10 +74,10 @@ class CameraShot:
 
 
 def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]) -> LabelledPoints:
-    """Labelled points of a frame: first return, then second, each row by row.
+    """Return the labelled points of a frame: first return, then second, each row by row.
 
     Raises:
-        SceneError: images of a return differ in size, or a class is unknown.
+        SceneError: the images of a return differ in size, or a class is unknown.
     """
     xyz, labels, visible = [], [], []
     for number, part in enumerate(frame.returns, start=1):
@@ -125,7 +125,7 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(frames: Iterable[LabelledPoints]) -> LabelledPoints:
-    """Points of several frames combined; visibility is kept if every frame has it."""
+    """Concatenate the points of several frames; visibility is kept if every frame has it."""
     parts = list(frames)
     seen = [part.visible for part in parts if part.visible is not None]
     return LabelledPoints(
@@ -138,7 +138,7 @@ def joined_points(frames: Iterable[LabelledPoints]) -> LabelledPoints:
 
 
 def shot_image(shot: CameraShot, segment_from_world: Float[np.ndarray, "4 4"]) -> PosedImage:
-    """An image with its camera in the frame of the segment; named after time and camera."""
+    """Return an image with its camera in the segment's frame, named after time and camera."""
     in_segment = segment_from_world @ shot.world_from_vehicle
     return PosedImage(
         f"{shot.timestamp_micros}_{shot.camera.name}.jpg",

@@ -1,4 +1,4 @@
-"""Waymo's range images as points, and its cameras (waymo-research/waymo-open-dataset, Apache-2.0).
+"""Points of Waymo's range images, and its cameras (waymo-research/waymo-open-dataset, Apache-2.0).
 
 The formulas are those of `utils/range_image_utils.py` and `wdl_limited/camera`, reimplemented. Vehicle and
 camera axes are x forward, y left, z up.
@@ -15,19 +15,19 @@ CV_FROM_WAYMO = np.array(
 """Camera axes: OpenCV's x is Waymo's -y, y is -z, z is x."""
 
 RADIAL_RANGE = (0.8, 1.2)
-"""Outside this factor of radial distortion Waymo calls a projection invalid."""
+"""Range of the radial distortion factor; outside it Waymo considers a projection invalid."""
 
 
 def beam_inclinations(
     values: Float[np.ndarray, " H"] | None, lowest: float, highest: float, height: int
 ) -> Float[np.ndarray, " H"]:
-    """Inclination of each row of a range image, radian; row 0 is the highest beam.
+    """Return the inclination of each row of a range image, radians; row 0 is the highest beam.
 
     Args:
-        values: of the calibration, ascending; None if beams are evenly spaced.
+        values: calibrated inclinations, ascending; None if beams are evenly spaced.
         lowest: border of the lowest beam, for evenly spaced ones.
-        highest: border of the highest.
-        height: rows.
+        highest: border of the highest beam.
+        height: number of rows.
     """
     if values is None:
         values = lowest + (np.arange(height) + 0.5) / height * (highest - lowest)
@@ -35,8 +35,7 @@ def beam_inclinations(
 
 
 def column_azimuths(width: int, vehicle_from_lidar: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " W"]:
-    """Azimuth of each column in the lidar's frame, radian: from just below pi down to just above -pi,
-    less the turn of the lidar in the vehicle, so that column 0 looks backwards along the vehicle.
+    """Return each column's azimuth in the lidar's frame, radians; column 0 points to the vehicle's rear.
 
     Example:
         >>> np.degrees(column_azimuths(4, np.eye(4)))
@@ -48,7 +47,7 @@ def column_azimuths(width: int, vehicle_from_lidar: Float[np.ndarray, "4 4"]) ->
 
 
 def rotation_of(angles: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Rz(yaw) Ry(pitch) Rx(roll) of (roll, pitch, yaw), radian."""
+    """Return Rz(yaw) Ry(pitch) Rx(roll) of (roll, pitch, yaw), radians."""
     roll, pitch, yaw = (angles[..., column] for column in range(3))
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
     rows = [
@@ -64,9 +63,9 @@ def range_image_points(
     inclinations: Float[np.ndarray, " H"],
     vehicle_from_lidar: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "H W 3"]:
-    """Positions of all pixels in the vehicle's frame at the time of each pixel, metres.
+    """Return positions of all pixels in the vehicle's frame at the time of each pixel, metres.
 
-    Pixels whose range is not positive have no point; their positions are meaningless.
+    Positions of pixels without a positive range are meaningless.
     """
     azimuth = column_azimuths(range_m.shape[1], vehicle_from_lidar)[None]
     up = inclinations[:, None]
@@ -79,11 +78,11 @@ def range_image_points(
 def to_world(
     points: Float[np.ndarray, "H W 3"], pixel_pose: Float[np.ndarray, "H W 6"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """Move points of the top lidar into the world by the vehicle's pose at each pixel.
+    """Transform points of the top lidar to the world by the vehicle's pose at each pixel.
 
     Args:
-        points: in the vehicle's frame at the time of the pixel.
-        pixel_pose: roll, pitch, yaw (radian), x, y, z (metres) of the vehicle in the world.
+        points: points in the vehicle's frame at the time of the pixel.
+        pixel_pose: roll, pitch, yaw (radians), x, y, z (metres) of the vehicle in the world.
     """
     pose = pixel_pose.astype(np.float64)
     turned = np.einsum("hwij,hwj->hwi", rotation_of(pose[..., :3]), points)
@@ -96,8 +95,8 @@ class WaymoCamera:
 
     Attributes:
         name: such as FRONT.
-        intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0,
-            which is this project's convention too.
+        intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0, as in
+            this project.
         vehicle_from_cam: pose on the vehicle, Waymo's camera axes.
         size_hw: height and width, px.
     """
@@ -115,25 +114,25 @@ class WaymoCamera:
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float]:
-        """k1, k2, p1, p2, k3, as OpenCV orders and defines them."""
+        """k1, k2, p1, p2, k3 in OpenCV's order and definition."""
         k1, k2, p1, p2, k3 = self.intrinsic[4:].tolist()
         return k1, k2, p1, p2, k3
 
     def cam_from_world(self, world_from_vehicle: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """World-to-camera transform in OpenCV axes.
+        """Return the world-to-camera transform in OpenCV axes.
 
         Args:
-            world_from_vehicle: the pose stored with the image; the frame's pose belongs to another moment.
+            world_from_vehicle: the pose stored with the image; the frame's pose has a different time.
         """
         return CV_FROM_WAYMO @ np.linalg.inv(world_from_vehicle @ self.vehicle_from_cam)
 
     def project(
         self, points: Float[np.ndarray, "P 3"]
     ) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
-        """Pixels of points given in this camera's Waymo axes, distortion included; rolling shutter is not.
+        """Project points given in this camera's Waymo axes, with distortion but without rolling shutter.
 
         Returns:
-            Places in the image, px (subtract 0.5 for samplers that put the first pixel's centre at 0), and
+            Pixel positions, px (subtract 0.5 for samplers that put the first pixel's centre at 0), and
             whether each point is in front with a radial factor inside `RADIAL_RANGE`.
         """
         f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = self.intrinsic

@@ -21,27 +21,27 @@ COMPONENTS = (
     "lidar_segmentation",
     "vehicle_pose",
 )
-"""Required tags; `lidar_camera_projection` is read if it is present."""
+"""Required components; `lidar_camera_projection` is read if present."""
 INTRINSIC = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.camera_name"
 
 
 def component_path(split: Path, tag: str, segment: str) -> Path:
-    """File of a component: `<split>/<tag>/<segment>.parquet`."""
+    """Return the path of a component: `<split>/<tag>/<segment>.parquet`."""
     return Path(split) / tag / f"{segment}.parquet"
 
 
 def read_component(
     split: Path, tag: str, segment: str, columns: list[str], only: dict[str, list[int]] | None = None
 ) -> list[dict[str, Any]]:
-    """Rows of a component in the order of the file: lists as arrays, other values unchanged.
+    """Return the rows of a component in file order: lists as arrays, other values unchanged.
 
     Args:
         split: folder such as `validation`.
         tag: name of the component.
         segment: context name.
-        columns: names, keys included.
-        only: values that a column may have; other rows are not decoded.
+        columns: column names, including keys.
+        only: allowed values per column; other rows are not decoded.
 
     Raises:
         SceneError: the file is missing, damaged, or lacks a column.
@@ -84,7 +84,7 @@ def read_component(
 
 
 def _plain(value: Any) -> Any:
-    """A cell: an array for a list, None for a null."""
+    """Return the value of a cell: an array for a list, None for a null."""
     if not value.is_valid:
         return None
     listed = getattr(value, "values", None)
@@ -92,7 +92,7 @@ def _plain(value: Any) -> Any:
 
 
 def _image(row: dict[str, Any], name: str, depth: int, where: str) -> np.ndarray | None:
-    """A range image of H x W x depth; None if it is null."""
+    """Return a range image of H x W x depth; None if it is null."""
     values, shape = row[f"{name}.values"], row[f"{name}.shape"]
     if values is None or shape is None:
         return None
@@ -108,23 +108,23 @@ def _image(row: dict[str, Any], name: str, depth: int, where: str) -> np.ndarray
 
 
 def labelled_frames(split: Path, segment: str) -> tuple[int, ...]:
-    """Time stamps of the frames that carry labels, in order."""
+    """Return the time stamps of the labelled frames, in order."""
     rows = read_component(split, "lidar_segmentation", segment, [FRAME, LASER], {LASER: [TOP]})
     return tuple(sorted(row[FRAME] for row in rows))
 
 
 def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """The vehicle's pose in the world at each frame, in order."""
+    """Return the vehicle's pose in the world at each frame, in order."""
     name = "[VehiclePoseComponent].world_from_vehicle.transform"
     rows = read_component(split, "vehicle_pose", segment, [FRAME, name])
     return dict(sorted((row[FRAME], row[name].reshape(4, 4)) for row in rows))
 
 
 def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
-    """The labelled frames of a segment, in order.
+    """Yield the labelled frames of a segment, in order.
 
     Raises:
-        SceneError: a component is missing or damaged, or they do not belong together.
+        SceneError: a component is missing or damaged, or components do not belong together.
     """
     poses = vehicle_poses(split, segment)
     calibration = "[LiDARCalibrationComponent]"
@@ -182,7 +182,7 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
 
 
 def _top(split: Path, segment: str, tag: str, component: str, time: int, returns: int) -> dict[str, Any]:
-    """The row of the top lidar at a time."""
+    """Return the row of the top lidar at a time stamp."""
     names = [f"[{component}].range_image_return{number + 1}" for number in range(returns)]
     columns = [f"{name}.{part}" for name in names for part in ("values", "shape")]
     rows = read_component(split, tag, segment, [FRAME, LASER, *columns], {FRAME: [time], LASER: [TOP]})
@@ -197,7 +197,7 @@ def _top(split: Path, segment: str, tag: str, component: str, time: int, returns
 
 
 def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
-    """The cameras of the car, by number from 1."""
+    """Return the cameras of the car, by number from 1."""
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
     place, width, height = f"{base}.extrinsic.transform", f"{base}.width", f"{base}.height"
@@ -214,12 +214,12 @@ def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
 
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
-    """Images by time, then camera.
+    """Yield images by time, then camera.
 
     Args:
         split: folder such as `validation`.
         segment: context name.
-        every: take each n-th frame, all its cameras.
+        every: use every n-th frame, with all its cameras.
 
     Raises:
         SceneError: a component is missing or damaged, or a camera has no calibration.

@@ -1,7 +1,7 @@
 """Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
 
-Release 2.0.1 (parquet) or 1.4.3 (TFRecord), which hold the same data. Coordinates are relative to the vehicle
-at the segment's first frame: positions in the files are kilometres from the origin, too far for float32.
+Release 2.0.1 (parquet) or 1.4.3 (TFRecord), which contain the same data. Coordinates are relative to the
+vehicle at the segment's first frame: file positions are kilometres from the origin, too far for float32.
 """
 
 import logging
@@ -21,13 +21,13 @@ from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_ima
 logger = logging.getLogger(__name__)
 
 SPLITS = ("validation", "training")
-"""Splits that are searched for a segment. Labels of the testing split are not public."""
+"""Splits searched for a segment. Labels of the testing split are not public."""
 RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord"
 """Name of a segment's file in release 1; the prefix up to `segment-` may be missing."""
 
 
 def find_parquet(root: Path, segment: str) -> Path | None:
-    """The split folder that holds a segment in release 2, None if none does."""
+    """Return the split folder that contains a segment in release 2, or None."""
     for split in SPLITS:
         if parquet.component_path(Path(root) / split, "lidar_segmentation", segment).is_file():
             return Path(root) / split
@@ -35,7 +35,7 @@ def find_parquet(root: Path, segment: str) -> Path | None:
 
 
 def find_record(root: Path, segment: str) -> Path | None:
-    """The file of a segment in release 1, in the folder or a split's folder; None if there is none."""
+    """Return the file of a segment in release 1, in the folder or a split's folder, or None."""
     for split in SPLITS:
         whole = RECORD.format(split=split, segment=segment)
         for name in (whole, whole.removeprefix(f"individual_files_{split}_")):
@@ -46,7 +46,7 @@ def find_record(root: Path, segment: str) -> Path | None:
 
 
 def segments_of(root: Path) -> tuple[str, ...]:
-    """Labelled segments below the data set's folder."""
+    """Return the labelled segments below the data set's folder."""
     found = set()
     for split in SPLITS:
         found |= {path.stem for path in (Path(root) / split).glob("lidar_segmentation/*.parquet")}
@@ -56,12 +56,12 @@ def segments_of(root: Path) -> tuple[str, ...]:
 
 
 def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
-    """Read a segment: all labelled frames of the top lidar, both returns, and the images.
+    """Read a segment: all labelled frames of the top lidar with both returns, and the images.
 
     Args:
         root: the data set's folder.
         segment: context name, such as 10023947602400723454_1120_000_1140_000.
-        every: take the images of every n-th frame; all labelled frames are read.
+        every: use images of every n-th frame only; all labelled frames are read.
 
     Raises:
         SceneError: the segment is missing or damaged, or has no labelled frame.
@@ -112,14 +112,14 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
 
 @dataclass(frozen=True)
 class Segments(Dataset):
-    """A data set for which the paper names no scenes: its scenes are the segments that are present."""
+    """A data set for which the paper names no scenes; its scenes are the segments present."""
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Segments with labels below the folder."""
+        """Return the segments with labels below the folder."""
         return segments_of(root)
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
-        """What a segment lacks; nothing if it is a file of release 1."""
+        """Return the missing paths of a segment; none if it is a file of release 1."""
         if find_record(root, scene) is not None:
             return ()
         split = find_parquet(root, scene)

@@ -1,7 +1,7 @@
 """Waymo v1 (1.4.3): TFRecord files of Frame messages, read without TensorFlow.
 
-protobuf decodes the messages. The records around them are read here, in a few lines: the package `tfrecord`
-would add two dependencies, and allocate as much memory as a damaged length asks for.
+protobuf decodes the messages; this module reads the records around them, because the package `tfrecord` would
+add two dependencies and allocate as much memory as a damaged length states.
 """
 
 import struct
@@ -38,12 +38,12 @@ CameraImage: required int32 name 1, required bytes image 2, required Transform p
 Frame: required Context context 1, required int64 timestamp_micros 2, required Transform pose 3, \
     repeated CameraImage images 4, repeated Laser lasers 5
 """
-"""The fields that are read of waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers;
-those that are never missing are marked required."""
+"""Fields used of waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers; fields that
+are always present are marked required."""
 
 
 def message_classes(fields: str) -> dict[str, Any]:
-    """Classes of messages by name, from lines such as `Frame: required int64 timestamp_micros 2, ...`."""
+    """Return message classes by name, from lines like `Frame: required int64 timestamp_micros 2, ...`."""
     field_type = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", package="waymo", syntax="proto2")
     for line in fields.replace("\\\n", "").strip().splitlines():
@@ -70,10 +70,10 @@ MESSAGES = message_classes(_FIELDS)
 
 
 def matrix(compressed: bytes, dtype: type) -> np.ndarray:
-    """A zlib-compressed MatrixInt32 or MatrixFloat, in its shape.
+    """Decode a zlib-compressed MatrixInt32 or MatrixFloat.
 
     Raises:
-        DecodeError, zlib.error: it is damaged.
+        DecodeError, zlib.error: the data is damaged.
         ValueError: the shape does not fit the values.
     """
     kind = MESSAGES["MatrixInt32" if dtype is np.int32 else "MatrixFloat"]
@@ -82,7 +82,7 @@ def matrix(compressed: bytes, dtype: type) -> np.ndarray:
 
 
 def records(path: Path) -> Iterator[bytes]:
-    """Records of a TFRecord file, without their checksums.
+    """Yield the records of a TFRecord file, without their checksums.
 
     Raises:
         SceneError: the file is missing, is not a TFRecord, or ends inside a record.
@@ -108,7 +108,7 @@ def records(path: Path) -> Iterator[bytes]:
 
 
 def frames(path: Path) -> Iterator[tuple[str, Any]]:
-    """Where each frame is, for messages, and the frame."""
+    """Yield each frame with its location, for messages."""
     for number, record in enumerate(records(path)):
         where = f"{path}, frame {number}"
         try:
@@ -118,7 +118,7 @@ def frames(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
-    """The vehicle's pose in the world at the first frame."""
+    """Return the vehicle's pose in the world at the first frame."""
     for where, frame in frames(path):
         return _transform(frame.pose, where)
     raise SceneError(f"{path} does not hold any frame", fix=UNPACK_AGAIN)
@@ -132,7 +132,7 @@ def _transform(message: Any, where: str) -> np.ndarray:
 
 
 def lidar_frames(path: Path) -> Iterator[LidarFrame]:
-    """The frames of a file whose top lidar is labelled.
+    """Yield the frames of a file in which the top lidar is labelled.
 
     Raises:
         SceneError: the file is damaged.
@@ -173,7 +173,7 @@ def lidar_frames(path: Path) -> Iterator[LidarFrame]:
 
 
 def _named(messages: Iterable[Any], name: int) -> Any:
-    """The message of a sensor."""
+    """Return the message of a sensor."""
     for message in messages:
         if message.name == name:
             return message
@@ -181,11 +181,11 @@ def _named(messages: Iterable[Any], name: int) -> Any:
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
-    """Images by frame, then camera.
+    """Yield images by frame, then camera.
 
     Args:
         path: the file.
-        every: take every n-th frame, with all its cameras.
+        every: use every n-th frame, with all its cameras.
 
     Raises:
         SceneError: the file is damaged.

@@ -1,4 +1,4 @@
-"""The similarity between two reconstructions that share cameras: true poses and estimated ones."""
+"""Similarity transform between two reconstructions with shared cameras: true and estimated poses."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,13 +10,13 @@ MIN_SHARED = 3
 
 
 def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]:
-    """Similarity that maps true coordinates to the scene's, from the cameras that both name.
+    """Return the similarity that maps true coordinates to the scene's, from the cameras shared by name.
 
-    The rotation is the mean of those between the cameras' orientations (orthogonal Procrustes), so that
-    cameras on a straight line still fix it; scale and offset are least squares over the centres.
+    The rotation is the mean of those between the cameras' orientations (orthogonal Procrustes), so that it is
+    determined even for cameras on a straight line; scale and offset are least squares over the centres.
 
     Raises:
-        MisalignedArtifactError: fewer than three cameras are shared, or all are in one place.
+        MisalignedArtifactError: fewer than three cameras are shared, or all have the same position.
     """
     shared = [name for name in found.names if name in set(true.names)]
     if len(shared) < MIN_SHARED:
@@ -49,7 +49,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
 
 
 def camera_error(true: Cameras, found: Cameras, scene_from_true: Float64[np.ndarray, "4 4"]) -> float:
-    """Median distance of estimated camera centres from the true ones under a similarity, true units."""
+    """Return the median distance of estimated camera centres from the true ones, true units."""
     scale = np.cbrt(np.linalg.det(scene_from_true[:3, :3]))
     known = set(true.names)
     apart = [

@@ -1,8 +1,7 @@
-"""How often the same surface point gets different masks in neighbouring views.
+"""Measure how often the same surface point is in different masks in neighbouring views.
 
-The same functions measure masks from any source (a segmenter, rendered answers, the truth): they take
-boolean masks of two views and the points that both views show. The points come from exact geometry or from
-any trusted depth; nothing here depends on which.
+The same functions apply to masks from any source (a segmenter, rendered answers, the truth). Their input is
+boolean masks of two views and the points visible in both, from exact geometry or any reliable depth.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -15,22 +14,22 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.scene.cameras import Camera, Cameras
 
 DEPTH_TOLERANCE = 0.01
-"""Two views show the same point if their depths of it differ by at most this share."""
+"""Two views show the same point if its depths differ by at most this share."""
 
 MIN_POINTS = 16
 """Masks with fewer shared points are not compared."""
 
 MAX_POINTS = 50_000
-"""Shared points of a pair of views beyond this number are thinned out evenly."""
+"""Maximum number of shared points per pair of views; more are evenly subsampled."""
 
 
 @dataclass(frozen=True)
 class SharedPoints:
-    """Surface points that two views both show, as the pixels that show them.
+    """Surface points visible in both of two views, as pixels.
 
     Attributes:
         pixel_a: row-major pixel index in view A; each pixel of A at most once.
-        pixel_b: the pixel of view B that holds the point's projection.
+        pixel_b: the pixel of view B that contains the point's projection.
     """
 
     pixel_a: Int64[np.ndarray, " P"]
@@ -42,20 +41,20 @@ class SharedPoints:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well the masks of one level agree between views. Empty comparisons are nan.
+    """Agreement of the masks of one level between views. Empty comparisons are nan.
 
     Attributes:
-        pairs: ordered pairs of views (A, B) compared.
-        points: shared points, all pairs together.
-        masks: masks of A compared, all pairs together.
-        best_iou: mean, over the masks of A and then over pairs, of the highest IoU of the mask with a mask
-            of B, counted in shared points; 0 if B has no mask. 1 is perfect.
-        disagreement: share of all pairs of shared points (p, q) that lie in the same mask in one view and
+        pairs: number of ordered pairs of views (A, B) compared.
+        points: number of shared points over all pairs.
+        masks: number of masks of A compared over all pairs.
+        best_iou: highest IoU of a mask of A with any mask of B, counted in shared points (0 if B has no
+            mask), averaged over the masks of A and then over pairs. 1 is perfect.
+        disagreement: share of all pairs of shared points (p, q) that are in the same mask in one view and
             not in the other (1 minus the Rand index), mean over pairs of views. 0 is perfect. If most pairs
-            of points lie in different masks in both views, it is small whatever the masks.
-        joined_disagreement: the same among the pairs of points that lie in the same mask in at least one
-            of the two views (a Jaccard distance of the two relations). 0 is perfect, 1 means that the
-            views have no joined pair in common.
+            of points are in different masks in both views, it is small for any masks.
+        joined_disagreement: the same share among pairs of points that are in the same mask in at least one
+            view (a Jaccard distance of the two relations). 0 is perfect; 1 means that no pair of points is
+            in the same mask in both views.
     """
 
     pairs: int
@@ -73,19 +72,19 @@ def shared_points(
     depth_b: Float[np.ndarray, "Hb Wb"],
     tolerance: float = DEPTH_TOLERANCE,
 ) -> SharedPoints:
-    """Points of view A's pixel centres that view B shows too.
+    """Return the points of view A's pixel centres that are also visible in view B.
 
-    A point is lifted by A's depth and projected into B. It counts as visible there if B's depth at the
-    projection equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse
-    depth, which is exact on planes, however slanted; next to a depth jump the interpolated value belongs to
-    neither side, so points at occluding borders drop out.
+    A point is lifted by A's depth and projected into B. It is visible there if B's depth at the projection
+    equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse depth, which
+    is exact on planes of any slant; next to a depth jump the interpolated value belongs to neither side, so
+    points at occluding borders are dropped.
 
     Args:
         camera_a: camera of view A.
         depth_a: depth along A's optical axis at the pixel centres, scene units; inf without a surface.
         camera_b: camera of view B.
-        depth_b: the same for B.
-        tolerance: largest relative difference in depth.
+        depth_b: depth along B's optical axis, as for A.
+        tolerance: maximum relative difference in depth.
     """
     pixel = np.flatnonzero(np.isfinite(depth_a))
     depth = depth_a.reshape(-1)[pixel].astype(np.float64)
@@ -99,7 +98,7 @@ def shared_points(
     projected = in_b @ camera_b.K.T
     xy = projected[:, :2] / projected[:, 2:]
     height, width = depth_b.shape
-    # the four pixel centres around the projection must lie in the image
+    # The four pixel centres around the projection must be in the image.
     low = np.floor(xy - 0.5)
     whole = (low >= 0).all(axis=1) & (low[:, 0] + 1 < width) & (low[:, 1] + 1 < height)
     pixel, in_b, xy, low = pixel[whole], in_b[whole], xy[whole], low[whole].astype(np.int64)
@@ -115,7 +114,7 @@ def shared_points(
 
 
 def thinned(points: SharedPoints, most: int = MAX_POINTS) -> SharedPoints:
-    """At most `most` of the points, evenly spread over their order."""
+    """Return at most `most` of the points, evenly subsampled in order."""
     if len(points) <= most:
         return points
     kept = np.linspace(0, len(points) - 1, most).astype(np.int64)
@@ -125,12 +124,12 @@ def thinned(points: SharedPoints, most: int = MAX_POINTS) -> SharedPoints:
 def best_ious(
     inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
 ) -> Float[np.ndarray, " m"]:
-    """For each mask of A with enough shared points the highest IoU with a mask of B, counted in points.
+    """Return, for each mask of A with enough shared points, the highest IoU with a mask of B, in points.
 
     Args:
-        inside_a: which shared points lie in which mask of A.
-        inside_b: the same for B.
-        min_points: masks of A with fewer points are left out.
+        inside_a: whether each shared point is in each mask of A.
+        inside_b: whether each shared point is in each mask of B.
+        min_points: masks of A with fewer points are ignored.
     """
     a = inside_a[inside_a.sum(axis=1) >= min_points].astype(np.float32)  # counts exactly up to 2**24
     b = inside_b.astype(np.float32)
@@ -144,15 +143,15 @@ def best_ious(
 def pair_disagreement(
     labels_a: Int[np.ndarray, " P"], labels_b: Int[np.ndarray, " P"]
 ) -> tuple[float, float]:
-    """Share of pairs of points that are in one mask together in one view and not in the other.
+    """Return the shares of pairs of points that are in the same mask in one view and not in the other.
 
     Args:
         labels_a: mask of each point in A, -1 for none: such a point shares its mask with no other.
-        labels_b: the same for B.
+        labels_b: mask of each point in B, -1 for none.
 
     Returns:
-        the share among all pairs of points, and among those together in at least one view; nan if there is
-        no such pair. All pairs count; the contingency table of the labels gives their number.
+        The share among all pairs of points, and among those in the same mask in at least one view; nan if
+        there is no such pair. All pairs are counted, via the contingency table of the labels.
     """
     rows = np.unique(labels_a, return_inverse=True)[1]
     names, columns = np.unique(labels_b, return_inverse=True)
@@ -170,15 +169,15 @@ def pair_disagreement(
 
 
 def _pairs(counts: Int[np.ndarray, " n"]) -> int:
-    """Pairs within groups of the given sizes."""
+    """Return the number of pairs within groups of the given sizes."""
     counts = counts.astype(np.int64)
     return int((counts * (counts - 1) // 2).sum())
 
 
 def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> Int32[np.ndarray, " P"]:
-    """Mask at each point, -1 for none: masks are painted from large to small, as in a label map.
+    """Return the mask at each point, -1 for none: masks are painted from large to small, as in a label map.
 
-    Of two equally large masks the lower row is painted last.
+    Of two equally large masks the one in the lower row is painted last.
     """
     labels = np.full(inside.shape[1], NONE, dtype=np.int32)
     for row in np.lexsort((-np.arange(len(area_px)), -area_px)):
@@ -192,13 +191,13 @@ def view_agreement(
     points: SharedPoints,
     min_points: int = MIN_POINTS,
 ) -> Agreement:
-    """How well the masks of one level agree between two views.
+    """Return the agreement of the masks of one level between two views.
 
     Args:
-        masks_a: masks of view A, which may overlap. `best_iou` takes them as they are, the disagreements take
-            the smallest mask at each point (`painted`), as the language field does.
+        masks_a: masks of view A, which may overlap. `best_iou` uses them as they are, the disagreements use
+            the smallest mask at each point (`painted`), like the language field.
         masks_b: masks of view B.
-        points: points that both views show.
+        points: points visible in both views.
         min_points: masks of A with fewer shared points are not compared.
     """
     inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, points.pixel_a]
@@ -212,7 +211,7 @@ def view_agreement(
 
 
 def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
-    """Counts summed, shares averaged over the pairs of views in which they are defined."""
+    """Sum the counts, and average the shares over the pairs of views in which they are defined."""
 
     def mean(name: str) -> float:
         values = [getattr(part, name) for part in parts]
@@ -230,9 +229,9 @@ def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
 
 
 def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple[str, str]]:
-    """Ordered pairs (A, B): for each view the `count` other views whose cameras are nearest.
+    """Return ordered pairs (A, B): each view with the `count` other views whose cameras are nearest.
 
-    Ties go to the earlier one in `views`.
+    The earlier one in `views` wins ties.
     """
     centres = np.array([cameras[view].centre for view in views])
     pairs = []
@@ -251,7 +250,7 @@ def measure_consistency(
     masks_of: Callable[[str, Level], Bool[np.ndarray, "M H W"]],
     tolerance: float = DEPTH_TOLERANCE,
 ) -> dict[Level, Agreement]:
-    """Agreement of the masks of each level over pairs of views.
+    """Return the agreement of the masks of each level over pairs of views.
 
     Args:
         cameras: cameras of the views, in the frame of the depths.

@@ -1,7 +1,7 @@
-"""How well masks and nodes fit annotated regions, by level and whatever they are called.
+"""Fit of masks and nodes to annotated regions, by level and regardless of texts.
 
-The best IoU of any mask or node with a region needs no text and so no CLIP: it says what a perfect query
-could still get from them.
+The best IoU of any mask or node with a region needs no text and no CLIP: it is the upper limit for a perfect
+query.
 """
 
 from collections.abc import Iterator, Mapping
@@ -43,13 +43,13 @@ COLUMNS = (
 
 @dataclass
 class Fits:
-    """Regions of one level, over some views.
+    """Results for the regions of one level, over some views.
 
     Attributes:
-        best: IoU of the best mask or node of the same level, a region each; 0 if there is none.
-        anywhere: the same over all levels.
-        containment: of each region with an annotated parent, the share of its best mask inside the parent's;
-            0 if either has none.
+        best: per region, IoU of the best mask or node of the same level; 0 if there is none.
+        anywhere: per region, IoU of the best mask or node of any level.
+        containment: per region with an annotated parent, the share of its best mask inside the parent's best
+            mask; 0 if either has none.
     """
 
     best: list[float] = field(default_factory=list)
@@ -57,7 +57,7 @@ class Fits:
     containment: list[float] = field(default_factory=list)
 
     def row(self) -> list[str]:
-        """Number of regions, means, and shares that fit."""
+        """Return number of regions, mean IoUs, and shares with an IoU of at least 0.5."""
         best, anywhere = np.array(self.best), np.array(self.anywhere)
         shares = [best.mean(), (best >= FIT_IOU).mean(), anywhere.mean(), (anywhere >= FIT_IOU).mean()]
         nested = f"{np.mean(self.containment):.3f}" if self.containment else ""
@@ -69,7 +69,7 @@ def add_view(
     regions: list[tuple[LabelledRegion, Bool[np.ndarray, "H W"]]],
     found: Mapping[Level, Bool[np.ndarray, "M P"]],
 ) -> None:
-    """Compare the regions of a view with what was found there at each level."""
+    """Compare the regions of a view with the masks or nodes at each level."""
     ious = {
         level: region_ious(np.stack([mask.ravel() for _, mask in regions]), found[level]) for level in LEVELS
     }
@@ -83,7 +83,7 @@ def add_view(
         fits[level].anywhere.append(max(float(ious[each][row].max(initial=0)) for each in LEVELS))
         if own.max(initial=0) > 0:
             bests[region.path] = found[level][int(own.argmax())]
-    for region, _ in regions:  # a path that two things share stands for the last of them
+    for region, _ in regions:  # if two objects share a path, it refers to the last of them
         parent, child = bests.get(region.path[:-1]), bests.get(region.path)
         if region.level is not None and len(region.path) > 1:
             inside = 0.0 if parent is None or child is None else float((parent & child).sum() / child.sum())
@@ -93,22 +93,21 @@ def add_view(
 def region_ious(
     regions: Bool[np.ndarray, "R P"], masks: Bool[np.ndarray, "M P"]
 ) -> Float64[np.ndarray, "R M"]:
-    """IoU of every region with every mask; both may overlap among themselves."""
+    """Return the IoU of every region with every mask; regions and masks may overlap."""
     shared = regions.astype(np.float32) @ masks.T.astype(np.float32)
     union = regions.sum(axis=1)[:, None] + masks.sum(axis=1)[None] - shared
     return np.divide(shared, union, out=np.zeros(shared.shape), where=union > 0)
 
 
 def masks_of_view(folder: Path, view: str) -> dict[Level, np.ndarray]:
-    """The segmenter's masks by level."""
+    """Return the segmenter's masks by level."""
     masks = HierarchicalMasks.load(folder / f"{view}.npz")
     dense = {level: masks.dense(masks.rows_of(level)) for level in LEVELS}
     return {level: each.reshape(len(each), -1) for level, each in dense.items()}
 
 
 def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:
-    """Pixels of which each node makes up more than half, by level; nodes that the view does not show are left
-    out."""
+    """Return, by level, the pixels in which each visible node has more than half of the weight."""
     found = {}
     for level in LEVELS:
         nodes = tree.node_of_gaussian[:, level.index]
@@ -127,7 +126,7 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
 
 
 def share_of(shares: sp.csc_matrix, node: int) -> Float32[np.ndarray, " e"]:
-    """Shares of a node in the pixels that show any of it."""
+    """Return a node's shares in the pixels where it is visible."""
     begin, end = shares.indptr[node : node + 2]
     return shares.data[begin:end]
 
@@ -135,15 +134,15 @@ def share_of(shares: sp.csc_matrix, node: int) -> Float32[np.ndarray, " e"]:
 def run_label_fits(
     folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
 ) -> str:
-    """Write and return a table: masks where the segmenter made some, nodes in all annotated views.
+    """Write and return a table: masks in views that have some, nodes in all annotated views.
 
     Args:
-        folder: of the scene, with `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`.
-        variant: whose masks and tree.
+        folder: scene folder, with `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`.
+        variant: variant of the masks and the tree.
         labels: labels with levels, such as "annotated/photos/desk".
         data_root: folder of the data sets.
-        out: CSV.
-        threads: for rendering.
+        out: output CSV.
+        threads: rendering threads.
 
     Raises:
         SceneError: the labels cannot be read, or do not fit the scene.
@@ -151,7 +150,7 @@ def run_label_fits(
     """
     folder, scene = Path(folder), Scene.load(folder / "scene")
     labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
-    labelled_truths(labelled, scene)  # checks that they fit
+    labelled_truths(labelled, scene)  # raises if they don't fit
     tree, gaussians = (
         SemanticTree.load(folder / variant / "semantic_tree"),
         load_ply(folder / "gaussians.ply"),

@@ -1,4 +1,4 @@
-"""How well the masks of a synthetic scene's views fit the true regions: a diagnostic that no table reads."""
+"""Fit of a synthetic scene's masks to the true regions: a diagnostic that is in no table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class ViewFit:
         ids: true nodes with a region of at least `LEAST_PX`.
         best: IoU of the best mask of each, 0 if there is no mask.
         masks: number of masks.
-        fitting: masks with an IoU of at least 0.5 with some region, however small.
+        fitting: number of masks with an IoU of at least 0.5 with some region of any size.
     """
 
     ids: Int64[np.ndarray, " r"]
@@ -82,7 +82,7 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
         out: PNG to write; a PDF and the table as CSV are written beside it.
 
     Returns:
-        the rows as a Markdown table.
+        The rows as a Markdown table.
 
     Raises:
         ArtifactError: an artifact is missing, or the scene is not synthetic.
@@ -104,7 +104,7 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
 
 
 def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
-    """One level over all views; means over regions, not over views."""
+    """Return the row of one level over all views; means are over regions, not over views."""
     own = [fit[level] for fit in fits.values()]
     best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
     number = sum(fit.masks for fit in own)
@@ -129,7 +129,7 @@ def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Leve
 
 
 def median_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
-    """The view whose mean over all regions is the median, and the one whose mean is lowest."""
+    """Return the views with the median and the lowest mean over all regions."""
 
     def mean_of(view: str) -> float:
         best = np.concatenate([fit.best for fit in fits[view].values()])
@@ -146,7 +146,7 @@ def draw_fits(
     fits: Mapping[str, dict[Level, ViewFit]],
     views: list[str],
 ) -> Figure:
-    """Per view two rows: its masks by level, and below each the true regions coloured by their best IoU."""
+    """Draw two rows per view: its masks by level, and below the true regions coloured by their best IoU."""
     wide = 1 + len(LEVELS)
     example = scene.cameras[views[0]].size_hw if views else (1, 1)
     height_in = 3.1 * example[0] / example[1] + 0.3
@@ -184,7 +184,7 @@ def draw_fits(
 
 
 def paint_fits(image: np.ndarray, labels: np.ndarray, fit: ViewFit) -> np.ndarray:
-    """True regions coloured by the IoU of the best mask, outlined; regions that are not scored stay grey."""
+    """Colour outlined true regions by the IoU of the best mask; unscored regions stay grey."""
     painted = 0.5 * grey(image)
     for node, value in zip(fit.ids, fit.best, strict=True):
         colour = np.array(colormaps[COLOURS](float(value))[:3]) * 255

@@ -1,4 +1,4 @@
-"""How well the 3D semantic tree matches the nodes of a synthetic world, counted in Gaussians."""
+"""Fit of the 3D semantic tree to the nodes of a synthetic world, counted in Gaussians."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -35,11 +35,11 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class TreeMeasure:
-    """One level of a tree against the truth.
+    """Results for one level of a tree.
 
     Attributes:
-        nodes: nodes of the tree at the level.
-        true_nodes: true nodes to which any Gaussian belongs.
+        nodes: number of nodes of the tree at the level.
+        true_nodes: number of true nodes that have any Gaussian.
         precision: share of nodes matched one to one with a true node at IoU 0.5.
         recall: share of true nodes matched.
         mean_iou: mean over true nodes of the matched node's IoU, 0 if unmatched.
@@ -66,8 +66,8 @@ def measure_tree(
 ) -> dict[Level, TreeMeasure]:
     """Compare nodes with true nodes.
 
-    At each level a Gaussian belongs to the true node that gets most of its visible weight, and counts by
-    its weight in labelled pixels.
+    At each level a Gaussian belongs to the true node with most of its visible weight, and is weighted by its
+    total weight in labelled pixels.
 
     Args:
         tree: the semantic tree.
@@ -86,7 +86,7 @@ def measure_tree(
         node_of = tree.node_of_gaussian[:, level.index]
         counted = (true_of != NONE) | (node_of != NONE)
         weight = np.where(mass > 0, mass, 0.0)[counted]
-        # the last row and column mean "no node", so that missed Gaussians count in the unions
+        # The last row and column mean "no node", so that missed Gaussians count in the unions.
         rows = np.where(node_of[counted] == NONE, len(tree), node_of[counted])
         columns = np.where(true_of[counted] == NONE, len(truth.nodes), true_of[counted])
         shape = (len(tree) + 1, len(truth.nodes) + 1)
@@ -133,7 +133,7 @@ def true_votes(
     min_weight: float,
     threads: int,
 ) -> Float[np.ndarray, "N t"]:
-    """Visible weight of each Gaussian in each true node over the views."""
+    """Return the visible weight of each Gaussian in each true node over the views."""
     gaussians = load_ply(gaussians_ply)
     votes = np.zeros((len(gaussians), len(truth.nodes)))
     for view in views:

@@ -1,4 +1,4 @@
-"""Do answers cover the same surface in neighbouring views? Measured on a synthetic scene's exact geometry."""
+"""Consistency of answers on the same surface in neighbouring views, by a synthetic scene's exact geometry."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ from hilsplat.world.mesh import TrueMesh
 
 METHODS = ("field", "tree")
 TEXTS_PER_LEVEL = 4
-"""Texts per level and view, each asked in two views."""
+"""Texts per level and view, each queried in two views."""
 MaskOf = Callable[[str, str, Query], Bool[np.ndarray, "H W"]]
 """(method, view, query) -> answer at the query's level."""
 
@@ -35,17 +35,17 @@ def measure_world_consistency(
     truth: Path,
     settings: EvaluateSettings,
 ) -> Iterator[tuple[str, Measured]]:
-    """Rows of `world/view-consistency`: each annotated view against its nearest neighbour.
+    """Yield the rows of `world/view-consistency`: each annotated view and its nearest neighbour.
 
-    Yields nothing without the true mesh (labels of a photographed scene).
+    Nothing is yielded without the true mesh (labels of a photographed scene).
 
     Args:
         answers: the scene.
-        selections: the nodes it selects.
+        selections: cached selections of its nodes.
         truths: annotated views.
-        answered: answers already given in them (`views.measure_view`).
+        answered: stored answers in them (`views.measure_view`).
         truth: truth folder of a synthetic scene.
-        settings: methods, the map rule.
+        settings: methods and map rule.
     """
     if not (Path(truth) / "mesh.ply").is_file():
         return
@@ -68,7 +68,7 @@ def measure_world_consistency(
 
 
 def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
-    """At most `per_level` texts per level, spread evenly from the largest region to the smallest."""
+    """Return at most `per_level` texts per level, evenly spaced from the largest region to the smallest."""
     chosen = []
     for level in LEVELS:
         same = [query for query in queries if query.level is level]
@@ -86,7 +86,7 @@ def answers_of(
     queries: Sequence[Query],
     settings: EvaluateSettings,
 ) -> MaskOf:
-    """Answers to texts in two views at given levels; most of those in annotated views are already known."""
+    """Return a function for the answers in two views at given levels; stored answers are reused."""
 
     def is_kept(view: str, query: Query) -> bool:
         return view in answered and given_key("field", query, settings) in answered[view]
@@ -118,9 +118,9 @@ def consistency_rows(
     mask_of: MaskOf,
     settings: EvaluateSettings,
 ) -> Iterator[Measured]:
-    """IoU over shared points of the answers in two views.
+    """Yield the IoU over shared points of the answers in two views.
 
-    Texts that neither view answers are left out; `n` is the number of points in the union.
+    Texts with no answer in either view are omitted; `n` is the number of points in the union.
     """
     for method in METHODS:
         if method not in settings.methods:

@@ -21,7 +21,7 @@ from hilsplat.world.mesh import TrueMesh
 logger = logging.getLogger(__name__)
 
 TRUTH = "true regions"
-"""Name of the rows that no masks can beat: those of the labels, whose borders are off by up to a pixel."""
+"""Row name of the labels, an upper limit for any masks: label borders are off by up to a pixel."""
 
 COLUMNS = (
     "scene",
@@ -41,12 +41,12 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     Args:
         truth: truth folder of the scene: true cameras, mesh and labels.
         masks_folder: masks artifact of any segmenter.
-        out: CSV to write, one row per level for the masks and for the true regions, whose rows are the best
-            that the measure allows (pixels at borders).
-        count: neighbours of each view.
+        out: CSV to write, one row per level for the masks and for the true regions, which are the upper limit
+            of the measure (because of pixels at borders).
+        count: number of neighbours of each view.
 
     Returns:
-        the rows as a Markdown table.
+        The rows as a Markdown table.
 
     Raises:
         ArtifactError: a folder is missing or incomplete, or fewer than two views have masks.
@@ -94,7 +94,7 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
 
 
 def true_masks(annotations: HierarchyAnnotations, view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
-    """True regions of a view at a level, surroundings included, one per visible node."""
+    """Return the true regions of a view at a level, one per visible node, including surroundings."""
     labels = annotations.label_image(view, level)
     ids = np.unique(labels[labels >= 0])
     return labels[None] == ids[:, None, None]

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 WIDTH_IN = 13.0
 MOST_COLUMNS = 8
-"""With more methods than this, each is a row of the figure of queries."""
+"""With more methods than this, each is a row instead of a column in the figure of queries."""
 VIEWS = 4
 """Number of views in the figure of one query."""
 
@@ -49,13 +49,13 @@ class Answerer:
     scene: LanguageScene
 
     def masks(self, rows: Sequence[Shown], evaluate: EvaluateSettings) -> list[Bool[np.ndarray, "H W"]]:
-        """Answers to queries in their views, at their levels if they have one."""
+        """Return the answers to queries in their views, at their levels if they have one."""
         if self.method == "tree":
             return [shown.tree_mask(self.scene) for shown in rows]
         rule, asked = rule_of(evaluate), defaultdict[str, list[str]](list)
         for shown in rows:
             asked[shown.view].append(shown.path[-1])
-        maps = {  # all texts of a view at once: a network decodes its pixels at every call
+        maps = {  # all texts of a view together, because a network decodes its pixels at every call
             view: dict(zip(texts, np.asarray(self.scene.field_relevancy(texts, view)), strict=True))
             for view, texts in asked.items()
         }
@@ -83,12 +83,12 @@ def run_comparison(
 
     Args:
         folder: `results/<dataset>/<scene>`, finished under every variant.
-        variants: variants to compare, each with the settings it was evaluated with; "default" answers with
-            its tree and its field, others with their field.
+        variants: variants to compare, each with the settings it was evaluated with; "default" has rows for
+            its tree and its field, others for their field.
         names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
-        settings: how much is shown.
-        evaluate: which regions count as true, and how maps become masks.
+        settings: number of queries and views.
+        evaluate: settings for true regions and for converting maps to masks.
         truth: truth folder of a synthetic scene.
         labels: labels of a published data set instead, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
@@ -123,7 +123,7 @@ def run_comparison(
 
 
 def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[str, LanguageScene]:
-    """Open variants of a scene with the settings each was evaluated with; what they share is opened once."""
+    """Open variants of a scene with their own evaluation settings; shared files are opened once."""
     opened, scenes = Opened(), {}
     for variant in variants:
         found = FinishedScene.locate(folder, variant)
@@ -135,9 +135,9 @@ def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[s
 def over_views(
     scene: Scene, rows: Sequence[Shown], truths: Mapping[str, Callable[[], ViewTruth]], count: int = VIEWS
 ) -> list[Shown]:
-    """One query in several views: the first part or subpart shown, else the first query.
+    """Return one query in several views: the first part or subpart in `rows`, else the first query.
 
-    Views with a known truth come first, in their order; then others, spread over the scene.
+    Views with a known truth come first, in order; then others, evenly spaced over the scene.
     """
     if not rows:
         return []
@@ -159,9 +159,9 @@ def over_views(
 
 
 def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
-    """One row per query, one column per method, or the other way round if there are many methods.
+    """Draw one row per query and one column per method, transposed if there are many methods.
 
-    The truth is outlined, and the IoU in the title.
+    The truth is outlined, and the IoU is in the title.
     """
     first = methods[0].scene
     scene = first.scene
@@ -191,7 +191,7 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
 
 
 def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
-    """One row per method, one column per view: does a method give the same answer from every side?"""
+    """Draw one row per method, one column per view, to compare a method's answers across views."""
     first = methods[0].scene
     scene = first.scene
     asked = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
@@ -211,7 +211,7 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
 
 
 def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
-    """One row per method, one column per level; a tree shows its nodes as colours."""
+    """Draw one row per method, one column per level; trees are drawn as coloured nodes."""
     scene = methods[0].scene.scene
     figure, grid = _grid(scene, len(methods), len(LEVELS) + 1, f"{scene.name}: features at three levels")
     for axes, method in zip(grid, methods, strict=True):
@@ -250,7 +250,7 @@ def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
 def _grid(
     scene: Scene, rows: int, columns: int, title: str, width_in: float = WIDTH_IN
 ) -> tuple[Figure, np.ndarray]:
-    """An empty grid for pictures of the scene's shape, without ticks."""
+    """Return an empty grid without ticks, for pictures with the scene's aspect ratio."""
     height, width = scene.cameras[scene.cameras.names[0]].size_hw
     row_in = width_in / columns * height / width + 0.18
     figure = Figure(figsize=(width_in, rows * row_in + 0.4), layout="constrained")

@@ -1,4 +1,4 @@
-"""The panel of a scene: photograph, masks, field, and what queries answer."""
+"""The panel of a scene: photograph, masks, field, and answers to queries."""
 
 import logging
 import shutil
@@ -64,15 +64,15 @@ class Shown:
     truth: Bool[np.ndarray, "H W"] | None
 
     def hits(self, answers: LanguageScene, *, by_path: bool = False) -> NodeHits:
-        """The tree's answer to the text alone, or to the whole path.
+        """Return the tree's answer to the text alone, or to the whole path.
 
-        A query without an annotated level is asked as written.
+        A query without an annotated level is used as written.
         """
         own = self.level is None or by_path
         return answers.select(self.path if own else self.path[-1:], level=self.level, view=self.view)
 
     def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
-        """Mask of the tree's answer in the view."""
+        """Return the mask of the tree's answer in the view."""
         return answers.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
 
 
@@ -89,15 +89,15 @@ def run_figures(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the panel; copy the pictures of poses and fit beside it.
+    """Draw the panel, and copy the pictures of poses and fit beside it.
 
     Args:
         parts: the finished scene.
         out: PNG to write; `registration.png` and `fit.png` are copied into its folder.
-        settings: how much is shown.
-        evaluate: how answers are made.
+        settings: number of queries and views.
+        evaluate: settings of the answers.
         fit: report folder of the fit; None copies nothing.
-        truth: annotations of a synthetic scene; they name the queries.
+        truth: annotations of a synthetic scene, which define the queries.
         labels: labels of a published data set instead, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
         queries: texts to show if there is neither truth nor labels.
@@ -115,7 +115,7 @@ def run_figures(
 
 
 def copy_picture(source: Path, out: Path) -> None:
-    """Copy a file; the copy is whole or absent."""
+    """Copy a file atomically."""
     with atomic_path(out) as temporary:
         shutil.copyfile(source, temporary)
 
@@ -123,14 +123,14 @@ def copy_picture(source: Path, out: Path) -> None:
 def truths_of(
     scene: Scene, truth: Path | None, labels: str, data_root: Path, evaluate: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """True regions in the views of a scene; empty if it has neither annotations nor labels."""
+    """Return the true regions in the views of a scene; empty if it has neither annotations nor labels."""
     if labels:
         return labelled_truths(open_labelled(labels, data_root), scene)
     return annotated_truths(truth, scene, evaluate.min_region_px) if truth is not None else {}
 
 
 def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:
-    """Texts of each level, from large to small regions, in the annotated views that show them best.
+    """Return texts of each level, from large to small regions, in the annotated views where they are largest.
 
     Labels without levels form one group.
     """
@@ -156,7 +156,7 @@ def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: Figu
 
 
 def free_rows(answers: LanguageScene, queries: Sequence[str], settings: FiguresSettings) -> list[Shown]:
-    """Given texts, each in the views that show its best node largest."""
+    """Return the given texts, each in the views where its best node is largest."""
     rows = []
     for text in queries:
         hits = answers.query(text, limit=1)
@@ -169,7 +169,7 @@ def free_rows(answers: LanguageScene, queries: Sequence[str], settings: FiguresS
 def draw_panel(
     answers: LanguageScene, masks_folder: Path, rows: Sequence[Shown], evaluate: EvaluateSettings
 ) -> Figure:
-    """Masks of a training view, the field in a held-out view, then one row per query."""
+    """Draw masks of a training view, the field in a held-out view, then one row per query."""
     scene = answers.scene
     index = read_index(masks_folder)
     masked = next(iter(index["views"]))
@@ -217,10 +217,10 @@ def draw_queries(
     evaluate: EvaluateSettings,
     columns: int,
 ) -> None:
-    """One row per query: truth, answers of tree and field, relevancy of the field at the three levels.
+    """Draw one row per query: truth, answers of tree and field, field relevancy at three levels.
 
-    Titles give IoU with the truth and the highest relevancy; the level that answered is framed. A ring marks
-    the localization point of the field.
+    Titles contain the IoU with the truth and the highest relevancy; the level of the answer is framed. A
+    ring marks the field's localization point.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)

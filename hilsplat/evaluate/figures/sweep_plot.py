@@ -14,12 +14,12 @@ from hilsplat.query.pictures import save_png_and_pdf
 KNOBS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
 DEFAULTS = {"theta": 0.9, "omega": 10.0}
-"""Values of the default variant, whose row does not name one."""
+"""Values of the default variant, which its row doesn't state."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: (value of the knob, percentage) pairs, sorted by the knob."""
+    """One curve: (setting, percentage) pairs, sorted by the setting."""
 
     kind: str
     column: str
@@ -27,13 +27,13 @@ class Line:
 
 
 def run_sweep_plot(name: str, table: Path, out: Path, default: float | None = None) -> None:
-    """Draw a sweep as PNG and PDF: the paper's curves beside ours, each kind in its own panel.
+    """Draw a sweep as PNG and PDF: the paper's curves and ours, each kind in its own panel.
 
     Args:
         name: "theta" or "omega".
         table: the finished CSV of that table.
         out: PNG; the PDF is written beside it.
-        default: value of the rows that do not name one: that of the default variant.
+        default: value for rows that don't state one; by default that of the default variant.
 
     Raises:
         ArtifactError: the sweep is unknown, or the table is missing.
@@ -45,7 +45,7 @@ def run_sweep_plot(name: str, table: Path, out: Path, default: float | None = No
 
 
 def read_lines(table: Path, default: float) -> list[Line]:
-    """Curves of a table: one per kind of row and column with at least two values."""
+    """Return the curves of a table: one per kind of row and column with at least two values."""
     try:
         with Path(table).open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream))
@@ -66,7 +66,7 @@ def read_lines(table: Path, default: float) -> list[Line]:
 
 
 def draw_sweep(name: str, lines: Sequence[Line]) -> Figure:
-    """One panel per kind of row; axes are not shared because the kinds are not comparable."""
+    """Draw one panel per kind of row; axes are not shared because the kinds are not comparable."""
     kinds = list(dict.fromkeys(line.kind for line in lines)) or ["reported"]
     figure = Figure(figsize=(4.6 * len(kinds), 3.4), layout="constrained")
     for axes, kind in zip(figure.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):

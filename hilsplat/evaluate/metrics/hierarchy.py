@@ -1,4 +1,4 @@
-"""Hierarchical consistency (HC): do predicted parts lie in predicted wholes?"""
+"""Hierarchical consistency (HC): whether predicted parts are inside predicted wholes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class Family:
     Attributes:
         parent: prediction for the parent's text.
         children: predictions for the children's texts, at least one.
-        true_parent: the annotated region of the parent; `anchored` needs it.
+        true_parent: the annotated region of the parent, used by `anchored`.
     """
 
     parent: Bool[np.ndarray, "H W"]
@@ -27,12 +27,12 @@ class Family:
 
 
 def children_consistency(family: Family, reading: Reading) -> list[float]:
-    """One term per child of a parent.
+    """Return one term per child of a parent.
 
     `containment`: area(p and c) / area(c), the paper's wording; 1 for perfect nesting.
     `literal`: area(p and c) / area(p), the printed symbols with l = 1 the whole.
-    `anchored`: area(c and true p) / area(c); predicting the whole image does not fool it.
-    An empty denominator (nothing was predicted) gives 0.
+    `anchored`: area(c and true p) / area(c), which doesn't reward predicting the whole image.
+    An empty denominator (no prediction) gives 0.
     """
     anchor = family.true_parent if reading == "anchored" else family.parent
     terms = []
@@ -45,27 +45,26 @@ def children_consistency(family: Family, reading: Reading) -> list[float]:
 def hierarchical_consistency(
     transitions: Sequence[Sequence[Family]], reading: Reading = "containment", pooled: bool = False
 ) -> float:
-    """HC of one view (paper, Sec. IV, Eq. 7). Averaging: children of a parent, parents of a level, levels.
+    """Return the HC of one view (paper, Sec. IV, Eq. 7), averaged over children, parents and levels in turn.
 
-    Every parent weighs the same, however many children it has: one child inside its parent and three
+    Every parent has the same weight, whatever its number of children: one child inside its parent and three
     outside another give (1 + 0) / 2 = 0.5. The mean over children alone is `consistency_per_child`: 0.25.
     A scene's value is the mean over its views with at least one parent; then scenes are averaged.
 
-    Departs: the printed normaliser uses N_l outside the sum over l, where it is not defined; here
-    it is the mean over the parents of each level, then over the L - 1 transitions. A transition
-    without parents contributes 0, as max(N_l, 1) implies: where a view shows no subparts, even perfect
-    nesting scores 0.5.
+    Departs: the printed normaliser uses N_l outside the sum over l, where it is undefined; here it is the
+    mean over the parents of each level, then over the L - 1 transitions. A transition without parents
+    contributes 0, as max(N_l, 1) implies: in a view without subparts, even perfect nesting scores 0.5.
 
     Args:
         transitions: families per level of the parent: wholes first, then parts.
         reading: see `children_consistency`.
-        pooled: mean over all parents of all levels instead.
+        pooled: whether to average over all parents of all levels at once instead.
     """
     return mean_over_parents(consistency_of_families(transitions, reading), pooled)
 
 
 def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Reading) -> list[list[float]]:
-    """Score of every parent, the mean over its children, per level of the parent."""
+    """Return the score of every parent, the mean over its children, per level of the parent."""
     return [
         [float(np.mean(children_consistency(family, reading))) for family in families]
         for families in transitions
@@ -73,7 +72,7 @@ def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Re
 
 
 def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
-    """Containment with every child of a level weighing the same, then the mean over levels.
+    """Return containment averaged over all children of a level, then over levels.
 
     As in `hierarchical_consistency`, a transition without parents contributes 0.
     """
@@ -86,7 +85,7 @@ def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
 
 
 def mean_over_parents(scores: Sequence[Sequence[float]], pooled: bool = False) -> float:
-    """Mean over the scores of each level and then over the levels, or over all at once."""
+    """Return the mean over parents per level and then over levels, or over all parents at once."""
     if pooled:
         every = [score for level in scores for score in level]
         return float(np.mean(every)) if every else 0.0

@@ -1,9 +1,9 @@
 """Instance segmentation of points: AP, AP50 and AP25 of the ScanNet benchmark.
 
 Source: OpenMask3D's copy of ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`.
-The integration of the curve follows that code, quirks included. Predictions are matched in the order given;
-the order of ScanNet's own script is that of a dict, which Python 2 leaves undefined. OpenMask3D gives every
-prediction of ScanNet200 the confidence 1.
+The integration of the curve follows that code, including its quirks. Predictions are matched in the order
+given; ScanNet's own script uses the order of a dict, which is undefined in Python 2. OpenMask3D assigns every
+ScanNet200 prediction the confidence 1.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from jaxtyping import Bool, Float, Float64, Int, Int64
 from hilsplat.base.errors import MisalignedArtifactError
 
 OVERLAPS: tuple[float, ...] = (*np.arange(0.5, 0.95, 0.05).tolist(), 0.25)
-"""IoU thresholds: nine from 0.50 to 0.90 (0.95 is not among them), then 0.25."""
+"""IoU thresholds: nine from 0.50 to 0.90 (without 0.95), then 0.25."""
 
 CLASS_STRIDE = 1000
-"""A vertex of class c and instance i carries c * 1000 + i; smaller values mean no object."""
+"""A vertex of class c and instance i has the value c * 1000 + i; smaller values mean no object."""
 
 MIN_POINTS = 100
-"""Smaller instances and predictions are left out."""
+"""Smaller instances and predictions are ignored."""
 
 
 @dataclass(frozen=True)
@@ -29,32 +29,32 @@ class InstanceScan:
     """Truth and predictions of one scan.
 
     Attributes:
-        truth: per point class * 1000 + instance; a value below 1000, or of a class that is not evaluated,
-            is void.
+        truth: per point class * 1000 + instance; values below 1000 or of a class that is not evaluated are
+            void.
         masks: predicted instances over the same points; they may overlap.
         classes: class id of each prediction.
-        confidences: higher is more certain; one value for all if the method has none.
+        confidences: confidence of each prediction; a constant if the method has none.
     """
 
     truth: Int[np.ndarray, " P"]
-    masks: Bool[np.ndarray, "M Q"]  # Q = P, which is checked
+    masks: Bool[np.ndarray, "M Q"]  # Q = P, checked below
     classes: Int[np.ndarray, " M"]
     confidences: Float[np.ndarray, " M"]
 
 
 @dataclass(frozen=True)
 class InstanceMatches:
-    """What one scan adds to the precision-recall curves of K classes at T thresholds.
+    """Contribution of one scan to the precision-recall curves of K classes at T thresholds.
 
-    Scans are matched one by one but their curves are drawn together, so matches are stored in between.
+    Scans are matched one by one, but curves are computed over all scans, so matches are stored in between.
 
     Attributes:
-        class_index: entries of the curves: class, 0 .. K - 1.
-        overlap_index: their threshold, 0 .. T - 1.
-        confidence: their confidence.
+        class_index: class of each curve entry, 0 .. K - 1.
+        overlap_index: threshold of each entry, 0 .. T - 1.
+        confidence: confidence of each entry.
         is_match: True for a match, False for a false positive.
-        misses: true instances that nothing matched.
-        has_truth: whether the scan has an instance of the class that is large enough.
+        misses: number of unmatched true instances.
+        has_truth: whether the scan has a sufficiently large instance of the class.
     """
 
     class_index: Int64[np.ndarray, " E"]
@@ -71,10 +71,10 @@ def match_instances(
     """Match predictions to true instances, per class and threshold.
 
     Instances are visited in order. Each unused prediction of the class that overlaps an instance by more
-    than the threshold matches it; of several, the most confident stays the match and every other one is a
-    false positive with the lower confidence. Only the first match of an instance marks its prediction as
-    used. A prediction that overlaps no true instance enough is a false positive, unless the share of its
-    points in void or in instances that are too small exceeds the threshold.
+    than the threshold matches it. If there are several, the most confident remains the match and each other
+    one is a false positive with the lower confidence. Only the first match of an instance marks its
+    prediction as used. A prediction without sufficient overlap with any true instance is a false positive,
+    unless the share of its points in void or in instances that are too small exceeds the threshold.
 
     Raises:
         MisalignedArtifactError: masks and truth have different numbers of points.
@@ -131,7 +131,7 @@ def _matches(
     is_ignored: Bool[np.ndarray, " M"],
     confidence: Float64[np.ndarray, " M"],
 ) -> tuple[list[tuple[float, bool]], int]:
-    """(confidence, is it a match) of one class at one threshold, and the number of missed instances."""
+    """Return (confidence, is match) entries of one class at one threshold, and the number of misses."""
     used = np.zeros(len(fits), dtype=bool)
     entries, missed = [], 0
     for instance in np.flatnonzero(large):
@@ -150,12 +150,12 @@ def _matches(
 
 
 def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, " E"], misses: int) -> float:
-    """Area under one precision-recall curve, as the benchmark integrates it.
+    """Return the area under one precision-recall curve, integrated as in the benchmark.
 
-    For each distinct confidence s, precision P and recall R count the entries of at least s; recall
-    misses the matches below s and the instances that nothing matched. The point (1, 0) ends the curve.
-    The area is the sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last; there is no
-    interpolation envelope. Without entries the area is 0.
+    For each distinct confidence s, precision P and recall R are computed from the entries with at least s;
+    matches below s and unmatched instances reduce recall. The point (1, 0) ends the curve. The area is the
+    sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last, without an interpolation
+    envelope. Without entries the area is 0.
     """
     if not len(confidence):
         return 0.0
@@ -172,7 +172,7 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
 
 
 def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "K T"]:
-    """Average precision per class and threshold of all scans together.
+    """Return the average precision per class and threshold over all scans.
 
     nan for a class without a true instance in any scan; 0 if it has instances but no prediction.
     """
@@ -193,17 +193,17 @@ def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "
 
 
 def ap(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Mean over the nine thresholds 0.50 .. 0.90 and the classes that have true instances."""
+    """Return the mean over the nine thresholds 0.50 .. 0.90 and the classes with true instances."""
     return _mean_of(precisions[:, :-1])
 
 
 def ap50(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Mean over the classes that have true instances, at an IoU above 0.5."""
+    """Return the mean over the classes with true instances, at an IoU above 0.5."""
     return _mean_of(precisions[:, :1])
 
 
 def ap25(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Mean over the classes that have true instances, at an IoU above 0.25."""
+    """Return the mean over the classes with true instances, at an IoU above 0.25."""
     return _mean_of(precisions[:, -1:])
 
 

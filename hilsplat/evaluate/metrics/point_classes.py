@@ -1,8 +1,8 @@
 """Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
 
 Labels are 1 .. K; 0 means none: ignored in the truth, a miss in the prediction. All benchmarks share the
-counts of a class and its IoU; they differ in which counts are added up first (those of one scene or of all)
-and in which classes are averaged; the functions are named after that.
+counts and IoU of a class. They differ in which counts are summed first (those of one scene or of all) and in
+which classes are averaged; the functions are named accordingly.
 """
 
 from collections.abc import Iterable
@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float, Int, Int64
 
 @dataclass(frozen=True)
 class ClassCounts:
-    """Points per class, over all points whose truth is not 0.
+    """Points per class, over all points with a true label.
 
     Attributes:
         hits: points of the class predicted as such.
-        truth: points of the class; those predicted 0 are among them.
+        truth: points of the class, including those predicted 0.
         predicted: points predicted as the class.
     """
 
@@ -31,7 +31,7 @@ class ClassCounts:
     def of(
         truth: Int[np.ndarray, " P"], prediction: Int[np.ndarray, " P"], num_classes: int
     ) -> "ClassCounts":
-        """Count points; predictions on points whose truth is 0 are ignored.
+        """Count points; predictions at points with truth 0 are ignored.
 
         Args:
             truth: labels 0 .. K.
@@ -49,7 +49,7 @@ class ClassCounts:
         return ClassCounts(per_class(truth[truth == prediction]), per_class(truth), per_class(prediction))
 
     def __add__(self, other: "ClassCounts") -> "ClassCounts":
-        """Counts of both point sets together."""
+        """Return the counts of both point sets together."""
         sums = (getattr(self, each.name) + getattr(other, each.name) for each in fields(self))
         return ClassCounts(*sums)
 
@@ -60,69 +60,69 @@ class ClassCounts:
 
 
 def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
-    """Counts of all scenes added up: a large scene weighs more, unlike in a mean over scenes."""
+    """Sum the counts of all scenes; unlike in a mean over scenes, a large scene has more weight."""
     return reduce(ClassCounts.__add__, counts)
 
 
 def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """TP / (TP + FP + FN) per class; nan if the class is neither in truth nor prediction."""
+    """Return TP / (TP + FP + FN) per class; nan if the class is neither in truth nor prediction."""
     return _ratio(counts.hits, counts.union)
 
 
 def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """TP / (TP + FN) per class; nan if the truth lacks the class."""
+    """Return TP / (TP + FN) per class; nan if the truth lacks the class."""
     return _ratio(counts.hits, counts.truth)
 
 
 def miou_over_present(counts: ClassCounts) -> float:
-    """Mean IoU over the classes of the truth; nan if it has none.
+    """Return the mean IoU over the classes of the truth; nan if it has none.
 
-    A wrong prediction of an absent class hurts only the true class. Source: yanmin-wu/OpenGaussian
+    A wrong prediction of an absent class lowers only the true class's IoU. Source: yanmin-wu/OpenGaussian
     `scripts/eval_scannet.py`, per scene.
     """
     return _mean(class_iou(counts)[counts.truth > 0])
 
 
 def macc_over_present(counts: ClassCounts) -> float:
-    """Mean accuracy over the classes of the truth; nan if it has none (OpenGaussian, per scene)."""
+    """Return the mean accuracy over the classes of the truth, else nan (OpenGaussian, per scene)."""
     return _mean(class_accuracy(counts)[counts.truth > 0])
 
 
 def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | None = None) -> float:
-    """Mean IoU over the classes of truth or prediction; nan if there is none.
+    """Return the mean IoU over the classes of truth or prediction; nan if there is none.
 
-    A class that is only predicted counts 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
+    A class that is only predicted counts as 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
     over all scans.
 
     Args:
-        counts: of all scans.
-        among: classes to take the mean of, such as the head, common or tail of ScanNet200.
+        counts: counts of all scans.
+        among: classes to average, such as the head, common or tail of ScanNet200.
     """
     ious = class_iou(counts)
     return _mean(ious[(counts.union > 0) & (True if among is None else among)])
 
 
 def miou_over_all(counts: ClassCounts) -> float:
-    """Mean IoU over all K classes; a class that occurs nowhere counts 0 (OpenNeRF)."""
+    """Return the mean IoU over all K classes; a class that doesn't occur counts as 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_iou(counts), nan=0.0))
 
 
 def macc_over_all(counts: ClassCounts) -> float:
-    """Mean accuracy over all K classes; a class without truth counts 0 (OpenNeRF)."""
+    """Return the mean accuracy over all K classes; a class without truth counts as 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
 
 
 def miou_absent_as_one(counts: ClassCounts) -> float:
-    """Mean IoU over all K classes; a class that occurs nowhere counts 1 (Waymo).
+    """Return the mean IoU over all K classes; a class that doesn't occur counts as 1 (Waymo).
 
-    Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. It flatters subsets
-    that lack classes; report `miou_over_present` beside it.
+    Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. The value is inflated for
+    subsets that lack classes; report `miou_over_present` beside it.
     """
     return _mean(np.nan_to_num(class_iou(counts), nan=1.0))
 
 
 def frequency_weighted_iou(counts: ClassCounts) -> float:
-    """Mean IoU over the classes of the truth, weighted by their points; nan if it has none."""
+    """Return the mean IoU over the classes of the truth, weighted by their points; nan if it has none."""
     points = counts.truth.sum()
     if not points:
         return float("nan")

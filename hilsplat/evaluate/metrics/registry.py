@@ -1,4 +1,4 @@
-"""Every metric that a row of `scores.csv` may carry."""
+"""Metrics allowed in rows of `scores.csv`."""
 
 from dataclasses import dataclass
 from math import isfinite
@@ -6,15 +6,15 @@ from math import isfinite
 
 @dataclass(frozen=True)
 class Metric:
-    """What a metric's value means.
+    """Properties of a metric.
 
     Attributes:
         function: module and name of the function that computes it, under `hilsplat.evaluate.metrics`.
-        symmetric: exchanging prediction and truth leaves it unchanged.
+        symmetric: whether exchanging prediction and truth leaves it unchanged.
         bounds: smallest and largest value.
-        averaging: how values of one scene become one number, before scenes are averaged.
+        averaging: how the values of one scene are combined, before scenes are averaged.
         perfect: value of a prediction that equals the truth; None if that depends on the truth.
-        uses_truth_to_choose: a diagnostic that sees the truth before it answers.
+        uses_truth_to_choose: whether it is a diagnostic in which the truth determines the answer.
     """
 
     function: str

@@ -1,4 +1,4 @@
-"""From relevancy maps of three levels to one mask: the rules of LangSplat and its successors.
+"""Rules of LangSplat and its successors that turn relevancy maps of three levels into one mask.
 
 Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from hilsplat.base.levels import LEVELS, Level
 
 MAJORITY_REACH_PX = 3
-"""Pixels from the middle of the majority window to its sides: 7 x 7."""
+"""Distance from the centre of the majority window to its sides, px; the window is 7 x 7."""
 
 ThresholdOn = Literal["normalised_pm1", "raw"]
 LevelRule = Literal["max", "mean_in_mask"]
@@ -23,25 +23,24 @@ Border = Literal["langsplat", "inside"]
 
 @dataclass(frozen=True)
 class RelevancyRule:
-    """How a map becomes a mask, and which level's mask is taken. The defaults are LangSplat's code.
+    """How a map becomes a mask, and which level's mask is used. The defaults are LangSplat's code.
 
     Attributes:
-        filter_px: side of the mean filter. LangSplat's code has 30 at an image height of 730, its
-            text and the paper say 20. 0 scales 30 with the height of the map.
+        filter_px: side of the mean filter. LangSplat's code uses 30 at an image height of 730, its text and
+            the paper state 20. 0 scales 30 with the height of the map.
         mix: average the filtered map with the map itself.
-        threshold: what the scores must exceed.
+        threshold: threshold that the scores must exceed.
         threshold_on: `normalised_pm1`: min-max mapped to [-1, 1], clipped at 0, so that 0.4 means
             min-max above 0.7; `raw`: the relevancy itself.
         majority: smooth the mask with the 7 x 7 majority filter.
-        level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the
-            highest mean inside its own mask (LangSplat's text on 3D-OVS). Ties go to the finest level, as
+        level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the highest
+            mean inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because
             LangSplat stacks its levels from fine to coarse.
-        border: windows at the border. `langsplat`: the mean filter reflects, the majority filter
-            never looks at the last row and column; `inside`: both average the part of the window inside the
-            image (LangSplatV2).
-        levels: levels among which one is chosen (LangSplatV2 on 3D-OVS: whole and part).
+        border: windows at the border. `langsplat`: the mean filter reflects, the majority filter ignores the
+            last row and column; `inside`: both average the part of the window inside the image (LangSplatV2).
+        levels: candidate levels (LangSplatV2 on 3D-OVS: whole and part).
         empty_wins: under `mean_in_mask`, a level with an empty mask is chosen (LangSplatV2 on 3D-OVS: its
-            mean is NaN, which torch's argmax prefers); otherwise it comes last.
+            mean is NaN, which torch's argmax prefers); otherwise it is chosen last.
     """
 
     filter_px: int = 0
@@ -55,7 +54,7 @@ class RelevancyRule:
     empty_wins: bool = False
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
-        """Differences from another rule in a few words each, as protocol names carry them."""
+        """Return brief descriptions of the differences from another rule, for protocol names."""
         words = {
             "filter_px": f"filter {self.filter_px}" if self.filter_px else "filter scaled",
             "mix": "mix" if self.mix else "no mix",
@@ -76,18 +75,18 @@ class RelevancyRule:
 
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
-    """Side of the mean filter; 0 means 30 px at a height of 730 px, scaled, at least 1."""
+    """Return the side of the mean filter; 0 means 30 px at a height of 730 px, scaled, at least 1."""
     return filter_px or max(1, round(30 * height_px / 730))
 
 
 def mean_filter(
     relevancy: Float[np.ndarray, "H W"], side_px: int, border: Border = "langsplat"
 ) -> Float32[np.ndarray, "H W"]:
-    """Mean over a square window.
+    """Average over a square window.
 
-    `langsplat`: as OpenCV does by default. Borders are reflected without repeating the edge pixel,
-    and the anchor of an even window is right of its middle: for side 30, output y averages rows
-    y - 15 .. y + 14. `inside`: the mean over those pixels of the window that lie in the image.
+    `langsplat`: OpenCV's default. Borders are reflected without repeating the edge pixel, and the anchor of
+    an even window is right of its centre: for side 30, output y averages rows y - 15 .. y + 14. `inside`: the
+    mean over those pixels of the window that are in the image.
     """
     import cv2
 
@@ -104,7 +103,7 @@ def mean_filter(
 def threshold_mask(
     relevancy: Float[np.ndarray, "H W"], threshold: float = 0.4, on: ThresholdOn = "normalised_pm1"
 ) -> Bool[np.ndarray, "H W"]:
-    """Pixels above the threshold. A constant map gives an empty mask unless `on` is `raw`."""
+    """Return the pixels above the threshold. A constant map gives an empty mask unless `on` is `raw`."""
     if on == "raw":
         return relevancy > threshold
     shifted = relevancy - relevancy.min()
@@ -113,11 +112,11 @@ def threshold_mask(
 
 
 def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat") -> Bool[np.ndarray, "H W"]:
-    """Each pixel becomes the most frequent value of its 7 x 7 window; a tie gives False.
+    """Set each pixel to the most frequent value of its 7 x 7 window; a tie gives False.
 
-    `langsplat`: the window is rows max(0, i - 3) .. min(i + 4, h - 1) - 1 and columns likewise, as its
-    code slices it: the last row and column are never looked at, so the filter is not symmetric near
-    the lower and right edges. `inside`: the part of the window that lies in the image.
+    `langsplat`: the window is rows max(0, i - 3) .. min(i + 4, h - 1) - 1 and the corresponding columns, as
+    sliced in its code: the last row and column are never used, so the filter is asymmetric near the lower and
+    right edges. `inside`: the part of the window that is in the image.
     """
     seen, count = _majority_windows(mask.shape, border)
     return 2 * _ones_in_windows(mask.view(np.uint8) & seen) > count
@@ -127,7 +126,7 @@ def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat")
 def _majority_windows(
     shape: tuple[int, int], border: Border
 ) -> tuple[UInt8[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
-    """Pixels that are looked at, and how many of them each window has."""
+    """Return the pixels used, and the number of them in each window."""
     seen = np.ones(shape, np.uint8)
     if border == "langsplat":
         seen[-1, :] = seen[:, -1] = 0
@@ -135,7 +134,7 @@ def _majority_windows(
 
 
 def _ones_in_windows(ones: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
-    """How many of the at most 49 pixels of a majority window are 1."""
+    """Count the ones among the at most 49 pixels of each majority window."""
     import cv2
 
     side_hw = (2 * MAJORITY_REACH_PX + 1,) * 2
@@ -147,8 +146,8 @@ class SmoothedRelevancy:
     """Relevancy of one query in one view at three levels, with its filtered forms.
 
     Attributes:
-        filtered: mean-filtered maps; localization reads these.
-        mixed: source of the masks: the mean of map and filtered map, or the map itself.
+        filtered: mean-filtered maps, used for localization.
+        mixed: maps used for masks: the mean of map and filtered map, or the map itself.
     """
 
     filtered: Float32[np.ndarray, "3 H W"]
@@ -175,14 +174,14 @@ def relevancy_mask(
     rule: RelevancyRule,
     united: Float[np.ndarray, "3 H W"] | None = None,
 ) -> tuple[Bool[np.ndarray, "H W"], Level]:
-    """The mask of a level, or of the level that the rule chooses if `level` is None.
+    """Return the mask of a level, or of the level that the rule chooses if `level` is None.
 
     Args:
         smoothed: relevancy of a text.
-        level: level to answer at.
-        rule: how.
-        united: unfiltered relevancy of another text, whose mask is united with this one's before the
-            majority filter; levels are compared by the first text alone.
+        level: level of the answer.
+        rule: the rule.
+        united: unfiltered relevancy of another text, whose mask is merged with this one's before the majority
+            filter; the level is chosen by the first text alone.
     """
 
     def mask_of(level: Level) -> np.ndarray:
@@ -209,7 +208,7 @@ def level_by_mean_in_mask(
     levels: tuple[Level, ...] = LEVELS,
     empty_wins: bool = False,
 ) -> Level:
-    """The level whose mean relevancy inside its own mask is highest; an empty mask comes last, or wins."""
+    """Return the level with the highest mean relevancy inside its own mask; an empty one is last, or wins."""
     empty = np.inf if empty_wins else -np.inf
     means = [
         float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else empty
@@ -219,5 +218,5 @@ def level_by_mean_in_mask(
 
 
 def _highest(levels: Sequence[Level], scores: Sequence[float]) -> Level:
-    """The level of the highest score; of equal ones, the finest."""
+    """Return the level with the highest score; the finest wins ties."""
     return max(zip(scores, levels, strict=True), key=lambda each: (each[0], each[1].index))[1]

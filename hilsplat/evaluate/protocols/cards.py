@@ -1,9 +1,9 @@
-"""Every protocol: its name, its version, and everything that decides a number under it.
+"""Protocols: name, version and everything that determines a number measured under them.
 
-A number without its protocol is not a result: the same model scores 51.4 under `lerf/langsplat` and 9.66
+A number is meaningless without its protocol: the same model scores 51.4 under `lerf/langsplat` and 9.66
 under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@2`, followed
-in brackets by whatever its settings change: `lerf/langsplat@2 (filter 20, raw)`. A change in what a card
-decides needs a new version; a test checks that.
+by any deviating settings in brackets: `lerf/langsplat@2 (filter 20, raw)`. A change to a card that affects
+its numbers requires a new version; a test checks this.
 """
 
 from collections.abc import Iterable
@@ -15,38 +15,38 @@ from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.relevancy_rule import RelevancyRule
 
 CANONICAL: tuple[str, ...] = ("object", "things", "stuff", "texture")
-"""Canonical phrases of every protocol that reads a relevancy (LERF, LangSplat)."""
+"""Canonical phrases of every protocol that uses relevancy (LERF, LangSplat)."""
 
 RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""A node answers a text if its cosine margin is within 1 - NODE_SELECT of the range of the level's margins
-below that of the best node in the view, or within three times that if it looks like the best.
+"""A node answers a text if its cosine margin is below that of the best node in the view by at most
+1 - NODE_SELECT of the range of margins at its level, or three times that if their cosine is at least 0.9.
 
 Version 1 of `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` used 0.85 of the range of the
 relevancies themselves. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency`,
-looks did not count, and nodes of the whole scene competed in every view. Up to version 4 of `lerf/tree-nodes`
-and `hierarchy/level-auto`, and 1 of the protocols after LangSplat, equal levels went to the coarsest."""
+that cosine was ignored, and all nodes of the scene competed in every view. Up to version 4 of
+`lerf/tree-nodes` and `hierarchy/level-auto`, and 1 of LangSplat's variants, the coarsest level won ties."""
 
 ANCESTORS = 0.2
 """Share of the mean margin of a node's ancestors that is added to its own, except on paths; version 2 of
 `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` added nothing."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
-"""How rows become a table's number.
+"""How rows are averaged to a number in a table.
 
 pairs: mean over the (view, query) pairs of a scene, then over scenes.
 classes: mean over the views of a query, then over the queries of a scene, then over scenes.
-levels: as pairs for each level; Avg is the mean of the levels.
+levels: as `pairs` for each level; Avg is the mean of the levels.
 views: mean over the views of a scene, then over scenes.
 scenes: one number per scene, mean over scenes.
-pooled: counts of all scenes are added first, so scenes weigh by their points.
+pooled: counts of all scenes are summed first, so each scene is weighted by its number of points.
 """
 
 
 Missing = Literal["zero", "left out"]
-"""A (view, query) pair without a prediction: it counts 0, or is dropped, which flatters a method."""
+"""Whether a (view, query) pair without a prediction counts as 0 or is omitted, which inflates the score."""
 
 
 @dataclass(frozen=True)
@@ -55,18 +55,18 @@ class ProtocolCard:
 
     Attributes:
         name: `benchmark/variant`.
-        version: raised when anything below changes what a number means.
-        metrics: keys of `METRICS` that its rows carry.
+        version: incremented when a change below affects the numbers.
+        metrics: keys of `METRICS` for which it has rows.
         averaging: see `Averaging`.
         selection: how a prediction is chosen, threshold and level, in words.
-        source: what it follows, and where it departs from that. Begins with "none" if no public code has it.
+        source: origin and departures from it. Begins with "none" if there is no public code.
         rule: how relevancy maps become masks, if they do.
         missing: see `Missing`.
-        classes: name of the `ClassSet` that is queried, if it is fixed.
-        truth: `labels`: the region that the data set defines; `any grey`: every pixel of its mask file that
-            is not black, if it has one.
-        united: text -> another text; the masks of both, united, answer the first.
-        public: the public function that it equals to rounding, apart from what `source` says it departs in:
+        classes: name of the queried `ClassSet`, if it is fixed.
+        truth: `labels`: the region that the data set defines; `any grey`: all non-black pixels of its mask
+            file, if it has one.
+        united: text -> second text; the answer to the first is the union of both masks.
+        public: public function with the same results up to rounding, except for the departures in `source`:
             `owner/repository@commit file`, with `:function` where the file has several; "" if there is none.
     """
 
@@ -85,11 +85,11 @@ class ProtocolCard:
 
     @property
     def full_name(self) -> str:
-        """Name with version."""
+        """Name and version."""
         return f"{self.name}@{self.version}"
 
     def labelled(self, departures: Iterable[str] = ()) -> str:
-        """The name in a row: the full name, then what its settings change."""
+        """Return the name used in rows: the full name and any deviating settings."""
         words = ", ".join(departures)
         return f"{self.full_name} ({words})" if words else self.full_name
 
@@ -266,7 +266,7 @@ OVS_LANGSPLAT_V2 = ProtocolCard(
 def _maps(
     name: str, source: str, selection: str, metrics: tuple[str, ...], public: str = "", **rule
 ) -> ProtocolCard:
-    """A protocol that differs from LangSplat's in its rule."""
+    """Return a protocol that differs from LangSplat's only in its rule."""
     return ProtocolCard(name, 2, metrics, "pairs", selection, source, RelevancyRule(**rule), public=public)
 
 
@@ -278,12 +278,12 @@ def _points(
     averaging: Averaging = "scenes",
     public: str = "",
 ) -> ProtocolCard:
-    """A protocol of points."""
+    """Return a protocol that scores points."""
     return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes, public=public)
 
 
 def card_named(name: str) -> ProtocolCard:
-    """The protocol `benchmark/variant` in its current version.
+    """Return the current version of the protocol `benchmark/variant`.
 
     Raises:
         ArtifactError: no protocol has that name.
@@ -407,7 +407,7 @@ PROTOCOLS: dict[str, ProtocolCard] = {card.full_name: card for card in CARDS}
 
 
 def card_of(label: str) -> ProtocolCard:
-    """The protocol that a row names, whatever its settings change.
+    """Return the protocol that a row names, ignoring deviating settings.
 
     Raises:
         ArtifactError: no protocol has that name and version.

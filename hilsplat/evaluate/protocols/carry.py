@@ -1,14 +1,14 @@
-"""Carry what Gaussians know to the points that a benchmark labels: mesh vertices, lidar returns.
+"""Transfer labels and features from Gaussians to labelled points: mesh vertices and lidar returns.
 
-| mode | a point gets |
+| mode | source of a point's label or feature |
 |---|---|
 | `frozen` | its own Gaussian, fitted without moving (OpenGaussian); transparent ones are not scored |
 | `nearest` | the nearest Gaussian that is opaque enough |
-| `vote` | the vote of the k nearest within a radius, weighted by opacity; nothing beyond the radius |
+| `vote` | a vote of the k nearest within a radius, weighted by opacity; none beyond the radius |
 | `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
 
-The numbers differ by mode, so every row names its mode. Between Gaussians at equal distances the search
-tree decides, always in the same way for the same input and any number of threads.
+The numbers depend on the mode, so every row names it. Among equidistant Gaussians the search tree chooses,
+deterministically for the same input and any number of threads.
 """
 
 from dataclasses import dataclass
@@ -23,21 +23,21 @@ from hilsplat.base.rotations import rotation_matrices
 Mode = Literal["frozen", "nearest", "vote", "density"]
 
 OPACITY_MIN = 0.1
-"""Gaussians below this are transparent: OpenGaussian leaves them out of the evaluation."""
+"""Gaussians below this opacity are transparent; OpenGaussian excludes them from the evaluation."""
 
 CHUNK_POINTS = 65536
-"""Points processed at once; bounds the memory."""
+"""Number of points processed at once; bounds memory use."""
 
 
 @dataclass(frozen=True)
 class CarriedPoints:
-    """Which Gaussians speak for each of P points, and with what weight.
+    """Gaussians assigned to each of P points, with weights.
 
     Attributes:
-        mode: its name in rows, with departures from the defaults.
-        index: Gaussians of each point; without meaning if the weight is 0.
-        weight: weight of each, not negative, summing to 1; all 0 if no Gaussian speaks for the point.
-        is_scored: False for points that the mode leaves out of the evaluation.
+        mode: name used in rows, with departures from the defaults.
+        index: Gaussians of each point; undefined where the weight is 0.
+        weight: non-negative weights that sum to 1; all 0 if no Gaussian is assigned to the point.
+        is_scored: False for points that the mode excludes from the evaluation.
     """
 
     mode: str
@@ -46,9 +46,9 @@ class CarriedPoints:
     is_scored: Bool[np.ndarray, " P"]
 
     def labels(self, of_gaussian: Int[np.ndarray, " N"]) -> Int32[np.ndarray, " P"]:
-        """The label with the largest weight among a point's Gaussians; ties go to the smallest.
+        """Return the label with the largest total weight among each point's Gaussians; the lowest wins ties.
 
-        Label 0 means none and has no vote; a point whose Gaussians have no label gets 0.
+        Label 0 means none and has no vote; a point whose Gaussians are unlabelled gets 0.
         """
         result = np.zeros(len(self.index), dtype=np.int32)
         for rows in _chunks(len(self.index)):
@@ -57,32 +57,32 @@ class CarriedPoints:
             same = labels[:, :, None] == labels[:, None, :]
             votes = (same * weight[:, None, :]).sum(axis=2)
             best = votes.max(axis=1)
-            # Sums of the same numbers in another order may differ in the last bits.
+            # Sums of the same numbers in different order may differ in the last bits.
             ties = (votes >= best[:, None] * (1 - 1e-12)) & (weight > 0)
             winner = np.where(ties, labels, np.iinfo(np.int32).max).min(axis=1)
             result[rows] = np.where(best > 0, winner, 0)
         return result
 
     def features(self, of_gaussian: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "P D"]:
-        """Weighted mean of the Gaussians' features; zeros if no Gaussian speaks for the point."""
+        """Return the weighted mean of the Gaussians' features; zeros for points without Gaussians."""
         result = np.zeros((len(self.index), of_gaussian.shape[1]), dtype=of_gaussian.dtype)
         for rows in _chunks(len(self.index)):
             result[rows] = np.einsum("pk,pkd->pd", self.weight[rows], of_gaussian[self.index[rows]])
         return result
 
     def truth(self, labels: Int[np.ndarray, " P"]) -> Int[np.ndarray, " P"]:
-        """The truth with 0 (ignored) at points that the mode leaves out of the evaluation."""
+        """Return the labels, set to 0 (ignored) at points that the mode excludes from the evaluation."""
         return np.where(self.is_scored, labels, 0).astype(labels.dtype)
 
 
 def frozen(opacities: Float[np.ndarray, " N"], num_points: int) -> CarriedPoints:
-    """Gaussian i is point i: the fit neither moved, split nor dropped any.
+    """Assign Gaussian i to point i; the fit must not have moved, split or dropped any Gaussian.
 
-    Points whose Gaussian has an opacity below 0.1 are not scored (yanmin-wu/OpenGaussian
-    `scripts/eval_scannet.py` sets their truth to 0).
+    Points whose Gaussian has an opacity below 0.1 are not scored: yanmin-wu/OpenGaussian
+    `scripts/eval_scannet.py` sets their truth to 0.
 
     Raises:
-        MisalignedArtifactError: there are more or fewer Gaussians than points.
+        MisalignedArtifactError: the numbers of Gaussians and points differ.
     """
     if len(opacities) != num_points:
         raise MisalignedArtifactError(
@@ -101,7 +101,7 @@ def nearest(
     opacities: Float[np.ndarray, " N"],
     threads: int = 1,
 ) -> CarriedPoints:
-    """The nearest Gaussian with an opacity of at least 0.1, however far.
+    """Assign the nearest Gaussian with an opacity of at least 0.1, at any distance.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
@@ -118,17 +118,17 @@ def vote(
     k: int = 5,
     threads: int = 1,
 ) -> CarriedPoints:
-    """The k nearest Gaussians of opacity at least 0.1 within a radius, weighted by opacity.
+    """Assign the k nearest Gaussians of opacity at least 0.1 within a radius, weighted by opacity.
 
-    A point without any has no prediction, which counts as a miss.
+    A point without such a Gaussian has no prediction, which counts as a miss.
 
     Args:
         points: labelled points, scene units.
-        means: centres of the Gaussians, scene units.
+        means: Gaussian centres, scene units.
         opacities: peak alphas.
         radius: scene units; 0.1 is 10 cm if the unit is a metre.
-        k: neighbours.
-        threads: threads of the search; they change only the time.
+        k: number of neighbours.
+        threads: search threads.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
@@ -149,20 +149,20 @@ def density(
     k: int = 8,
     threads: int = 1,
 ) -> CarriedPoints:
-    """The k nearest Gaussians, weighted by opacity * exp(-d**2 / 2) with d the Mahalanobis distance.
+    """Assign the k nearest Gaussians, weighted by opacity * exp(-d**2 / 2), d the Mahalanobis distance.
 
-    This is the alpha that each has at the point, as 3DGS blends it. Candidates are the nearest centres:
-    a large Gaussian whose centre is far has no weight. Far from all Gaussians the relative weights still
-    decide, so that every point has a prediction.
+    This weight is the alpha that 3DGS blends at the point. Candidates are the nearest centres, so a large
+    Gaussian with a distant centre has no weight. Relative weights are used even far from all Gaussians, so
+    every point has a prediction.
 
     Args:
         points: labelled points, scene units.
-        means: centres of the Gaussians, scene units.
-        opacities: peak alphas; below 0.1 a Gaussian is not a candidate.
+        means: Gaussian centres, scene units.
+        opacities: peak alphas; Gaussians below 0.1 are not candidates.
         scales: standard deviations along the axes, scene units.
         quats: world-from-Gaussian rotation, wxyz, any non-zero length.
-        k: neighbours.
-        threads: threads of the search; they change only the time.
+        k: number of neighbours.
+        threads: search threads.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
@@ -181,19 +181,19 @@ def density(
 
 
 def argmax_labels(scores: Float[np.ndarray, "P K"]) -> Int32[np.ndarray, " P"]:
-    """Labels 1 .. K of the largest score (cosine or relevancy); ties go to the first class.
+    """Return the label 1 .. K of the largest score (cosine or relevancy) per row; the first class wins ties.
 
-    A row that is all zero has no feature and gets 0, a miss. OpenGaussian's argmax gives such points its
+    An all-zero row has no feature and gets 0, a miss. OpenGaussian's argmax assigns such points to its
     first class, wall.
     """
     return np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0).astype(np.int32)
 
 
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:
-    """Labels 1 .. K by the largest cosine with the class texts: no canonical phrases, no "other".
+    """Return labels 1 .. K by the largest cosine with the class texts: no canonical phrases, no "other".
 
     Args:
-        features: of points or Gaussians, any length; zeros mean none and give 0.
+        features: features of points or Gaussians, any length; an all-zero feature gives 0.
         texts: unit vectors.
     """
     # A feature's length does not change which cosine is largest.
@@ -204,7 +204,7 @@ def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]
 def _neighbours(
     points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Index (P, k) and distance (P, k) of the nearest opaque Gaussians; infinite if missing."""
+    """Return index (P, k) and distance (P, k) of the nearest opaque Gaussians; infinite if missing."""
     opaque = np.flatnonzero(opacities >= OPACITY_MIN)
     if not opaque.size:
         raise MisalignedArtifactError(
@@ -213,10 +213,10 @@ def _neighbours(
             found=f"{len(opacities)} Gaussians below",
             fix="look at gaussians.ply; the fit has probably failed",
         )
-    from scipy.spatial import cKDTree  # takes 0.2 s, and only points need it
+    from scipy.spatial import cKDTree  # importing takes 0.2 s and is needed only for points
 
     tree = cKDTree(means[opaque].astype(float))
-    # The radius itself counts as within.
+    # The radius is inclusive.
     bound = np.nextafter(radius, np.inf)
     distance, place = tree.query(
         points.astype(float), k=np.arange(1, k + 1), distance_upper_bound=bound, workers=threads
@@ -226,7 +226,7 @@ def _neighbours(
 
 
 def _gaussian_from_world(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Matrices (N, 3, 3) that turn an offset from the centre into standard deviations."""
+    """Return matrices (N, 3, 3) that map an offset from the centre to standard deviations."""
     return rotation_matrices(quats).transpose(0, 2, 1) / scales.astype(float)[:, :, None]
 
 

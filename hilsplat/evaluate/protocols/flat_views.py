@@ -1,8 +1,8 @@
-"""Protocols of images without levels, scored beside LangSplat's: 3D-OVS, LERF-Mask, other rules for maps.
+"""Protocols for images without levels, scored beside LangSplat's: 3D-OVS, LERF-Mask and other map rules.
 
-They read the relevancy maps that `views.measure_view` renders anyway, and plain cosines. On a stand-in with
-levels only the texts of whole objects are asked, because those benchmarks do not name parts; the names of the
-protocols then carry `wholes`.
+They use plain cosines and the relevancy maps that `views.measure_view` renders anyway. On a stand-in with
+levels, only texts of whole objects are queried, because those benchmarks do not name parts; the protocol
+names then include `wholes`.
 """
 
 import functools
@@ -38,12 +38,12 @@ MASKS = (LERF_MASK, LERF_MASK_SKIPPING)
 
 
 class FlatProtocols:
-    """Scores one view under further protocols while its texts are answered one by one.
+    """Scores one view under further protocols, one text at a time.
 
     Args:
-        cards: protocols with a rule for maps, those of LERF-Mask, and the nodes and the argmax of 3D-OVS.
-        level: only texts of this level are asked; None for data without levels.
-        words: what the settings change in the relevancy, for the protocols' names.
+        cards: protocols with a map rule, LERF-Mask's protocols, and 3D-OVS by nodes and by argmax.
+        level: only texts of this level are queried; None for data without levels.
+        words: settings that change the relevancy, for the protocol names.
     """
 
     def __init__(self, cards: Sequence[ProtocolCard], level: Level | None, words: Sequence[str] = ()) -> None:
@@ -61,16 +61,16 @@ class FlatProtocols:
         queries: Sequence[Query],
         maps: ViewMaps,
     ) -> Iterator[Measured]:
-        """Rows of one text by one method.
+        """Yield the rows of one text and method.
 
         Args:
             method: "field" or "tree".
-            relevancy: its maps.
-            nodes_mask: the tree's own answer, for LERF-Mask and `3d-ovs/tree-nodes`; None: LERF-Mask takes
-                the map's mask.
-            category: the text with all levels united.
-            queries: the same per level.
-            maps: what the method's maps say of further texts.
+            relevancy: the text's relevancy maps.
+            nodes_mask: the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`; if None, LERF-Mask uses the
+                mask from the relevancy maps.
+            category: the text, merged over levels.
+            queries: the text at each level.
+            maps: the method's maps of any text.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
@@ -79,7 +79,7 @@ class FlatProtocols:
 
         @functools.cache
         def smoothed_by(filter_px: int, mix: bool, border: Border) -> SmoothedRelevancy:
-            """Most rules smooth alike, and that takes longer than the rest of them."""
+            """Smooth once for all rules with the same filter, because it takes most of the time."""
             return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
 
         def smoothed_for(rule: RelevancyRule) -> SmoothedRelevancy:
@@ -89,7 +89,7 @@ class FlatProtocols:
             label = card.labelled(self.words)
             region = flat.any_grey_region if card.truth == "any grey" else flat.truth
             if not region.any() or (card is OVS_NODES and nodes_mask is None):
-                continue  # the view doesn't show it; a field has no nodes
+                continue  # not visible in the view, or a field, which has no nodes
             if card in (*MASKS, OVS_NODES):
                 mask = nodes_mask
                 if mask is None:
@@ -110,14 +110,14 @@ class FlatProtocols:
             self._queries[flat.text] = flat
 
     def finish(self) -> Iterator[Measured]:
-        """Rows that need all texts of the view: 3D-OVS by argmax over texts and levels."""
-        texts = sorted(self._queries)  # ties go to the first
+        """Yield the rows that need all texts of the view: 3D-OVS by argmax over texts and levels."""
+        texts = sorted(self._queries)  # the first wins ties
         if not texts:
             return
         rows, columns, truth = eighth_truth([self._queries[text] for text in texts])
         asked = np.full(truth.shape[1:], True)
         words = ["best level", *self.words]
-        if self.level is not None:  # the surroundings of the objects have no text
+        if self.level is not None:  # pixels around the objects have no text
             words = ["labelled pixels", *words]
             asked &= truth.any(axis=0)
         width = self._queries[texts[0]].truth.shape[1]
@@ -133,7 +133,7 @@ class FlatProtocols:
 def eighth_truth(
     queries: Sequence[Query],
 ) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"], Bool[np.ndarray, "K h w"]]:
-    """Rows and columns of a prediction at an eighth of the image's size, and the queries' regions there."""
+    """Return rows, columns and the queries' regions of a prediction at an eighth of the image's size."""
     size_hw, small = queries[0].truth.shape, queries[0].eighth
     rows, columns = kept_by_pillow(size_hw, eighth_of(size_hw) if small is None else small.shape)
     masks = [

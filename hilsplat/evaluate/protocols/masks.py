@@ -1,4 +1,4 @@
-"""Score masks or class maps that a method supplies: LERF-Mask, LERF-OVS in 3D, 3D-OVS by argmax."""
+"""Score masks or class maps supplied by a method: LERF-Mask, LERF-OVS in 3D, 3D-OVS by argmax."""
 
 import difflib
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -18,29 +18,29 @@ MASK_METRICS = {
     "acc_25": lambda prediction, truth: exceeds(prediction, truth, 0.25),
     "acc_50": lambda prediction, truth: exceeds(prediction, truth, 0.5),
 }
-"""Metrics of one mask against one region."""
+"""Metrics that compare one mask with one region."""
 
 
 def measure_masks(
     card: ProtocolCard,
     method: str,
-    predictions: Mapping[str, Bool[np.ndarray, "h w"] | None],  # h = H and w = W, which is checked
+    predictions: Mapping[str, Bool[np.ndarray, "h w"] | None],  # h = H and w = W, checked below
     truths: Mapping[str, Bool[np.ndarray, "H W"]],
     queries: Collection[str] | None = None,
 ) -> Iterator[Measured]:
-    """Rows of one view, one per text of the truth and metric.
+    """Yield the rows of one view, one per metric and text of the truth.
 
     Args:
-        card: such as `lerf-mask/gaussian-grouping`; decides the metrics and what a missing prediction counts.
-        method: what made the masks.
-        predictions: mask per text, at the size of the truth; a text that is absent or None has no
-            prediction. Texts that the truth of this view lacks are ignored.
+        card: such as `lerf-mask/gaussian-grouping`; determines the metrics and how missing predictions count.
+        method: name of the method.
+        predictions: text -> mask of the truth's size; a text that is absent or None has no prediction. Texts
+            that the truth of this view lacks are ignored.
         truths: true region per text.
-        queries: all texts asked in any view of the scene; a prediction for another text is refused, because
-            a misspelt text would silently count 0. None skips the check.
+        queries: all texts queried in any view of the scene; predictions for other texts raise an error,
+            because a misspelt text would silently count as 0. None skips the check.
 
     Raises:
-        MisalignedArtifactError: a prediction differs in size from its truth, or is for an unknown query.
+        MisalignedArtifactError: a prediction's size differs from its truth's, or its query is unknown.
     """
     for text in predictions:
         if queries is not None and text not in queries:
@@ -65,17 +65,17 @@ def measure_masks(
 
 def measure_class_maps(
     method: str,
-    similarity: Float[np.ndarray, "k h w"] | None,  # of the truth's shape, which is checked
+    similarity: Float[np.ndarray, "k h w"] | None,  # same shape as truth, checked below
     truth: Bool[np.ndarray, "K H W"],
     texts: Sequence[str],
 ) -> Iterator[Measured]:
-    """Rows of one view under `3d-ovs/argmax`: the IoU of each class, the accuracy of the pixels.
+    """Yield the rows of one view under `3d-ovs/argmax`: IoU of each class and pixel accuracy.
 
     Args:
-        method: what made the maps.
+        method: name of the method.
         similarity: cosine of each pixel with each text; None if the view has no prediction.
         truth: one mask per text.
-        texts: sorted, because ties go to the first.
+        texts: sorted, because the first wins ties.
 
     Raises:
         MisalignedArtifactError: maps and truth differ in size or number.

@@ -1,11 +1,11 @@
-"""One number, before the scene and the variant are known."""
+"""One measured number."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One number before scene and variant are known."""
+    """One number, without the scene and variant that it belongs to."""
 
     method: str
     query: str

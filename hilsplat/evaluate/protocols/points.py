@@ -1,7 +1,6 @@
 """Score classes and instances of points: ScanNet, ScanNet200, Replica, Waymo.
 
-Predictions per point may come from any source; `carry` brings those of Gaussians to points, and every row
-names its mode.
+Predictions may have any source; `carry` transfers those of Gaussians to points. Every row names the mode.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -38,11 +37,11 @@ MEANS: dict[str, Callable[[ClassCounts], float]] = {
     "miou_absent_as_one": miou_absent_as_one,
     "frequency_weighted_iou": frequency_weighted_iou,
 }
-"""Metrics that give one number per scene, or one for all scenes if a protocol pools."""
+"""Metrics with one number per scene, or one for all scenes under a pooled protocol."""
 
 
 def point_label(card: ProtocolCard, carried: str) -> str:
-    """Protocol of a row, with how predictions came to the points."""
+    """Return the protocol name of a row, including how predictions were transferred to points."""
     return card.labelled([f"points: {carried}"])
 
 
@@ -50,21 +49,21 @@ def measure_points(
     card: ProtocolCard,
     method: str,
     truth: Int[np.ndarray, " P"],
-    prediction: Int[np.ndarray, " Q"] | None,  # Q = P, which is checked
+    prediction: Int[np.ndarray, " Q"] | None,  # Q = P, checked below
     classes: ClassSet,
     carried: str,
 ) -> Iterator[Measured]:
-    """Rows of one scene: IoU and accuracy of each class, and the scene's means if the card has them.
+    """Yield the rows of one scene: IoU and accuracy per class, and the scene's means if the card has them.
 
-    `n` of a class row is the number of points its value is a share of, so that `pooled_points` can add
-    scenes up. A class that is neither in truth nor prediction has no row; without any truth there is none.
+    In a class row, `n` is the number of points in the denominator, so that `pooled_points` can pool scenes.
+    Classes absent from truth and prediction have no row; a scene without truth has no rows.
 
     Args:
-        card: a protocol of points; its classes are `classes`.
-        method: what answered.
+        card: a point protocol; its classes are `classes`.
+        method: name of the method.
         truth: labels 1 .. K in the order of `classes`; 0 is ignored.
-        prediction: the same; 0 is a miss. None if the scene has no prediction: all 0.
-        classes: what was queried.
+        prediction: labels as in `truth`, 0 for a miss; None if the scene has no prediction (all 0).
+        classes: the queried classes.
         carried: mode of `carry.CarriedPoints`, or another way by which predictions reached the points.
 
     Raises:
@@ -102,12 +101,12 @@ def measure_points(
 def pooled_points(
     card: ProtocolCard, scenes: Iterable[Sequence[Measured]], classes: ClassSet
 ) -> dict[str, float]:
-    """The means of a pooled protocol from the class rows of all scenes.
+    """Return the means of a pooled protocol from the class rows of all scenes.
 
     Args:
-        card: its metrics are computed.
-        scenes: rows of each scene, of one method.
-        classes: what was queried.
+        card: protocol whose metrics are computed.
+        scenes: rows of each scene, from one method.
+        classes: the queried classes.
     """
     counts = pooled(_counts_of(rows, classes) for rows in scenes)
     means = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
@@ -118,7 +117,7 @@ def pooled_points(
 
 
 def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
-    """Counts from class rows. Values carry six decimals in a file: exact up to a million points per class."""
+    """Return counts from class rows, exact up to 10**6 points per class because files keep six decimals."""
     hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
     place = {text: row for row, text in enumerate(classes.texts)}
     for row in rows:
@@ -133,10 +132,10 @@ def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
 def measure_instances(
     method: str, scans: Mapping[str, InstanceMatches], carried: str, card: ProtocolCard = INSTANCES
 ) -> Iterator[Measured]:
-    """AP, AP50 and AP25 of all scans together, and AP of each split; `n` is the number of scans.
+    """Yield AP, AP50 and AP25 over all scans, and AP of each split; `n` is the number of scans.
 
-    Include scans without predictions: their instances are misses. Yields nothing if no scan has an instance
-    of any class.
+    Scans without predictions must be included: their instances are misses. Nothing is yielded if no scan has
+    an instance of any class.
     """
     precisions = average_precision(list(scans.values()))
     if np.isnan(precisions).all():

@@ -1,9 +1,9 @@
-"""Ask a scene for the classes of labelled points: ScanNet, Replica, Waymo and their stand-ins.
+"""Query a scene for the classes of labelled points: ScanNet, Replica, Waymo and synthetic stand-ins.
 
 | method | class of a point |
 |---|---|
-| `tree` | that of the node its Gaussian belongs to at level whole: the class text of the highest cosine |
-| `field` | that of the latent carried to the point at level whole, decoded |
+| `tree` | the class text with the highest cosine to the node of its Gaussian at level whole |
+| `field` | the class text with the highest cosine to the latent transferred to the point at level whole |
 
 Instances (ScanNet200) are the tree's nodes at level whole; a field has none.
 """
@@ -25,10 +25,10 @@ from hilsplat.evaluate.protocols.points import measure_points
 from hilsplat.query.language_scene import LanguageScene
 
 VOTE_RADIUS_M = 0.1
-"""OpenGaussian-like votes come from Gaussians within 10 cm."""
+"""Radius of votes; 10 cm."""
 
 LEVEL = Level.WHOLE
-"""Classes of these data sets are things and surfaces, not parts."""
+"""The classes of these data sets are things and surfaces, not parts."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class PointAnswers:
     """A scene's answers at given points.
 
     Attributes:
-        scene: what answers.
-        carried: which Gaussians speak for the points.
+        scene: the queried scene.
+        carried: Gaussians assigned to the points.
     """
 
     scene: LanguageScene
@@ -51,14 +51,14 @@ class PointAnswers:
         scene_units_per_metre: float,
         threads: int = 1,
     ) -> "PointAnswers":
-        """Carry the scene's Gaussians to points (`carry`).
+        """Assign the scene's Gaussians to points (`carry`).
 
         Args:
-            scene: what answers.
+            scene: the queried scene.
             points: positions, scene units.
-            mode: how predictions come to points.
-            scene_units_per_metre: for the radius of a vote.
-            threads: threads of the search.
+            mode: how Gaussians are assigned to points.
+            scene_units_per_metre: scales the radius of a vote.
+            threads: search threads.
         """
         gaussians = scene.gaussians
         means, opacities = (gaussians.means, gaussians.opacities)
@@ -75,7 +75,7 @@ class PointAnswers:
         return PointAnswers(scene, carried)
 
     def classes(self, method: str, texts: Sequence[str]) -> Int32[np.ndarray, " P"]:
-        """Labels 1 .. K of the points; 0 if no Gaussian speaks for a point."""
+        """Return labels 1 .. K of the points; 0 if no Gaussian is assigned to a point."""
         vectors = self.scene.text_vectors(texts)
         if method == "tree":
             node = self.scene.tree.node_of_gaussian[:, LEVEL.index]
@@ -92,7 +92,7 @@ class PointAnswers:
         return labels
 
     def instances(self, truth: LabelledPoints, classes: ClassSet) -> InstanceMatches:
-        """Match the nodes at level whole, each with its best class and that cosine as confidence."""
+        """Match the nodes at level whole to the truth; a node's best cosine gives class and confidence."""
         tree = self.scene.tree
         nodes = tree.nodes_of(LEVEL)
         cosines = tree.clip[nodes].astype(np.float32) @ self.scene.text_vectors(classes.texts).T
@@ -114,7 +114,7 @@ def instance_scan(
     class_ids: Int[np.ndarray, " M"],
     confidences: Float[np.ndarray, " M"],
 ) -> InstanceMatches:
-    """Match predicted instances, with class ids as in the data set's files, to the labelled ones."""
+    """Match predicted instances, with class ids as in the data set's files, to the labelled instances."""
     labels = classes.labels(truth.class_id)
     ids = np.array([0, *classes.ids])[labels]
     of_points = np.where(labels > 0, ids * CLASS_STRIDE + truth.instance_id, 0).astype(np.int64)
@@ -122,7 +122,7 @@ def instance_scan(
 
 
 def class_set(name: str) -> tuple[str, ClassSet]:
-    """Labelling and set of classes by the set's name."""
+    """Return the labelling and the class set with the given name."""
     for labelling, sets in LABELLINGS.items():
         for classes in sets:
             if classes.name == name:
@@ -139,20 +139,20 @@ def measure_scene_points(
     mode: carry.Mode,
     threads: int = 1,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Rows of one scene under protocols of points, and the matches of its instances by method.
+    """Yield the rows of one scene under point protocols, and the instance matches of each method.
 
     Args:
-        scene: what answers.
+        scene: the queried scene.
         truth: labelled points by labelling, metres.
-        scene_from_points: similarity from their frame to the scene's.
-        cards: protocols of points; those whose labelling is absent are skipped.
-        methods: "tree" and "field"; others have no answer at points.
+        scene_from_points: similarity transform from their frame to the scene's.
+        cards: point protocols; those whose labelling is absent are skipped.
+        methods: "tree" and "field"; other methods don't label points.
         mode: see `carry`.
-        threads: threads of the search for neighbours.
+        threads: search threads.
     """
     scale = float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
     answers: dict[int, PointAnswers] = {}  # labellings of a mesh share its vertices
-    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # and protocols their classes
+    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # protocols share classes
     for card in cards:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:

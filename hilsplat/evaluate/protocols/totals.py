@@ -1,7 +1,7 @@
-"""From rows of scores to the number in a table, in the averaging order that their protocol states.
+"""Average rows of scores to a number in a table, in the averaging order of their protocol.
 
-Rows are those of `scores.csv` as a frame (`evaluate.scores.read_scores`). A pair without a prediction has a
-row of value 0 unless its protocol leaves such pairs out.
+Rows are a frame of `scores.csv` (`evaluate.scores.read_scores`). A pair without a prediction has a row with
+value 0 unless its protocol omits such pairs.
 """
 
 from collections.abc import Iterable
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) -> "pd.Series":
-    """One number per scene, by its name; scenes without a row are left out.
+    """Return one number per scene, by name; scenes without a row are omitted.
 
-    It is the mean over the scene's rows; under a protocol of `classes`, the mean over the views of each
-    query, then over queries.
+    The number is the mean over the scene's rows; under a protocol with averaging `classes`, the mean over
+    the views of each query, then over queries.
 
     Args:
-        rows: of one table row, so of one averaging order.
-        metric: rows of other metrics are left out.
-        level: rows of other levels are left out; None keeps all.
+        rows: rows of one table row, which share an averaging order.
+        metric: rows of other metrics are ignored.
+        level: rows of other levels are ignored; None keeps all.
     """
     kept = rows[rows["metric"] == metric]
     if level is not None:
@@ -38,33 +38,33 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
 
 
 def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
-    """Mean of the scenes' numbers, each of the same weight whatever its rows; nan without a row."""
+    """Return the unweighted mean of the scenes' numbers; nan without a row."""
     return float(scene_values(rows, metric, level).mean())
 
 
 def share_above(rows: "pd.DataFrame", metric: str, threshold: float) -> float:
-    """Share of rows above a threshold, such as Acc@0.25, averaged as the values themselves are."""
+    """Return the share of rows above a threshold, such as Acc@0.25, averaged as the values themselves are."""
     return table_value(rows.assign(value=(rows["value"] > threshold).astype(float)), metric)
 
 
 def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:
-    """The number of each level, L1 to L3; nan for a level without a row."""
+    """Return the number of each level, L1 to L3; nan for a level without a row."""
     return {level: table_value(rows, metric, level.label) for level in LEVELS}
 
 
 def mean_over_levels(values: Iterable[float]) -> float:
-    """Plain mean of the levels that have a number: the column Avg; nan if none has."""
+    """Return the mean of the levels that have a number (column Avg); nan if none has."""
     present = [value for value in values if value == value]
     return sum(present) / len(present) if present else float("nan")
 
 
 def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
-    """One number per scene over all seeds: mean over the rows of a level, over levels, then over seeds.
+    """Return one number per scene: mean over the rows of a level, then over levels, then over seeds.
 
-    It pairs two table rows by scene.
+    Used to pair two table rows by scene.
 
     Args:
-        rows: with seeds in their own column (`tables.measured.with_seeds`).
+        rows: rows with a seed column (`tables.measured.with_seeds`).
     """
     kept = rows[rows["metric"] == metric]
     of_level = kept.groupby(["scene", "seed", "level"], sort=True)["value"].mean()

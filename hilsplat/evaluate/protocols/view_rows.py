@@ -1,4 +1,4 @@
-"""Scores of one answer in one view."""
+"""Rows of one answer in one view."""
 
 from collections.abc import Iterator, Sequence
 
@@ -20,12 +20,12 @@ def mask_rows(
     points_xy: np.ndarray,
     metrics: Sequence[str] = LERF_LANGSPLAT.metrics,
 ) -> Iterator[Measured]:
-    """IoU, boundary IoU and localization of one answer.
+    """Yield IoU, boundary IoU and localization of one answer.
 
     Args:
-        method: what answered.
-        query: what was asked, with its truth.
-        protocol: full name, with departures.
+        method: name of the method.
+        query: the query, with its truth.
+        protocol: full name, with deviating settings.
         mask: the answer.
         points_xy: pixels of the highest relevancy.
         metrics: metrics to compute.

@@ -1,4 +1,4 @@
-"""The truth of one view: the queries that are scored there and their regions."""
+"""The truth of one view: its scored queries and their regions."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.metrics.localization import box_of
 
 EIGHTH = 8
-"""3D-OVS compares at an eighth of the image's size."""
+"""3D-OVS compares masks at an eighth of the image's size."""
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,13 @@ class Query:
     """One annotated text in one view.
 
     Attributes:
-        text: what is asked.
-        level: level of its annotation; None if the protocol unites levels.
-        paths: chains of texts that lead to its nodes, each once.
+        text: query text.
+        level: level of its annotation; None if merged over levels.
+        paths: distinct chains of texts that lead to its nodes.
         truth: true region.
         boxes_xyxy: box of each annotated node, borders included.
-        any_grey: true region of protocols that take any grey of a mask file; None: the same as `truth`.
-        eighth: true region at an eighth of the image's size, straight from the label; None: from `truth`.
+        any_grey: true region for protocols with truth `any grey`; None if it equals `truth`.
+        eighth: true region at an eighth of the image's size, read from the label; None: from `truth`.
     """
 
     text: str
@@ -41,7 +41,7 @@ class Query:
 
     @property
     def any_grey_region(self) -> Bool[np.ndarray, "H W"]:
-        """True region of protocols that take any grey."""
+        """True region for protocols with truth `any grey`."""
         return self.truth if self.any_grey is None else self.any_grey
 
 
@@ -51,10 +51,10 @@ class ViewTruth:
 
     Attributes:
         queries: one per (text, level).
-        categories: one per text, levels united.
+        categories: one query per text, merged over levels.
         regions: true region of each path that is large enough.
-        absent: texts that the labels list although the view doesn't show them. They compete in an argmax,
-            and protocols that take any grey may find a region.
+        absent: texts that the labels list but the view doesn't show. They compete in an argmax, and protocols
+            with truth `any grey` may find a region.
     """
 
     queries: tuple[Query, ...]
@@ -66,7 +66,7 @@ class ViewTruth:
     def of(
         annotations: HierarchyAnnotations, view: str, size_hw: tuple[int, int], min_px: int
     ) -> "ViewTruth":
-        """Collect the regions of at least `min_px` pixels.
+        """Collect the annotated regions of at least `min_px` pixels.
 
         Raises:
             MisalignedArtifactError: label images and camera differ in size.
@@ -103,15 +103,15 @@ class ViewTruth:
     def of_regions(
         regions: Iterable[LabelledRegion], size_hw: tuple[int, int], image_hw: tuple[int, int] | None = None
     ) -> "ViewTruth":
-        """Truth of a view of a published data set, with or without levels.
+        """Return the truth of a view of a published data set, with or without levels.
 
-        Regions of one text and level are united; all their boxes are kept. A region whose chain of parents is
-        broken is queried but belongs to no family.
+        Regions of one text and level are merged, keeping all their boxes. A region with a broken chain of
+        parents is queried but belongs to no family.
 
         Args:
             regions: the labels of the view.
             size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
-            image_hw: size of the image, if it differs.
+            image_hw: size of the image, if different.
         """
         small_hw = eighth_of(image_hw or size_hw)
         masks = [(region, region.mask(size_hw)) for region in regions]
@@ -157,11 +157,11 @@ class ViewTruth:
         truths: Mapping[str, Bool[np.ndarray, "H W"]],
         boxes_xyxy: Mapping[str, Int[np.ndarray, "B 4"]] | None = None,
     ) -> "ViewTruth":
-        """Truth of a benchmark without levels: LERF-OVS, LERF-Mask, 3D-OVS.
+        """Return the truth of a benchmark without levels: LERF-OVS, LERF-Mask, 3D-OVS.
 
         Args:
-            truths: true region per text; objects of one text are united.
-            boxes_xyxy: annotated boxes per text, borders included; None takes the boxes of the regions.
+            truths: true region per text; objects with the same text are merged.
+            boxes_xyxy: annotated boxes per text, borders included; None uses the boxes of the regions.
         """
         categories = tuple(
             Query(text, None, ((text,),), truth, boxes_xyxy[text] if boxes_xyxy else box_of(truth)[None])
@@ -170,9 +170,9 @@ class ViewTruth:
         return ViewTruth((), categories, {})
 
     def own_part(self, path: tuple[str, ...], answer: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-        """Remove from a text's answer what is inside other annotated wholes with a part of this text.
+        """Return the answer to a part without the area of other annotated wholes that have the same part.
 
-        "leg" answers with the legs of chair and table; those in the annotated table are not the chair's.
+        The answer to "leg" covers legs of chair and table; those in the annotated table aren't the chair's.
         """
         named_alike = (
             other for other in self.regions if len(other) == len(path) > 1 and other[-1] == path[-1]
@@ -187,7 +187,7 @@ class ViewTruth:
         return answer & ~(np.any(others, axis=0) & ~self.regions[path[:-1]])
 
     def families(self) -> list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]]:
-        """(parent path, child paths) per transition whole -> part, part -> subpart."""
+        """Return (parent path, child paths) pairs per transition whole -> part, part -> subpart."""
         transitions: list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]] = []
         for depth in range(1, len(LEVELS)):
             families = []
@@ -200,7 +200,7 @@ class ViewTruth:
 
 
 def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
-    """One query per text, levels united."""
+    """Return one query per text, merged over levels."""
     by_text: dict[str, list[Query]] = {}
     for query in queries:
         by_text.setdefault(query.text, []).append(query)
@@ -221,22 +221,22 @@ def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
 
 
 def _union(masks: Iterable[np.ndarray | None]) -> np.ndarray | None:
-    """Union of the masks that exist; None if there is none."""
+    """Return the union of the masks that aren't None, or None."""
     known = [mask for mask in masks if mask is not None]
     return np.any(known, axis=0) if known else None
 
 
 def eighth_of(size_hw: tuple[int, int]) -> tuple[int, int]:
-    """Height and width at which 3D-OVS compares an image of this size."""
+    """Return the height and width at which 3D-OVS compares an image of this size."""
     return max(1, size_hw[0] // EIGHTH), max(1, size_hw[1] // EIGHTH)
 
 
 def kept_by_pillow(
     old_hw: tuple[int, int], new_hw: tuple[int, int]
 ) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"]]:
-    """Rows and columns that Pillow's nearest neighbour keeps when it resizes, as 3D-OVS does.
+    """Return the rows and columns that Pillow's nearest-neighbour resizing keeps, as in 3D-OVS.
 
-    They are 8 i + 4 at an eighth of a size that 8 divides.
+    At an eighth of a size divisible by 8 they are 8 i + 4.
     """
 
     def kept(old: int, new: int) -> Int64[np.ndarray, " n"]:

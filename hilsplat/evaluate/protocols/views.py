@@ -1,18 +1,18 @@
-"""Score the answers of a scene in one view: LERF-OVS, 3D-OVS, Hi-LERF and Hi-3DOVS.
+"""Score a scene's answers in one view: LERF-OVS, 3D-OVS, Hi-LERF and Hi-3DOVS.
 
 | protocol | queries | answer |
 |---|---|---|
-| `lerf/langsplat` | every distinct text; regions of all levels united | field; level chosen by the rule |
+| `lerf/langsplat` | every distinct text, regions merged over levels | field; level chosen by the rule |
 | `lerf/tree-nodes` | the same | tree; level chosen by the tree |
 | `hierarchy/level-given` | every (text, level) | field or tree, at the annotation's level |
 | `hierarchy/level-auto` | every (text, level) | field or tree, level chosen by the method |
-| `hierarchy/path` | every (text, level), asked as the chain of texts from the whole down | tree |
+| `hierarchy/path` | every (text, level), as a chain of texts from the whole down | tree |
 | `hierarchy/scene-wide` | every (text, level) | tree, at the annotation's level, one answer for all views |
-| `hierarchy/annotations` | - | the annotations themselves, HC only: what perfect masks would score |
+| `hierarchy/annotations` | - | the annotations themselves, HC only: the score of perfect masks |
 
-A path gives more information than a flat query and is not the paper's protocol. A missing or empty
-prediction counts 0. A field answers with what the view shows; likewise only nodes that the view shows
-compete, except under `hierarchy/scene-wide`.
+A path contains more information than a flat query and is not part of the paper's protocol. A missing or empty
+prediction counts as 0. Only Gaussians and nodes visible in the view compete, except for nodes under
+`hierarchy/scene-wide`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -61,14 +61,14 @@ from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.settings import EvaluateSettings
 
 NO_POINTS = np.zeros((0, 2), np.int64)
-"""For answers that are not localized."""
+"""Peaks of answers without localization."""
 
 RELEVANCY_CHUNK_MIB = 512
 """Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
-    """The map rule that the settings describe."""
+    """Return the map rule that the settings describe."""
     return RelevancyRule(
         settings.filter_px,
         settings.mix,
@@ -80,14 +80,14 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
 
 
 def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str:
-    """Protocol of a row: the card's name, then the settings that change what this method does."""
+    """Return the protocol name of a row: the card's name and deviating settings that affect this method."""
     if method == "truth":
         return card.labelled()
     rule = rule_of(settings)
     words: list[str] = []
     if method == "field":
         words += rule.departures(RelevancyRule())
-    else:  # nodes are selected, not thresholded; localization and diagnostics still read smoothed maps
+    else:  # nodes are selected without thresholds; localization and diagnostics still use smoothed maps
         words += RelevancyRule(rule.filter_px, rule.mix).departures(RelevancyRule())
         if settings.node_select != NODE_SELECT:
             words.append(f"node share {settings.node_select:g}")
@@ -97,12 +97,12 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
 
 
 def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
-    """Key under which the answer at the query's level is kept."""
+    """Return the key under which the answer at the query's level is stored."""
     return (method, label_of(LEVEL_GIVEN, method, settings), query.text, query.level)
 
 
 def relevancy_departures(settings: EvaluateSettings) -> list[str]:
-    """What the settings change in the relevancy itself."""
+    """Return descriptions of the settings that change the relevancy itself."""
     words = []
     if settings.canonical != CANONICAL:
         words.append(f"canonical {'+'.join(settings.canonical)}")
@@ -123,17 +123,17 @@ def measure_view(
     also: FlatProtocols | None = None,
     masks: PackedMasks | None = None,
 ) -> Iterator[Measured]:
-    """All numbers of one view, in no particular order.
+    """Yield all rows of one view, in no particular order.
 
     Args:
-        scene: scene that answers.
-        selections: the nodes it selects.
+        scene: the queried scene.
+        selections: cached selections of its nodes.
         truth: queries to score, with their regions.
-        view: name of their view.
+        view: name of the view.
         size_hw: height and width of the view, px.
-        settings: methods, the map rule and the settings of the relevancy.
+        settings: methods, map rule and relevancy settings.
         also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
-        masks: keeps the answers, for measures between views.
+        masks: stores the answers, for measures between views.
     """
     masks = PackedMasks(size_hw) if masks is None else masks
     rule = rule_of(settings)
@@ -227,17 +227,17 @@ def _answer_rows(
     settings: EvaluateSettings,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """Rows of one text by field or tree.
+    """Yield the rows of one text by field or tree.
 
     Args:
         method: "field" or "tree".
-        flat: protocol of texts whose levels are united.
+        flat: protocol of texts merged over levels.
         smoothed: the text's relevancy.
-        answer: level, or None for the method's own choice -> mask of the text.
-        category: the text with all levels united.
-        queries: the same per level.
+        answer: level, or None if the method chooses it -> mask of the text.
+        category: the text, merged over levels.
+        queries: the text at each level.
         settings: as in `measure_view`.
-        masks: keeps the answers.
+        masks: stores the answers.
     """
     united, given, auto = (label_of(card, method, settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO))
     auto_mask = answer(None)
@@ -260,7 +260,7 @@ def _scene_wide_rows(
     view: str,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """Rows of the tree's answer for the whole scene; its maps, and so its localization, are the view's."""
+    """Yield the rows of the tree's answers for the whole scene, without localization, which is per view."""
     protocol = label_of(SCENE_WIDE, "tree", settings)
     for query in queries:
         mask = selections.mask(view, selections.nodes((query.text,), query.level, None), masks.size_hw)
@@ -276,7 +276,7 @@ def _path_rows(
     view: str,
     masks: PackedMasks,
 ) -> Iterator[Measured]:
-    """Rows of answers to paths; localization looks inside the prediction for the parent, if there is one."""
+    """Yield the rows of answers to paths; localization searches the parent's predicted mask, if any."""
     protocol = label_of(PATH, "tree-path", settings)
     size_hw = masks.size_hw
     side_px = filter_side_px(settings.filter_px, size_hw[0])
@@ -289,7 +289,7 @@ def _path_rows(
             masks.put(("tree-path", protocol, path), path_mask)
             mask |= path_mask
             if len(path) > 1:
-                is_full = len(path) == int(query.level)  # labels may lack a level in between
+                is_full = len(path) == int(query.level)  # labels may lack an intermediate level
                 parent_level = Level(len(path) - 1) if is_full else None
                 inside |= selections.mask(view, selections.nodes(path[:-1], parent_level, view), size_hw)
         level_map = relevancy[query.level.index]
@@ -299,8 +299,8 @@ def _path_rows(
 
 
 def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:
-    """HC of every method and of the annotations; a view without any parent gives no row."""
-    # (method, protocol) -> function from a path to the rest of its answer's key
+    """Yield the HC of every method and of the annotations; nothing for a view without parents."""
+    # (method, protocol) -> function that returns the rest of the key of a path's answer
     rest_of: dict[tuple[str, str], Callable[[tuple[str, ...]], tuple]] = {
         ("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: (path,)
     }
@@ -325,13 +325,13 @@ def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSe
 def consistency_rows(
     method: str, protocol: str, truth: ViewTruth, mask_of: Callable[[tuple[str, ...]], np.ndarray]
 ) -> Iterator[Measured]:
-    """HC of one method in one view; nothing if the view has no parent.
+    """Yield the HC of one method in one view; nothing if the view has no parent.
 
     Args:
-        method: what answered.
-        protocol: full name, with departures.
+        method: name of the method.
+        protocol: full name, with deviating settings.
         truth: the view's regions.
-        mask_of: path of texts -> the answer to it.
+        mask_of: path of texts -> its answer.
     """
     transitions = truth.families()
     parents = sum(map(len, transitions))

@@ -1,4 +1,4 @@
-"""What each part of the method adds, and the sweeps over theta, Omega and pruning."""
+"""Ablations of the method's parts, and the sweeps over theta, Omega and pruning."""
 
 import math
 import statistics
@@ -43,7 +43,7 @@ COLUMNS_NOTE = (
 
 
 def ablation_table(sources: Sources) -> Table:
-    """The paper's ablation: parts of its method switched on one after the other, in its own reading."""
+    """Build the paper's ablation: parts of its method enabled one after the other, in its own reading."""
     footnotes = (
         COLUMNS_NOTE,
         "Initial-2D: levels of the 2D masks by the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
@@ -54,13 +54,13 @@ def ablation_table(sources: Sources) -> Table:
 
 
 def component_table(sources: Sources) -> Table:
-    """Our own ablation: what each part of the default field and of its code adds."""
+    """Build our own ablation: the contribution of each part of the default field and of its code."""
     footnotes = (COLUMNS_NOTE, "Rows name the losses that are switched on; d is the size of a latent.")
     return sources.finished("components", "Parts of the default field", component_blocks(sources), footnotes)
 
 
 def theta_table(sources: Sources) -> Table:
-    """Sweep over the coverage threshold."""
+    """Build the sweep over the coverage threshold."""
     footnotes = (
         COLUMNS_NOTE,
         "theta decides which mask of a view lies inside which other. Rows in the paper's reading take levels "
@@ -72,7 +72,7 @@ def theta_table(sources: Sources) -> Table:
 
 
 def omega_table(sources: Sources) -> Table:
-    """Sweep over the similarity degree."""
+    """Build the sweep over the similarity degree."""
     footnotes = (
         COLUMNS_NOTE,
         "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and "
@@ -83,7 +83,7 @@ def omega_table(sources: Sources) -> Table:
 
 
 def reported(sources: Sources, what: str) -> Block:
-    """The rows that the paper reports for an ablation."""
+    """Return the rows that the paper reports for an ablation."""
     return reported_block(
         sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
     )
@@ -92,7 +92,7 @@ def reported(sources: Sources, what: str) -> Block:
 def component_blocks(
     sources: Sources, methods: tuple[str, ...] = ("field", "tree", "tree-path")
 ) -> list[Block]:
-    """One row per variant and answer, all protocols of the ablation side by side."""
+    """Return one row per variant and method, all protocols of the ablation side by side."""
     if sources.scores.empty:
         return []
     scores = with_seeds(sources.scores)
@@ -110,9 +110,9 @@ def component_blocks(
 
 
 def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
-    """Numbers of one row from its scores under all protocols.
+    """Return the values of one row from its scores under all protocols.
 
-    Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS, whose own labels give the other columns.
+    Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS, whose own labels are used for the other columns.
     """
     own = part.iloc[0]["dataset"]
     lerf, ovs3d = ("lerf_ovs", "3d_ovs") if own in LEVELLED else (own, own)
@@ -130,9 +130,9 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
 
 
 def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """How far a row's mIoU is above that of the default field, paired by scene.
+    """Return a row's mIoU minus that of the default field, paired by scene.
 
-    Scenes differ by more than rows do; the spread of the differences shows whether one is better in general.
+    Scenes differ more than rows, so the spread of the paired differences shows whether one row is better.
 
     Args:
         scores: scores with seeds (`with_seeds`).
@@ -156,5 +156,5 @@ def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
 
 
 def filled(block: Block, column: str) -> bool:
-    """Whether any row of a block has a value in a column."""
+    """Return whether any row of a block has a value in a column."""
     return any(row.cells.get(column, Cell()).text != "-" for row in block.rows)

@@ -1,4 +1,4 @@
-"""Build any table by name. Imports neither torch nor anything heavy: a table takes about a second."""
+"""Build any table by name, in about a second: imports neither torch nor other slow packages."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -29,16 +29,16 @@ logger = logging.getLogger(__name__)
 
 
 LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
-"""Data on which the ablations are measured: the stand-in, and images with labels at levels."""
+"""Data used for the ablations: the synthetic stand-in, and images with labels at levels."""
 
 
 @dataclass(frozen=True)
 class TableKind:
-    """How one table of the paper is built.
+    """Description of one table of the paper.
 
     Attributes:
         build: function that builds the table.
-        data: kinds of synthetic scenes and published data sets that it is measured on.
+        data: kinds of synthetic scenes and published data sets that it covers.
         variants: configuration key that lists its variants.
         shows_costs: whether it also reads the times of jobs and queries.
     """
@@ -76,11 +76,11 @@ TABLES: dict[str, TableKind] = {
     "frames-hi-lerf": TableKind(hi_lerf_frames, ("tabletop", "lerf_ovs")),
     "frames-hi-3dovs": TableKind(hi_3dovs_frames, ("tabletop", "3d_ovs")),
 }
-"""Every table by name, in the order of the report; a new one is a function and a line here."""
+"""Every table by name, in report order; a new table needs a function and an entry here."""
 
 
 def published_values(table: str) -> Path:
-    """Return the file with the paper's values for a table; tables of seconds share the main table's."""
+    """Return the file with the paper's values for a table; `-seconds` tables share the main table's."""
     return project_path(f"config/published/{table.removesuffix(SECONDS)}.csv")
 
 
@@ -96,14 +96,14 @@ def run_table(
 
     Args:
         name: a key of `TABLES`.
-        scores: `scores.csv` of every scene and variant that the table shows.
-        published: the paper's values: `published_values(name)`.
-        labels: variant -> its name in the table; others keep their own.
+        scores: `scores.csv` of every scene and variant in the table.
+        published: file with the paper's values, `published_values(name)`.
+        labels: variant -> its name in the table; other variants keep their own.
         out: the CSV; `.md`, `.tex` and `.html` are written beside it.
-        absent: a sentence per data set that was not measured, with the reason.
+        absent: a sentence with the reason for each data set that was not measured.
 
     Raises:
-        ArtifactError: the table is unknown, or a file is missing or has other columns.
+        ArtifactError: the table is unknown, or a file is missing or has different columns.
     """
     if name not in TABLES:
         raise ArtifactError(f"there is no table {name!r}", expected=f"one of {', '.join(TABLES)}")
@@ -123,7 +123,7 @@ def run_table(
 
 
 def write_table(table: Table, out: Path) -> None:
-    """Write all four forms; the same table gives the same bytes."""
+    """Write all four formats; equal tables give identical files."""
     out = Path(out)
     write_text(out.with_suffix(".md"), as_markdown(table))
     write_text(out.with_suffix(".tex"), as_latex(table))

@@ -1,7 +1,7 @@
 """Time and memory: computational cost, efficiency, pruning.
 
-What the jobs took on this machine differs from run to run. It stands in tables of its own, whose names end
-with `-seconds`: the others repeat byte for byte.
+Time and memory of jobs differ from run to run. They are in separate tables, whose names end with `-seconds`,
+so that the other tables are reproducible byte for byte.
 """
 
 import statistics
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 LOWER = ("(min)", "(GB)", "(s)")
 SECONDS = "-seconds"
-"""End of the names of tables that do not repeat byte for byte."""
+"""Suffix of the names of tables that are not reproducible byte for byte."""
 
 COST_NOTE = (
     "Measured rows, on this machine, means over scenes: preparation is masks, trees of the views and CLIP; "
@@ -34,7 +34,7 @@ COST_NOTE = (
 
 
 def cost_table(sources: Sources, seconds: bool = False) -> Table:
-    """Training time, memory and seconds per query and scene (paper: computational costs)."""
+    """Build the table of training time, memory and seconds per query (paper: computational costs)."""
     blocks = [reported(sources, "one RTX 3090")]
     for data, costs in by_dataset(sources.costs).items():
         scenes = sorted({cost.scene for cost in costs})
@@ -52,14 +52,14 @@ def cost_table(sources: Sources, seconds: bool = False) -> Table:
 
 
 def efficiency_table(sources: Sources, seconds: bool = False) -> Table:
-    """Quality at three levels beside training time and memory (paper: efficiency)."""
+    """Build the table of quality at three levels beside training time and memory (paper: efficiency)."""
     blocks = [reported(sources, "one RTX 3090")]
     blocks += quality_blocks(sources, ("Preparation (min)", "Training (min)", "Memory (GB)"))
     return finished(sources, "efficiency", "Efficiency", blocks, seconds)
 
 
 def pruning_table(sources: Sources, seconds: bool = False) -> Table:
-    """Cost and quality with pruned pairs in the contrastive losses (paper: sample pruning)."""
+    """Build the table of cost and quality with pruned contrastive pairs (paper: sample pruning)."""
     blocks = [reported(sources, "sample pruning")]
     blocks += quality_blocks(sources, ("Training (min)", "Memory (GB)", "Query (s)"), ("field",))
     footnote = (
@@ -77,7 +77,7 @@ def finished(
     seconds: bool,
     footnotes: Sequence[str] = (),
 ) -> Table:
-    """A table with all columns, or with those alone that are the same in every run."""
+    """Return a table with all columns, or only with those that are reproducible."""
     if seconds:
         return sources.finished(name + SECONDS, f"{title}, on this machine", blocks, (COST_NOTE, *footnotes))
     repeated = [block if block.kind == "reported" else without_costs(block) for block in blocks]
@@ -88,7 +88,7 @@ def finished(
 
 
 def without_costs(block: Block) -> Block:
-    """A block without seconds and memory."""
+    """Return a block without times and memory."""
     columns = tuple(column for column in block.columns if column not in block.lower_is_better)
     rows = (
         replace(row, cells={column: row.cells[column] for column in columns if column in row.cells})
@@ -98,7 +98,7 @@ def without_costs(block: Block) -> Block:
 
 
 def reported(sources: Sources, what: str) -> Block:
-    """The paper's rows, with the smallest times and memories ranked best."""
+    """Return the paper's rows, with the smallest times and memories ranked best."""
     block = reported_block(
         sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
     )
@@ -109,7 +109,7 @@ def reported(sources: Sources, what: str) -> Block:
 def quality_blocks(
     sources: Sources, time_columns: tuple[str, ...], methods: tuple[str, ...] = ("field", "tree")
 ) -> list[Block]:
-    """mIoU and HC at given levels beside times, per data set with queries at levels."""
+    """Return mIoU and HC at given levels beside times, for each data set with queries at levels."""
     blocks = []
     scores = with_seeds(sources.scores) if len(sources.scores) else sources.scores
     for data, costs in by_dataset(sources.costs).items():
@@ -128,7 +128,7 @@ def quality_blocks(
 
 
 def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: str) -> "pd.DataFrame | None":
-    """Return a row's scores with the level given, or None if there are none.
+    """Return a row's scores at given levels, or None if there are none.
 
     Labels with levels have their own data set (Hi-LERF), or are the scenes' own.
     """
@@ -146,7 +146,7 @@ def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: s
 
 
 def time_cells(costs: list[Cost]) -> Mapping[str, Cell]:
-    """Means over scenes; memory is the largest."""
+    """Return mean times over scenes and the largest memory."""
     return {
         "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60, 2),
         "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60, 2),
@@ -155,13 +155,13 @@ def time_cells(costs: list[Cost]) -> Mapping[str, Cell]:
 
 
 def timed(data: str, rows: list[Row], columns: list[str]) -> Block:
-    """A block of measured times."""
+    """Return a block of measured times."""
     lower = frozenset(column for column in columns if column.endswith(LOWER))
     return Block(*kind_and_title(data), tuple(rows), tuple(columns), lower)
 
 
 def by_dataset(costs: Iterable[Cost]) -> dict[str, list[Cost]]:
-    """Costs by data set, sorted by name."""
+    """Group costs by data set, sorted by name."""
     found: dict[str, list[Cost]] = {}
     for cost in sorted(costs, key=lambda cost: (cost.dataset, cost.scene)):
         found.setdefault(cost.dataset, []).append(cost)
@@ -169,7 +169,7 @@ def by_dataset(costs: Iterable[Cost]) -> dict[str, list[Cost]]:
 
 
 def by_answer(sources: Sources, costs: list[Cost]) -> list[tuple[str, str, list[Cost]]]:
-    """(variant, method, costs of the scenes) in the order of rows."""
+    """Return (variant, method, costs of the scenes) in row order."""
     order = ["default", *sources.labels]
     found: dict[tuple[str, str], list[Cost]] = {}
     for cost in costs:

@@ -1,6 +1,6 @@
-"""What a scene and variant cost: seconds and memory of its jobs, seconds of a query.
+"""Cost of a scene and variant: time and memory of its jobs, seconds per query.
 
-Times differ from run to run and are kept apart from `scores.csv`, whose bytes must not change.
+Times differ from run to run and are stored apart from `scores.csv`, which must be reproducible byte for byte.
 """
 
 import math
@@ -24,15 +24,15 @@ TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of one scene under one variant; shared stages count in full.
+    """Cost of one scene under one variant; shared stages are counted in full.
 
     Attributes:
         dataset: data set of the scene.
         scene: scene name.
         variant: named set of settings.
-        prepare_s: wall clock of masks, trees of the views and CLIP, s; nan if a job left no record.
-        train_s: the same of contributions, semantic tree, autoencoder and field, s.
-        peak_mib: largest resident memory of a training job, MiB; nan if none left a record.
+        prepare_s: wall-clock time of masks, trees of the views and CLIP, s; nan if a job has no record.
+        train_s: wall-clock time of contributions, semantic tree, autoencoder and field, s; nan as above.
+        peak_mib: largest resident memory of a training job, MiB; nan without a record.
         query_s: per method, seconds from a text to a mask in a view.
     """
 
@@ -46,23 +46,22 @@ class Cost:
 
 
 def times_path(scores: Path) -> Path:
-    """Path of the seconds per query that belong to a score file."""
+    """Return the path of the seconds per query that belong to a score file."""
     return Path(scores).with_name("times.csv")
 
 
 def time_queries(
     answers: "LanguageScene", asks: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
 ) -> dict[str, float]:
-    """Seconds of one query per method: text, weights of the view, relevancy and mask.
+    """Return the seconds of one query per method: text, weights of the view, relevancy and mask.
 
-    The weights of the view and the text's vector are timed once and added, because both stay in memory for
-    later queries.
+    The view's weights and the text's vector are timed once and added, because later queries reuse them.
 
     Args:
         answers: the scene.
-        asks: per method a function from a text to its mask in `view`, with weights and vectors ready.
+        asks: per method, a function from a text to its mask in `view`, with weights and vectors cached.
         view: view name.
-        texts: texts whose vectors are known; the result is the median over them.
+        texts: texts whose vectors are cached; the result is the median over them.
     """
     start = time.perf_counter()
     answers.encode_texts([texts[0]])
@@ -87,16 +86,16 @@ def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: M
 
 
 def read_times(scores: Path) -> list[dict[str, str]]:
-    """Rows of `times.csv`.
+    """Read the rows of `times.csv`.
 
     Raises:
-        ArtifactError: the file is missing or has other columns.
+        ArtifactError: the file is missing or has different columns.
     """
     return read_csv(times_path(scores), TIME_COLUMNS, "run the evaluate stage again")
 
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:
-    """Costs of the scenes and variants of score files, from the records beside their artifacts.
+    """Return the costs of the scenes and variants of score files, from the records beside their artifacts.
 
     Raises:
         ArtifactError: a score file has no times, or a record cannot be read.
@@ -123,10 +122,10 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
 
 
 def jobs_of(scores: Path) -> dict[str, Job | None]:
-    """The jobs behind a score file by stage, whichever variant ran them; None if a job left no record.
+    """Return the jobs behind a score file by stage, of whichever variant ran them; None without a record.
 
-    The provenance of the score file names the artifacts that were read; that of the field names those that
-    `evaluate` does not read. A stage that nothing read is absent, as for a baseline without trees.
+    The score file's provenance lists the artifacts that `evaluate` read; the field's provenance lists the
+    rest. A stage whose output nothing read is absent, such as trees for a baseline.
     """
     places = _inputs(scores)
     if "field" in places:
@@ -145,7 +144,7 @@ def _inputs(artifact: Path) -> dict[str, Path]:
 
 
 def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
-    """Wall clock of the stages that were needed, s; nan if one left no record or none is known."""
+    """Return the wall-clock time of the needed stages, s; nan if one has no record or none is known."""
     needed = [jobs[stage] for stage in stages if stage in jobs]
     if not needed:
         return math.nan

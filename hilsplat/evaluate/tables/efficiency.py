@@ -1,6 +1,6 @@
-"""Where the time went: Snakemake's benchmark files as a table.
+"""Time per stage: Snakemake's benchmark files as a table.
 
-Times differ from run to run, so this table is kept apart from those that must not change.
+Times differ from run to run, so this table is separate from those that must be reproducible.
 """
 
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
 
 STAGE_ORDER = tuple(SECTIONS)
-"""Stages in the order of the settings, which is that of the data."""
+"""Stages in the order of the settings, which is that of the data flow."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,12 @@ class Job:
 
     Attributes:
         stage: its rule.
-        dataset: empty for a job that belongs to no scene, such as a table.
-        scene: the same.
+        dataset: empty for a job without a scene, such as a table.
+        scene: empty for a job without a scene.
         variant: empty if all variants share the stage.
-        elapsed_s: wall clock, s.
+        elapsed_s: wall-clock time, s.
         cpu_s: CPU time of the job and its children, s; 0 if the job was too short to be sampled.
-        peak_mib: largest resident memory, MiB; the same.
+        peak_mib: largest resident memory, MiB; 0 if the job was too short to be sampled.
     """
 
     stage: str
@@ -48,10 +48,10 @@ def run_efficiency(results: Path, out: Path) -> str:
         out: the CSV; `.md` is written beside it.
 
     Returns:
-        the Markdown table.
+        The Markdown table.
 
     Raises:
-        ArtifactError: there is no benchmark file, or one cannot be read, or an output is another file.
+        ArtifactError: there is no benchmark file, one is unreadable, or an output is an unrelated file.
     """
     files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
     if not files:
@@ -76,7 +76,7 @@ def run_efficiency(results: Path, out: Path) -> str:
 
 
 def read_benchmark(path: Path, results: Path) -> list[Job]:
-    """Jobs of one file: `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one line each.
+    """Read the jobs of `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one per line.
 
     Raises:
         ArtifactError: a line is not a JSON object with a time.
@@ -107,7 +107,7 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
 
 
 def stage_table(jobs: Iterable[Job]) -> str:
-    """Markdown: per stage the number of jobs, time of one job, total, CPU and peak memory."""
+    """Return a Markdown table with number of jobs, times, CPU and peak memory per stage."""
     jobs = list(jobs)
     of_stage: dict[str, list[Job]] = {}
     for job in jobs:
@@ -137,10 +137,10 @@ def _line(name: str, jobs: list[Job]) -> str:
 
 
 def _order(stage: str) -> tuple[int, str]:
-    """Order of the workflow; other stages come last, by name."""
+    """Return the sort key of a stage: workflow order, then other stages by name."""
     return (STAGE_ORDER.index(stage) if stage in STAGE_ORDER else len(STAGE_ORDER), stage)
 
 
 def _number(value: object) -> float:
-    """Snakemake writes "-" or null for what it could not sample."""
+    """Return a number; Snakemake writes "-" or null for values that it could not sample."""
     return float(value) if isinstance(value, int | float) else 0.0

@@ -1,4 +1,4 @@
-"""The lists of frames that are scored: Hi-LERF and Hi-3DOVS."""
+"""Lists of scored frames: Hi-LERF and Hi-3DOVS."""
 
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.measured import kind_and_title
@@ -8,17 +8,17 @@ from hilsplat.evaluate.tables.sources import Sources
 
 
 def hi_lerf_frames(sources: Sources) -> Table:
-    """Frames of Hi-LERF, and those that were scored."""
+    """Build the table of published and scored frames of Hi-LERF."""
     return frames_table(sources, "frames-hi-lerf", "Hi-LERF")
 
 
 def hi_3dovs_frames(sources: Sources) -> Table:
-    """Frames of Hi-3DOVS, and those that were scored."""
+    """Build the table of published and scored frames of Hi-3DOVS."""
     return frames_table(sources, "frames-hi-3dovs", "Hi-3DOVS")
 
 
 def frames_table(sources: Sources, name: str, data: str) -> Table:
-    """The paper's list, and the views in which texts at levels were asked here, with their number."""
+    """Build a table of the paper's frames, and of the views queried at levels with their number of texts."""
     blocks = [reported_block(sources.published, data, f"Reported in the paper: {data}", families=False)]
     for dataset, views in asked_views(sources).items():
         rows = [
@@ -35,7 +35,7 @@ def frames_table(sources: Sources, name: str, data: str) -> Table:
 
 
 def asked_views(sources: Sources) -> dict[str, dict[str, list[str]]]:
-    """Views by data set and scene in which texts were asked at levels, each with the number of texts."""
+    """Return the views queried at levels by data set and scene, each with its number of texts."""
     asked: dict[tuple[str, str, str], set] = {}
     for row in sources.scores.itertuples():
         if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):

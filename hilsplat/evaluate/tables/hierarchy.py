@@ -1,4 +1,4 @@
-"""Queries at three levels: Hi-LERF, Hi-3DOVS and their stand-ins."""
+"""Queries at three levels: Hi-LERF, Hi-3DOVS and their synthetic stand-ins."""
 
 from typing import TYPE_CHECKING
 
@@ -33,7 +33,7 @@ COLUMNS = (
 
 
 def hierarchy_table(sources: Sources) -> Table:
-    """mIoU at three levels, hierarchical consistency, consistency between views."""
+    """Build the table of mIoU at three levels, hierarchical consistency and view consistency."""
     blocks = []
     for data in ("Hi-LERF", "Hi-3DOVS"):
 
@@ -88,6 +88,6 @@ def hierarchy_table(sources: Sources) -> Table:
 
 
 def view_consistency(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """Consistency between views of the same row's answers; a dash if it was not measured."""
+    """Return the view consistency of the same row's answers; a dash if it was not measured."""
     same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
     return level_cells(same, "view_consistency")["Avg"]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def lerf_table(sources: Sources) -> Table:
-    """Segmentation and localization per scene (paper: LERF), on LERF-OVS and LERF-Mask."""
+    """Build the table of segmentation and localization per scene (paper: LERF), on LERF-OVS and LERF-Mask."""
     metrics = {"mIoU": "iou", "mBIoU": "boundary_iou", "localization": "localization_box"}
 
     def columns_of(of_data: "pd.DataFrame") -> list[str]:
@@ -47,11 +47,11 @@ def lerf_table(sources: Sources) -> Table:
 
 
 OVS_SCENES = ("bed", "bench", "room", "sofa", "lawn")
-"""Scenes of the paper's table, over which its column Overall is a mean."""
+"""Scenes of the paper's table, averaged in its column Overall."""
 
 
 def ovs_table(sources: Sources) -> Table:
-    """Segmentation per scene (paper: 3D-OVS), thresholded as LangSplat does and by argmax."""
+    """Build the table of segmentation per scene (paper: 3D-OVS), by LangSplat's thresholds and by argmax."""
 
     def columns_of(of_data: "pd.DataFrame") -> list[str]:
         scenes = sorted(set(of_data["scene"]))

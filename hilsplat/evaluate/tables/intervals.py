@@ -1,6 +1,6 @@
 """Bootstrap intervals of point labelling, over scenes and class names.
 
-A room has about twenty names, most of them all or nothing: one node moves the mean by several points.
+A room has about twenty names, most entirely right or wrong: one node changes the mean by several points.
 """
 
 from typing import TYPE_CHECKING
@@ -23,13 +23,13 @@ def bootstrap_mean(
     present: Bool[np.ndarray, "S K"],
     pooled: bool,
 ) -> tuple[float, float]:
-    """Return the 95 % interval of a mean IoU when scenes, and names within them, are drawn again.
+    """Return the 95 % interval of a mean IoU when scenes, and names within them, are resampled.
 
     Args:
-        hits: points of each class that were found, per scene.
+        hits: correctly predicted points of each class, per scene.
         union: points of the class or predicted as it; 0 where it doesn't occur.
-        present: classes that count.
-        pooled: counts of all scenes are added first; otherwise scenes are averaged.
+        present: classes included in the mean.
+        pooled: whether counts of all scenes are summed first; otherwise scenes are averaged.
     """
     draws, found = np.random.default_rng(0), []
 
@@ -55,11 +55,11 @@ def bootstrap_mean(
 
 
 def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
-    """Interval, scenes and names of the rows of one protocol, method and seed; nothing without class rows.
+    """Return interval, scenes and names of one protocol, method and seed; nothing without class rows.
 
     Args:
         part: score rows.
-        name: first word of the columns.
+        name: prefix of the columns.
         pooled: as in `bootstrap_mean`.
     """
     ious = part[part["metric"] == "class_iou"]

@@ -1,6 +1,6 @@
 """A table as LaTeX: booktabs, best three marked.
 
-Written without pandas' Styler, which does not escape < and ± and has no footnotes.
+pandas' Styler is not used because it does not escape < and ± and has no footnotes.
 """
 
 from hilsplat.evaluate.tables.rows import Cell, Table, shown_columns
@@ -23,12 +23,12 @@ LATEX_SPECIAL = {
 
 
 def latex_text(text: str) -> str:
-    """Escape what LaTeX would read as commands."""
+    """Escape characters that LaTeX would interpret."""
     return "".join(LATEX_SPECIAL.get(letter, letter) for letter in text)
 
 
 def as_latex(table: Table) -> str:
-    """booktabs, footnotes as paragraphs below. Best bold, second underlined, third italic."""
+    """Return a booktabs table with footnotes below. Best bold, second underlined, third italic."""
     marks = {1: r"\textbf{%s}", 2: r"\underline{%s}", 3: r"\textit{%s}", 0: "%s"}
     notes = table.numbered_notes()
     lines = [r"% needs \usepackage{booktabs,graphicx}", r"\begin{table*}[t]", r"\centering"]

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SYNTHETIC = "synthetic"
-"""Data sets whose names begin with this are stand-ins."""
+"""Prefix of the names of synthetic data sets."""
 
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
-"""A variant's name with a seed; all seeds of a variant share one row."""
+"""A variant's name with a seed; all seeds of a variant share a row."""
 
 ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth": "annotations"}
-"""Method -> its name in rows, in the order of rows."""
+"""Method -> its name in rows, in row order."""
 
 PROTOCOLS = {
     LEVEL_GIVEN.full_name: "level given",
@@ -30,14 +30,14 @@ PROTOCOLS = {
     PATH.full_name: "path of texts",
     ANNOTATIONS.full_name: "reference",
 }
-"""Protocol -> its name in tables; others keep their own."""
+"""Protocol -> its name in tables; other protocols keep their own."""
 
 STAND_INS = {
     "synthetic": "tables of the synthetic world",
     "synthetic-rooms": "rooms of the synthetic world",
     "synthetic-streets": "streets of the synthetic world",
 }
-"""Data set of a stand-in -> its description in headings."""
+"""Synthetic data set -> its description in headings."""
 
 TRUE_MASKS = "diagnostic, true masks: "
 """Prefix of the method's name in rows whose masks were made from true labels."""
@@ -54,18 +54,18 @@ def measured_blocks(
     lower_is_better: frozenset[str] = frozenset(),
     over_seeds: Callable[["pd.DataFrame"], dict[str, Cell]] = lambda part: {},
 ) -> list[Block]:
-    """One block per data set; one row per variant, method, masks and protocol.
+    """Return one block per data set, with one row per variant, method, masks and protocol.
 
     Args:
         scores: rows of `scores.csv`.
         labels: variant -> its name in the table.
-        protocols: prefixes of the protocols that make a row.
-        cells_of: values of a row, from the scores of one variant, method, masks, protocol and seed.
-        columns_of: value columns, from the scores of a data set.
-        unranked: columns in which nothing is best.
-        ranked_by_protocol: rows of different protocols are not ranked against each other.
+        protocols: prefixes of the protocols that have rows.
+        cells_of: computes a row's values from the scores of one variant, method, masks, protocol and seed.
+        columns_of: returns the value columns, from the scores of a data set.
+        unranked: columns without ranking.
+        ranked_by_protocol: whether rows of different protocols are ranked separately.
         lower_is_better: columns in which the smallest value is best.
-        over_seeds: further values of a row, from the scores of all its seeds together.
+        over_seeds: computes further values of a row from the scores of all its seeds.
     """
     if scores.empty:
         return []
@@ -98,16 +98,16 @@ def placed_row(
     cells_of: Callable[["pd.DataFrame"], Mapping[str, Cell]],
     group: str,
 ) -> tuple[tuple, Row]:
-    """One row, and its place among the rows of a block (`in_order`).
+    """Return one row and its position among the rows of a block (`in_order`).
 
     Args:
         variant: named set of settings.
-        masks: what made the masks.
-        method: what answered.
-        protocol: full name of the protocol, or what else tells the row from its neighbours.
-        part: the scores of the row under all its seeds.
+        masks: origin of the masks.
+        method: name of the method.
+        protocol: full name of the protocol, or another label that distinguishes the row.
+        part: scores of the row under all its seeds.
         labels: variant -> its name in the table.
-        cells_of: values of the row, from the scores of one seed.
+        cells_of: computes the row's values from the scores of one seed.
         group: rows of a group are ranked together; annotations and true masks are not ranked.
     """
     is_diagnostic = method != "truth" and made_from_truth(masks)
@@ -137,7 +137,7 @@ def placed_row(
 
 
 def in_order(rows: Sequence[tuple[tuple, Row]]) -> list[Row]:
-    """Rows sorted by their places."""
+    """Return the rows sorted by position."""
     return [row for _, row in sorted(rows, key=lambda placed: placed[0])]
 
 
@@ -149,7 +149,7 @@ def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Mean of each cell and its standard deviation (n - 1) over seeds; one seed stays unchanged."""
+    """Return mean and standard deviation (n - 1) of each cell over seeds; one seed is unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
@@ -164,7 +164,7 @@ def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
 
 
 def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Keep one of each set of equal rows: the annotations' row is the same for every variant."""
+    """Remove duplicate rows: the annotations' row is the same for every variant."""
     seen: dict[tuple, Row] = {}
     for row in rows:
         key = (*row.names.values(), *(cell.text for cell in row.cells.values()))
@@ -173,10 +173,10 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
-    """Name of a row, from its variant and method.
+    """Return the name of a row, from its variant and method.
 
-    The default variant answers by field and tree, `hilsplat (field)` and `hilsplat (tree)`; another
-    variant's label is that of its field. Predictions from files bear the name of their program.
+    The default variant has rows for field and tree, `hilsplat (field)` and `hilsplat (tree)`; the label of
+    any other variant refers to its field. Predictions from files are named after their program.
     """
     if method == "truth":
         return "annotations"
@@ -187,7 +187,7 @@ def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
 
 
 def kind_and_title(dataset: str) -> tuple[str, str, str]:
-    """Kind, data set and heading of measured rows."""
+    """Return kind, data set and heading of measured rows."""
     if dataset.startswith(SYNTHETIC):
         what = STAND_INS.get(dataset, dataset)
         return "synthetic stand-in", dataset, f"Measured on a synthetic stand-in ({what}); not comparable"
@@ -197,10 +197,10 @@ def kind_and_title(dataset: str) -> tuple[str, str, str]:
 def scene_cells(
     part: "pd.DataFrame", metrics: Mapping[str, str], average: str = "Average"
 ) -> dict[str, Cell]:
-    """Columns `<scene> <name>` of every scene, and the mean over scenes.
+    """Return the columns `<scene> <name>` of every scene, and the mean over scenes.
 
     Args:
-        part: the scores of one row.
+        part: scores of one row.
         metrics: name in the column -> metric.
         average: prefix of the mean's column.
     """
@@ -214,7 +214,7 @@ def scene_cells(
 
 
 def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
-    """L1, L2, L3 and Avg, the mean of the levels that have rows."""
+    """Return L1, L2, L3 and Avg, the mean of the levels that have rows."""
     values = level_values(part, metric)
     cells = {f"L{int(level)}": Cell.percent(value) for level, value in values.items()}
     return {**cells, "Avg": Cell.percent(mean_over_levels(values.values()))}
@@ -223,13 +223,13 @@ def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
 def same_row(
     scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...], dataset: str | None = None
 ) -> "pd.DataFrame":
-    """Return what the same variant, seed, method and masks scored under other protocols.
+    """Return the scores of the same variant, seed, method and masks under other protocols.
 
     Args:
         scores: scores with seeds (`with_seeds`).
-        part: the scores of one row.
+        part: scores of one row.
         protocols: prefixes of the protocols' names.
-        dataset: data set of the scores; None: that of the row.
+        dataset: data set of the scores; None for the row's own.
     """
     first = part.iloc[0]
     keys = ("variant", "seed", "masks", "method")

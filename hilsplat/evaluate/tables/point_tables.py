@@ -28,7 +28,7 @@ SCANNET_COLUMNS: Mapping[str, str] = {
     "scannet/opengaussian-10": "10 classes",
     "scannet200/opengaussian": "ScanNet200",
 }
-"""Protocol -> the paper's column."""
+"""Protocol -> column in the paper."""
 
 BENCHMARK = "scannet200/benchmark"
 SPLIT_COLUMNS = {f"miou_{split}": f"ScanNet200 {split} mIoU" for split in ("head", "common", "tail")}
@@ -53,7 +53,7 @@ INTERVAL_NOTE = (
 
 
 def replica_table(sources: Sources) -> Table:
-    """mIoU and mAcc per scene (paper: Replica, semantic segmentation)."""
+    """Build the table of mIoU and mAcc per scene (paper: Replica, semantic segmentation)."""
 
     def columns_of(of_data: "pd.DataFrame") -> list[str]:
         scenes = [*sorted(set(of_data["scene"])), "Mean"]
@@ -86,7 +86,7 @@ def replica_table(sources: Sources) -> Table:
 
 
 def scannet_table(sources: Sources) -> Table:
-    """ScanNet with 19, 15, 10 classes, ScanNet200 with 200, instances of ScanNet200: one row per method."""
+    """Build the ScanNet table: 19, 15, 10 and 200 classes and ScanNet200 instances, one row per method."""
     blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
     scores = with_seeds(sources.scores)
     names = (*SCANNET_COLUMNS, BENCHMARK)
@@ -125,7 +125,7 @@ def scannet_table(sources: Sources) -> Table:
 
 
 def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
-    """mIoU and mAcc of each set of classes."""
+    """Return mIoU and mAcc of each class set."""
     cells = {}
     for protocol, name in SCANNET_COLUMNS.items():
         of_protocol = part[part["protocol"].str.startswith(protocol)]
@@ -136,7 +136,7 @@ def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def split_cells(part: "pd.DataFrame") -> dict[str, Cell]:
-    """mIoU of ScanNet200's head, common and tail classes, all scenes pooled."""
+    """Return mIoU of ScanNet200's head, common and tail classes, pooled over scenes."""
     of_benchmark = part[part["protocol"].str.startswith(BENCHMARK)]
     if of_benchmark.empty:
         return {}
@@ -148,7 +148,7 @@ def split_cells(part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
-    """AP of all scans of a row together; dashes if the method has no instances."""
+    """Return the AP over all scans of a row; nothing if the method has no instances."""
     first = part.iloc[0]
     variant = first["variant"] if first["seed"] == "0" else f"{first['variant']}.seed{first['seed']}"
     key = (first["dataset"], variant, first["masks"], first["method"])
@@ -166,7 +166,7 @@ def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
 
 
 def waymo_table(sources: Sources) -> Table:
-    """mIoU over 22 classes, with the counts of all scenes pooled (paper: Waymo)."""
+    """Build the table of mIoU over 22 classes, with counts pooled over scenes (paper: Waymo)."""
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         from hilsplat.datasets.classes.waymo import WAYMO_22
@@ -206,7 +206,7 @@ def waymo_table(sources: Sources) -> Table:
 
 
 def measured_scenes(part: "pd.DataFrame") -> list[list[Measured]]:
-    """Score rows as `Measured`, one list per scene."""
+    """Convert score rows to `Measured`, one list per scene."""
     return [
         [
             Measured(row.method, row.query, row.level, row.metric, row.protocol, row.value, row.n)

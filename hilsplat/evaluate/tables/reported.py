@@ -1,4 +1,4 @@
-"""The paper's own rows, as `config/published/` transcribes them."""
+"""The paper's own rows, as transcribed in `config/published/`."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -10,10 +10,10 @@ PUBLISHED_COLUMNS = ("method", "family", "column", "value", "note")
 
 
 def read_published(path: Path) -> list[dict[str, str]]:
-    """Rows of a published table: method, family, column, value, note.
+    """Read the rows of a published table: method, family, column, value, note.
 
     Raises:
-        ArtifactError: the file is missing or has other columns.
+        ArtifactError: the file is missing or has different columns.
     """
     return read_csv(path, PUBLISHED_COLUMNS, "restore it from the repository")
 
@@ -25,14 +25,14 @@ def reported_block(
     rename: Callable[[str], str | None] = lambda column: column,
     families: bool = True,
 ) -> Block:
-    """The paper's rows.
+    """Return a block with the paper's rows.
 
     Args:
         published: rows of a published table.
         data: data set.
         title: heading.
-        rename: maps the paper's columns to ours, and those to leave out to None.
-        families: show the family of each method.
+        rename: maps the paper's columns to ours, or to None to omit them.
+        families: whether to include the family of each method.
     """
     rows: dict[tuple[str, str], dict[str, Cell]] = {}
     columns: dict[str, None] = {}

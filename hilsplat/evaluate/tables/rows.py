@@ -1,4 +1,4 @@
-"""What a table is made of: cells, rows, blocks of one kind, footnotes."""
+"""Parts of a table: cells, rows, blocks of one kind, footnotes."""
 
 import re
 from collections.abc import Mapping
@@ -10,10 +10,10 @@ class Cell:
     """One value of a table.
 
     Attributes:
-        text: as shown.
-        value: the number, if it is one; ranking needs it.
+        text: displayed text.
+        value: the number used for ranking, if any.
         note: footnote, or empty.
-        spread: what follows ±, usually the standard deviation over seeds; None without one.
+        spread: number after ±, usually the standard deviation over seeds; None without one.
     """
 
     text: str = "-"
@@ -23,24 +23,24 @@ class Cell:
 
     @staticmethod
     def percent(value: float) -> "Cell":
-        """A share in [0, 1] as a percentage with one decimal; nan is a dash."""
+        """Format a share in [0, 1] as a percentage with one decimal; nan as a dash."""
         return Cell() if value != value else Cell(f"{100 * value:.1f}", 100 * value)
 
     @staticmethod
     def number(value: float, digits: int = 1) -> "Cell":
-        """A number with some decimals; nan is a dash."""
+        """Format a number with the given decimals; nan as a dash."""
         return Cell() if value != value else Cell(f"{value:.{digits}f}", value)
 
     @staticmethod
     def printed(text: str, note: str = "") -> "Cell":
-        """A value as the paper prints it."""
+        """Return a value as printed in the paper."""
         number = re.fullmatch(r"-?\d+(\.\d+)?", text)
         return Cell(text, float(text) if number else None, note)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method: names on the left, values by column, and the group it is ranked in, if any."""
+    """One method: names on the left, values by column, and its ranking group, if any."""
 
     names: Mapping[str, str]
     cells: Mapping[str, Cell]
@@ -55,10 +55,10 @@ class Block:
         kind: `reported`, `measured` or `synthetic stand-in`.
         data: data set.
         title: heading.
-        rows: in the order of display.
-        columns: value columns, in the order of display.
+        rows: rows in display order.
+        columns: value columns in display order.
         lower_is_better: columns in which the smallest value is best.
-        unranked: columns in which nothing is best.
+        unranked: columns without ranking.
     """
 
     kind: str
@@ -70,7 +70,7 @@ class Block:
     unranked: frozenset[str] = frozenset()
 
     def ranks(self) -> dict[tuple[int, str], int]:
-        """(row, column) -> 1, 2, 3 for the three best values of rows that are ranked together.
+        """Map (row, column) to 1, 2 or 3 for the three best values within a ranking group.
 
         Equal values share a rank. A single row is not ranked.
         """
@@ -82,7 +82,7 @@ class Block:
             for number, row in enumerate(self.rows):
                 cell = row.cells.get(column, Cell())
                 if row.ranked_with is not None and cell.value is not None:
-                    # Compare the displayed values, so that equal texts get equal marks.
+                    # Displayed values are compared, so that equal texts get equal marks.
                     shown = float(cell.text.partition(" ")[0])
                     groups.setdefault(row.ranked_with, {})[number] = shown
             for values in groups.values():
@@ -105,7 +105,7 @@ class Table:
     footnotes: tuple[str, ...] = field(default=())
 
     def numbered_notes(self) -> dict[str, int]:
-        """Cell notes, numbered in reading order."""
+        """Return the cell notes, numbered in reading order."""
         notes: dict[str, int] = {}
         for block in self.blocks:
             for row in block.rows:
@@ -117,7 +117,7 @@ class Table:
 
 
 def shown_columns(block: Block) -> tuple[list[str], list[str]]:
-    """Name and value columns of a block; value columns without any entry are left out."""
+    """Return the name and value columns of a block; empty value columns are omitted."""
     names = list(dict.fromkeys(name for row in block.rows for name in row.names))
     values = [
         column

@@ -1,4 +1,4 @@
-"""What a table is built from, and the warnings below it."""
+"""Input of the tables, and the warnings below them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,15 +30,15 @@ SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; nothing
 
 @dataclass(frozen=True)
 class Sources:
-    """Everything that tables read.
+    """All input of the tables.
 
     Attributes:
         published: the paper's values (`reported.read_published`).
         scores: rows of all score files.
         labels: variant -> its name in tables.
-        costs: time and memory of scenes and variants, if the table shows them.
+        costs: time and memory of scenes and variants, if the table contains them.
         instances: matches per (data set, scene, variant, masks, method), if scans have instances.
-        absent: a sentence per data set that was not measured, with the reason.
+        absent: a sentence with the reason for each data set that was not measured.
     """
 
     published: Sequence[Mapping[str, str]]
@@ -49,7 +49,7 @@ class Sources:
     absent: Sequence[str] = ()
 
     def finished(self, name: str, title: str, blocks: Iterable[Block], footnotes: Sequence[str]) -> Table:
-        """A table with the warnings that its rows need."""
+        """Return a table with the warnings required by its rows."""
         blocks = tuple(block for block in blocks if block.rows)
         warnings = []
         rows = [row for block in blocks for row in block.rows]

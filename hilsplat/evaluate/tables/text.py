@@ -8,7 +8,7 @@ from hilsplat.evaluate.tables.rows import Cell, Table, shown_columns
 
 
 def as_csv(table: Table) -> str:
-    """All blocks in one sheet; measured values with two decimals, reported ones as printed."""
+    """Return all blocks in one sheet; measured values with two decimals, reported ones as printed."""
     names = list(dict.fromkeys(name for block in table.blocks for row in block.rows for name in row.names))
     values = list(dict.fromkeys(column for block in table.blocks for column in block.columns))
     stream = io.StringIO()
@@ -33,7 +33,7 @@ def _csv_value(cell: Cell, kind: str) -> str:
 
 
 def as_markdown(table: Table) -> str:
-    """Best bold, second underlined, third in italics."""
+    """Return the table as Markdown. Best bold, second underlined, third in italics."""
     marks = {1: "**{}**", 2: "<u>{}</u>", 3: "*{}*", 0: "{}"}
     notes = table.numbered_notes()
     lines = [f"# {table.title}", ""]
@@ -57,5 +57,5 @@ def as_markdown(table: Table) -> str:
 
 
 def _plain(note: str) -> str:
-    """A note without HTML or links; it may hold emphasis of ours."""
+    """Return a note without HTML or links; our own emphasis is kept."""
     return " ".join(note.replace("<", "&lt;").replace("](", "]\\(").splitlines())

@@ -1,1 +1,1 @@
-"""What several methods share: optimiser, clusters, codebooks, training on rendered pixels."""
+"""Code shared by several methods: clusters, codebooks, training on rendered pixels."""

@@ -20,13 +20,13 @@ CENTRES = 256
 KMEANS_ROUNDS = 10
 MIN_SCORE = 0.2
 MIN_VIEWS = 2
-"""Least score of a mask, and least views, for a code of a cluster (OpenGaussian, for ScanNet)."""
+"""Minimum score of a mask and minimum number of views for a cluster's code (OpenGaussian, for ScanNet)."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
 
 
 def standardised(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
-    """Centres of Gaussians about their mean, with a standard deviation of 1 over all three axes."""
+    """Centre the Gaussians' positions and scale them to a standard deviation of 1 over all three axes."""
     apart = means - means.mean(axis=0)
     return apart / max(float(apart.std()), 1e-12)
 
@@ -34,7 +34,7 @@ def standardised(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"
 def group_means(
     rows: Float[np.ndarray, "n D"], group: Int[np.ndarray, " n"], num: int
 ) -> tuple[Float64[np.ndarray, "T D"], Int64[np.ndarray, " T"]]:
-    """Mean of the rows of each of `num` groups, 0 for an empty one, and how many they have."""
+    """Return the mean of the rows of each of `num` groups, 0 for an empty one, and the number of rows."""
     counts = np.bincount(group, minlength=num)
     sums = np.stack([np.bincount(group, column, num) for column in rows.T], axis=1)
     return sums / np.maximum(counts, 1)[:, None], counts
@@ -51,23 +51,23 @@ def group_latents(
     min_views: int,
     closeness: Closeness | None = None,
 ) -> tuple[Float32[np.ndarray, "T D"], Bool[np.ndarray, " T"]]:
-    """Code of each group by association: in every view the mask that shows it best, averaged over views.
+    """Return each group's code by association: the best-fitting mask of every view, averaged over views.
 
-    Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU is of visible weights in place of a group
+    Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU uses visible weights instead of a group
     rendered alone, so that hidden Gaussians do not count.
 
     Args:
-        group: of each Gaussian, -1 for none.
+        group: group of each Gaussian, -1 for none.
         num_groups: T.
-        contributions: of the scene.
-        rows: masks that may be chosen.
+        contributions: mask weights of the Gaussians.
+        rows: candidate masks.
         latents: code of every mask of the scene.
-        min_score: a mask is chosen if its score is above this.
-        min_views: groups with masks in fewer views get none; a scene of fewer views asks for all of them.
-        closeness: factor of the score for pairs of a mask (place in `rows`) and a group; 1 if missing.
+        min_score: a mask is chosen only if its score is above this.
+        min_views: groups with masks in fewer views get no code; capped at the number of views.
+        closeness: factor of the score for pairs of a mask (index into `rows`) and a group; 1 if None.
 
     Returns:
-        codes, 0 for groups without one, and which groups have one.
+        codes, 0 for groups without one, and whether each group has one.
     """
     has = np.flatnonzero(group != NONE)
     num = len(group)
@@ -93,7 +93,7 @@ def group_latents(
 def features_of_groups(
     group: Int32[np.ndarray, " N"] | Int64[np.ndarray, " N"], latents: Float32[np.ndarray, "T D"]
 ) -> Float32[np.ndarray, "N D"]:
-    """Code of its group for every Gaussian, 0 without a group."""
+    """Return the code of each Gaussian's group, 0 without a group."""
     nothing = np.zeros((1, latents.shape[1]), np.float32)
     return np.concatenate([latents, nothing])[group]
 
@@ -101,7 +101,7 @@ def features_of_groups(
 def clusters(
     features: Float32[np.ndarray, "N D"], thresholds: tuple[float, ...], seed: int
 ) -> Int64[np.ndarray, "N K"]:
-    """Cluster of each Gaussian at every threshold of the cosine; a higher threshold splits clusters only."""
+    """Return each Gaussian's cluster at every cosine threshold; clusters of higher thresholds are nested."""
     _, centre = kmeans(features, CENTRES, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
     means, _ = group_means(features, centre, len(used))
@@ -114,9 +114,9 @@ def clusters(
 
 
 def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
-    """Code of its cluster at each level for every Gaussian; masks of all levels compete.
+    """Return the code of each Gaussian's cluster at each level; masks of all levels compete.
 
-    A level without masks gets 0, as from methods that learn each level from its own masks.
+    A level without masks gets zeros, as in methods that learn each level from its own masks.
     """
     every = np.arange(len(inputs.contributions))
     features = []
@@ -140,10 +140,10 @@ def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Floa
 def density_clusters(
     points: Float32[np.ndarray, "n D"], radius: float, least: int
 ) -> Int64[np.ndarray, " n"]:
-    """Cluster of each point, -1 for none: dense points within the radius of each other are one (DBSCAN*).
+    """Return each point's cluster, -1 for none: dense points within the radius are connected (DBSCAN*).
 
-    A point is dense with at least `least` points within the radius, itself among them. Clusters are numbered
-    by their first point (Campello et al., PAKDD 2013).
+    A point is dense if at least `least` points, including itself, are within the radius. Clusters are
+    numbered by their first point (Campello et al., PAKDD 2013).
     """
     tree = cKDTree(points)
     dense = tree.query_ball_point(points, radius, return_length=True) >= least
@@ -156,10 +156,10 @@ def density_clusters(
 
 
 def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> tuple[float, float, float]:
-    """The thresholds that are set, or the method's own, which also say whether they grow or fall.
+    """Return the configured thresholds, or the method's own, whose order the configured ones must have.
 
     Raises:
-        SettingsError: they are not in the order of the method's own.
+        SettingsError: the thresholds are in the wrong order.
     """
     if settings.thresholds == "auto":
         return own

@@ -1,4 +1,4 @@
-"""The labelled pixels of the train views, from which methods learn, with weights computed once per view."""
+"""Labelled pixels of the train views, the training data of methods, with weights computed once per view."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class LabelledView:
     Attributes:
         number: index of the view in the contributions.
         weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted there at each level among the view's masks, -1 for none.
+        labels: row, among the view's masks, of the mask painted at each pixel and level, -1 for none.
         xy: column and row of each pixel, px.
     """
 
@@ -31,12 +31,12 @@ class LabelledView:
         return len(self.labels)
 
     def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
-        """Some of the pixels, in the given order."""
+        """Return the given pixels, in that order."""
         return LabelledView(self.number, self.weights[pixels], self.labels[pixels], self.xy[pixels])
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Pixels of all train views that have any.
+    """Return the labelled pixels of all train views that have any.
 
     Raises:
         ArtifactError: no view has a labelled pixel.
@@ -61,6 +61,6 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
 
 
 def grid_pixels(size_hw: tuple[int, int], step: int) -> Int64[np.ndarray, " p"]:
-    """Row-major indices of every `step`-th pixel of every `step`-th row."""
+    """Return the row-major indices of every `step`-th pixel of every `step`-th row."""
     rows, columns = np.arange(0, size_hw[0], step), np.arange(0, size_hw[1], step)
     return (rows[:, None] * size_hw[1] + columns[None]).ravel()

@@ -1,7 +1,7 @@
 """Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
 
-`hilsplat.base.lanes` has sixteen lanes; codes of three channels would leave thirteen empty.
-Nothing is fused or reordered: the bytes are those of plain loops over the channels.
+`hilsplat.base.lanes` has sixteen lanes; codes of three channels would waste thirteen. Operations are
+neither fused nor reordered, so results are bit-identical to plain loops over the channels.
 """
 
 from typing import Any
@@ -46,7 +46,7 @@ def _all(builder: Any, scalar: Any) -> Any:
 
 @intrinsic
 def load(typingctx, array, index):
-    """Four consecutive numbers of a flat float32 array."""
+    """Return four consecutive numbers of a flat float32 array."""
 
     def codegen(context, builder, sig, args):
         return builder.load(_pointer(context, builder, sig.args[0], *args), align=4)
@@ -67,7 +67,7 @@ def store(typingctx, array, index, value):
 
 @intrinsic
 def plus(typingctx, total, scale, row):
-    """total + scale * row; each product is rounded before it is added."""
+    """Return total + scale * row; each product is rounded before the addition."""
 
     def codegen(context, builder, sig, args):
         return builder.fadd(args[0], builder.fmul(_all(builder, args[1]), args[2]))
@@ -77,13 +77,13 @@ def plus(typingctx, total, scale, row):
 
 @intrinsic
 def zeros(typingctx):
-    """Four zeros."""
+    """Return four zeros."""
     return QUAD(), lambda context, builder, sig, args: _ZEROS
 
 
 @intrinsic
 def signs_of_difference(typingctx, a, b, scale):
-    """scale where a > b, -scale where a < b, 0 where they are equal; NaN stays."""
+    """Return scale where a > b, -scale where a < b, 0 where they are equal; NaN is kept."""
 
     def codegen(context, builder, sig, args):
         apart, up = builder.fsub(args[0], args[1]), _all(builder, args[2])

@@ -1,4 +1,4 @@
-"""K-means, and product quantisation: vectors as one byte per part of theirs."""
+"""K-means and product quantisation, which stores a vector as one byte per part."""
 
 import warnings
 from dataclasses import dataclass
@@ -8,25 +8,25 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from scipy.cluster.vq import kmeans2, vq
 
 ROUNDS = 20
-"""Of Lloyd's iteration; the error falls by less than one per cent after them."""
+"""Lloyd iterations; further ones reduce the error by less than 1 %."""
 
 BYTE = 256
-"""Centroids of a part, so that a part is one byte."""
+"""Centroids per part, so that each part is stored in one byte."""
 
 
 def kmeans(
     vectors: Float32[np.ndarray, "n C"], count: int, seed: int, rounds: int = ROUNDS
 ) -> tuple[Float32[np.ndarray, "E C"], Int64[np.ndarray, " n"]]:
-    """Centroids by k-means from distant starts (k-means++), and the nearest of them for every vector.
+    """Return centroids by k-means from distant starts (k-means++), and each vector's nearest centroid.
 
     Args:
-        vectors: any number; with no more different ones than `count`, those are the centroids.
+        vectors: data; if at most `count` are distinct, those are the centroids.
         count: E.
-        seed: of the starts.
-        rounds: of Lloyd's iteration; a centroid that loses its last vector stays where it is.
+        seed: seed of the starts.
+        rounds: Lloyd iterations; a centroid that loses its last vector keeps its position.
 
     Returns:
-        E centroids, of which missing ones repeat the first, and the row of the nearest for every vector.
+        E centroids, the first one repeated if there are fewer, and the row of each vector's nearest.
     """
     if not len(vectors):
         return np.zeros((count, vectors.shape[1]), np.float32), np.zeros(0, np.int64)
@@ -41,7 +41,7 @@ def kmeans(
 def _distant_rows(
     data: Float[np.ndarray, "n C"], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "E C"]:
-    """Rows drawn by their squared distance from those before; scipy's own draw takes E times as long."""
+    """Draw rows by squared distance from previous ones; scipy's own sampling takes E times as long."""
     chosen = np.full(count, -1, np.int64)
     square, chances = np.full(len(data), np.inf), np.arange(1.0, len(data) + 1)
     for place in range(count):
@@ -56,17 +56,17 @@ def _distant_rows(
 
 @dataclass(frozen=True)
 class ProductQuantiser:
-    """A codebook for each part of a vector (Jegou et al., PAMI 2011).
+    """One codebook for each part of a vector (Jegou et al., PAMI 2011).
 
     Attributes:
-        codebooks: parts x centroids, at most 256, x numbers of a part.
+        codebooks: parts x centroids (at most 256) x elements of a part.
     """
 
     codebooks: Float32[np.ndarray, "P E S"]
 
     @staticmethod
     def fit(vectors: Float32[np.ndarray, "B C"], part: int, seed: int) -> "ProductQuantiser":
-        """Train on vectors, cut into parts of `part` numbers; the last is filled up with zeros."""
+        """Train on vectors split into parts of `part` elements; the last is padded with zeros."""
         pieces = _pieces(vectors, part)
         return ProductQuantiser(
             np.stack(
@@ -78,7 +78,7 @@ class ProductQuantiser:
         )
 
     def encode(self, vectors: Float32[np.ndarray, "B C"]) -> UInt8[np.ndarray, "B P"]:
-        """The nearest centroid of each part."""
+        """Return the index of each part's nearest centroid."""
         pieces = _pieces(vectors, self.codebooks.shape[2])
         return np.stack(
             [
@@ -89,7 +89,7 @@ class ProductQuantiser:
         )
 
     def decode(self, codes: UInt8[np.ndarray, "B P"], channels: int) -> Float32[np.ndarray, "B C"]:
-        """The centroids side by side."""
+        """Return the concatenated centroids."""
         parts = [book[codes[:, at]] for at, book in enumerate(self.codebooks)]
         return np.concatenate(parts, axis=1)[:, :channels]
 

@@ -1,4 +1,4 @@
-"""Train features of Gaussians on rendered pixels of masks, with frozen geometry: what grouping methods share.
+"""Train features of Gaussians on rendered pixels of masks, with frozen geometry, for grouping methods.
 
 A step renders random labelled pixels of one random view. Rendering is a product with fixed compositing
 weights, which are computed once per view; losses are written in torch and differentiated by it.
@@ -19,14 +19,14 @@ from hilsplat.methods.common.pixels import LabelledView
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096
-"""Pixels that a step renders, at most; published: VCH as many, OmniSeg3D 32,768, others whole views."""
+"""Maximum pixels rendered per step; published: VCH also 4096, OmniSeg3D 32,768, others whole views."""
 
 START_NOISE = 0.1
-"""Standard deviation of the first features about their common value."""
+"""Standard deviation of the initial features about their common value."""
 
 
 class _Product(torch.autograd.Function):
-    """A constant sparse matrix times features, by scipy: torch's sparse product is slower, and in beta."""
+    """Product of a constant sparse matrix and features, by scipy: torch's is slower and in beta."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, matrix: sp.csr_matrix) -> Tensor:
@@ -39,12 +39,12 @@ class _Product(torch.autograd.Function):
 
 
 def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tensor, "p D"]:
-    """Rendered features W F, or means of masks A F; differentiable by the features."""
+    """Return rendered features W F, or means of masks A F; differentiable with respect to the features."""
     return _Product.apply(features, matrix)
 
 
 def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
-    """The columns that are not empty, and their numbers: most Gaussians are not seen in a few pixels."""
+    """Return the non-empty columns and their indices; a step's pixels show few of the Gaussians."""
     columns, place = np.unique(matrix.indices, return_inverse=True)
     parts = matrix.data, place.reshape(-1), matrix.indptr
     return sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns))), torch.from_numpy(
@@ -53,15 +53,15 @@ def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
 
 
 def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
-    """Rows of length 1; a row of zeros stays."""
+    """Return rows scaled to length 1; a row of zeros is unchanged."""
     return rows / rows.norm(dim=-1, keepdim=True).clamp(min=1e-9)
 
 
 def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
-    """First features, almost the same for all Gaussians, to be trained.
+    """Return trainable initial features that are almost the same for all Gaussians.
 
-    What starts together stays together unless a mask parts it; after independent starts every Gaussian keeps
-    some of its own.
+    Gaussians with equal features stay together unless a mask separates them; after independent starts, each
+    would keep some of its initial feature.
     """
     draw = torch.Generator().manual_seed(seed)
     start = torch.randn(1, channels, generator=draw)
@@ -69,7 +69,7 @@ def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
 
 
 Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
-"""Loss of some pixels of a view; the number is the share of the steps that are done."""
+"""Loss of the given pixels of a view; the number is the completed share of the steps."""
 
 
 def train(
@@ -80,15 +80,15 @@ def train(
     seed: int,
     pixels: int = PIXELS,
 ) -> None:
-    """Minimise in place by Adam: each step one view, each view once before any is repeated.
+    """Minimise in place by Adam: each step uses one view, each view once before any is repeated.
 
     Args:
-        views: where pixels are drawn from.
+        views: views from which pixels are drawn.
         groups: parameter groups of `torch.optim.Adam`, each with its rate.
-        loss: of some random pixels of a view.
+        loss: loss of random pixels of a view.
         settings: number of steps.
-        seed: for the order of views and the pixels.
-        pixels: of a step, at most.
+        seed: seed of the order of views and the pixels.
+        pixels: maximum pixels per step.
     """
     random = np.random.default_rng(seed)
     with one_torch_thread():
@@ -107,7 +107,7 @@ def train(
 def segment_means(
     values: Float[Tensor, "p D"], segment: Int64[Tensor, " p"], num: int
 ) -> tuple[Float[Tensor, "m D"], Float[Tensor, " m"]]:
-    """Mean of the rows of each segment, and how many there are; an empty one has mean 0."""
+    """Return the mean of the rows of each segment, 0 for an empty one, and the number of rows."""
     counts = torch.bincount(segment, minlength=num).to(values.dtype)
     sums = torch.zeros(num, values.shape[1], dtype=values.dtype).index_add(0, segment, values)
     return sums / counts.clamp(min=1)[:, None], counts
