@@ -1,4 +1,4 @@
-"""The configuration of a run: every stage's section, variants, seeds, scenes and tables."""
+"""The configuration of a run: the section of each stage, variants, seeds, scenes and tables."""
 
 import difflib
 import json
@@ -36,15 +36,15 @@ from hilsplat.settings import (
 )
 
 CONFIG = Path("config/config.yaml")
-"""The configuration of the project; files of `--configfile` override it."""
+"""The project's configuration; files given with `--configfile` override it."""
 
 
 LONGEST_SHOWN = 120
-"""Most letters of a value in a message."""
+"""Maximum number of characters of a value in a message."""
 
 
 class StageSettings(Section):
-    """All sections, by name."""
+    """All sections by name."""
 
     world: WorldSettings = WorldSettings()
     poses: PosesSettings = PosesSettings()
@@ -63,7 +63,7 @@ class StageSettings(Section):
     figures: FiguresSettings = FiguresSettings()
 
     def with_models(self) -> "StageSettings":
-        """All sections with what they take from others: models, crops for the field's targets, one theta."""
+        """Return all sections after resolving values that depend on others: models, crops, theta."""
         clip, masks = with_models(self.clip), with_models(self.masks)
         if masks.levels == "tree" and masks.theta is None:
             masks = masks.model_copy(update={"theta": self.coverage_tree.theta})
@@ -73,14 +73,14 @@ class StageSettings(Section):
         return self.model_copy(update={"masks": masks, "clip": clip})
 
     def upstream(self, stage: str) -> tuple[str, ...]:
-        """Sections that a stage depends on, directly or through its inputs."""
+        """Return the sections on which a stage depends, directly or through its inputs."""
         sections = UPSTREAM[stage]
         if "semantic_tree" in sections and self.semantic_tree.evidence == "features":
             return tuple(name for name in VARIANT_SECTIONS if name in {*sections, "coverage_tree", "field"})
         return sections
 
     def depends_on_seed(self, stage: str) -> bool:
-        """Whether the result of a stage, or of one that it reads, depends on the variant's seed."""
+        """Return whether the result of a stage or of its inputs depends on the variant's seed."""
         return any(getattr(self, section).is_random for section in self.upstream(stage))
 
 
@@ -88,10 +88,10 @@ SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in S
 
 
 def parse_section(name: str, text: str) -> Any:
-    """Read one section from JSON, as a rule passes it to a stage.
+    """Parse one section from JSON, as passed from a rule to a stage.
 
     Raises:
-        SettingsError: a key is unknown, or a value is of the wrong type or out of range.
+        SettingsError: a key is unknown, or a value has the wrong type or is out of range.
     """
     try:
         return SECTIONS[name].model_validate_json(text or "{}")
@@ -103,11 +103,11 @@ Settings = TypeVar("Settings", bound=Section)
 
 
 def with_models(section: Settings) -> Settings:
-    """The section with `auto` replaced by the models that are there, so that records name what was used.
+    """Replace `auto` in a section by existing models, so that records name the models that were used.
 
-    `masks.segmenter: auto` is the SAM that `masks.model` names or, if that is auto too, the best real one
-    that is here; without a real one it is the graph segmenter. `masks.model: auto` and `clip.model: auto` are
-    the best real model, else the embedded one. Other sections come back as they are.
+    `masks.segmenter: auto` selects the SAM in `masks.model` or, if that is also auto, the best pretrained
+    SAM; without a pretrained SAM, it selects the graph segmenter. `masks.model: auto` and `clip.model: auto`
+    select the best pretrained model, else the embedded one. Other sections are returned unchanged.
     """
     if isinstance(section, ClipSettings) and section.model == AUTO:
         return section.model_copy(update={"model": str(real_model("clip") or EMBEDDED["clip"])})
@@ -115,7 +115,7 @@ def with_models(section: Settings) -> Settings:
         named = section.model != AUTO
         folder = Path(section.model) if named else real_model("sam") or Path(EMBEDDED["sam"])
         segmenter = section.segmenter
-        if segmenter == AUTO:  # a folder that is named and missing is for the stage to report
+        if segmenter == AUTO:  # if a named folder is missing, the stage reports it
             model = read_model(folder)
             is_real = not model.embedded if model else named
             segmenter = "sam" if is_real else "graph"
@@ -124,7 +124,7 @@ def with_models(section: Settings) -> Settings:
 
 
 def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:
-    """Turn pydantic's report into one line per key: its place, the problem, what is allowed."""
+    """Convert pydantic's error to one line per key: its place, the problem, and what is allowed."""
     lines = []
     for problem in error.errors():
         path = [str(part) for part in problem["loc"]]
@@ -142,7 +142,6 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
 
 
 def _known_keys(model: Any, path: list[str]) -> list[str]:
-    """Keys allowed at a place of the configuration."""
     for part in path:
         model = model.model_fields[part].annotation
     return sorted(model.model_fields)
@@ -172,20 +171,20 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
     "field": VARIANT_SECTIONS[:-1],
     "evaluate": VARIANT_SECTIONS,
 }
-"""Sections that each stage of a variant depends on, directly or through its inputs; see `upstream`."""
+"""Stage -> sections on which it depends, directly or through its inputs; see `upstream`."""
 
 
 RESERVED = frozenset(
     ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
 )
-"""Folders of a scene that are no variant."""
+"""Names of files and folders in a scene folder, which variants cannot have."""
 
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
-"""Name of a variant under another seed than the first: the variant, and the number of the seed."""
+"""Name of a variant with a seed other than the first: the variant, and the number of the seed."""
 
 
 class RunSettings(StageSettings):
-    """The whole configuration: what to run, and with which settings."""
+    """The whole configuration: what to run, and the settings to use."""
 
     seed: int = knob(0, "seed for everything random", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
@@ -198,7 +197,7 @@ class RunSettings(StageSettings):
     data_root: str = knob(
         "",
         "folder of the published data sets; empty: their scenes are skipped",
-        pattern="^[^<>]*$",  # it stands in the report's parameters
+        pattern="^[^<>]*$",  # the value is shown in the report's parameters
     )
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the paper's ablation table")
@@ -229,17 +228,17 @@ class RunSettings(StageSettings):
     @field_validator("groups", "only", "sweep_scenes", mode="before")
     @classmethod
     def _names(cls, value: Any) -> Any:
-        """Accept a single name: `only=desk` on a command line is a text."""
+        """Accept a single name, because `only=desk` on a command line is a string."""
         return (value,) if isinstance(value, str) else value
 
     def every_variant(self) -> list[str]:
-        """All variants, in any table or none: "default", then in the order of `variants`; per seed."""
+        """Return all variants per seed, in a table or not: "default", then in the order of `variants`."""
         return [
             name for first in dict.fromkeys(["default", *self.variants]) for name in self._all_seeds(first)
         ]
 
     def variant_names(self) -> list[str]:
-        """Variants of a run's tables, "default" first; with several seeds, each of them per seed."""
+        """Return the variants in the run's tables, "default" first; with several seeds, each per seed."""
         names = (
             *self.main_variants,
             *self.ablation_variants,
@@ -251,9 +250,9 @@ class RunSettings(StageSettings):
         return [name for first in dict.fromkeys(["default", *names]) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
-        """A variant under every seed: its own name, then `<name>.seed1`, ...
+        """Return the names of a variant for every seed: its own name, then `<name>.seed1`, ...
 
-        A variant in which nothing is random has one seed: others would give the same bytes.
+        A variant without randomness has one seed, because others would give the same bytes.
         """
         is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
         return self._all_seeds(variant) if is_random else [variant]
@@ -262,15 +261,15 @@ class RunSettings(StageSettings):
         return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
 
     def seed_of(self, variant: str) -> int:
-        """Seed of a variant's networks."""
+        """Return the seed of a variant."""
         return self.seed + _parts_of(variant)[1]
 
     def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
-        """Settings of a variant for a scene.
+        """Return the settings of a variant for a scene.
 
         Args:
             variant: name of a variant.
-            scopes: keys of `overrides` that apply, general first (group, then dataset/scene).
+            scopes: keys of `overrides` to apply, general ones first (group, then dataset/scene).
 
         Raises:
             SettingsError: the variant is unknown or an override cannot be used.
@@ -306,13 +305,13 @@ class RunSettings(StageSettings):
 
 
 def _parts_of(name: str) -> tuple[str, int]:
-    """A variant without its seed, and the number of the seed; 0 if the name has none."""
+    """Split a variant name into the variant and the number of the seed (0 if the name has none)."""
     found = SEEDED.fullmatch(name)
     return (found[1], int(found[2])) if found else (name, 0)
 
 
 def parse_run(config: dict[str, Any]) -> RunSettings:
-    """Validate a whole configuration, variants and overrides included.
+    """Validate a whole configuration, including variants and overrides.
 
     Raises:
         SettingsError: keys cannot be used; the message names each of them.
@@ -353,10 +352,10 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
 
 
 def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> None:
-    """Refuse keys that stand for nothing, which would change nothing.
+    """Refuse unknown keys, which would have no effect.
 
     Raises:
-        SettingsError: the first unknown key, with the one that may have been meant.
+        SettingsError: there is an unknown key; the message suggests a similar known key.
     """
     for key in keys:
         if key not in known:
@@ -369,7 +368,7 @@ def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> No
 
 
 class _UniqueKeys(yaml.SafeLoader):
-    """YAML in which a key may be given once: of two, the first would be ignored."""
+    """YAML loader that refuses duplicate keys, because the first of them would be ignored."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -386,7 +385,7 @@ def read_config(path: Path) -> dict[str, Any]:
     """Read a configuration file.
 
     Raises:
-        SettingsError: it is missing, or is not YAML that holds keys; the message names line and column.
+        SettingsError: the file is missing or is not a YAML mapping; the message names line and column.
     """
     try:
         found = yaml.load(Path(path).read_text(encoding="utf-8"), _UniqueKeys)
@@ -405,20 +404,20 @@ def read_config(path: Path) -> dict[str, Any]:
         ValueError,
         RecursionError,
         OSError,
-    ) as error:  # ValueError: no such day, no UTF-8
+    ) as error:  # ValueError: invalid date, or not UTF-8
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
     if not isinstance(found, dict):
         kind = "nothing" if found is None else type(found).__name__
         raise SettingsError(f"{path} does not hold settings", expected="lines of key: value", found=kind)
     try:
         json.dumps(found, default=str)
-    except (ValueError, RecursionError, TypeError) as error:  # an alias of what holds it; a list as key
+    except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key
         raise SettingsError(f"{path} cannot be used: {error}", fix="write keys and values in full") from error
     return found
 
 
 def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge `config/config.yaml`, further files and settings in order, section by section as Snakemake does.
+    """Merge `config/config.yaml`, further files and overrides in order, recursively as Snakemake does.
 
     Raises:
         SettingsError: a file is missing or is not YAML.
@@ -430,7 +429,7 @@ def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[
 
 
 def first_unusable(paths: Sequence[Path]) -> str:
-    """Name the first of the layers of `merged_config` that makes a configuration unusable."""
+    """Return the name of the first layer of `merged_config` that makes the configuration invalid."""
     for count, name in enumerate([CONFIG, *paths]):
         try:
             parse_run(merged_config(paths[:count]))
@@ -448,13 +447,13 @@ def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 
 def config_schema() -> dict[str, Any]:
-    """JSON schema of the configuration, for editors that check YAML (`hilsplat settings --schema`)."""
+    """Return the configuration's JSON schema, for editors that check YAML (`hilsplat settings --schema`)."""
     schema = RunSettings.model_json_schema()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def _choices(annotation: Any) -> list[str]:
-    """Words that a knob accepts, also beside numbers."""
+    """Return the words that a setting accepts, possibly in addition to numbers."""
     if get_origin(annotation) is Literal:
         return list(get_args(annotation))
     if get_origin(annotation) is UnionType or get_origin(annotation) is Union:
@@ -463,7 +462,7 @@ def _choices(annotation: Any) -> list[str]:
 
 
 def _limits_inside(annotation: Any) -> list[Any]:
-    """Limits of a number that a knob accepts beside words."""
+    """Return the limits of a number that a setting accepts in addition to words."""
     if get_origin(annotation) is UnionType or get_origin(annotation) is Union:
         return [limit for part in get_args(annotation) for limit in _limits_inside(part)]
     if get_origin(annotation) is Annotated:
@@ -472,7 +471,7 @@ def _limits_inside(annotation: Any) -> list[Any]:
 
 
 def knob_table() -> str:
-    """Every knob as text: name, default, choices or range, unit, origin, meaning."""
+    """Format all settings as text: name, default, choices or range, unit, origin, meaning."""
     lines = []
     models: dict[str, type[BaseModel]] = {"": RunSettings, **SECTIONS}
     for section, model in models.items():
@@ -480,7 +479,7 @@ def knob_table() -> str:
             if not section and name in SECTIONS:
                 continue
             extra = field.json_schema_extra
-            assert isinstance(extra, dict), name  # every field is a knob
+            assert isinstance(extra, dict), name  # every field is defined with `knob`
             limits = ", ".join(
                 f"{symbol} {getattr(limit, attribute)}"
                 for limit in [*field.metadata, *_limits_inside(field.annotation)]

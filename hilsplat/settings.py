@@ -1,8 +1,8 @@
-"""Every knob: its default, unit, range and origin, each in one place.
+"""All settings, each defined once with its default, unit, range and origin.
 
-Configuration files choose values; this module defines which values can be chosen. A section holds what one
-stage, or a family of stages, depends on, so a changed knob reruns exactly the stages that read its section.
-`hilsplat settings` prints the knobs, `hilsplat settings --schema` a JSON schema of them for editors.
+Configuration files choose values; this module defines the valid values. A section contains the settings of
+one stage or of related stages, so a changed setting reruns exactly the stages that read its section.
+`hilsplat settings` prints all settings, `hilsplat settings --schema` their JSON schema for editors.
 """
 
 from typing import Annotated, Any, Literal, get_args
@@ -10,25 +10,25 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 LARGEST = 2_000_000_000
-"""Largest whole number of any knob: the libraries take 32 bits, and a run adds up to 10 to its seed."""
+"""Largest integer in any setting: libraries accept 32 bits, and a run adds up to 10 to its seed."""
 
 
 def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **limits: Any) -> Any:
-    """A field with its description, unit, range (ge, gt, le, lt) and the origin of its default."""
+    """Define a setting with its description, unit, range (ge, gt, le, lt) and the origin of its default."""
     if type(default) is int and not {"le", "lt"} & limits.keys():
         limits["le"] = LARGEST
     return Field(default, description=what, json_schema_extra={"unit": unit, "origin": origin}, **limits)
 
 
 class Section(BaseModel):
-    """Settings of one stage; frozen. Unknown keys and numbers that are not finite are refused."""
+    """Frozen settings of one stage. Unknown keys and numbers that are not finite are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     @field_validator("*", mode="before")
     @classmethod
     def _no_truth_value(cls, value: Any, info: Any) -> Any:
-        """Refuse true and false where a number or a word is expected: YAML reads yes and no as these."""
+        """Refuse booleans where a number or a word is expected, because YAML reads yes and no as booleans."""
         if isinstance(value, bool) and not _takes(cls.model_fields[info.field_name].annotation, bool):
             raise ValueError(
                 "a number or a word is expected; YAML reads yes, no, on and off as true and false"
@@ -42,7 +42,7 @@ class Section(BaseModel):
 
 
 def _takes(annotation: Any, kind: type) -> bool:
-    """Whether a type, or a part of it, is `kind`, or any type."""
+    """Return whether a type or a part of it is `kind` or `Any`."""
     return annotation in (kind, Any) or any(_takes(part, kind) for part in get_args(annotation))
 
 
@@ -53,7 +53,7 @@ Auto = Literal["auto"]
 
 
 class WorldSettings(Section):
-    """How a synthetic scene is rendered. Its kind and seed (scene sheet) decide what it contains."""
+    """Rendering of a synthetic scene. Its content depends on its kind and seed in the scene sheet."""
 
     views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
     image_px: int = knob(256, "height and width of each view", unit="px", ge=32, le=4096)
@@ -68,7 +68,7 @@ class WorldSettings(Section):
 
 
 class PosesSettings(Section):
-    """Camera poses, found by structure from motion or imported."""
+    """Camera poses, from structure from motion or imported."""
 
     max_side_px: int = knob(
         1600, "images with a longer side are shrunk to it", unit="px", ge=64, origin="3DGS: 1600"
@@ -126,8 +126,8 @@ class GaussiansSettings(Section):
     ssim_weight: float = knob(
         0.2, "weight of D-SSIM in the photometric loss; L1 has the rest", ge=0, le=1, origin="3DGS"
     )
-    # We take a fifteenth of the published number of steps, so each step must go further (docs/splat.md).
-    # config/paper.yaml takes all steps at the published sizes.
+    # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
+    # config/paper.yaml uses the published number and sizes of steps.
     means_rate: float = knob(
         1.5e-3, "initial step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-4"
     )
@@ -299,12 +299,11 @@ class MasksSettings(Section):
 
 
 class PerturbSettings(Section):
-    """Faults added to true masks; only masks.segmenter: truth-perturbed reads them.
+    """Faults added to true masks, used only with masks.segmenter: truth-perturbed.
 
-    The defaults estimate what a good SAM does to a clean image of about 256 px: a little more consistent
-    from view to view than the embedded model (`hilsplat world inconsistency`). With every fault at 0 the
-    masks are the truth. A scene has few wholes, so the effect of systematic faults varies with the seed:
-    average over several seeds.
+    The defaults approximate a good SAM on a clean image of about 256 px: slightly more consistent across
+    views than the embedded model (`hilsplat world inconsistency`). With all faults at 0, masks are true. A
+    scene has few wholes, so the effect of systematic faults depends on the seed: average over several seeds.
     """
 
     seed: int = knob(0, "seed of the faults; independent of the run's seed", ge=0)
@@ -353,7 +352,7 @@ class CoverageTreeSettings(Section):
 
 
 class ClipSettings(Section):
-    """CLIP vectors of masks, and of the nodes that they show."""
+    """CLIP vectors of masks and nodes."""
 
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
@@ -391,7 +390,7 @@ class ClipSettings(Section):
 
 
 class ContributionsSettings(Section):
-    """How much each Gaussian weighs in each mask, with frozen geometry."""
+    """Weights of the Gaussians in each mask, with frozen geometry."""
 
     min_weight: float = knob(1 / 255, "smaller weights of a Gaussian at a pixel are dropped", ge=0, lt=1)
     keep: Literal["auto", "gram", "weights", "none"] = knob(
@@ -405,7 +404,7 @@ class ContributionsSettings(Section):
 
 
 class SemanticTreeSettings(Section):
-    """3D semantic tree: masks linked across views by the Gaussians they share."""
+    """3D semantic tree: masks linked across views by shared Gaussians."""
 
     evidence: Literal["masks", "features"] = knob(
         "masks",
@@ -435,12 +434,12 @@ class SemanticTreeSettings(Section):
 
     @property
     def is_random(self) -> bool:
-        """Linked masks involve nothing random; features start at random."""
+        """Whether the tree depends on the seed: features start at random, linked masks do not."""
         return self.evidence == "features"
 
 
 class AutoencoderSettings(Section):
-    """The scene's code of CLIP vectors."""
+    """Compression of the scene's CLIP vectors to codes."""
 
     code: Literal["network", "pca"] = knob(
         "pca", "network: a trained autoencoder; pca: mean and principal directions", origin="paper: network"
@@ -463,7 +462,7 @@ class AutoencoderSettings(Section):
 
     @property
     def is_random(self) -> bool:
-        """A network starts from random weights; principal directions involve nothing random."""
+        """Whether the code depends on the seed: a network starts from random weights, PCA does not."""
         return self.code == "network"
 
 
@@ -535,7 +534,7 @@ class FieldSettings(Section):
 
     @property
     def is_random(self) -> bool:
-        """The solver draws nothing; the literal trainer draws views, and a field may start at random."""
+        """Whether the field depends on the seed: the literal trainer draws views; a start may be random."""
         return self.trainer == "literal" or self.start in ("random", "langsplat")
 
     @model_validator(mode="after")
@@ -546,7 +545,7 @@ class FieldSettings(Section):
 
 
 class MethodSettings(Section):
-    """The method that computes the field: that of this repository, or a baseline (hilsplat/methods)."""
+    """The method that computes the field: ours or a baseline (hilsplat/methods)."""
 
     name: str = knob("hilsplat", "hilsplat, or a baseline in hilsplat/methods/registry.py")
     steps: int = knob(
@@ -581,12 +580,12 @@ class MethodSettings(Section):
 
     @property
     def is_random(self) -> bool:
-        """Our solver and plain averaging involve nothing random; other methods may."""
+        """Whether the method depends on the seed: our solver and plain averaging do not; others may."""
         return self.name not in ("hilsplat", "lifted", "occam")
 
 
 class EvaluateSettings(Section):
-    """Queries and protocols."""
+    """Queries and evaluation protocols."""
 
     canonical: tuple[str, ...] = knob(
         ("object", "things", "stuff", "texture"),
@@ -654,7 +653,7 @@ class EvaluateSettings(Section):
 
 
 class QuerySettings(Section):
-    """Names of nodes, and the doubt whether an answer is one."""
+    """Vocabulary for node names and for detecting doubtful answers."""
 
     vocabulary: str = knob(
         "auto",

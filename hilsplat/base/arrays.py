@@ -1,8 +1,8 @@
-"""Whether the arrays of an artifact are what its dataclass declares.
+"""Validation of an artifact's arrays against its dataclass.
 
-Compiled loops check no bounds: an offset out of range crashes the process. So arrays are checked once, when
-an artifact is opened, against the annotations of its dataclass (dtype and shape, with sizes of one name
-equal), for finite values, and against limits.
+Compiled loops do not check bounds, so an offset out of range crashes the process. Arrays are therefore
+checked once, when an artifact is opened: dtype and shape against the annotations of the dataclass (sizes with
+the same name must agree), values for being finite and within limits.
 """
 
 import json
@@ -22,21 +22,20 @@ from hilsplat.base.errors import ArtifactError
 
 Made = TypeVar("Made")
 Limits = Mapping[str, tuple[int | float, int | float]]
-"""Least and largest value by the name of an array."""
+"""Array name -> smallest and largest allowed value."""
 
 
 def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
     """Check arrays against the fields of a dataclass.
 
     Args:
-        maker: the dataclass, whose arrays are annotated by jaxtyping.
-        arrays: by the name of the field.
-        path: their file, for the error.
-        limits: of the values.
+        maker: the dataclass; its arrays are annotated with jaxtyping.
+        arrays: arrays by field name.
+        path: their file, for the error message.
+        limits: limits of the values.
 
     Raises:
-        ArtifactError: an array is of another type or shape, or has a value that is not finite or is out of
-            range.
+        ArtifactError: an array has the wrong type or shape, or a value that is not finite or is out of range.
     """
     hints = get_type_hints(maker)
     with jaxtyped("context"):
@@ -55,7 +54,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
             low, high = limits.get(name, (-np.inf, np.inf))
             if array.dtype.kind not in "biuf" or not array.size:
                 continue
-            least, most = array.min(), array.max()  # NaN if any value is
+            least, most = array.min(), array.max()  # NaN if any value is NaN
             if not (low <= least and most <= high and np.isfinite(least) and np.isfinite(most)):
                 raise ArtifactError(
                     f"{path}: a value of array {name} cannot be right",
@@ -66,22 +65,22 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
 
 
 def described(declared: type[AbstractArray]) -> str:
-    """Return an annotation of jaxtyping for people: `Float32[N 3]`."""
+    """Return a jaxtyping annotation in readable form: `Float32[N 3]`."""
     return f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]"
 
 
 def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:
-    """Make a dataclass from the arrays of an .npz.
+    """Create a dataclass instance from the arrays of an .npz file.
 
     Args:
-        maker: the dataclass; its fields are the names of the arrays and of `more`.
+        maker: the dataclass; its field names are those of the arrays and of `more`.
         path: the file.
-        limits: of the values.
+        limits: limits of the values.
         more: fields that are not in the file.
 
     Raises:
-        ArtifactError: the file is missing or damaged, another version of the program wrote it, or an array
-            is not what the dataclass declares.
+        ArtifactError: the file is missing, damaged or written by another version of the program, or an array
+            does not match the dataclass.
     """
     return made(maker, read_npz(path), more, path, limits)
 
@@ -93,7 +92,7 @@ def made(
     path: Path,
     limits: Limits | None = None,
 ) -> Made:
-    """Make a dataclass from the arrays of a file and other fields; see `read_into`."""
+    """Create a dataclass instance from the arrays of a file and other fields; see `read_into`."""
     expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
     if {*arrays, *more} != expected:
         raise ArtifactError(
@@ -107,7 +106,7 @@ def made(
 
 
 TENSORS_KEY = "hilsplat"
-"""Entry of a .safetensors file's metadata: JSON of what is known about its arrays, with their checksum."""
+"""Metadata key of a .safetensors file: JSON with information about its arrays and their checksum."""
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
@@ -119,7 +118,7 @@ def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) ->
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays of a .safetensors file, and what is known about them.
+    """Read the arrays of a .safetensors file and the information stored with them.
 
     Raises:
         ArtifactError: the file is missing or damaged, or was not written by `write_tensors`.

@@ -24,7 +24,7 @@ from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
 from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinished_folder
 
 ZIP64_BYTES = 2**30
-"""Larger arrays get an archive entry that may exceed 2 GiB."""
+"""Arrays above this size get an archive entry that may exceed 2 GiB."""
 
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
@@ -44,18 +44,18 @@ DAMAGE = (
 
 
 def provenance_path(artifact: Path) -> Path:
-    """Return the path of an artifact's provenance: beside the artifact, with its name."""
+    """Return the path of an artifact's provenance record: a file beside it, with its name."""
     artifact = Path(artifact)
     return artifact.parent / f"{artifact.name}.provenance.json"
 
 
 def remake(path: Path) -> str:
-    """Return the command that rebuilds an artifact, or the artifact that a file belongs to."""
+    """Return the command that rebuilds an artifact, given the artifact or a file in it."""
     places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
     if not places:
         return "run the stage that writes it again"
     place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule declares two folders
-    parts = place.parts  # Snakemake knows its files by their paths from the project
+    parts = place.parts  # Snakemake identifies files by their paths relative to the project
     start = len(parts) - 1 - parts[::-1].index("results") if "results" in parts else 0
     return f"snakemake --cores 2 --forcerun {shlex.quote(str(Path(*parts[start:])))}"
 
@@ -66,13 +66,13 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
     Args:
         path: the file to write.
-        durable: write the file through to the disk, so that it survives a power failure.
+        durable: flush the file to the disk, so that it survives a power failure.
 
     Raises:
         DiskSpaceError: the disk is full.
     """
     path = Path(path)
-    if is_unfinished(path):  # a file of a folder that is hidden and written through later
+    if is_unfinished(path):  # the file is in a hidden folder that is flushed to the disk later
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with explain_full_disk(path), _keep_mode(path):
@@ -94,7 +94,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def _keep_mode(path: Path) -> Iterator[None]:
-    """Create a file, whose mode follows the umask, and keep the mode: safetensors would change it to 0600."""
+    """Create a file with the umask's mode, and restore that mode, because safetensors changes it to 0600."""
     path.touch()
     mode = path.stat().st_mode & 0o777
     yield
@@ -144,7 +144,7 @@ def work_folder(path: Path) -> Iterator[Path]:
 
 
 def _flush(path: Path) -> None:
-    """Write a file, or the list of files in a folder, through to the disk."""
+    """Flush a file, or a folder's list of files, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -156,7 +156,7 @@ def _flush(path: Path) -> None:
 
 
 _renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-"""A function of Linux, from <stdio.h>."""
+"""Linux function from <stdio.h>."""
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """From Linux's <fcntl.h> and <linux/fs.h>."""
@@ -175,15 +175,15 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""Parts of the messages of C++ and Rust libraries that raise errors of their own: safetensors, SQLite."""
+"""Parts of the messages of C++ and Rust libraries with their own error types: safetensors, SQLite."""
 
 FULL_BELOW_MIB = 1.0
-"""Other library errors are attributed to a full disk if less is free, because COLMAP does not report it."""
+"""Free space below which other library errors are attributed to a full disk: COLMAP does not report one."""
 
 
 @contextmanager
 def explain_full_disk(path: Path) -> Iterator[None]:
-    """Turn errors of a full disk while `path` is written into an error that names the disk and the fix.
+    """Convert an error caused by a full disk while writing `path` into one that names the disk and the fix.
 
     Raises:
         DiskSpaceError: the disk is full.
@@ -210,7 +210,7 @@ def explain_full_disk(path: Path) -> Iterator[None]:
 
 
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
-"""Errors of C++ libraries, and of libraries that end their process."""
+"""Errors from C++ libraries, and from libraries that end their process."""
 
 
 def _lasting_folder(path: Path) -> Path:
@@ -249,7 +249,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically, indented, keys in the given order, with a closing newline."""
+    """Write JSON atomically: indented, keys in the given order, with a final newline."""
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
 
 
@@ -271,7 +271,7 @@ def parse_json(text: str | bytes) -> Any:
     """Parse JSON from outside the package.
 
     Raises:
-        ValueError: it is not JSON, or is nested too deeply.
+        ValueError: the text is not JSON, or is nested too deeply.
     """
     try:
         return json.loads(text)
@@ -280,7 +280,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
-    """Write a compressed .npz atomically, with fixed time stamps: same arrays, same bytes."""
+    """Write a compressed .npz file atomically, with fixed time stamps: same arrays, same bytes."""
     _write_zip(path, arrays, zipfile.ZIP_DEFLATED)
 
 
@@ -290,22 +290,22 @@ def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durabl
         zipfile.ZipFile(temporary, "w", method, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # Entries opened by name get the time 1980-01-01. They are written in pieces, so that memory holds
-            # neither a copy of a large array nor its compressed form.
+            # Entries opened by name get the time stamp 1980-01-01. They are written in pieces, because memory
+            # may not have space for a copy of a large array or its compressed form.
             large = array.nbytes > ZIP64_BYTES
             with archive.open(f"{name}.npy", "w", force_zip64=large) as stream:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
 def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
-    """Read an .npz into a dict, without unpickling anything.
+    """Read an .npz file into a dict, without unpickling anything.
 
     Args:
         path: the file.
-        needed: names of arrays that it must have.
+        needed: names of the required arrays.
 
     Raises:
-        ArtifactError: the file is missing or damaged, holds objects, or lacks an array.
+        ArtifactError: the file is missing or damaged, contains objects, or lacks a required array.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -314,7 +314,7 @@ def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
             raise ValueError("it contains other data than arrays")
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except (*DAMAGE, AttributeError) as error:  # AttributeError: it is an .npy
+    except (*DAMAGE, AttributeError) as error:  # AttributeError: it is an .npy file
         raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
     if lacking := [name for name in needed if name not in arrays]:
         raise ArtifactError(
@@ -326,16 +326,16 @@ def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:
-    """Write one array as .npy atomically."""
+    """Write one array to an .npy file atomically."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, array, allow_pickle=False)
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read one .npy array of numbers, without unpickling anything.
+    """Read one array of numbers from an .npy file, without unpickling anything.
 
     Raises:
-        ArtifactError: the file is missing or damaged, or holds something else.
+        ArtifactError: the file is missing or damaged, or contains anything else.
     """
     try:
         array = np.load(path, allow_pickle=False)
@@ -349,7 +349,7 @@ def read_npy(path: Path) -> np.ndarray:
 
 
 def sha256_of_bytes(*parts: bytes) -> str:
-    """SHA-256 of the parts, each preceded by its length so that the boundaries count."""
+    """Return the SHA-256 of the parts, each preceded by its length so that the boundaries count."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
@@ -358,18 +358,18 @@ def sha256_of_bytes(*parts: bytes) -> str:
 
 
 def sha256_of_json(value: Any) -> str:
-    """SHA-256 of a JSON value, independent of the order of keys."""
+    """Return the SHA-256 of a JSON value, independent of the order of keys."""
     return sha256_of_bytes(json.dumps(value, sort_keys=True).encode())
 
 
 def sha256_of_file(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
+    """Return the SHA-256 of a file's bytes."""
     with Path(path).open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def sha256_of_path(path: Path) -> str:
-    """SHA-256 of a file, or of the names and bytes of a folder's files, without hidden files and folders."""
+    """Return the SHA-256 of a file, or of the names and bytes of a folder's files that are not hidden."""
     path = Path(path)
     if path.is_file():
         return sha256_of_file(path)
@@ -380,16 +380,16 @@ def sha256_of_path(path: Path) -> str:
 
 
 def visible_files(folder: Path) -> list[Path]:
-    """Return the files below a folder, sorted, without hidden files and those in hidden folders."""
+    """Return the files below a folder, sorted, without hidden files and files in hidden folders."""
     folder = Path(folder)
     files = (path for path in folder.rglob("*") if path.is_file())
     return sorted(f for f in files if not any(part[0] == "." for part in f.relative_to(folder).parts))
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
-    """Complete a folder artifact: write `index.json`, which seals the folder.
+    """Complete a folder artifact by writing `index.json`, which seals the folder.
 
-    It has one entry per view, keyed by view name, a checksum of each file, and one of itself.
+    The index has one entry per view, keyed by view name, a checksum of each file, and one of itself.
     """
     folder = Path(folder)
     files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
@@ -406,7 +406,7 @@ def read_index(folder: Path) -> dict[str, Any]:
     """Read a folder artifact's index.
 
     Raises:
-        ArtifactError: there is no index, so the folder is missing or incomplete, or it was changed.
+        ArtifactError: the index is missing (so the folder is missing or incomplete) or was changed.
     """
     return copy.deepcopy(_index(Path(folder)))
 
@@ -423,7 +423,7 @@ def _index(folder: Path) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=16)
 def _unsealed(path: Path, *_: int) -> dict[str, Any]:
-    """Read an index and compare it with its seal; reads of one state of the file share the result."""
+    """Read an index and compare it with its seal; the result is cached until the file changes."""
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
         raise ArtifactError(
@@ -438,7 +438,7 @@ def sealed(folder: Path, name: str) -> Path:
     """Return the path of an artifact's file, after comparing its bytes with the index.
 
     Raises:
-        ArtifactError: the file is missing, or is not as it was written.
+        ArtifactError: the file is missing, or was changed after it was written.
     """
     path = Path(folder) / name
     sums = _index(Path(folder))["crc32"]
@@ -458,7 +458,7 @@ def _changed(path: Path) -> ArtifactError:
 
 
 def _seal(index: Mapping[str, Any]) -> int:
-    as_read = json.loads(json.dumps(index))  # JSON has no tuples, and its keys are texts
+    as_read = json.loads(json.dumps(index))  # JSON has no tuples, and its keys are strings
     return zlib.crc32(json.dumps(as_read, sort_keys=True).encode())
 
 
@@ -474,7 +474,7 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
     """Read a folder artifact's index and check that it has the given entries.
 
     Raises:
-        ArtifactError: there is no index, or another version of the program wrote it.
+        ArtifactError: the index is missing, or was written by another version of the program.
     """
     index = read_index(folder)
     if missing := [entry for entry in entries if entry not in index]:
@@ -489,12 +489,12 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
 class ViewCache:
     """Finished views of a long stage, stored outside its declared output and keyed by content.
 
-    A stage that was killed reuses them, and an added photograph costs the time of one photograph. An entry is
-    an .npz file. Its key must cover everything that the result depends on: the digests of image, model and
-    code, and the settings.
+    A rerun after a kill reuses them, and adding a photograph takes the time of one photograph. Entries are
+    .npz files. Keys must cover all inputs of the result: the digests of image, model and code, and the
+    settings.
 
     Args:
-        folder: holds the entries, such as `results/.cache/masks`.
+        folder: folder of the entries, such as `results/.cache/masks`.
         compressed: compress the entries; floating-point numbers shrink little, and compression takes time.
     """
 
@@ -505,7 +505,7 @@ class ViewCache:
         self.misses = 0
 
     def path(self, key: str) -> Path:
-        """Return the file of a key, which may not exist."""
+        """Return the file of a key; it may not exist."""
         return self.folder / key[:2] / f"{key}.npz"
 
     def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -524,28 +524,28 @@ class ViewCache:
         path = self.path(key)
         if path.is_file():
             with suppress(ArtifactError):
-                if arrays := read_npz(path):  # a file whose end is zeros may pass for an empty archive
+                if arrays := read_npz(path):  # a file that ends in zeros may look like an empty archive
                     with suppress(OSError):  # another process may have pruned it
                         os.utime(path)  # last use, for pruning
                     return arrays
         return None
 
     def put(self, key: str, arrays: dict[str, np.ndarray]) -> None:
-        """Store an entry in place of any that there is."""
-        # A power failure may cut entries or fill them with zeros. Reading detects this by checksums and
-        # computes the entry again, so entries are not written through to the disk (milliseconds each).
+        """Store an entry, replacing any existing one."""
+        # A power failure may truncate entries or fill them with zeros. Reading detects this by checksums, and
+        # the entry is recomputed, so entries are not flushed to the disk (milliseconds each).
         _write_zip(self.path(key), arrays, self._method, durable=False)
 
 
 @contextmanager
 def output_lock(output: Path) -> Iterator[None]:
-    """Lock an output for writing; a second writer of the same output is refused.
+    """Lock an output for writing, and refuse a second writer.
 
-    The lock file of a writer that is killed or fails is not empty: the output may then match neither its
+    If a writer fails or is killed, its lock file is left non-empty: the output may then match neither its
     provenance nor the inputs of that writer.
 
     Raises:
-        ArtifactError: another process is writing it.
+        ArtifactError: another process is writing the output.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Sizes of the caches, and pruning of finished views and of checkpoints."""
+"""Cache sizes, and pruning of finished views and checkpoints."""
 
 import time
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.base.processes import remove_leftovers
 
 VIEW_CACHES = ("masks", "clip", "contributions")
-"""Caches of finished views: a missing entry costs time, but changes no result."""
+"""Caches of finished views: a missing entry costs time but does not change a result."""
 
 CHECKPOINTS = "gaussians"
-"""Cache of the checkpoints of fits."""
+"""Cache of the fits' checkpoints."""
 
 FIT_DAYS = 1.0
-"""A checkpoint younger than this is kept: its fit may still run. Fits write them much more often."""
+"""Age below which a checkpoint is kept: its fit may still be running. Fits write them far more often."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Entries:
     """Files of one cache.
 
     Attributes:
-        name: name of its folder, or of the only file.
+        name: name of the cache's folder or single file.
         files: complete entries, without unfinished files.
         size_mib: total size.
     """
@@ -47,7 +47,7 @@ def caches(folder: Path) -> list[Entries]:
 
 
 def size_table(folder: Path) -> str:
-    """Return the size of each cache as text."""
+    """Return a text table with the size of each cache."""
     found = caches(folder)
     lines = [f"{cache.name:<14} {len(cache.files):>7} files {cache.size_mib:>9.1f} MiB" for cache in found]
     total = sum(cache.size_mib for cache in found)
@@ -57,20 +57,20 @@ def size_table(folder: Path) -> str:
 def prune_cache(
     folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
-    """Delete unfinished files of killed jobs, and cache entries, the least recently used first.
+    """Delete unfinished files of killed jobs, and cache entries starting with the least recently used.
 
     Args:
         folder: cache folder.
-        stages: caches to prune, of `VIEW_CACHES` and `CHECKPOINTS`; empty: the view caches, and with `days`
-            the checkpoints too.
+        stages: caches to prune, from `VIEW_CACHES` and `CHECKPOINTS`. An empty list selects the view caches
+            and, with `days`, also the checkpoints.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until at most this much is left. No limit: no entry is deleted.
+        max_mib: then delete entries until at most this much is left. Without limits, no entry is deleted.
 
     Returns:
         Number of deleted entries, and their size in MiB.
 
     Raises:
-        HilsplatError: a stage has no cache that can be pruned.
+        HilsplatError: `stages` contains a name that is not a cache that can be pruned.
     """
     known = (*VIEW_CACHES, CHECKPOINTS)
     if unknown := sorted(set(stages) - set(known)):

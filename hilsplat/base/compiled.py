@@ -16,14 +16,14 @@ logger = logging.getLogger(__name__)
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Apply `numba.njit` without the interpreter lock, cached on disk until code that the loop uses changes.
+    """Apply `numba.njit` without the GIL, cached on disk until code that the loop uses changes.
 
-    numba itself recompiles a cached loop if and only if the loop's own file changes: it would miss an edit to
-    a function in another file that the loop calls, and recompile after an edited comment.
+    By default, numba recompiles a cached loop if and only if the loop's own file changes: it would miss edits
+    to a function in another file that the loop calls, and recompile after a comment is edited.
     """
     if function is None:
         return lambda later: compiled(later, **options)
-    function = inspect.unwrap(function)  # the tests' type checker wraps every function
+    function = inspect.unwrap(function)  # the type checker used in tests wraps every function
     dispatcher = numba.njit(nogil=True, cache=True, **options)(function)
     if function.__module__.split(".")[0] == PACKAGE and "<locals>" not in function.__qualname__:
         # numba has no public way to declare the dependencies of a cached function
@@ -35,7 +35,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 class _Stamp:
     """Digest of the imported code that a loop is compiled from, computed when numba first opens its cache.
 
-    It is false if the package was edited since the import: numba then neither reads nor writes the cache.
+    It is falsy if the package was edited after the import: numba then neither reads nor writes the cache.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -57,11 +57,11 @@ class _Stamp:
         return str(self) == str(other)
 
     def __reduce__(self) -> tuple[type[str], tuple[str]]:
-        return str, (str(self),)  # the cache's index file keeps plain text
+        return str, (str(self),)  # the cache's index file stores plain text
 
 
 class _Notice(event.Listener):
-    """Logs once that loops are being compiled; numba does not report loops that it reads from the cache."""
+    """Listener that logs once that loops are being compiled; loops read from the cache raise no event."""
 
     given = False
 
@@ -72,7 +72,7 @@ class _Notice(event.Listener):
             logger.info("compiling kernels, once: about 15 s; later runs load them from disk")
 
     def on_end(self, happening: Any) -> None:
-        """Nothing to report."""
+        """Do nothing: only the start is logged."""
 
 
 event.register("numba:compile", _Notice())

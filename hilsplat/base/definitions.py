@@ -1,6 +1,6 @@
-"""The definitions of a module, as far as they can change a result: their text, and the names they look up.
+"""The parts of a module's definitions that can change a result: their text and the names they look up.
 
-`identity` follows these names from definition to definition; its docstring says what does not count.
+`identity` follows these names from definition to definition; its docstring lists what is ignored.
 """
 
 import ast
@@ -25,21 +25,21 @@ NEUTRAL_DECORATORS = frozenset(
         "overload",
     ]
 )
-"""Decorators that register nothing: what they decorate counts only if it is reached."""
+"""Decorators that do not register anything: a definition with only these counts only if it is reached."""
 
 PROSE = {
     "knob": ("unit", "origin"),
     "Dataset": ("licence", "terms", "citation", "layout"),
     "Segments": ("licence", "terms", "citation", "layout"),
 }
-"""Called name -> keywords that only people read."""
+"""Called name -> keyword arguments that are documentation only."""
 
 LOG_METHODS = frozenset({"debug", "info", "warning", "error", "exception"})
 
 
 @dataclass(frozen=True)
 class Import:
-    """What an imported name means: a module, or a name in one."""
+    """Target of an imported name: a module, or a name in a module."""
 
     module: str
     name: str
@@ -52,8 +52,8 @@ class Statement:
     Attributes:
         text: the parts that count.
         names: dotted names that it looks up in the module.
-        inner: what it imports itself, inside functions, and the attributes that it takes from that.
-        imports: for import statements, what each name means.
+        inner: imports inside its functions, each with the attributes used from it.
+        imports: for import statements, the target of each name.
         signature: names in the annotations of a function's arguments, or of a class's methods.
     """
 
@@ -66,7 +66,7 @@ class Statement:
 
 @dataclass
 class Module:
-    """The statements of a module: those that bind names, by name, and those that importing runs."""
+    """Statements of a module: those that bind names, by name, and those with effects on import."""
 
     bindings: dict[str, Statement] = field(default_factory=dict)
     effects: list[Statement] = field(default_factory=list)
@@ -138,7 +138,7 @@ def _both(one: Statement, other: Statement) -> Statement:
 
 
 def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
-    """Meaning of each name that an import statement binds."""
+    """Return the target of each name that an import statement binds."""
     if isinstance(node, ast.Import):
         return {
             alias.asname or alias.name.split(".")[0]: Import(
@@ -159,20 +159,20 @@ def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
 
 
 def _bound_at_top(node: ast.stmt) -> list[str]:
-    """Names that a statement binds in its module, also inside its blocks."""
+    """Return the names that a statement, including its blocks, binds in its module."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         return [node.name]
     return sorted(_bound(node))
 
 
 def _registers(node: ast.stmt) -> bool:
-    """Whether a decorator may register what it decorates."""
+    """Return whether a decorator may register the definition."""
     decorators = getattr(node, "decorator_list", ())
     chains = [_chain(each.func if isinstance(each, ast.Call) else each) for each in decorators]
     return any(not chain or chain[-1] not in NEUTRAL_DECORATORS for chain in chains)
 
 
-# ---- what does not count --------------------------------------------------------------------------
+# ---- removal of irrelevant parts ------------------------------------------------------------------
 
 
 def _is_bare_string(node: ast.AST) -> bool:
@@ -190,10 +190,10 @@ def _annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.expr]
 
 
 def _strip(top: ast.AST) -> None:
-    """Take out of a syntax tree, in place, what cannot change a result."""
+    """Remove, in place, the parts of a syntax tree that cannot change a result."""
     waiting = [(top, False)]
     while waiting:
-        node, is_local = waiting.pop()  # local: a statement of a function, whose annotations do nothing
+        node, is_local = waiting.pop()  # local: inside a function, where annotations have no effect
         for block in ("body", "orelse", "finalbody"):
             statements = getattr(node, block, None)
             if isinstance(statements, list):
@@ -214,13 +214,13 @@ def _strip(top: ast.AST) -> None:
             for inner in ast.walk(node):
                 if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
                     inner.value = ""
-                elif isinstance(inner, ast.JoinedStr):  # its words also separate its values
+                elif isinstance(inner, ast.JoinedStr):  # its literal parts also separate its values
                     inner.values = [part for part in inner.values if isinstance(part, ast.FormattedValue)]
         elif isinstance(node, ast.Call):
             called = (_chain(node.func) or ("",))[-1]
             node.keywords = [each for each in node.keywords if each.arg not in PROSE.get(called, ())]
             if called == "knob":
-                node.args = node.args[:1]  # the second is its description
+                node.args = node.args[:1]  # the second is the description
             elif called == "Plugins":
                 node.args = []
         waiting += [(child, is_local) for child in _children(node)]
@@ -230,7 +230,7 @@ _LEAVES = (ast.expr_context, ast.operator, ast.unaryop, ast.boolop, ast.cmpop)
 
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes right below one, but for those that hold nothing, such as operators."""
+    """Yield the direct children of a node, except leaves such as operators."""
     for name in node._fields:
         value = getattr(node, name, None)
         if isinstance(value, list):
@@ -247,7 +247,7 @@ def _is_log_call(node: ast.AST) -> bool:
 
 
 def _chain(node: ast.AST) -> tuple[str, ...]:
-    """A dotted name as its parts; empty for other expressions."""
+    """Return the parts of a dotted name; empty for other expressions."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute):
         parts.append(node.attr)
@@ -263,7 +263,7 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 @dataclass
 class _Scope:
-    """Names of a function, comprehension or class, and the meaning of those that it imports."""
+    """Names of a function, comprehension or class, and the targets of its imports."""
 
     names: set[str]
     imports: dict[str, Import]
@@ -271,7 +271,7 @@ class _Scope:
 
 
 class _Names:
-    """Finds the names that a statement looks up outside itself."""
+    """Collector of the names that a statement looks up outside itself."""
 
     def __init__(self, package: str) -> None:
         self.package = package
@@ -280,7 +280,7 @@ class _Names:
         self.inner: dict[tuple[Import, tuple[str, ...]], None] = {}
 
     def of(self, node: ast.AST) -> tuple[list[tuple[str, ...]], list[tuple[Import, tuple[str, ...]]]]:
-        """Dotted names of the module, and what is taken from modules that functions import themselves."""
+        """Return the dotted names looked up in the module, and those used from imports inside functions."""
         self._visit(node)
         return list(self.names), list(self.inner)
 
@@ -316,7 +316,7 @@ class _Names:
     def _look_up(self, chain: tuple[str, ...]) -> None:
         for depth, scope in enumerate(reversed(self.scopes)):
             if scope.is_class and depth:
-                continue  # methods do not see the names of their class
+                continue  # names of a class are not in scope in its methods
             if chain[0] in scope.imports:
                 self.inner[scope.imports[chain[0]], chain[1:]] = None
                 return
@@ -333,7 +333,7 @@ class _Names:
 
 
 def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
-    """Nodes of a block, without those inside functions and classes that it defines."""
+    """Yield the nodes of a block, without those inside functions and classes that it defines."""
     waiting = list(body)
     while waiting:
         node = waiting.pop()
@@ -343,7 +343,6 @@ def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
 
 
 def _bound_in(body: Iterable[ast.AST]) -> set[str]:
-    """Names that a block binds."""
     names: set[str] = set()
     for node in _own(body):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):

@@ -1,4 +1,4 @@
-"""The device of the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
+"""Device for the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
 
 import importlib.metadata
 import logging
@@ -27,7 +27,7 @@ def is_installed(distribution: str) -> bool:
 
 @cache
 def cuda_missing() -> str | None:
-    """Why torch cannot use CUDA here; None if it can."""
+    """Return why torch cannot use CUDA here, or None if it can."""
     import torch
 
     return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
@@ -35,9 +35,9 @@ def cuda_missing() -> str | None:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Make torch sum in one order: the same bytes for any number of threads of the stage.
+    """Make torch sum in a fixed order: results are the same bytes for any number of the stage's threads.
 
-    torch keeps the number per thread: work on a pool enters this in each of its threads.
+    torch stores its thread count per thread, so each thread of a pool must enter this context itself.
     """
     import torch
 
@@ -51,11 +51,11 @@ def one_torch_thread() -> Iterator[None]:
 
 @cache
 def compute_device(wanted: WantedDevice) -> ComputeDevice:
-    """The device of a stage.
+    """Return the device of a stage.
 
     Args:
-        wanted: auto: cuda if torch finds a device. The default is cpu: sums of cuda agree with the CPU's up
-            to rounding, but not byte for byte.
+        wanted: `auto` selects cuda if torch finds a device. The default setting is cpu, because sums computed
+            with cuda agree with those of the CPU up to rounding, but not byte for byte.
 
     Raises:
         DeviceError: `wanted` is `cuda`, and torch finds no device. There is no fallback.

@@ -1,4 +1,4 @@
-"""Errors that a user can fix: where, expected, found, and the way out."""
+"""Errors that a user can fix: each reports the place, what was expected and found, and the fix."""
 
 import errno
 import resource
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class HilsplatError(Exception):
-    """Base of every error that a file, a setting or a user causes.
+    """Base class of all errors that a file, a setting or a user causes.
 
     The command prints `str(error)` without a traceback and exits with 1.
 
@@ -14,7 +14,7 @@ class HilsplatError(Exception):
         message: one sentence that names the file, scene, view or key.
         expected: what was expected there.
         found: what was found instead.
-        fix: what to do about it.
+        fix: how to fix it.
     """
 
     def __init__(
@@ -32,15 +32,15 @@ class HilsplatError(Exception):
         super().__init__("\n".join(lines))
 
     def add_line(self, name: str, value: object) -> None:
-        """Add a line such as `found`, known only to a caller, at the end of the message."""
+        """Append a line, such as `found`, that only a caller can supply."""
         self.args = (f"{self}\n  {name:<9} {value}",)
 
 
 def system_error(error: BaseException) -> HilsplatError | None:
-    """Return an error of the system that a user can fix, in words; None for any other error.
+    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error.
 
-    Libraries report that they cannot start a thread or be loaded in many ways: where memory is limited
-    (`ulimit -v`), this is taken for the reason.
+    Libraries report in many ways that they cannot start a thread or be loaded. If memory is limited
+    (`ulimit -v`), the limit is assumed to be the reason.
     """
     is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
     by_library = isinstance(error, (RuntimeError, ImportError)) or (
@@ -62,10 +62,10 @@ def system_error(error: BaseException) -> HilsplatError | None:
 
 
 def require_working_directory() -> None:
-    """Check that the working directory exists; a shell may stand in one that was deleted.
+    """Check that the working directory exists; a shell may still be in a deleted one.
 
     Raises:
-        HilsplatError: it does not.
+        HilsplatError: it does not exist.
     """
     try:
         Path.cwd()
@@ -91,7 +91,7 @@ PLACES = {
     errno.ENOSPC: "does not fit on the disk, which is full",
     errno.EDQUOT: "does not fit into your share of the disk",
 }
-"""What is wrong with a place, by the system's number."""
+"""System error number -> problem with the path."""
 
 
 class SettingsError(HilsplatError):
@@ -115,15 +115,15 @@ class ModelError(HilsplatError):
 
 
 class DownloadError(HilsplatError):
-    """A model cannot be fetched: the hub is out of reach, refuses, or sent other bytes than it stated."""
+    """A model cannot be downloaded: the hub is unreachable, refuses, or sent bytes with a wrong digest."""
 
 
 class ArtifactError(HilsplatError):
-    """A stage's output is missing, incomplete, damaged or belongs to other inputs."""
+    """A stage's output is missing, incomplete, damaged or made from other inputs."""
 
 
 class MisalignedArtifactError(ArtifactError):
-    """Two artifacts do not belong together: other rows, sizes or digests."""
+    """Two artifacts do not belong together: their rows, sizes or digests differ."""
 
 
 class EmptyMaskError(HilsplatError):

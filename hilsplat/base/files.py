@@ -1,4 +1,4 @@
-"""Names that folders are made from, images of a folder, and files of the installed project."""
+"""Rules for names used as folder names, images in a folder, and files of the installed project."""
 
 import re
 from collections.abc import Collection
@@ -11,31 +11,31 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi"})
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 INSTALLED = _PACKAGE / "_project" if (_PACKAGE / "_project").is_dir() else _PACKAGE.parent
-"""Folder of the installed project: Snakefile, rules, config, models. A wheel holds it in the package."""
+"""Folder of the installed project: Snakefile, rules, config, models. In a wheel, it is inside the package."""
 
 MAX_NAME = 100
-"""Length of a name of a data set, scene, group or variant: folders, files and commands are made from them."""
+"""Maximum length of the name of a data set, scene, group or variant, used in paths and commands."""
 
 NAME_RULE = "letters a-z A-Z, digits, dot, dash and underscore, beginning with a letter or digit"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def project_path(path: str | Path) -> Path:
-    """Return a path of the project: in the working folder if it exists there, else in the installed project.
+    """Return a project path: in the working folder if it exists there, else in the installed project.
 
-    A path that exists in neither is returned unchanged, so that messages name what the user wrote.
+    A path that exists in neither is returned unchanged, so that messages show what the user wrote.
     """
     installed = INSTALLED / path
     return installed if not Path(path).exists() and installed.exists() else Path(path)
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder, by name; other and hidden files are ignored."""
+    """Return the image files in a folder, sorted by name, without hidden files."""
     return _with_suffix(folder, IMAGE_SUFFIXES)
 
 
 def list_videos(folder: Path) -> list[Path]:
-    """Video files of a folder, by name; other and hidden files are ignored."""
+    """Return the video files in a folder, sorted by name, without hidden files."""
     return _with_suffix(folder, VIDEO_SUFFIXES)
 
 
@@ -45,12 +45,12 @@ def _with_suffix(folder: Path, suffixes: Collection[str]) -> list[Path]:
         for path in Path(folder).iterdir()
         if path.suffix.lower() in suffixes
         and not path.name.startswith(".")
-        and (path.is_file() or (path.is_symlink() and not path.exists()))  # who reads such a link is told
+        and (path.is_file() or (path.is_symlink() and not path.exists()))  # reading a broken link fails later
     )
 
 
 def name_problem(name: str) -> str | None:
-    """What is wrong with a name, or None."""
+    """Return what is wrong with a name, or None."""
     if not name:
         return "it is empty"
     if len(name) > MAX_NAME:

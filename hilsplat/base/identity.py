@@ -1,17 +1,17 @@
-"""The identity of code: a digest over the definitions that a function can reach.
+"""Code identity: a digest of the definitions that a function can reach.
 
 One mechanism decides which rules rerun, which cache entries are valid, and which compiled loops are stale. It
-reads syntax trees, never runs the code, and follows names from definition to definition: functions, classes
-and module-level statements of this package. What cannot change a result does not count:
+reads syntax trees without running the code, and follows names from definition to definition: functions,
+classes and module-level statements of this package. Parts that cannot change a result are ignored:
 
 - comments, formatting, docstrings and other bare strings;
-- the words of `raise` statements and of log messages (the names in them do count);
-- descriptions: words in `knob()` and `Dataset()` that only people read (`PROSE`);
-- annotations of functions, except for roots, whose arguments come from outside;
-- the entries of a `Plugins` table: a stage that uses one names it as a further root.
+- string literals in `raise` statements and log messages (the names in them do count);
+- descriptions: text in `knob()` and `Dataset()` that is documentation only (`PROSE`);
+- function annotations, except those of roots, whose arguments come from outside;
+- the entries of a `Plugins` table: a stage that uses one adds it to its roots.
 
-A reached class counts as a whole. If anything in a module is reached, its statements that bind no name count
-too, and so do definitions whose decorators may register them, because importing the module runs both.
+A class that is reached counts as a whole. If anything in a module is reached, its statements that bind no
+name also count, as do definitions whose decorators may register them: importing the module runs both.
 """
 
 import contextlib
@@ -32,27 +32,27 @@ from hilsplat.base.errors import HilsplatError
 
 ROOT = Path(__file__).resolve().parents[1]
 _PARSING = threading.Lock()
-"""Kernels ask for digests from several threads, and before 3.11.8 Python's parser fails (SystemError) if two
-threads parse at once (python/cpython#106905)."""
+"""Lock for parsing: kernels request digests in several threads, and before Python 3.11.8 the parser fails
+(SystemError) if two threads parse at once (python/cpython#106905)."""
 
 Code = str | Callable[..., Any]
 Key = tuple[str, str]
-"""Module and name of a definition; an empty name is what importing the module runs."""
+"""Module and name of a definition; an empty name stands for the statements that importing the module runs."""
 
 
 def code_digest(*roots: Code, root: Path = ROOT) -> str:
-    """Digest every definition of the package that the roots can reach.
+    """Return a digest of every definition of the package that the roots can reach.
 
     Args:
-        roots: functions or classes, as objects or as "hilsplat.field.field:run_field". The name of a module
-            alone means all of its definitions.
+        roots: functions or classes, as objects or as "hilsplat.field.field:run_field". A module name alone
+            stands for all of its definitions.
         root: folder of the package.
 
     Returns:
         16 hexadecimal digits. Digests of different Python minor versions differ.
 
     Raises:
-        HilsplatError: a root, or a name that reached code imports, does not exist.
+        HilsplatError: a root, or a name that the reached code imports, does not exist.
     """
     with _PARSING:
         return _digest(tuple(_place(each) for each in roots), root)
@@ -60,7 +60,7 @@ def code_digest(*roots: Code, root: Path = ROOT) -> str:
 
 @functools.cache
 def _digest(roots: tuple[str, ...], root: Path) -> str:
-    """Return the digest, stored beside numba's compiled loops: computing it takes up to 0.6 s."""
+    """Return the digest, cached beside numba's compiled loops because computing it takes up to 0.6 s."""
     kept = root / "__pycache__" / f"identity.{sys.implementation.cache_tag}.json"
     state, key = _state(root), " ".join(roots)
     known = _known(kept, state)
@@ -75,7 +75,7 @@ def _digest(roots: tuple[str, ...], root: Path) -> str:
 
 
 def _read_state(root: Path) -> str:
-    """Return a digest of the names, times and sizes of all modules: Python detects changes by them too."""
+    """Return a digest of the names, times and sizes of all modules; Python detects changes the same way."""
     found, folders = [], [str(root)]
     for folder in folders:
         with os.scandir(folder) as entries:
@@ -93,7 +93,7 @@ _STATE_AT_IMPORT = _read_state(ROOT)
 
 
 def is_as_imported() -> bool:
-    """Whether the package is as it was when this process imported this module, early in every command."""
+    """Return whether the package is unchanged since this module was imported, early in every command."""
     try:
         return _read_state(ROOT) == _STATE_AT_IMPORT
     except FileNotFoundError:  # a module was deleted while the state was read
@@ -101,7 +101,6 @@ def is_as_imported() -> bool:
 
 
 def _known(kept: Path, state: str) -> dict[str, str]:
-    """Return the digests stored for this state of the package."""
     try:
         found = parse_json(kept.read_bytes())
         return dict(found["digests"]) if found["state"] == state else {}
@@ -120,7 +119,7 @@ def _digest_of(roots: tuple[str, ...], root: Path) -> str:
 
 
 def reached(*roots: Code, root: Path = ROOT) -> list[str]:
-    """What `code_digest` digests: definitions as "module:name", sorted."""
+    """Return the definitions that `code_digest` covers, as "module:name", sorted."""
     places = tuple(_place(each) for each in roots)
     return [f"{module}:{name}" for module, name in sorted(_reach(places, root)) if name]
 
@@ -130,19 +129,19 @@ def _place(code: Code) -> str:
 
 
 def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
-    """Every definition that is reached, with those parts of its text that count."""
+    """Return every definition that is reached, with the parts of its text that count."""
     found: dict[Key, list[bytes]] = {}
     waiting: list[tuple[str, str]] = []
 
     def reach(module: str, name: str) -> None:
-        if module in (__name__, definitions.__name__):  # how code is identified changes no result
+        if module in (__name__, definitions.__name__):  # how code is identified does not change results
             return
         if (module, name) not in found:
             found[module, name] = []
             waiting.append((module, name))
 
     def follow(module: str, chain: tuple[str, ...]) -> str:
-        """Reach what a dotted name means in a module; return what an imported name refers to."""
+        """Reach the definition of a dotted name in a module; return the target if the name is imported."""
         statement = module_of(module, root).bindings.get(chain[0])
         if statement is None:
             return ""

@@ -1,4 +1,4 @@
-"""Reading and writing images: upright, sRGB, channel-last."""
+"""Reading and writing of images: upright, sRGB, channel-last."""
 
 import functools
 import io
@@ -30,17 +30,17 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 DEEP_MAX = 65535
-"""Largest value of a 16-bit channel; 257 of its steps are one step of 8 bits."""
+"""Largest value of a 16-bit channel; 257 of its steps equal one 8-bit step."""
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image with Pillow, which reads HEIF (.heic) by the library pillow-heif.
+    """Open an image with Pillow, which reads HEIF (.heic) with the library pillow-heif.
 
-    Size and EXIF are known at once, pixels are decoded on demand. A HEIF image comes upright: its rotation is
-    part of the format, and its EXIF orientation is reset.
+    Size and EXIF data are read at once, pixels are decoded on demand. A HEIF image is returned upright: its
+    rotation is part of the format, and its EXIF orientation is reset.
 
     Raises:
-        ImageError: it states more pixels than a photograph has.
+        ImageError: its header specifies more pixels than a photograph has.
     """
     _register_heif()
     try:
@@ -65,8 +65,8 @@ def _register_heif() -> None:
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image as upright sRGB.
 
-    The EXIF orientation is applied, colours of an embedded profile (Display P3 of telephones, Adobe RGB) are
-    converted, alpha is dropped, grey is repeated, CMYK is converted, 16 bits per channel are rounded to 8.
+    The EXIF orientation is applied. Colours with an embedded profile (Display P3 from phones, Adobe RGB) and
+    CMYK are converted, alpha is dropped, grey is repeated, and 16 bits per channel are rounded to 8.
 
     Raises:
         ImageError: the file is missing, empty, truncated or not an image.
@@ -78,7 +78,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
                 raise ValueError(f"it holds {num_frames} pictures of one size, as an animation does")
             image.load()
             upright = ImageOps.exif_transpose(image)
-            if upright.mode.startswith("I"):  # Pillow would clip what exceeds 255
+            if upright.mode.startswith("I"):  # Pillow would clip values above 255
                 values = np.asarray(upright).astype(np.int64)
                 if values.min() < 0 or values.max() > DEEP_MAX:
                     raise ValueError(
@@ -100,7 +100,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _frames(image: Image.Image) -> int:
-    """Return the number of frames of an animation; further pictures of telephones and previews are none."""
+    """Return the number of animation frames; previews and a phone's additional pictures do not count."""
     num_frames = int(getattr(image, "n_frames", 1))
     if num_frames < 2 or image.format in ("MPO", "HEIF"):
         return 1
@@ -112,7 +112,7 @@ def _frames(image: Image.Image) -> int:
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
-    """Convert to sRGB by the embedded profile; without one, or with a damaged one, pixels count as sRGB."""
+    """Convert to sRGB with the embedded profile; if it is missing or damaged, assume that pixels are sRGB."""
     profile = image.info.get("icc_profile")
     if profile and image.mode in ("RGB", "RGBA", "CMYK"):
         colours = image.convert("RGB") if image.mode == "RGBA" else image
@@ -125,7 +125,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
                 "%s: its colours count as sRGB, for its colour profile is damaged: %s", path, error
             )
         else:
-            assert converted is not None  # only a conversion in place returns nothing
+            assert converted is not None  # only in-place conversion returns None
             return converted
     return image.convert("RGB")
 
@@ -138,13 +138,13 @@ def _srgb_profile() -> ImageCms.ImageCmsProfile:
 def write_png(
     path: Path, pixels: np.ndarray, compression: int = 6, text: Mapping[str, str] | None = None
 ) -> None:
-    """Write an 8-bit RGB or grey, or a 16-bit grey image, as PNG, atomically.
+    """Write an image (8-bit RGB or grey, or 16-bit grey) as PNG, atomically.
 
     Args:
         path: file to write.
         pixels: (H, W, 3) or (H, W).
-        compression: level of zlib, 0 to 9.
-        text: what the file says of itself, by key.
+        compression: zlib level, 0 to 9.
+        text: text entries of the file's metadata, by key.
     """
     said = PngImagePlugin.PngInfo()
     for key, value in (text or {}).items():

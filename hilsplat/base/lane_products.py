@@ -1,4 +1,4 @@
-"""Products of a few rows with sixteen or thirty-two columns, all sums in registers."""
+"""Matrix products of a few rows with 16 or 32 columns, with all sums in registers."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ _ZERO = ir.Constant(_VECTOR, [ir.Constant(ir.FloatType(), 0.0)] * WIDTH)
 _FIRST = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
 
 _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
-"""Then a core has 32 registers of 16 numbers, otherwise 16 of 8 or fewer."""
+"""With AVX-512, a core has 32 registers of 16 numbers, otherwise 16 registers of at most 8."""
 
 MOST_ROWS = 8 if _HAS_AVX512 else 6
 WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH
@@ -22,15 +22,15 @@ WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH
 
 
 def rows_of_products(rows: int) -> Any:
-    """Make the function that computes y[r, c] = sum over k of a[r, k] x[k, c] for a fixed number of rows.
+    """Return a function that computes y[r, c] = sum over k of a[r, k] x[k, c] for a fixed number of rows.
 
-    A number of `x` is loaded once for all rows, and one of `a` once for all columns. Sums run in the order of
-    k. A loop in numba spills sums to memory if there are as many as this.
+    Each number of `x` is loaded once for all rows, and each of `a` once for all columns. Sums are in the
+    order of k. A plain numba loop would spill this many sums to memory.
 
     Returns:
-        a function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide) for numba: flat
-        float32 arrays, each with the place of its first number and the step from row to row; the number of
-        products; whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
+        a numba function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide): flat float32
+        arrays, each with the index of its first number and the step from row to row; the number of products;
+        whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
     """
 
     @intrinsic

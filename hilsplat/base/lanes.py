@@ -1,13 +1,12 @@
-"""Sixteen lanes as one numba value, so that a 4x4-pixel block is a single vector.
+"""Vectors of 16 lanes as one numba value, so that a block of 4 x 4 pixels is a single vector.
 
-numba turns a loop over 16 pixels into vector code only if it can prove that arrays do not
-overlap, and it spills every temporary to memory. A value of type `LANES` is an LLVM `<16 x float>`, one
-of type `WIDE` a `<16 x double>`: arithmetic on them is vector arithmetic and accumulators stay in
-registers. LLVM splits them into what the machine has (16 floats are one register with AVX-512, two with
-AVX2, four with NEON).
+numba vectorises a loop over 16 pixels only if it can prove that arrays do not overlap, and it spills every
+temporary to memory. A value of type `LANES` is an LLVM `<16 x float>`, and one of type `WIDE` a
+`<16 x double>`: arithmetic on them is vector arithmetic, and accumulators stay in registers. LLVM splits them
+into the machine's registers (16 floats are one register with AVX-512, two with AVX2, four with NEON).
 
 Operations, for use inside `numba.njit` functions: `+ - * /` between lanes or with a float, `lanes(x)`
-(all lanes equal x), and the functions below. Sums run in a fixed order.
+(all lanes equal x), and the functions below. The order of sums is fixed.
 """
 
 import operator
@@ -27,15 +26,15 @@ _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, WIDTH)
 _INTS = ir.VectorType(_INT, WIDTH)
-# Products and sums may fuse into one rounding; nothing may be reordered.
+# A product and a sum may be fused into one operation with one rounding; reordering is not allowed.
 _FLAGS = ("contract",)
 _RECIPROCAL_BITS = 0x7EF311C7
-"""Twice the exponent bits of 1, less what makes the first guess equally wrong on both sides."""
+"""Twice the exponent bits of 1, minus a correction that balances the first guess's errors on both sides."""
 _MASKED_STORE = f"llvm.masked.store.v{WIDTH}f32.p0"
 
 
 class LanesType(types.Type):
-    """numba type of 16 numbers of one element type."""
+    """Numba type of 16 numbers with one element type."""
 
     def __init__(self, dtype: types.Float) -> None:
         self.dtype = dtype
@@ -62,7 +61,7 @@ def _all_equal(
 
 
 def _binary(python_operator: Any, emit: Any) -> None:
-    """Teach numba one operator between two lane values, or one and a scalar."""
+    """Register an operator with numba, between two lane values or a lane value and a scalar."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
@@ -101,14 +100,14 @@ def _pointer(
 
 
 def _is_flat(array: Any) -> bool:
-    """Whether a numba type is that of a flat array of float32 or float64."""
+    """Return whether a numba type is a flat array of float32 or float64."""
     return isinstance(array, types.Array) and array.dtype in _OF and array.ndim == 1
 
 
 @compiled
 @no_type_check
 def aligned(count):
-    """Room for float32 numbers that begins with a line of the cache, so that no vector spans two lines."""
+    """Allocate float32 numbers from the start of a cache line, so that no vector spans two lines."""
     room = np.empty(count + WIDTH, np.float32)
     skip = (-(room.ctypes.data // 4)) % WIDTH
     return room[skip : skip + count]
@@ -116,7 +115,7 @@ def aligned(count):
 
 @intrinsic
 def lanes(typingctx, scalar):
-    """All lanes equal one float32 number."""
+    """Return lanes that all equal one float32 number."""
 
     def codegen(context, builder, sig, args):
         return _splat(builder, args[0])
@@ -126,7 +125,7 @@ def lanes(typingctx, scalar):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Sixteen consecutive numbers of a flat float32 or float64 array."""
+    """Load 16 consecutive numbers of a flat float32 or float64 array."""
     if not _is_flat(array):
         return None
 
@@ -139,7 +138,7 @@ def load(typingctx, array, index):
 
 @intrinsic
 def load_same(typingctx, array, index):
-    """All lanes equal one number of a flat array; the index must not be negative."""
+    """Load one number of a flat array into all lanes; the index must not be negative."""
     if not _is_flat(array):
         return None
 
@@ -152,7 +151,7 @@ def load_same(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
-    """Write sixteen consecutive numbers of a flat array of the lanes' type."""
+    """Store the lanes as 16 consecutive numbers of a flat array of the same type."""
     if not (_is_flat(array) and value == _OF[array.dtype]):
         return None
 
@@ -166,22 +165,22 @@ def store(typingctx, array, index, value):
 
 @intrinsic
 def wide(typingctx, value):
-    """The same numbers as float64."""
+    """Convert the lanes to float64."""
     return WIDE(LANES), lambda context, builder, sig, args: builder.fpext(args[0], WIDE.vector)
 
 
 @intrinsic
 def narrow(typingctx, value):
-    """The nearest float32 numbers."""
+    """Round the lanes to float32."""
     return LANES(WIDE), lambda context, builder, sig, args: builder.fptrunc(args[0], LANES.vector)
 
 
 @intrinsic
 def exp2_negative(typingctx, value):
-    """2**x for x in [-126, 0], relative error below 3e-7.
+    """Compute 2**x for x in [-126, 0], with a relative error below 3e-7.
 
-    Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial is 2**f and k goes into the
-    exponent bits. Lanes outside the range get some finite or infinite number; nothing traps.
+    Truncation gives x = k + f with f in (-1, 0]; a degree-6 polynomial approximates 2**f, and k is added to
+    the exponent bits. Lanes outside the range get an arbitrary finite or infinite number; nothing traps.
     """
 
     def codegen(context, builder, sig, args):
@@ -203,7 +202,7 @@ def exp2_negative(typingctx, value):
 
 
 def _fit_exp2() -> tuple[float, ...]:
-    """Coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
+    """Return the coefficients, constant first, of the polynomial for 2**f on [-1, 0]."""
     fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp2, 6, domain=[-1, 0])
     return tuple(float(np.float32(c)) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
 
@@ -251,7 +250,7 @@ larger = _pick(">", "Lane-wise maximum.")
 
 @intrinsic
 def any_ge(typingctx, left, right):
-    """Whether left >= right in any lane."""
+    """Return whether left >= right in any lane."""
 
     def codegen(context, builder, sig, args):
         mask = builder.bitcast(builder.fcmp_ordered(">=", args[0], args[1]), ir.IntType(WIDTH))
@@ -262,7 +261,7 @@ def any_ge(typingctx, left, right):
 
 @intrinsic
 def bits_ge(typingctx, left, right):
-    """Bit k is set unless left < right in lane k; so it is where either is not a number."""
+    """Return a bit mask in which bit k is 0 if left < right in lane k, else 1 (also if either is NaN)."""
 
     def codegen(context, builder, sig, args):
         mask = builder.bitcast(builder.fcmp_unordered(">=", args[0], args[1]), ir.IntType(WIDTH))
@@ -273,7 +272,7 @@ def bits_ge(typingctx, left, right):
 
 @intrinsic
 def prefetch(typingctx, array, index):
-    """Begin to load a place of an array's memory into the cache; it may lie outside the array."""
+    """Start loading the cache line of an array index, which may be outside the array."""
 
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
@@ -289,7 +288,7 @@ def prefetch(typingctx, array, index):
 
 @intrinsic
 def column_bits(typingctx, words, index, bit):
-    """Bit k is set if bit `bit` of words[index + k] is, for 64 words of a flat uint16 array."""
+    """Collect bit `bit` of words[index + k] as bit k of the result, for 64 words of a flat uint16 array."""
     count = 64
 
     def codegen(context, builder, sig, args):
@@ -311,7 +310,7 @@ def column_bits(typingctx, words, index, bit):
 
 @intrinsic
 def first_bit(typingctx, bits):
-    """Number of the lowest bit that is set; `bits` must not be 0."""
+    """Return the number of the lowest bit that is set; `bits` must not be 0."""
 
     def codegen(context, builder, sig, args):
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -321,10 +320,10 @@ def first_bit(typingctx, bits):
 
 @intrinsic
 def store_sums(typingctx, array, index, vectors):
-    """Write the sum over the lanes of each of up to 16 vectors (a tuple) to consecutive places.
+    """Store the lane sums of up to 16 vectors (a tuple) at consecutive indices.
 
-    Two vectors become one of half as wide groups at a time, which takes half as many instructions as a
-    `lane_sum` of each.
+    Each step merges two vectors into one with groups of half the width, which takes half as many instructions
+    as a `lane_sum` of each.
     """
     if not isinstance(vectors, types.UniTuple) or vectors.dtype != LANES or not 2 <= len(vectors) <= WIDTH:
         return None
@@ -332,7 +331,7 @@ def store_sums(typingctx, array, index, vectors):
 
     def codegen(context, builder, sig, args):
         nothing = ir.Constant(_VECTOR, ir.Undefined)
-        # what a lane holds after the merges: the number of the vector
+        # each vector, with the number of the input vector that each lane belongs to
         held = [(cgutils.unpack_tuple(builder, args[2])[k], [k] * WIDTH) for k in range(count)]
         width = WIDTH
         while width > 1:
@@ -370,7 +369,7 @@ def store_sums(typingctx, array, index, vectors):
 
 
 def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
-    """Combine the lower with the upper half of a vector until one number is left: the order is fixed."""
+    """Combine the lower and the upper half of a vector until one number is left, in a fixed order."""
     width = WIDTH
     while width > 1:
         width //= 2
@@ -384,13 +383,13 @@ def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
 
 @intrinsic
 def lane_sum(typingctx, value):
-    """Sum of the lanes."""
+    """Return the sum of the lanes."""
     return types.float32(LANES), lambda context, builder, sig, args: _halved(builder, args[0], builder.fadd)
 
 
 @intrinsic
 def lane_max(typingctx, value):
-    """Largest lane."""
+    """Return the largest lane."""
 
     def codegen(context, builder, sig, args):
         return _halved(
@@ -404,9 +403,9 @@ def lane_max(typingctx, value):
 
 @intrinsic
 def transpose(typingctx, source, source_index, source_step, target, target_index, target_step):
-    """Copy a 16 x 16 block between flat float32 arrays and exchange its rows and columns.
+    """Transpose a 16 x 16 block while copying it between flat float32 arrays.
 
-    Each array comes with the place of the block's first number and the step from row to row.
+    Each array is followed by the index of the block's first number and the step from row to row.
     """
 
     def codegen(context, builder, sig, args):
@@ -432,10 +431,10 @@ def transpose(typingctx, source, source_index, source_step, target, target_index
 
 @intrinsic
 def reciprocal(typingctx, value):
-    """1 / x in every lane, for positive normal numbers; relative error below 3e-7.
+    """Compute 1 / x in every lane, for positive normal numbers, with a relative error below 3e-7.
 
-    Reversing the exponent bits is right to 12 %, and each of three Newton steps squares the error. A
-    division of sixteen numbers would keep the processor for as long as thirty such instructions.
+    Negating the exponent bits gives a first guess within 12 %, and each of three Newton steps squares the
+    error. A division of 16 numbers would take as long as 30 such instructions.
     """
 
     def codegen(context, builder, sig, args):
@@ -452,7 +451,7 @@ def reciprocal(typingctx, value):
 
 @intrinsic
 def root(typingctx, value):
-    """Square root of every lane."""
+    """Compute the square root of every lane."""
 
     def codegen(context, builder, sig, args):
         kind = ir.FunctionType(value.vector, [value.vector])

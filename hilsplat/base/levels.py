@@ -6,8 +6,8 @@ from enum import IntEnum
 class Level(IntEnum):
     """Semantic level of a mask, a node or an annotation (paper, Sec. III: l = 1, 2, 3).
 
-    The number is the paper's `l`: 1 is the whole object, 3 the finest part. Arrays store it as
-    uint8. SAM's output heads run the other way (subpart, part, whole).
+    The number is the paper's `l`: 1 is the whole object, 3 the finest part. Arrays store it as uint8. SAM's
+    output heads are in the opposite order (subpart, part, whole).
     """
 
     WHOLE = 1
@@ -16,7 +16,7 @@ class Level(IntEnum):
 
     @property
     def label(self) -> str:
-        """Lower-case name, as files and tables write it."""
+        """Lower-case name, as in files and tables."""
         return self.name.lower()
 
     @property

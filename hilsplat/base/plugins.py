@@ -1,4 +1,4 @@
-"""Tables of interchangeable parts, such as readers and baselines, imported on first use."""
+"""Tables of interchangeable components, such as readers and baselines, imported on first use."""
 
 import importlib
 from collections.abc import Iterator, Mapping
@@ -8,10 +8,10 @@ Part = TypeVar("Part")
 
 
 class Plugins(Mapping[str, Part], Generic[Part]):
-    """Parts by name.
+    """Components by name.
 
-    The identity of code (`base.identity`) does not follow the entries: a stage that uses one part depends
-    on that part alone, and adds its place to its roots.
+    The code identity (`base.identity`) does not follow the entries: a stage that uses one component depends
+    on that component alone, and adds its import path to its roots.
 
     Attributes:
         places: name -> "module:constant".
@@ -31,4 +31,4 @@ class Plugins(Mapping[str, Part], Generic[Part]):
         return len(self.places)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.places  # without importing the part
+        return name in self.places  # without importing the component

@@ -1,4 +1,4 @@
-"""Child processes that end with their parent, unfinished files of killed processes, pools of both kinds."""
+"""Child processes that end with their parent, unfinished files, and process and thread pools."""
 
 import ctypes
 import fcntl
@@ -26,24 +26,24 @@ Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 PARENT = "HILSPLAT_PARENT"
-"""Environment variable with the number of the process whose jobs must end with it (rules/common.smk)."""
+"""Environment variable with the id of the process whose jobs must end with it (rules/common.smk)."""
 
 PR_SET_PDEATHSIG = 1
 """From Linux's <sys/prctl.h>."""
 
 
 def end_with_parent(parent: int) -> None:
-    """Kill this process as soon as the process that started it ends, however that ends.
+    """Kill this process as soon as the process that started it ends for any reason.
 
-    Otherwise the jobs of a killed Snakemake continue, and write outputs of old settings during the next run.
-    Linux does this if no shell is in between; elsewhere a thread checks every second.
+    Otherwise the jobs of a killed Snakemake would continue, and write outputs with old settings during the
+    next run. Linux kills the process if no shell is in between; otherwise a thread checks every second.
 
     Args:
-        parent: number of the process that started this one, possibly through a shell.
+        parent: id of the process that started this one, possibly through a shell.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if not is_alive(parent):  # it ended before the line above
+    if not is_alive(parent):  # it ended before prctl was called
         os._exit(1)
     if sys.platform != "linux" or os.getppid() != parent:
         Thread(target=_watch, args=(parent,), daemon=True).start()
@@ -56,35 +56,35 @@ def _watch(parent: int) -> None:
 
 
 def jobs_end_with_this_process() -> None:
-    """Make the commands that this process starts later end with it."""
+    """Make the commands that this process starts from this point end with it."""
     os.environ[PARENT] = str(os.getpid())
 
 
 def end_with_workflow() -> None:
-    """End with the Snakemake that started this job; do nothing in a command that a person starts."""
+    """End this process with the Snakemake that started it; do nothing if a user started the command."""
     parent = os.environ.pop(PARENT, "")  # popped, because the children of this process have another parent
     if parent.isdecimal():
         end_with_parent(int(parent))
 
 
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
-"""Name of a folder of unfinished files: hidden, so no digest counts it."""
+"""Name of a folder of unfinished files; it is hidden, so digests ignore it."""
 
 LOCK = ".lock"
-"""File in such a folder that its writer locks."""
+"""File in such a folder; its writer locks it."""
 
 FORMER = ".former"
-"""Folder in it that holds the former version of an artifact while the new one takes its place."""
+"""Folder in it for the previous version of an artifact while the new one replaces it."""
 
 
 @functools.cache
 def host_token() -> str:
-    """Return eight digits that identify this host by name; a host keeps its name when it reboots."""
+    """Return eight hexadecimal digits that identify this host by name; a reboot does not change the name."""
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
 def is_unfinished(path: Path) -> bool:
-    """Whether a path is a folder of unfinished files or in one."""
+    """Return whether a path is a folder of unfinished files or inside one."""
     return any(UNFINISHED.fullmatch(part) for part in Path(path).parts)
 
 
@@ -92,15 +92,15 @@ def is_unfinished(path: Path) -> bool:
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """Create a folder for unfinished files, and delete it at the end.
 
-    A lock on a file in it shows `remove_leftovers` that the writer is alive: the system frees the lock when
-    the writer ends, even by a kill. Process numbers mean nothing in other containers and after a reboot.
+    A locked file in it shows `remove_leftovers` that the writer is alive: the system releases the lock when
+    the writer ends, even if it is killed. Process ids have no meaning in other containers and after a reboot.
     The folder itself is not locked, because NFS locks only files.
     """
     is_locked = False
     while not is_locked:
         folder = Path(parent) / f".writing-{host_token()}-{secrets.token_hex(4)}"
         folder.mkdir()
-        with suppress(FileNotFoundError):  # a clean-up found the folder without a lock and deleted it
+        with suppress(FileNotFoundError):  # a clean-up deleted the folder before it was locked
             stream = (folder / LOCK).open("ab")
             fcntl.flock(stream, fcntl.LOCK_EX)
             is_locked = os.fstat(stream.fileno()).st_nlink > 0
@@ -111,23 +111,23 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
 
 
 def _discard(folder: Path, lock: IO[bytes]) -> None:
-    """Delete a folder of unfinished files; a former version in it returns if no version took its place."""
+    """Delete a folder of unfinished files; restore a previous version in it that was not replaced."""
     former = folder / FORMER
     if former.is_dir():
         for version in former.iterdir():
             if not os.path.lexists(folder.parent / version.name):
                 version.rename(folder.parent / version.name)
-        former.rename(folder / "old")  # a version that is partly deleted must never return
+        former.rename(folder / "old")  # a partly deleted version must never be restored
     shutil.rmtree(folder, ignore_errors=True)
     lock.close()
-    shutil.rmtree(folder, ignore_errors=True)  # NFS keeps a deleted file in its folder until it is closed
+    shutil.rmtree(folder, ignore_errors=True)  # NFS keeps a deleted file until it is closed
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete the unfinished files of dead processes of this host below a folder.
+    """Delete the unfinished files below a folder that dead processes of this host left.
 
-    Those of living processes are kept, also if these run in other containers, and those of other hosts that
-    share the folder, whose locks may be invisible here.
+    Files of live processes, including those in other containers, are kept. So are files of other hosts that
+    share the folder, because their locks may be invisible here.
 
     Returns:
         The deleted folders.
@@ -151,7 +151,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process with this number exists in this process namespace."""
+    """Return whether a process with this id exists in this process namespace."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -166,11 +166,11 @@ def in_processes(
 ) -> Iterator[Result]:
     """Yield the results of `work(*item)` in the order of `items`, computed in several processes.
 
-    For work that holds Python's lock. Processes are spawned, because forking a process with threads may hang.
-    With one worker or one item, no process is started.
+    Use this for work that holds the GIL. Processes are spawned, because forking a process with threads may
+    hang. With one worker or one item, no process is started.
 
     Args:
-        work: a function at the top level of a module, or a `functools.partial` of one.
+        work: a module-level function, or a `functools.partial` of one.
         items: arguments of each call.
         workers: number of processes.
         chunk: number of items that a process takes at a time.
@@ -179,7 +179,7 @@ def in_processes(
         for item in items:
             yield work(*item)
         return
-    from concurrent.futures import ProcessPoolExecutor  # most commands start none
+    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need none
     from multiprocessing import get_context
 
     with ProcessPoolExecutor(
@@ -194,16 +194,16 @@ def in_processes(
 def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
     """Return `work(*given)`, computed in a separate process, for libraries that may end their process.
 
-    Their stderr is not user-facing: the error ends with its last 2000 characters.
+    Their stderr is not shown; the error ends with its last 2000 characters.
 
     Args:
-        work: a function at the top level of a module.
+        work: a module-level function.
         given: its arguments.
 
     Raises:
         ChildProcessError: the process ended without a result.
     """
-    from concurrent.futures import ProcessPoolExecutor  # most commands start none
+    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need none
     from concurrent.futures.process import BrokenProcessPool
     from multiprocessing import get_context
     from tempfile import TemporaryDirectory
@@ -229,9 +229,9 @@ def _begin_alone(parent: int, said: Path) -> None:
 
 
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
-    """Results of `work` in the order of `items`, up to `threads` at once.
+    """Yield the results of `work` in the order of `items`, computed by up to `threads` threads.
 
-    At most twice as many results are waiting at any time. If one item fails, those not started are dropped.
+    At most `2 * threads` results are pending. If an item fails, those not yet started are cancelled.
     """
     threads = max(1, threads)
     with ThreadPoolExecutor(max_workers=threads) as pool:

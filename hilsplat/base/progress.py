@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, otherwise lines in a log that a run reads."""
+"""Progress of long loops: a bar on a terminal, otherwise lines in a log that the enclosing run reads."""
 
 import logging
 import os
@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
 
 LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-"""Format of the log of a stage that a run starts; `last_progress` and `warnings_in` read it."""
+"""Log format of a stage that a run starts; `last_progress` and `warnings_in` parse it."""
 
 LOG_EVERY_S = 5.0
 """Seconds between progress lines if stderr is not a terminal."""
@@ -30,13 +30,13 @@ WARNING = re.compile(r"^\d{4}-\S+ \S+ WARNING \S+ (?P<text>.+?)(?=\n\d{4}-|\Z)",
 
 
 def last_progress(log: Path) -> tuple[str, int, int] | None:
-    """Return the last progress in a stage's log: loop, items done, items in total. None without any."""
+    """Return the last progress in a stage's log (loop, items done, total items), or None."""
     found = list(PROGRESS.finditer(_tail(log)))
     return (found[-1]["what"], int(found[-1]["done"]), int(found[-1]["total"])) if found else None
 
 
 def warnings_in(log: Path) -> list[str]:
-    """Return the warnings in the last part of a stage's log."""
+    """Return the warnings in the last `LOG_TAIL_BYTES` of a stage's log."""
     return [found["text"].rstrip() for found in WARNING.finditer(_tail(log))]
 
 
@@ -45,13 +45,13 @@ def _tail(log: Path) -> str:
         with log.open("rb") as stream:
             stream.seek(max(0, stream.seek(0, os.SEEK_END) - LOG_TAIL_BYTES))
             return stream.read().decode("utf-8", errors="replace")
-    except OSError:  # the job has not written it yet
+    except OSError:  # the job has not created the log yet
         return ""
 
 
 def _bar(*measures: str) -> "Progress":
-    """A bar on the terminal, with these columns of `rich.progress` before the time left."""
-    from rich import progress  # takes a while to import
+    """Return a terminal bar with the given columns of `rich.progress` before the time left."""
+    from rich import progress  # slow to import
     from rich.console import Console
 
     columns = [progress.TextColumn("{task.description}"), progress.BarColumn()]
@@ -60,11 +60,11 @@ def _bar(*measures: str) -> "Progress":
 
 
 def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
-    """Yield the items, showing how many are done.
+    """Yield the items and show how many are done.
 
     Args:
         items: what to iterate over.
-        what: a few words, such as "masks of views".
+        what: label of a few words, such as "masks of views".
         total: number of items, if `len(items)` is not available.
     """
     if total is None:
@@ -87,11 +87,11 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
 
 @contextmanager
 def transfer_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show how many bytes of a transfer are there; yields the function that is told that number.
+    """Show the progress of a transfer; yield the function to call with the number of bytes transferred.
 
     Args:
-        what: name of what is transferred.
-        total: its bytes.
+        what: name of the transferred file.
+        total: its size in bytes.
     """
     if sys.stderr.isatty():
         with _bar("DownloadColumn", "TransferSpeedColumn") as progress:
@@ -111,9 +111,9 @@ def transfer_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def stage_log(stage: str, scene: str) -> Iterator[dict[str, object]]:
-    """Log one line when a stage starts and one when it ends, with the counts that matter.
+    """Log one line when a stage starts and one with its counts when it ends.
 
-    Yields a dict; the closing line prints what the stage puts in it.
+    Yields a dict to which the stage adds these counts.
     """
     counts: dict[str, object] = {}
     logger.info("%s %s: start", stage, scene)

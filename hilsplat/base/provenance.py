@@ -1,4 +1,4 @@
-"""Provenance of artifacts, written beside them, and what a command may replace: its own earlier outputs."""
+"""Provenance records beside artifacts, and checks that a command replaces only its own earlier outputs."""
 
 import functools
 import os
@@ -37,11 +37,11 @@ LIBRARIES = (
 )
 
 SOFTWARE = {"Software": "hilsplat"}
-"""Text in the PNGs that commands draw for people; they have no provenance."""
+"""Metadata of the PNGs that commands draw for users; these files have no provenance."""
 
 
 class Inputs:
-    """Inputs of a stage with the digests that they had before it ran.
+    """Inputs of a stage, with their digests from before it ran.
 
     Args:
         stage: name of the stage, for messages.
@@ -65,7 +65,7 @@ class Inputs:
     def require_unchanged(self) -> None:
         """Check that no input changed since the digests were computed.
 
-        Files are compared by size, time and inode; only inputs with a difference are read again.
+        Files are compared by size, time and inode; only inputs that differ are read again.
 
         Raises:
             HilsplatError: an input changed; the message names the file.
@@ -98,7 +98,7 @@ class Inputs:
 
 
 def files_of(path: Path | Sequence[Path]) -> list[Path]:
-    """Return the files of a folder without hidden ones, or the file or files themselves."""
+    """Return the files in a folder that are not hidden, or the given file or files."""
     if not isinstance(path, Path):
         return [file for each in path for file in files_of(each)]
     if not path.is_dir():
@@ -124,7 +124,7 @@ def write_provenance(
     plugins: Sequence[str] = (),
     device: str | None = None,
 ) -> None:
-    """Write the record of an artifact: how it was made, from what, and the digests of what was written.
+    """Write an artifact's provenance record: how and from what it was made, and the digests of the outputs.
 
     Args:
         artifact: the output.
@@ -132,11 +132,11 @@ def write_provenance(
         code: digest of the stage's code.
         command: command line.
         settings: sections of the settings.
-        seed: seed of everything random, or None.
+        seed: the random seed, or None.
         inputs: inputs with their digests from before the stage ran.
         beside: further outputs.
         plugins: import paths of the readers or baselines that the stage used.
-        device: device that `device: auto` stands for, if the stage has this setting.
+        device: device that the setting `device` resolves to, if the stage has this setting.
     """
     folder = Path(artifact).parent
     write_json(
@@ -166,8 +166,8 @@ class Written(BaseModel):
     """An output as it was written.
 
     Attributes:
-        sha256: as `sha256_of_path`.
-        bytes: as `sizes_of`.
+        sha256: digest from `sha256_of_path`.
+        bytes: sizes from `sizes_of`.
     """
 
     sha256: str
@@ -179,7 +179,7 @@ class Read(BaseModel):
 
     Attributes:
         path: file or folder.
-        sha256: as `sha256_of_path`; None: there was nothing.
+        sha256: digest from `sha256_of_path`, or None if the path did not exist or was empty.
         files: for a list of files, the digest of each.
     """
 
@@ -189,7 +189,7 @@ class Read(BaseModel):
 
 
 class Provenance(BaseModel):
-    """What `write_provenance` records, as far as it is read again; see there."""
+    """The fields of a record that are read back; `write_provenance` documents them."""
 
     stage: str
     code: str
@@ -201,10 +201,10 @@ class Provenance(BaseModel):
 
 
 def read_provenance(artifact: Path) -> Provenance | None:
-    """Read the provenance of an artifact; None if it has none.
+    """Read the provenance of an artifact, or return None if it has none.
 
     Raises:
-        ArtifactError: it is damaged.
+        ArtifactError: the record is damaged.
     """
     path = provenance_path(artifact)
     if not path.is_file():
@@ -219,14 +219,14 @@ def read_provenance(artifact: Path) -> Provenance | None:
 
 
 def sizes_of(path: Path) -> dict[str, int]:
-    """Return the size in bytes of each file of an artifact by its path inside; a file has the path "."."""
+    """Return the size in bytes of each file of an artifact, by relative path ("." for a single file)."""
     path = Path(path)
     return {file.relative_to(path).as_posix(): file.stat().st_size for file in files_of(path)}
 
 
 @functools.cache
 def library_versions() -> dict[str, str]:
-    """Versions of the libraries that shape results."""
+    """Return the versions of the libraries that affect results."""
     versions = {}
     for name in LIBRARIES:
         try:
@@ -238,7 +238,7 @@ def library_versions() -> dict[str, str]:
 
 @functools.cache
 def git_commit() -> str:
-    """Commit of the checkout, with "+edits" if the tree has changes; "unknown" outside one."""
+    """Return the commit of the checkout, with "+edits" if the tree has changes, or "unknown" outside one."""
     folder = Path(__file__).resolve().parent
 
     def git(*words: str) -> str:
@@ -254,10 +254,10 @@ def git_commit() -> str:
 
 
 def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Path]) -> None:
-    """Check that nothing is lost if a stage writes its outputs.
+    """Check that a stage can write its outputs without overwriting unrelated data.
 
-    An existing file or folder may be replaced if it is empty, if the provenance of the first output says that
-    the same stage wrote it, or if a writer of it was killed.
+    An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
+    provenance of the first output, or if a writer of it was killed.
 
     Args:
         outputs: the artifact, whose provenance lists all of them, and further outputs.
@@ -265,8 +265,8 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
         inputs: files and folders that the stage reads.
 
     Raises:
-        ArtifactError: an output is an input, holds one, holds the working, home or root folder, or is
-            something else than an earlier output of the stage.
+        ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
+            not an earlier output of the stage.
     """
     own = _recorded_outputs(outputs[0], stage)
     read = [Path(each).resolve() for each in inputs]
@@ -292,14 +292,14 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Check that a picture for people replaces nothing but an earlier one.
+    """Check that a picture replaces only an earlier picture by this program.
 
     Args:
-        path: of the picture.
+        path: path of the picture.
         beside: a file that is always written with it.
 
     Raises:
-        ArtifactError: the name is not that of a PNG, or another file has it or the other one's.
+        ArtifactError: the name does not end in .png, or an unrelated file exists at `path` or `beside`.
     """
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not named as a PNG", expected="a name that ends in .png")
@@ -318,10 +318,10 @@ def _is_own_picture(path: Path) -> bool:
 
 
 def require_beginning(path: Path, line: str) -> None:
-    """Check that a table replaces nothing but an earlier one, which begins with the same line.
+    """Check that a table replaces only an earlier table, which begins with the same line.
 
     Raises:
-        ArtifactError: another file has its name.
+        ArtifactError: an unrelated file exists at this path.
     """
     if not _is_something(path):
         return
@@ -353,7 +353,7 @@ def _recorded_outputs(artifact: Path, stage: str) -> set[Path]:
 
 
 def _is_something(path: Path) -> bool:
-    """Whether a path exists and holds anything; hidden files, such as Snakemake's marks, do not count."""
+    """Return whether a path exists and is not empty, ignoring hidden files such as Snakemake's markers."""
     if not os.path.lexists(path):
         return False
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""Quaternions (wxyz) and rotation matrices: the one place that knows how they belong together."""
+"""Quaternions (wxyz), rotation matrices and conversions between them."""
 
 from typing import Any, no_type_check
 
@@ -8,15 +8,15 @@ from jaxtyping import Bool, Float, Float64
 from hilsplat.base.compiled import compiled
 
 RIGID_TOLERANCE = 1e-3
-"""How far R R' of a camera may be from the identity: poses come as text with four digits."""
+"""Largest deviation of a camera's R R' from the identity; poses in text files may have only four digits."""
 
 
 @compiled(inline="always")
 @no_type_check
 def matrix_entries(w, x, y, z):
-    """Rotation matrix of a unit quaternion, row by row: nine numbers.
+    """Return the nine entries of a unit quaternion's rotation matrix, row by row.
 
-    Inlined into compiled loops; `rotation_matrices` runs the same lines on arrays.
+    The function is inlined into compiled loops; `rotation_matrices` applies it to arrays.
     """
     return (
         1.0 - 2.0 * (y * y + z * z),
@@ -32,19 +32,19 @@ def matrix_entries(w, x, y, z):
 
 
 def unit_quaternions(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
-    """Quaternions of any length but 0, scaled to length 1."""
+    """Scale quaternions of any nonzero length to length 1."""
     quats = quats.astype(np.float64)
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
 def rotation_matrices(quats: Float[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 3 3"]:
-    """Rotation matrices of quaternions of any length but 0; `matrices[i] @ v` turns v by `quats[i]`."""
+    """Convert quaternions of any nonzero length to matrices: `matrices[i] @ v` rotates v by `quats[i]`."""
     entries: Any = matrix_entries.py_func(*unit_quaternions(quats).T)
     return np.stack(entries, axis=1).reshape(-1, 3, 3)
 
 
 def quaternion_of(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
-    """Unit quaternion of a rotation matrix; of the two that turn alike, scipy's choice."""
+    """Convert a rotation matrix to a unit quaternion; the sign is scipy's."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
@@ -54,7 +54,7 @@ def quaternion_of(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "
 def rotate(
     quats: Float64[np.ndarray, "N 4"], vectors: Float64[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "N 3"]:
-    """Turn each vector by its unit quaternion."""
+    """Rotate each vector by its unit quaternion."""
     # v + 2 w (u x v) + 2 u x (u x v)
     u = quats[:, 1:]
     turned = np.cross(u, vectors)
@@ -64,7 +64,7 @@ def rotate(
 def multiply(
     left: Float64[np.ndarray, " 4"], right: Float64[np.ndarray, "N 4"]
 ) -> Float64[np.ndarray, "N 4"]:
-    """Quaternions that turn first by `right`, then by `left`; lengths multiply."""
+    """Compose rotations: first `right`, then `left`; lengths multiply."""
     w, u = left[0], left[1:]
     scalar = w * right[:, 0] - right[:, 1:] @ u
     vector = w * right[:, 1:] + right[:, :1] * u + np.cross(u, right[:, 1:])
@@ -72,10 +72,10 @@ def multiply(
 
 
 def are_rotations(matrices: Float[np.ndarray, "*n 3 3"], tolerance: float) -> Bool[np.ndarray, "*n"]:
-    """Whether each matrix is a rotation: finite, orthogonal, and no mirror.
+    """Return whether each matrix is a rotation: finite, orthogonal, and not a reflection.
 
     Args:
-        tolerance: how far an entry of R R' may be from that of the identity.
+        tolerance: largest deviation of an entry of R R' from the identity.
     """
     finite = np.isfinite(matrices).all(axis=(-2, -1))
     safe = np.where(finite[..., None, None], matrices, 0.0)

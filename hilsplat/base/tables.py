@@ -1,4 +1,4 @@
-"""Small tables: CSV files with known columns, and Markdown."""
+"""Small tables: CSV files with fixed columns, and Markdown."""
 
 import csv
 import io
@@ -17,11 +17,11 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
 
 
 def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str]]:
-    """Rows of a CSV file by column.
+    """Read the rows of a CSV file as dicts keyed by column.
 
     Args:
         path: the file.
-        columns: the columns that it must have, in order.
+        columns: the required columns, in order.
         fix: what to do if the file is missing or has other columns.
 
     Raises:
@@ -44,14 +44,14 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
 
 
 def plain_markdown(text: str) -> str:
-    """Text of a cell that Markdown shows as it is: no column, emphasis, link or HTML comes from it."""
+    """Escape the text of a cell, so that Markdown does not read columns, emphasis, links or HTML in it."""
     for mark in ("|", "*", "]("):
         text = text.replace(mark, f"\\{mark}" if len(mark) == 1 else "]\\(")
     return " ".join(text.replace("<", "&lt;").splitlines())
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], words: int) -> str:
-    """A table as Markdown; the first `words` columns are words, the others numbers."""
+    """Format a Markdown table; the first `words` columns are text, the others numbers."""
     numbers = len(columns) - words
     lines = [columns, ["---"] * words + ["---:"] * numbers, *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)

@@ -1,4 +1,4 @@
-"""CLIP by onnxruntime: crops of masks and texts as unit vectors of one space."""
+"""CLIP with onnxruntime: unit vectors of mask crops and texts in one space."""
 
 import logging
 import time
@@ -24,20 +24,20 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SIGLIP_TOKENS = 64
-"""Length of every text of a SigLIP whose configuration names none."""
+"""Text length of a SigLIP if its configuration does not specify one."""
 
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
-"""Places of model folders under `models/`."""
+"""Patterns of model folders in `models/`."""
 
 
 class ClipModel:
-    """A CLIP, ready to run.
+    """A loaded CLIP model.
 
     Attributes:
         digest: SHA-256 of the model's files.
-        side_px: side of the square crops the vision network takes.
-        max_tokens: longest text the text network takes; None if the folder names no limit.
-        precision: "fp32" or "int8", of pictures.
+        side_px: side of the vision network's square input.
+        max_tokens: maximum text length of the text network; None if the folder specifies no limit.
+        precision: precision of the vision network, "fp32" or "int8".
     """
 
     precision: str = "fp32"
@@ -51,7 +51,7 @@ class ClipModel:
         self.text = model.network("text_model")
         self.ids, (self.words,) = next(iter(self.text.spec.inputs)), self.text.spec.outputs
         self.side_px = input_side_px(model)
-        # CLIP's own statistics if the folder names none, as in transformers
+        # default: CLIP's statistics, as in transformers
         preprocessing = model.preprocessing
         self.mean = np.array(preprocessing.get("image_mean", (0.48145466, 0.4578275, 0.40821073)), np.float32)
         self.std = np.array(preprocessing.get("image_std", (0.26862954, 0.26130258, 0.27577711)), np.float32)
@@ -78,10 +78,10 @@ class ClipModel:
 
     @cached_property
     def vision(self) -> Network:
-        """The network of pictures, opened at its first use: it is large, and texts do not need it.
+        """Vision network, opened on first use because it is large and not needed for texts.
 
         Raises:
-            ModelError: it cannot be read, or has another width than that of texts.
+            ModelError: it cannot be read, or its vectors differ in width from those of the text network.
         """
         opened = self.model.network("vision_model")
         (vector,) = opened.spec.outputs
@@ -90,11 +90,11 @@ class ClipModel:
         return opened
 
     def use_int8(self, network: Network) -> None:
-        """Embed pictures with the int8 version of their network."""
+        """Replace the vision network with its int8 version."""
         self.__dict__["vision"], self.precision = network, "int8"
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
-        """Token that fills a text up: what the tokenizer names, else its configuration, else the model's."""
+        """Return the padding token of the tokenizer, else of its configuration, else of the model's."""
         named = (self.tokenizer.padding or {}).get("pad_id")
         beside = self.model.tokenizer.with_name("tokenizer_config.json")
         if named is None and beside.is_file():
@@ -110,25 +110,25 @@ class ClipModel:
         """Open a model folder.
 
         Args:
-            folder: in a layout of `models.layouts`.
-            threads: batches of crops embedded at once; results do not depend on it.
-            template: sentence around every text, which replaces `{}`.
-            variant: ending of the networks' names, such as `fp16`.
+            folder: model folder in a layout of `models.layouts`.
+            threads: number of batches of crops embedded at once; results do not depend on it.
+            template: prompt template, in which each text replaces `{}`.
+            variant: suffix of the network names, such as `fp16`.
 
-        Raises:
-            ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
+            Raises:
+                ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
         """
         model = ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
-        _ = model.vision  # opened and checked at once
+        _ = model.vision  # open and check it now
         return model
 
     @property
     def width(self) -> int:
-        """Numbers in a vector."""
+        """Length of a vector."""
         return self.text.declared_axis(self.words, 1) or self.embed_texts(["object"]).shape[1]
 
     def require_width(self, numbers: int, what: str) -> None:
-        """Refuse something made for vectors of another width.
+        """Check that an artifact was made for vectors of this CLIP's width.
 
         Raises:
             MisalignedArtifactError: the widths differ.
@@ -142,19 +142,19 @@ class ClipModel:
             )
 
     def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
-        """Normalise crops, channel first."""
+        """Normalise crops and move the channels to the first axis."""
         values = (crops.astype(np.float32) * self.rescale - self.mean) / self.std
         return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
 
     def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
-        """Unit vectors of square crops of `side_px`."""
+        """Return the unit vectors of square crops of `side_px`."""
         pixels = next(iter(self.vision.spec.inputs))
-        step = self.vision.fixed_axis(pixels, 0) or len(crops)  # open_clip's exports take one picture
+        step = self.vision.fixed_axis(pixels, 0) or len(crops)  # open_clip's exports take one image per call
         pieces = np.split(self.prepare(crops), range(step, len(crops), step))
         return unit(np.concatenate([self.vision(**{pixels: piece})[0] for piece in pieces]))
 
     def seconds(self, network: Network) -> float:
-        """Measure the seconds per crop of the picture network, or of a version of it."""
+        """Measure the seconds per crop of the vision network or a version of it."""
         pixels = next(iter(self.vision.spec.inputs))
         crops = np.zeros((self.vision.fixed_axis(pixels, 0) or 1, self.side_px, self.side_px, 3), np.uint8)
         network(**{pixels: self.prepare(crops)})
@@ -163,7 +163,7 @@ class ClipModel:
         return (time.perf_counter() - start) / len(crops)
 
     def embed_picture(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " C"]:
-        """Unit vector of a whole picture, centred in a black square like the crops of masks."""
+        """Return the unit vector of a whole image, centred in a black square like mask crops."""
         inside = np.ones(picture.shape[:2], np.bool_)
         return self.embed_crops(crop_to_square(picture, inside, "keep", self.side_px)[None])[0]
 
@@ -179,8 +179,8 @@ class ClipModel:
         Args:
             image: the view.
             masks: its masks.
-            settings: what fills the crop outside the mask, and crops per network call; None: defaults.
-            rows: the masks to embed; None: all.
+            settings: background outside the mask and crops per network call; None for the defaults.
+            rows: rows of the masks to embed; None for all.
         """
         settings = settings or ClipSettings()
         chosen = range(len(masks)) if rows is None else rows.tolist()
@@ -197,17 +197,16 @@ class ClipModel:
     def crop(
         self, image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, row: int, settings: ClipSettings
     ) -> UInt8[np.ndarray, "side side 3"]:
-        """Cut out a mask; only its box is unpacked, since a photograph may have 40 million pixels."""
+        """Crop a mask; only its box is unpacked, because a photograph may have 40 million pixels."""
         x0, y0, x1, y1 = box = tuple(masks.box_xyxy[row].tolist())
         as_langsplat = settings.crop == "langsplat"
         inside = masks.window(row, box)
         return crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px, as_langsplat)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
-        """Unit vectors of texts, in order, each inserted into the template.
+        """Return the unit vectors of texts, in order, each inserted into the template.
 
-        Texts run one by one, so the vector of a query never depends on other queries. A repeated text
-        costs nothing.
+        Texts are embedded one by one, so a vector never depends on other queries. Vectors are cached.
 
         Raises:
             ModelError: a text has no token.
@@ -218,7 +217,7 @@ class ClipModel:
         return np.stack([self._known_texts[text] for text in texts])
 
     def unknown_words(self, text: str) -> list[str]:
-        """Words of a text outside the model's vocabulary; a tokenizer of word pieces knows every word."""
+        """Return the words of a text that are not in the vocabulary; none with a tokenizer of word pieces."""
         unknown = self.tokenizer.token_to_id(getattr(self.tokenizer.model, "unk_token", None) or "")
         encoding = self.tokenizer.encode(text)
         places = zip(encoding.ids, encoding.offsets, strict=True)
@@ -226,7 +225,6 @@ class ClipModel:
         return [word for word in words if any(letter.isalnum() for letter in word)]
 
     def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
-        """The unit vector of one text."""
         if not text.strip() or not sum(self.tokenizer.encode(text).attention_mask):
             raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
         sentence = self.template.replace("{}", text)
@@ -250,12 +248,12 @@ def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
 def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> ClipModel:
     """Open the CLIP that embedded the masks of a clip artifact, wherever its folder is now.
 
-    Its digest identifies it. The search covers the recorded path and every folder in `models/`, each relative
-    to the working directory, to the folders above the artifact (such as the project that holds the results)
-    and to the installation, and the user's models. The network of pictures is opened at its first use.
+    The model is identified by its digest. The search covers the recorded path and every folder in `models/`,
+    each relative to the working directory, to the parent folders of the artifact (such as the project of the
+    results) and to the installation, and the user's models. The vision network is opened on first use.
 
     Args:
-        clip_folder: what the clip stage wrote.
+        clip_folder: output of the clip stage.
         threads: as in `ClipModel.load`.
         template: as in `ClipModel.load`.
 
@@ -276,7 +274,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         try:
             model = open_model_folder(folder, "clip", variant=variant)
         except ModelError:
-            continue  # SAM, or half a copy
+            continue  # a SAM, or an incomplete copy
         if model.digest == wanted:
             return ClipModel(model, threads, template)
         seen[place] = model.digest

@@ -1,4 +1,4 @@
-"""Write masks and vectors as LangSplat's preprocessing does (`langsplat_files` describes the format)."""
+"""Export of masks and vectors in the format of LangSplat's preprocessing (see `langsplat_files`)."""
 
 from pathlib import Path
 
@@ -18,9 +18,9 @@ from hilsplat.splat.coordinates import write_source_ply
 def maps_of(
     masks: HierarchicalMasks,
 ) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
-    """LangSplat's four maps of a view, and the mask that each row of its vectors belongs to.
+    """Return LangSplat's four maps of a view, and the mask of each row of its vectors.
 
-    The map of mixed levels holds all masks, large to small.
+    The map of mixed levels contains all masks, painted from large to small.
     """
     maps, rows = [], []
     count = 0
@@ -34,13 +34,13 @@ def maps_of(
 
 
 def export_langsplat(scene: Scene, masks: Path, clip: Path, gaussians: Path, out: Path) -> None:
-    """Write a scene as LangSplat's input: images, `sparse/0`, `language_features/`, and `point_cloud.ply`.
+    """Export a scene as LangSplat's input: images, `sparse/0`, `language_features/` and `point_cloud.ply`.
 
     Args:
         scene: the posed scene.
-        masks, clip: masks of its training views, and a CLIP vector for each.
+        masks, clip: masks of its training views, and a CLIP vector for each mask.
         gaussians: the scene's PLY.
-        out: folder to write; replaced.
+        out: folder to write; an existing one is replaced.
 
     Raises:
         MisalignedArtifactError: the vectors were computed from other masks.

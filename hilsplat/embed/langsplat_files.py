@@ -1,10 +1,10 @@
-"""Read LangSplat's masks and vectors (the `language_features/` of its preprocessing).
+"""Import of LangSplat's masks and vectors (the `language_features/` of its preprocessing).
 
 An image `a.jpg` has two plain arrays:
     a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 for none;
     a_f.npy  float32 (N, C): a CLIP vector per mask.
-The four maps are default, s, m, l: all heads mixed, then from fine to coarse. Row numbers run through all
-four. File names are cut at their first dot.
+The four maps are default, s, m, l: all heads mixed, then from fine to coarse. Rows are numbered across all
+four maps. File names are truncated at their first dot.
 """
 
 import logging
@@ -31,26 +31,26 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Relative difference between the shapes of maps and view that is rounding."""
+"""Relative difference between the aspect ratios of maps and view that is attributed to rounding."""
 
 LEAST_SHARE = 0.5
-"""Share of the training views that must have files; fewer are likely to be those of another scene."""
+"""Share of the training views that must have files; with fewer, the files are likely from another scene."""
 
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
-"""Masks that are embedded again, and the least median cosine of their vectors. The same CLIP reaches 0.99;
-another one of the same width about 0."""
+"""Number of masks embedded again as a check, and the minimum median cosine of their vectors. The same CLIP
+reaches 0.99; another one of the same width about 0."""
 
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
-"""Levels of the four maps, in their order; the first mixes all levels."""
+"""Levels of the four maps, in order; the first map mixes all levels."""
 
 
 def stem_of(view: str) -> str:
-    """Stem of a view's files: its name, cut at the first dot as LangSplat does."""
+    """Return the stem of a view's files: its name, truncated at the first dot as in LangSplat."""
     return view.split(".")[0]
 
 
 def stems_of(views: list[str]) -> dict[str, str]:
-    """Stem of each view.
+    """Return the stem of each view.
 
     Raises:
         ArtifactError: two views have the same stem.
@@ -69,20 +69,20 @@ def stems_of(views: list[str]) -> dict[str, str]:
 def read_view(
     folder: Path, view: str, size_hw: tuple[int, int]
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
-    """Masks and vectors of one view, rows in `content_order`.
+    """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The map of mixed levels is ignored. Where masks of one level overlap, these files keep only the one
-    painted last. They hold no scores: predicted IoU and stability are 1.
+    The map of mixed levels is ignored. Where masks of one level overlap, the files contain only the one
+    painted last. They contain no scores, so predicted IoU and stability are set to 1.
 
     Args:
-        folder: holds `<stem>_s.npy` and `<stem>_f.npy`.
-        view: its name.
-        size_hw: of the view; maps of the same shape in another size, such as LangSplat's 1080 rows, are read
-            at the nearest pixel.
+        folder: folder of `<stem>_s.npy` and `<stem>_f.npy`.
+        view: name of the view.
+        size_hw: size of the view; maps of another size with the same aspect ratio, such as LangSplat's 1080
+            rows, are read at the nearest pixel.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or not as described above.
-        MisalignedArtifactError: the maps are of another shape.
+        MisalignedArtifactError: the maps have another aspect ratio.
     """
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
@@ -137,10 +137,10 @@ def read_view(
 
 
 def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Masks and vectors of the training views that have files.
+    """Read the masks and vectors of the training views that have files.
 
     Raises:
-        ArtifactError: fewer than half of the views have files.
+        ArtifactError: fewer than half of the training views have files.
     """
     stems = stems_of(train_views(scene))
     views = [view for view, stem in stems.items() if (folder / f"{stem}_s.npy").is_file()]
@@ -162,7 +162,7 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
 
 
 def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
-    """Write LangSplat's masks as the masks stage would: `<view>.npz` and `index.json`."""
+    """Write LangSplat's masks in the format of the masks stage: `<view>.npz` and `index.json`."""
     scene = Scene.load(scene_folder)
     with stage_log("langsplat masks", scene.name) as counts, atomic_folder(out) as folder:
         index = {}
@@ -182,10 +182,10 @@ def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
 
 
 def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
-    """Write LangSplat's vectors as the clip stage would: `<view>.npy`, rows as in `read_masks`.
+    """Write LangSplat's vectors in the format of the clip stage: `<view>.npy`, with rows as in `read_masks`.
 
     Raises:
-        MisalignedArtifactError: the vectors are not those of `settings.model`, which embeds the texts.
+        MisalignedArtifactError: the vectors were not computed with `settings.model`, which embeds the texts.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
@@ -219,7 +219,7 @@ def _require_model(
     """Embed some masks of a view again, as LangSplat does, and compare the vectors.
 
     Raises:
-        MisalignedArtifactError: they differ. The width alone does not tell one CLIP from another.
+        MisalignedArtifactError: the vectors differ. Comparing widths alone would not distinguish all CLIPs.
     """
     view = max(found, key=lambda view: len(found[view][0]))
     masks, vectors = found[view]

@@ -1,4 +1,4 @@
-"""Check that a model folder works, describe it, and measure what it takes on this machine."""
+"""Checks and descriptions of model folders, and measurements of their speed on this machine."""
 
 from pathlib import Path
 
@@ -13,27 +13,27 @@ from hilsplat.models.network import execution_providers, require_one_space
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
-"""Stores measured seconds, and int8 networks if the models are read-only."""
+"""Folder for measured timings, and for int8 networks if the models are read-only."""
 
 LARGEST_PROVIDER_DIFFERENCE = 0.02
-"""Relative difference that rounding explains: TF32 products on CUDA."""
+"""Largest relative difference attributed to rounding, such as that of TF32 products on CUDA."""
 
 Seconds = dict[str, float]
-"""SAM: per "image", and per prompt for its "masks" and, if there is one, its "preview". CLIP: per "crop"."""
+"""Timings. SAM: per "image", and per prompt for "masks" and the optional "preview". CLIP: per "crop"."""
 
 
 def check_model(folder: Path, variant: str = "") -> str:
-    """Describe a model folder after running each of its networks on an empty input, also in int8.
+    """Run each network of a model on an empty input, also in int8, and describe the model.
 
     Args:
-        folder: in a layout of `models.layouts`.
-        variant: ending of the networks' names, such as `fp16`.
+        folder: model folder in a layout of `models.layouts`.
+        variant: suffix of the network names, such as `fp16`.
 
     Returns:
         kind, image size, shapes, digest, execution provider and time, one per line.
 
     Raises:
-        ModelError: as for `open_model_folder` and `Network`.
+        ModelError: as in `open_model_folder` and `Network`.
     """
     model = open_model_folder(folder, variant=variant)
     side = input_side_px(model)
@@ -68,10 +68,10 @@ def check_model(folder: Path, variant: str = "") -> str:
 
 
 def provider_disagreement(folder: Path) -> str | None:
-    """Return how the image network differs between onnxruntime's providers on a random image, or None.
+    """Describe how outputs of the image network for a random image differ between providers, or return None.
 
     Raises:
-        ModelError: as for `open_model_folder` and `Network`.
+        ModelError: as in `open_model_folder` and `Network`.
     """
     model = open_model_folder(folder)
     name = "vision_encoder" if model.kind == "sam" else "vision_model"
@@ -93,13 +93,13 @@ def provider_disagreement(folder: Path) -> str | None:
 
 
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
-    """Return how long a model takes, from an earlier measurement if there is one.
+    """Return the timings of a model, from an earlier measurement if there is one.
 
     Args:
         folder: the model folder.
         variant: as in `check_model`.
-        precision: "fp32", or "auto" or "int8" for int8 where it is possible.
-        cache: stores measurements.
+        precision: "fp32", or "auto" or "int8" for int8 where possible.
+        cache: folder of the measurements.
 
     Raises:
         ModelError: the model cannot be opened.
@@ -118,7 +118,6 @@ def _precisions(model: ModelFolder) -> list[str]:
 
 
 def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
-    """Measure a model on an empty input."""
     if isinstance(model, SamModel):
         encoder = model.int8_encoder(CACHE) if precision == "int8" else model.encoder
         side = input_side_px(model.model)

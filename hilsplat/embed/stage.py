@@ -1,4 +1,4 @@
-"""The stage `clip`: CLIP vectors of the crops that show each node best, or of all masks."""
+"""The stage `clip`: CLIP vectors of each node's best crops, or of all masks."""
 
 import math
 from collections.abc import Mapping
@@ -58,23 +58,23 @@ def run_clip(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Embed the crops that the settings choose.
+    """Embed the crops selected by the settings.
 
     Args:
         scene_folder: the `Scene` artifact.
         masks_folder: output of the masks stage.
-        semantic_tree_folder: nodes, and how well each mask shows its node; None: every mask is embedded.
+        semantic_tree_folder: output of the semantic tree stage, with crop ranks; None to embed every mask.
         out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, zero for masks
-            that were not chosen, and `index.json` with the number C and the model.
-        cache: folder of the view cache. Its entries grow: a run that chooses other masks embeds only those
-            that no run embedded before.
+            that were not selected, and `index.json` with C and the model.
+        cache: folder of the view cache. Entries accumulate: a run that selects other masks embeds only masks
+            that no earlier run embedded.
         settings: model and cropping.
         threads: views embedded at once, if they fit into the memory; the result does not depend on it.
-        memory_mib: memory that the stage may use; None: what is free.
+        memory_mib: memory that the stage may use; None for all free memory.
 
     Raises:
-        MisalignedArtifactError: the masks belong to other views or sizes than the scene's, or are not
-            those that their index records.
+        MisalignedArtifactError: views or sizes of the masks differ from the scene's, or the masks differ from
+            those recorded in their index.
     """
     scene = Scene.load(scene_folder)
     digests = digests_in(masks_folder)
@@ -100,7 +100,7 @@ def run_clip(
     def embed(view: str) -> np.ndarray:
         masks = load_masks(masks_folder, view, digests)
         pixels = pixel_digests(masks)
-        order = sorted(range(len(pixels)), key=pixels.__getitem__)  # of the cache: levels don't matter
+        order = sorted(range(len(pixels)), key=pixels.__getitem__)  # cache order, independent of levels
         key = sha256_of_json(
             {
                 "image": sha256_of_file(scene.image_path(view)),
@@ -170,7 +170,7 @@ def _choose_precision(
     settings: ClipSettings,
     threads: int,
 ) -> None:
-    """Let the model use int8 if the settings say so, or if it agrees with float32 on crops of the scene."""
+    """Switch the model to int8 if the settings require it or it agrees with float32 on crops of the scene."""
     if settings.precision == "fp32" or not may_be_int8(model.model):
         return
     digests = digests_in(masks_folder)
@@ -193,7 +193,7 @@ def _choose_precision(
 
     def measure() -> Agreement:
         pixels = next(iter(model.vision.spec.inputs))
-        quantised()  # before threads ask for it
+        quantised()  # computed once, before the threads start
 
         def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return model.embed_crops(one[None]), unit(quantised()(**{pixels: model.prepare(one[None])})[0])
@@ -209,11 +209,11 @@ def _choose_precision(
 
 
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:
-    """Return the masks of each view whose crops show some node best; all masks if the tree has no node.
+    """Return the rows of each view's masks that are among a node's best crops; all masks if there are none.
 
     Args:
-        semantic_tree_folder: output of the semantic tree's stage.
-        per_node: the most crops of a node, by rank.
+        semantic_tree_folder: output of the semantic tree stage.
+        per_node: maximum number of crops per node, by rank.
     """
     rank = read_npz(sealed(semantic_tree_folder, "tree.npz"), "crop_rank")["crop_rank"]
     is_chosen = (rank >= 0) & (rank < per_node)

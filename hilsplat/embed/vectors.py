@@ -1,4 +1,4 @@
-"""Reading the CLIP vectors of masks."""
+"""Reading of the masks' CLIP vectors."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
 
 UNIT_TOLERANCE = 2e-3
-"""Vectors are stored as halves."""
+"""Largest deviation of a vector's length from 1; vectors are stored as float16."""
 
 
 def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:
-    """CLIP vectors of all masks in the row order of an artifact of theirs; zero where none was computed.
+    """Read the CLIP vectors of all masks, in the row order of `folder`; zero for masks without a vector.
 
     Raises:
-        ArtifactError: a file is missing or damaged, or its vectors are not of length 1 or of the same width.
+        ArtifactError: a file is missing or damaged, or its vectors differ in width or are not of length 1.
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
@@ -43,7 +43,7 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
 
 
 def require_every_vector(vectors: Shaped[np.ndarray, "M C"], clip_folder: Path, purpose: str) -> None:
-    """Refuse vectors of the crops that show nodes best where every mask needs one.
+    """Check that every mask has a vector, not only the best crops of nodes.
 
     Raises:
         ArtifactError: a mask has no vector.

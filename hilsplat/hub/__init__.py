@@ -1,1 +1,1 @@
-"""Released models: fetched from a model hub, checked, exported where no ready networks exist."""
+"""Released models: downloaded from a model hub, checked, and exported if no ONNX networks are published."""

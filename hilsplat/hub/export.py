@@ -1,4 +1,4 @@
-"""PyTorch weights to ONNX networks, by optimum in a separate process (the extra `export`)."""
+"""Export of PyTorch weights to ONNX networks with optimum, in a separate process (the extra `export`)."""
 
 import importlib.util
 import logging
@@ -14,16 +14,16 @@ from hilsplat.models.clip_split import split_whole, whole_clip
 logger = logging.getLogger(__name__)
 
 NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
-"""Without Pillow, optimum writes no preprocessor_config.json, and says nothing."""
+"""Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
 
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 
 LAST_LINES = 15
-"""Lines of the exporter's output that an error shows."""
+"""Lines of the exporter's output shown in an error."""
 
 
 def require_exporter(what: str) -> None:
-    """Refuse before anything is fetched if the exporter is not installed.
+    """Check that the exporter is installed, before anything is downloaded.
 
     Raises:
         ModelError: some of its packages are missing.
@@ -40,19 +40,19 @@ def require_exporter(what: str) -> None:
 def _is_installed(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # of the package above it
+    except ModuleNotFoundError:  # the parent package is missing
         return False
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
-    """Make the networks of a PyTorch SAM or CLIP in the layout that is read here.
+    """Export the networks of a PyTorch SAM or CLIP in a supported layout.
 
     Args:
-        weights: folder of the transformers library: config.json, weights, preprocessor, tokenizer.
+        weights: folder in the format of transformers: config.json, weights, preprocessor, tokenizer.
         out: folder to write.
 
     Returns:
-        versions of the exporter's packages.
+        versions of the exporter's packages by name.
 
     Raises:
         ModelError: the exporter fails; its last lines are shown.

@@ -1,4 +1,4 @@
-"""What a repository of the hub holds, and which of its files a model needs here."""
+"""Listings of hub repositories, and the choice of the files that a model needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from hilsplat.models.clip_split import WHOLE
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
-nothing (`weights_only`)."""
+"""PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers does
+not run code in it (`weights_only`)."""
 
 SMALL_BYTES = 50_000_000
-"""Larger text files of a PyTorch model are not part of its tokenizer."""
+"""Text files of a PyTorch model above this size are not part of its tokenizer."""
 
 
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
-"""Places of a whole CLIP."""
+"""Possible paths of a whole CLIP without `.onnx`."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Parts:
     """Files of a kind of model.
 
     Attributes:
-        networks: places of each network without `.onnx`, the usual one first.
-        described: files that must be beside them.
-        whole: places of a network that holds all of them, from which they can be split.
-        beside: files that are taken if they are there.
+        networks: possible paths of each network without `.onnx`, the usual one first.
+        described: files required in addition to the networks.
+        whole: possible paths of a single network that contains all of them and can be split.
+        beside: files that are downloaded if they exist.
     """
 
     networks: tuple[tuple[str, ...], ...]
@@ -43,7 +43,7 @@ class Parts:
 
     @property
     def usual(self) -> tuple[str, ...]:
-        """Every file, at its usual place."""
+        """Usual paths of all required files."""
         return (*self.described, *(f"{places[0]}.onnx" for places in self.networks))
 
 
@@ -56,18 +56,18 @@ PARTS = {
     )
     for name, layout in LAYOUTS.items()
 }
-"""By the layout of the model."""
+"""Layout -> files of its models."""
 
 
 @dataclass(frozen=True)
 class HubFile:
-    """A file as the hub states it.
+    """A file as listed by the hub.
 
     Attributes:
-        path: inside the repository.
-        size: bytes.
+        path: path in the repository.
+        size: size in bytes.
         digest: SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits).
-        cached: the file in the hub's cache on this machine, if the listing was made from that.
+        cached: the file in the hub's cache on this machine, if the listing is that of the cache.
     """
 
     path: str
@@ -83,8 +83,8 @@ class Listing:
     Attributes:
         repository: owner/name.
         revision: the commit.
-        licence: as the hub states it; empty if it does not.
-        files: by path.
+        licence: licence according to the hub; empty if not stated.
+        files: files by path.
     """
 
     repository: str
@@ -93,10 +93,10 @@ class Listing:
     files: Mapping[str, HubFile]
 
     def require(self, *paths: str) -> list[HubFile]:
-        """Files by path.
+        """Return files by path.
 
         Raises:
-            DownloadError: the repository lacks some of them.
+            DownloadError: the repository lacks one or more of them.
         """
         if missing := [path for path in paths if path not in self.files]:
             raise DownloadError(
@@ -110,12 +110,12 @@ class Listing:
 
 @dataclass(frozen=True)
 class Choice:
-    """The files that are fetched.
+    """The files to download.
 
     Attributes:
-        files: file of the repository -> its place in the model's folder.
-        exported: they are PyTorch weights, from which the networks are still to be made.
-        split: they are a whole CLIP, to be split into its two networks.
+        files: path in the repository -> path in the model folder.
+        exported: whether they are PyTorch weights, to be exported as networks.
+        split: whether they are a whole CLIP, to be split into its two networks.
     """
 
     files: Mapping[str, str]
@@ -124,18 +124,18 @@ class Choice:
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
-    """Ask the hub what a repository holds.
+    """Request the listing of a repository from the hub.
 
     Raises:
-        requests.RequestException: the hub is out of reach, or refuses.
+        requests.RequestException: the hub is unreachable, or refuses.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
-        DownloadError: the hub states no digest of a file.
+        DownloadError: the hub does not state the size and digest of a file.
     """
     info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
     files = {}
     for each in info.siblings or ():
         if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
-            continue  # no hub has such a file, and it would be written elsewhere
+            continue  # not a valid repository path, and it would be written outside the folder
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
             raise DownloadError(
@@ -149,7 +149,7 @@ def read_listing(repository: str, revision: str | None) -> Listing:
 
 
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
-    """What the hub's cache on this machine (HF_HOME) holds of a repository; its files are named by digest."""
+    """Return a repository's listing from the hub's local cache (HF_HOME; files named by digest), or None."""
     try:
         repositories = huggingface_hub.scan_cache_dir(huggingface_hub.constants.HF_HUB_CACHE).repos
     except CacheNotFound:
@@ -169,16 +169,16 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
-    """Which files of a repository make a model: ready networks, else a whole CLIP, else PyTorch weights.
+    """Choose the files of a model: separate networks, else a whole CLIP, else PyTorch weights.
 
     Args:
         listing: the repository.
         config: its config.json.
-        variant: "quantized", "fp16", ...: networks of that ending, which get the plain names; empty: the
-            plain ones.
+        variant: suffix of the networks, such as "quantized" or "fp16", which is removed from their names;
+            empty for the plain networks.
 
     Raises:
-        DownloadError: the model is of no kind that is read here, or it has neither networks nor weights.
+        DownloadError: the model is not supported, or it has neither networks nor weights.
     """
     try:
         described = parse_json(config)
@@ -201,7 +201,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             listing.require(*parts.described)
             plain = [*parts.described, *(path for path in parts.beside if path in listing.files)]
             files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
-            # a network looks for its weights under the names that it was saved with
+            # a network refers to its weight files by their original names
             weights = [
                 path
                 for path in listing.files
@@ -221,9 +221,8 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
 
 
 def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None:
-    """The first place at which the repository has a network."""
     return next((place for place in places if f"{place}{ending}.onnx" in listing.files), None)
 
 
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled)
-"""Errors of the way to the hub, which say nothing about the repository."""
+"""Errors of the connection to the hub, which do not concern the repository."""

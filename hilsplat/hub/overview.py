@@ -1,4 +1,4 @@
-"""Tables for people: which models there are, and whether those that are here work."""
+"""Overviews of released and installed models, and checks of installed ones."""
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.embed.model_check import check_model
@@ -15,7 +15,7 @@ COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<14} {}"
 
 
 def models_table() -> str:
-    """Released models with size and licence, and models that are here; which of them photographs use."""
+    """Return a table of released and installed models, with those that are used for photographs."""
     here = {model.folder.name: model for model in present_models()}
     chosen = {str(real_model(family)) for family in ("sam", "clip")}
 
@@ -50,10 +50,10 @@ def models_table() -> str:
 
 
 def check_models() -> tuple[str, int]:
-    """Check every model folder that is here.
+    """Check every installed model folder.
 
     Returns:
-        what `check_model` says about each, and how many do not work.
+        the report of `check_model` on each, and the number of models that do not work.
     """
     texts, num_failed = [], 0
     for folder in [*(model.folder for model in present_models()), *broken_models()]:

@@ -1,4 +1,4 @@
-"""Bytes from the hub: resumed where a cut left them, patient with a busy hub, checked against its digest."""
+"""Downloads from the hub: resumed after an interruption, retried if the hub is busy, checked by digest."""
 
 import hashlib
 import logging
@@ -22,33 +22,33 @@ logger = logging.getLogger(__name__)
 Answer = TypeVar("Answer")
 
 CHUNK_BYTES = 2**16
-"""Bytes read at once; a cut loses no more than these."""
+"""Bytes read at once; an interruption loses at most this many."""
 
 TRIES = 5
-"""Failures in a row, without a new byte, after which a transfer gives up."""
+"""Consecutive failures without a new byte after which a transfer is aborted."""
 
 MAX_WAIT_S = 330.0
-"""Longest wait that the hub may ask for: its limits count over five minutes."""
+"""Longest wait that is accepted from the hub: its rate limits apply to windows of five minutes."""
 
 BUSY = (429, 500, 502, 503, 504)
-"""Answers of a hub that may answer otherwise later."""
+"""Status codes after which a later request may succeed."""
 
 
 def fetch(listing: Listing, file: HubFile, target: Path, tell: Callable[[int], None]) -> None:
-    """Bring one file, from the hub's cache on this machine or from the hub, and check it.
+    """Fetch one file, from the hub's cache on this machine or from the hub, and check it.
 
     Args:
         listing: the repository.
-        file: what to fetch.
-        target: where to; a part kept from before is beside it, and is continued.
-        tell: called with the number of bytes reached.
+        file: the file to fetch.
+        target: path to write; an earlier partial download beside it is resumed.
+        tell: callback for the number of bytes transferred.
 
     Raises:
-        DownloadError: the bytes are not those that the hub states; they are deleted.
+        DownloadError: the digest differs from the hub's; the bytes are deleted.
         DiskSpaceError: the disk is full.
-        requests.RequestException: the hub cannot be reached any more, or refuses.
+        requests.RequestException: the hub is unreachable, or refuses.
     """
-    if not (target.is_file() and _digest(file, target) == file.digest):  # else it is whole from before
+    if not (target.is_file() and _digest(file, target) == file.digest):  # else an earlier run completed it
         target.parent.mkdir(parents=True, exist_ok=True)
         part = partial(file, target)
         cached = file.cached or huggingface_hub.try_to_load_from_cache(
@@ -65,22 +65,22 @@ def fetch(listing: Listing, file: HubFile, target: Path, tell: Callable[[int], N
 
 
 def partial(file: HubFile, target: Path) -> Path:
-    """Where a file grows: named by digest too, so that another revision does not continue it."""
+    """Return the path of a partial download, with the digest so that another revision is not resumed."""
     return target.with_name(f"{target.name}.{file.digest[:12]}.part")
 
 
 def patiently(
     attempt: Callable[[], Answer], reached: Callable[[], int] = lambda: 0, tries: int = TRIES
 ) -> Answer:
-    """Call until it succeeds; wait after a cut or a busy answer, as long as the hub asks or ever longer.
+    """Retry until success, and wait between attempts as long as the hub requests or with exponential backoff.
 
     Args:
-        attempt: what to do.
-        reached: how far it has come; failures that bring it further do not count.
-        tries: failures in a row after which to give up.
+        attempt: function to call.
+        reached: returns the progress; a failure after progress restarts the count.
+        tries: consecutive failures after which to give up.
 
     Raises:
-        requests.RequestException: that of the last attempt, or one that waiting cannot mend.
+        requests.RequestException: the error of the last attempt, or one that retrying cannot fix.
     """
     failures, before = 0, reached()
     while True:
@@ -97,7 +97,7 @@ def patiently(
 
 
 def _wait_s(error: requests.RequestException, failures: int) -> float | None:
-    """Seconds to wait after an error: what the hub asks for, else 1, 2, 4, ...; None if it is useless."""
+    """Return the seconds to wait after an error (the hub's value, else 1, 2, 4, ...); None: do not retry."""
     backoff = float(2 ** (failures - 1))
     if error.response is None:
         return backoff
@@ -110,7 +110,7 @@ def _wait_s(error: requests.RequestException, failures: int) -> float | None:
 
 
 def _asked_wait_s(response: requests.Response) -> float | None:
-    """Seconds that an answer asks to wait: Retry-After (seconds or a date), or the hub's own RateLimit."""
+    """Return the seconds to wait from a response: Retry-After (seconds or a date) or the hub's RateLimit."""
     text = response.headers.get("Retry-After", "").strip()
     if re.fullmatch(r"\d+(\.\d+)?", text):
         return float(text)
@@ -124,14 +124,13 @@ def _asked_wait_s(response: requests.Response) -> float | None:
 
 
 def _cause(error: requests.RequestException) -> str:
-    """An error in a few words."""
     if error.response is not None:
         return f"the hub answers {error.response.status_code} {error.response.reason}"
     return f"the connection to the hub was lost ({type(error).__name__})"
 
 
 def _continue(listing: Listing, file: HubFile, part: Path, tell: Callable[[int], None]) -> None:
-    """Ask for the bytes that are missing and append them."""
+    """Request the missing bytes and append them."""
     done = _size(part)
     if done > file.size:
         part.unlink()
@@ -164,7 +163,7 @@ def _size(path: Path) -> int:
 
 
 def _digest(file: HubFile, path: Path) -> str:
-    """Digest of a file's bytes, of the kind that the hub states for it."""
+    """Return the digest of a file, of the kind that the hub lists for it."""
     with path.open("rb") as stream:
         if len(file.digest) == 64:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -173,7 +172,7 @@ def _digest(file: HubFile, path: Path) -> str:
 
 
 def _require_digest(listing: Listing, file: HubFile, arrived: Path) -> None:
-    """Compare a file with what the hub states; a wrong one is deleted, for it cannot be continued."""
+    """Check a file's digest; delete a wrong file, because it cannot be resumed."""
     found = _digest(file, arrived)
     if found != file.digest:
         size = _size(arrived)

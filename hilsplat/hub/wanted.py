@@ -1,4 +1,4 @@
-"""What a user asks for: a name of the table, or any repository of the hub."""
+"""Requested models: names of released models, or any repository of the hub."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ from hilsplat.models.store import RELEASES, Release
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is to be fetched.
+    """A model to download.
 
     Attributes:
-        name: of the folder.
+        name: name of the folder.
         repository: owner/name on the hub.
-        release: the line of the table, for a model that has one.
+        release: the released model, or None for any other repository.
     """
 
     name: str
@@ -25,10 +25,10 @@ class Wanted:
 
     @staticmethod
     def named(name: str, variant: str) -> "Wanted":
-        """By its name in the table, or as owner/name.
+        """Find a model by its release name or as owner/name.
 
         Raises:
-            DownloadError: it is neither.
+            DownloadError: the name is neither.
         """
         ending = f"-{variant}" if variant else ""
         for release in RELEASES:

@@ -1,7 +1,7 @@
-"""Split the single network of an exported CLIP into the two that we read.
+"""Splitting of an exported CLIP's single network into an image and a text network.
 
-Optimum writes a CLIP or a SigLIP as `model.onnx`, which takes an image and a text together. Its image vectors
-depend on the image alone and its text vectors on the text alone, so each half is a subgraph.
+Optimum exports a CLIP or a SigLIP as `model.onnx`, which takes an image and a text together. The image
+vectors depend only on the image and the text vectors only on the text, so each half is a subgraph.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ModelError
 
 WHOLE = "model.onnx"
-"""The network that holds both halves, in the folder itself or under `onnx/`."""
+"""Network with both halves, in the model folder itself or in its subfolder `onnx/`."""
 
 HALVES = {
     "vision_model": (("pixel_values",), ("image_embeds",)),
@@ -19,11 +19,11 @@ HALVES = {
 """Inputs and outputs of each half."""
 
 OPTIONAL = {"attention_mask"}
-"""Inputs that a network may lack; SigLIP's reads the padding."""
+"""Inputs that a network may lack; SigLIP's text network reads the padding instead."""
 
 
 def whole_clip(folder: Path) -> Path | None:
-    """The network that holds both halves, if a folder has one."""
+    """Return the path of a folder's network with both halves, or None."""
     places = (Path(folder) / WHOLE, Path(folder) / "onnx" / WHOLE)
     return next((place for place in places if place.is_file()), None)
 
@@ -31,11 +31,11 @@ def whole_clip(folder: Path) -> Path | None:
 def split_clip(folder: Path) -> list[Path]:
     """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP's `model.onnx`.
 
-    A network above 2 GiB keeps its weights in a file of their own (`model.onnx_data`). They are not read or
-    copied: both halves name their places in that file.
+    A network above 2 GiB has its weights in a separate file (`model.onnx_data`). They are not read or copied:
+    both halves refer to that file.
 
     Returns:
-        the two files; `model.onnx` stays and is no longer needed, its file of weights is.
+        the two files. `model.onnx` is kept but not needed; its weight file is still needed.
 
     Raises:
         ModelError: there is no `model.onnx`, it cannot be read, or it lacks an input or output.
@@ -66,7 +66,7 @@ def split_clip(folder: Path) -> list[Path]:
             found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
             fix="export it with optimum's task feature-extraction",
         )
-    # Shapes inside the graph do not matter here, and inferring them fails above 2 GiB.
+    # Shapes inside the graph are not needed, and inferring them fails above 2 GiB.
     extractor = Extractor(model)
     written = []
     for name, (wanted, given) in HALVES.items():
@@ -79,10 +79,10 @@ def split_clip(folder: Path) -> list[Path]:
 
 
 def split_whole(folder: Path) -> None:
-    """Replace a CLIP's `model.onnx` by the two networks; a file of weights beside it stays.
+    """Replace a CLIP's `model.onnx` with the two networks; its separate weight file, if any, is kept.
 
     Raises:
-        ModelError: as `split_clip`.
+        ModelError: as in `split_clip`.
     """
     whole = whole_clip(folder)
     split_clip(folder)

@@ -1,4 +1,4 @@
-"""Digests of model folders, cached by sizes and times of their files."""
+"""Digests of model folders, cached by the sizes and modification times of their files."""
 
 import functools
 import json
@@ -9,11 +9,11 @@ from hilsplat.base.artifacts import parse_json, sha256_of_path, write_json
 
 @functools.cache
 def model_digest(folder: Path, cache: Path) -> str:
-    """Return the digest of a model folder, cached: ViT-H takes seconds to read.
+    """Return the digest of a model folder, cached because reading ViT-H takes seconds.
 
     Args:
-        folder: model folder. If it is missing, the result says so; the stage reports how to fix it.
-        cache: folder of the file with known digests.
+        folder: model folder. If it is missing, the result is a text that says so; the stage reports the fix.
+        cache: folder of the file with cached digests.
     """
     if not folder.is_dir():
         return f"{folder} is missing"

@@ -1,8 +1,8 @@
-"""Model folders in the layouts of published ONNX exports: finding and checking.
+"""Finding and checking of model folders in the layouts of published ONNX exports.
 
-A folder holds `config.json`, what prepares its inputs, and its networks as `.onnx` files
-(`layouts.LAYOUTS`). Everything needed to turn a photograph into a network's input is read from the
-folder, so its digest identifies the model.
+A folder contains `config.json`, the preprocessing configuration and the networks as `.onnx` files
+(`layouts.LAYOUTS`). Everything needed to convert a photograph into a network's input is read from the folder,
+so its digest identifies the model.
 """
 
 import math
@@ -34,15 +34,15 @@ SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """A model folder that is complete.
+    """A complete model folder.
 
     Attributes:
-        folder: as the settings name it.
+        folder: path of the folder, as returned by `model_path`.
         layout: key of `LAYOUTS`.
         config: content of `config.json`.
-        preprocessing: how a picture becomes an input, in the words of `preprocessor_config.json`.
-        networks: file of each network by name, and of those that few models have if it is there.
-        files: all files that count for the digest.
+        preprocessing: image preprocessing, with the keys of `preprocessor_config.json`.
+        networks: file of each network by name, including optional networks that exist.
+        files: all files included in the digest.
     """
 
     folder: Path
@@ -59,12 +59,12 @@ class ModelFolder:
 
     @property
     def tokenizer(self) -> Path:
-        """File of a CLIP's tokenizer."""
+        """Tokenizer file of a CLIP."""
         return self.folder / LAYOUTS[self.layout].tokenizer
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over names and bytes of the files, independent of the folder's path. Computed once."""
+        """SHA-256 of the names and bytes of the files, independent of the folder's path; computed once."""
         return sha256_of_json(
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
@@ -79,16 +79,16 @@ class ModelFolder:
 def open_model_folder(
     folder: Path, kind: str | None = None, *, variant: str = "", fix: str = ""
 ) -> ModelFolder:
-    """Find a model's files.
+    """Find the files of a model and check that they are complete.
 
     Args:
         folder: the model folder.
         kind: "sam" or "clip"; None accepts either.
-        variant: ending of the networks' names, such as `fp16` for `vision_encoder_fp16.onnx`; "": none.
-        fix: another way out, added to the message about a missing folder.
+        variant: suffix of the network names, such as `fp16` for `vision_encoder_fp16.onnx`; "" for none.
+        fix: alternative fix, added to the message about missing files.
 
-    Raises:
-        ModelError: the folder or some of its files are missing, or it holds another kind of model.
+        Raises:
+            ModelError: the folder or some of its files are missing, or it contains another kind of model.
     """
     folder = model_path(folder)
     way_out = "name a folder in a layout that docs/models.md lists" + (f", or {fix}" if fix else "")
@@ -124,10 +124,10 @@ def open_model_folder(
 
 
 def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[str, Any]]:
-    """Layout and configuration of a folder.
+    """Return the layout and configuration of a folder.
 
     Raises:
-        ModelError: it holds no model that can be read, or one of another kind.
+        ModelError: it does not contain a supported model, or contains one of another kind.
     """
     supported = "; ".join(SUPPORTED[each] for each in ([kind] if kind else SUPPORTED))
     try:
@@ -152,18 +152,16 @@ def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[
 
 
 def _ending(variant: str) -> str:
-    """Ending of a network's name."""
     return f"_{variant}" if variant else ""
 
 
 def _network_file(folder: Path, spec: NetworkSpec, variant: str) -> Path | None:
-    """The file of a network, if it is there."""
     places = (folder / f"{place}{_ending(variant)}.onnx" for place in spec.places)
     return next((place for place in places if place.is_file()), None)
 
 
 def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: str) -> ModelError:
-    """The message about a folder that lacks files: what it holds instead, and what to do."""
+    """Return the error for a folder that lacks files: what was found instead, and how to fix it."""
     layout = LAYOUTS[name]
     found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     variants = variants_of(folder, name)
@@ -192,7 +190,7 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: 
 
 
 def variants_of(folder: Path, layout: str) -> list[str]:
-    """Endings that all networks of a folder have, such as `fp16`; "" for the plain names."""
+    """Return the suffixes, such as `fp16`, for which a folder has all networks; "" for the plain names."""
     endings: set[str] | None = None
     for spec in LAYOUTS[layout].networks.values():
         have = set()
@@ -207,10 +205,10 @@ def variants_of(folder: Path, layout: str) -> list[str]:
 
 
 def _preprocessing_of(path: Path) -> dict[str, Any]:
-    """How a picture becomes an input; open_clip's words are translated.
+    """Read the image preprocessing; keys of open_clip are converted.
 
     Raises:
-        ModelError: the file cannot be read, switches off a step, or has statistics that no image has.
+        ModelError: the file cannot be read, disables a step, or contains an invalid mean or deviation.
     """
     try:
         found = read_json(path)
@@ -244,15 +242,15 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
 
 
 def external_weights(network: Path, folder: Path) -> list[Path]:
-    """Files beside a network that hold its weights, as its graph names them; the weights are not read.
+    """Return the weight files beside a network that its graph names, without reading the weights.
 
     Raises:
         ModelError: the graph cannot be read, or such a file is missing or outside the model folder.
     """
     if not network.stat().st_size:
-        return []  # opening it says what is wrong
+        return []  # opening the network reports the problem
     with network.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        if content.find(b"location") < 0:  # the key that every tensor outside the graph has
+        if content.find(b"location") < 0:  # key of every tensor stored outside the graph
             return []
     import onnx
     from google.protobuf.message import DecodeError
@@ -261,7 +259,7 @@ def external_weights(network: Path, folder: Path) -> list[Path]:
     try:
         graph = onnx.load(str(network), load_external_data=False).graph
     except DecodeError:
-        return []  # a damaged copy: opening it says so
+        return []  # a damaged copy: opening the network reports it
     named = {ExternalDataInfo(tensor).location for tensor in _tensors(graph) if uses_external_data(tensor)}
     found = []
     for name in sorted(named):
@@ -278,7 +276,7 @@ def external_weights(network: Path, folder: Path) -> list[Path]:
 
 
 def _tensors(graph: Any) -> Iterator[Any]:
-    """All weights and constants of a graph and of the graphs inside it."""
+    """Yield all weights and constants of a graph and its subgraphs."""
     yield from graph.initializer
     for node in graph.node:
         for attribute in node.attribute:
@@ -288,7 +286,7 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def side_px(size: Any, default: int) -> int:
-    """Side of a square input, from a preprocessor's size: a number, or a dict in any of its forms."""
+    """Return the side of a square input, given a preprocessor's size (a number or a dict in any form)."""
     if isinstance(size, dict):
         for key in ("longest_edge", "shortest_edge", "height"):
             if key in size:
@@ -298,7 +296,7 @@ def side_px(size: Any, default: int) -> int:
 
 
 def input_side_px(model: ModelFolder) -> int:
-    """Side of the square that the image network takes, px."""
+    """Return the side of the image network's square input, px."""
     keys = ("pad_size", "size") if model.layout == "sam" else ("crop_size", "size")
     default = 1024 if model.kind == "sam" else 224
     for key in keys:

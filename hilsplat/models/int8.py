@@ -1,4 +1,4 @@
-"""Networks in int8, dynamically quantised. Stages check them on the scene's own photographs."""
+"""Dynamically quantised int8 networks. Stages check them on the scene's own photographs."""
 
 import logging
 import os
@@ -16,28 +16,28 @@ from hilsplat.models.network import Network, execution_providers
 logger = logging.getLogger(__name__)
 
 RECIPE = "dynamic, per channel, 1"
-"""Changes whenever the same network would become other bytes."""
+"""Version of the quantisation: it changes whenever the same network would give other bytes."""
 
 WORDS = (
     *("object", "things", "stuff", "texture", "person", "face", "hand", "animal", "head", "toy", "cup"),
     *("bottle", "plate", "food", "fruit", "table", "chair", "sofa", "bed", "cushion", "blanket", "lamp"),
     *("book", "screen", "door", "window", "wall", "floor", "plant", "tree", "car", "wheel", "button"),
 )
-"""The canonical phrases of LERF, and everyday words, that crops are ranked for."""
+"""Texts that each crop ranks: the canonical phrases of LERF and everyday words."""
 
 LEAST_COSINE, LEAST_RANK_CORRELATION = 0.99, 0.95
-"""Mean agreement of the vectors of both precisions, and of the order of `WORDS` by their cosines with a crop.
-Two crops of one thing from neighbouring views differ by more."""
+"""Minimum mean cosine between the vectors of both precisions, and minimum rank correlation of `WORDS` by
+cosine with a crop. Two crops of one object from neighbouring views differ by more."""
 
 LEAST_IOU = 0.98
-"""Mean IoU of masks of one prompt by both precisions."""
+"""Minimum mean IoU between the masks of both precisions for the same prompts."""
 
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
-"""Crops that a CLIP is checked on; views, and prompts per side, that a SAM is checked on."""
+"""Number of crops for checking a CLIP; number of views, and of prompts per side, for checking a SAM."""
 
 
 def may_be_int8(model: ModelFolder) -> bool:
-    """Whether int8 can pay: on a CPU, for a model whose weights take most of its time."""
+    """Return whether int8 can save time: on a CPU, for models other than those of the synthetic world."""
     return execution_providers()[0] == "CPUExecutionProvider" and not model.config.get("world_only")
 
 
@@ -46,20 +46,20 @@ def int8_network(
 ) -> Network:
     """Open the int8 version of a model's network, which `hilsplat models get` or the first use computes.
 
-    It is stored beside the model's folder, in `.int8`, under the digest of what it was made from.
+    It is stored beside the model folder, in `.int8`, under a digest of its source.
 
     Args:
-        model: the folder.
-        name: network in it.
-        cache: stores the network instead if that place is read-only.
-        graph: a changed graph that takes the file's place.
+        model: the model folder.
+        name: name of the network.
+        cache: folder to use instead if the model's parent folder is read-only.
+        graph: a modified graph to use instead of the file.
         exact: outputs that stay in float32, such as sines of large arguments.
 
     Raises:
         ModelError: the network cannot be opened.
     """
     source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
-    beside = model.folder.parent  # a new file in the model's folder would be another model
+    beside = model.folder.parent  # a new file in the model folder could change its digest
     folder = beside if os.access(beside, os.W_OK) else Path(cache)
     path = folder / ".int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
     if not path.is_file():
@@ -69,12 +69,11 @@ def int8_network(
 
 
 def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
-    """Write the int8 version of a network."""
     import onnx
     from onnxruntime.quantization import QuantType, quantize_dynamic
 
     graph = onnx.load_from_string(network) if isinstance(network, bytes) else onnx.load(str(network))
-    logging.disable(logging.WARNING)  # it logs a line per layer, about what it leaves in float32
+    logging.disable(logging.WARNING)  # onnxruntime logs a line for each layer that stays in float32
     try:
         with atomic_path(out) as temporary:
             quantize_dynamic(
@@ -90,7 +89,7 @@ def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
 
 
 def _leading_only_to(graph: object, outputs: Sequence[str]) -> list[str]:
-    """Return the names of nodes that no other output of a graph needs."""
+    """Return the names of nodes that are needed for the given outputs only."""
     makers = {name: node for node in graph.node for name in node.output}  # type: ignore[attr-defined]
 
     def needed(names: Sequence[str]) -> set[str]:
@@ -108,18 +107,18 @@ def _leading_only_to(graph: object, outputs: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far a network in int8 agrees with the one in float32.
+    """Agreement of an int8 network with its float32 original.
 
     Attributes:
         values: measured values by name.
-        least: what each must be at least.
+        least: minimum of each value.
     """
 
     values: dict[str, float]
     least: dict[str, float]
 
     def decide(self, precision: str, what: str) -> bool:
-        """Whether to use int8 (`precision` "auto" or "int8"), with a line about it in the log."""
+        """Return whether to use int8 (`precision` is "auto" or "int8"), and log the decision."""
         agrees = all(self.values[name] >= least for name, least in self.least.items())
         use = agrees or precision == "int8"
         said = ", ".join(
@@ -130,11 +129,11 @@ class Agreement:
 
     @staticmethod
     def remembered(cache: Path, inputs: object, measure: Callable[[], "Agreement"]) -> "Agreement":
-        """Return what was measured before on the same inputs, or measure it.
+        """Return the cached agreement for the same inputs, or measure it.
 
         Args:
             cache: folder of the caches.
-            inputs: digests of the model and of what it is checked on.
+            inputs: digests of the model and of the data it is checked on.
         """
 
         def arrays() -> dict[str, np.ndarray]:
@@ -148,7 +147,7 @@ class Agreement:
 def agreement_of_vectors(
     full: Float[np.ndarray, "B C"], quantised: Float[np.ndarray, "B C"], texts: Float[np.ndarray, "T C"]
 ) -> Agreement:
-    """Compare unit vectors of crops by both precisions, also by how they rank texts."""
+    """Compare the crops' unit vectors of both precisions, directly and by how they rank texts."""
     ranks = [np.argsort(np.argsort(vectors @ texts.T, axis=1), axis=1) for vectors in (full, quantised)]
     centred = [rank - rank.mean(axis=1, keepdims=True) for rank in ranks]
     order = (centred[0] * centred[1]).sum() / max(float(np.square(centred[0]).sum()), 1e-12)
@@ -157,7 +156,7 @@ def agreement_of_vectors(
 
 
 def agreement_of_masks(full: Bool[np.ndarray, "K h w"], quantised: Bool[np.ndarray, "K h w"]) -> Agreement:
-    """Compare masks of the same prompts by both precisions; pairs of empty masks don't count."""
+    """Compare the masks of both precisions for the same prompts; pairs of empty masks are ignored."""
     union, shared = (full | quantised).sum(axis=(1, 2)), (full & quantised).sum(axis=(1, 2))
     iou = float((shared[union > 0] / union[union > 0]).mean()) if union.any() else 0.0
     return Agreement({"mask IoU": iou}, {"mask IoU": LEAST_IOU})

@@ -1,10 +1,10 @@
-"""Layouts of published ONNX exports of SAM and CLIP: which files, with which inputs and outputs."""
+"""Layouts of published ONNX exports of SAM and CLIP: files, inputs and outputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 Axes = tuple[int | None, ...]
-"""Axes of an array: their lengths if the layout fixes them, None if any will do."""
+"""Axis lengths of an array; None where the layout does not fix the length."""
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,8 @@ class NetworkSpec:
         inputs: names and axes of required inputs.
         outputs: names and axes of required outputs; others are ignored.
         optional: names of inputs that are passed if the network has them.
-        places: the file without `.onnx`, relative to the folder; the first that exists is taken.
-        synonyms: other name of an output, under which some exports have it.
+        places: possible paths without `.onnx`, relative to the folder; the first that exists is used.
+        synonyms: output name -> alternative name in some exports.
     """
 
     inputs: Mapping[str, Axes]
@@ -28,15 +28,15 @@ class NetworkSpec:
 
 @dataclass(frozen=True)
 class Layout:
-    """How the files of a model are named.
+    """File names of a kind of model.
 
     Attributes:
-        kind: what the model is for: "sam" segments, "clip" compares pictures with texts.
-        networks: by the names that our code gives them.
-        further: networks that few models have; they are used if the folder has them.
-        preprocessing: file that says how a picture becomes an input.
-        tokenizer: file that turns texts into tokens; "" if the model reads none.
-        beside: further files that count for the digest, if they exist.
+        kind: "sam" for segmentation, "clip" for comparing images with texts.
+        networks: required networks, by the names used in this package.
+        further: optional networks, used if the folder contains them.
+        preprocessing: file with the image preprocessing.
+        tokenizer: file of the tokenizer; "" if the model does not read texts.
+        beside: further files that are included in the digest if they exist.
     """
 
     kind: str
@@ -48,12 +48,12 @@ class Layout:
 
     @property
     def usable(self) -> dict[str, NetworkSpec]:
-        """`networks` and `further`."""
+        """Required and optional networks."""
         return {**self.networks, **self.further}
 
     @property
     def described(self) -> tuple[str, ...]:
-        """Files that must be beside the networks."""
+        """Files required in addition to the networks."""
         return ("config.json", self.preprocessing, *([self.tokenizer] if self.tokenizer else []))
 
 
@@ -64,8 +64,8 @@ _MASKS: dict[str, Axes] = {"iou_scores": (None, None, 3), "pred_masks": (None, N
 
 DECODER = "prompt_encoder_mask_decoder"
 PREVIEW = "prompt_encoder_mask_preview"
-"""A decoder with the same predicted IoUs, but only every second row and column of the masks: in a fraction of
-the decoder's time it says which prompts repeat others (`segment.candidates`). sam-tiny has one."""
+"""A decoder with the same predicted IoUs, but only every second row and column of the masks. It detects
+duplicate prompts in a fraction of the decoder's time (`segment.candidates`). sam-tiny has one."""
 
 
 def _places(name: str) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ def _places(name: str) -> tuple[str, ...]:
 
 
 def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layout:
-    """A SAM whose encoder hands the named features to its decoder."""
+    """Return the layout of a SAM whose encoder passes the named features to its decoder."""
     encoded = dict.fromkeys(features, _ANY4)
     return Layout(
         "sam",
@@ -88,7 +88,7 @@ def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layou
 
 
 def _image_and_text(image: str, text: str, optional: tuple[str, ...] = ()) -> Layout:
-    """A CLIP of the Hugging Face exports whose networks return vectors under the given names."""
+    """Return the layout of a Hugging Face CLIP export whose vectors have the given output names."""
     synonyms = {"pooler_output": ("image_embeds", "text_embeds")}
     others = [{image: synonyms[image][0]}, {text: synonyms[text][1]}] if image in synonyms else [{}, {}]
     return Layout(
@@ -122,8 +122,8 @@ LAYOUTS: dict[str, Layout] = {
         beside=("textual/tokenizer_config.json", "textual/special_tokens_map.json"),
     ),
 }
-"""Layouts that are read: SAM, SAM 2 and 2.1, CLIP and SigLIP as transformers.js and optimum name their parts,
-and open_clip's two folders, as Immich publishes them."""
+"""Supported layouts: SAM, SAM 2 and 2.1, CLIP and SigLIP with the file names of transformers.js and optimum,
+and open_clip's two folders, as published by Immich."""
 
 MODEL_TYPES = {
     "sam": "sam",
@@ -131,11 +131,11 @@ MODEL_TYPES = {
     "clip": "clip",
     "siglip": "siglip",
 }
-"""`model_type` of a config.json -> layout. open_clip's has `vision_cfg` and `text_cfg` instead."""
+"""`model_type` in config.json -> layout. open_clip has `vision_cfg` and `text_cfg` instead."""
 
 
 def layout_of(config: object) -> str | None:
-    """Layout of a model by the content of its config.json; None if it is not one that we read."""
+    """Return a model's layout from the content of its config.json, or None if it is not supported."""
     if not isinstance(config, dict):
         return None
     if {"vision_cfg", "text_cfg"} <= config.keys():
@@ -149,7 +149,7 @@ SUPPORTED = {
     "clip": "CLIP (model_type clip), SigLIP or SigLIP 2 of fixed resolution (siglip), open_clip (folders "
     "visual/ and textual/)",
 }
-"""What can be read, by kind."""
+"""Supported models by kind, for messages."""
 
 OTHER_TYPES = {
     "siglip2": "this is a SigLIP 2 of variable resolution (NaFlex); take one of fixed resolution, such as "
@@ -159,10 +159,10 @@ OTHER_TYPES = {
     "sam3_tracker": "take SAM 2.1",
     "chinese_clip": "take CLIP, SigLIP 2 (many languages) or an open_clip in two folders",
 }
-"""What to take instead of models that look alike."""
+"""Unsupported `model_type` -> which model to use instead."""
 
 SECTIONS = {"sam": "masks", "clip": "clip"}
-"""Section of the settings that names the model, by kind."""
+"""Settings section that selects the model, by kind."""
 
 TORCH_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth")
-"""Files that hold PyTorch's weights."""
+"""Suffixes of PyTorch weight files."""

@@ -1,4 +1,4 @@
-"""Memory that a model takes and memory that is free, from which follows how many views run at once."""
+"""Memory use of models and free memory, which together limit the number of views processed at once."""
 
 import os
 from dataclasses import dataclass
@@ -8,57 +8,57 @@ from typing import Any
 from hilsplat.models.folder import ModelFolder, input_side_px
 
 PROCESS_MIB = 1500
-"""A stage without its networks: libraries, images, candidates, masks."""
+"""Memory of a stage without its networks: libraries, images, candidates, masks."""
 
 MIB = 2**20
 ATTENTION_COPIES = 3.5
-"""Arrays as large as all attention weights of a layer that are alive at once. Measured: 2615 MiB for a
-picture in SAM ViT-B, whose weights of attention take 768 MiB."""
+"""Number of arrays of the size of a layer's attention weights that exist at once. Measured: 2615 MiB for an
+image in SAM ViT-B, whose attention weights take 768 MiB."""
 
 ACTIVATIONS = 35
-"""Arrays of all patches' features that a picture takes in SAM if attention goes row by row. Measured: 475 MiB
-in ViT-B, whose features of all patches take 12 MiB."""
+"""Memory of an image in SAM with row-wise attention, in arrays of all patch features. Measured: 475 MiB in
+ViT-B, whose patch features take 12 MiB."""
 
 PROMPT_MIB = 64
-"""Memory of a prompt in SAM's exported decoder at a picture of 1024 px. Measured: 507 MiB for 8 of ViT-B."""
+"""Memory per prompt in SAM's exported decoder, for a 1024 px image. Measured: 507 MiB for 8 in ViT-B."""
 
 FACTORED_MIB = 250
-"""Memory of all prompts of a picture of 1024 px in the factored decoder. Measured: 104 MiB while 1024 prompts
-are previewed; masks of the prompts that are kept come on top."""
+"""Memory of all prompts of a 1024 px image in the factored decoder. Measured: 104 MiB while 1024 prompts are
+previewed, plus the masks of the prompts that are kept."""
 
 UNKNOWN_BYTES_PER_PX = 400
-"""Memory of a picture's encoding per pixel, if the configuration does not describe the network (sam-tiny)."""
+"""Memory for encoding an image, per pixel, if the configuration does not describe the network (sam-tiny)."""
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Memory of a model.
+    """Memory use of a model.
 
     Attributes:
-        weights_mib: of the networks once they are open.
-        view_mib: of each view that runs at the same time.
+        weights_mib: memory of the open networks.
+        view_mib: additional memory of each view processed at the same time.
     """
 
     weights_mib: float
     view_mib: float
 
     def total_mib(self, views: int) -> int:
-        """Memory of a stage that works on so many views at once."""
+        """Return the memory of a stage that processes this many views at once, MiB."""
         return round(PROCESS_MIB + self.weights_mib + views * self.view_mib)
 
     def views_at_once(self, threads: int, memory_mib: float) -> int:
-        """Views that fit into the memory, at most one per thread and at least one."""
+        """Return the number of views that fit into the memory: at most one per thread, and at least one."""
         fitting = int((memory_mib - PROCESS_MIB - self.weights_mib) // self.view_mib)
         return max(1, min(threads, fitting))
 
 
 def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Needs:
-    """Memory of a model, from its configuration and the size of its files.
+    """Estimate the memory of a model from its configuration and file sizes.
 
     Args:
-        model: the folder.
+        model: the model folder.
         batch: prompts (SAM) or crops (CLIP) per call.
-        as_exported: SAM's networks run as they are (see `segment.sam.SamModel.as_exported`).
+        as_exported: run SAM's networks unchanged (see `segment.sam.SamModel.as_exported`).
     """
     files = {*model.networks.values(), *(path for path in model.files if "onnx" in path.name)}
     weights = 1.2 * sum(path.stat().st_size for path in files) / MIB
@@ -81,10 +81,10 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
 
 
 def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
-    """Weights of attention among all patches of a picture, in one layer.
+    """Return the memory of one layer's attention weights between all patches of an image, MiB.
 
-    What a configuration leaves out has the default of transformers: patches of 16 px, 12 heads; for SAM 2 the
-    stage that attends to the whole picture has a stride of 16 px and 4 heads.
+    Keys missing from the configuration have the defaults of transformers: patches of 16 px and 12 heads. In
+    SAM 2, the stage with global attention has a stride of 16 px and 4 heads.
     """
     stages = (vision.get("backbone_config") or {}).get("num_attention_heads_per_stage")
     heads = stages[2] if stages else vision.get("num_attention_heads", 12)
@@ -92,34 +92,33 @@ def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
 
 
 def _patch_px(vision: dict[str, Any]) -> int:
-    """Side of a patch."""
     return vision.get("patch_size", 16)
 
 
 def _crop_mib(vision: dict[str, Any], side_px: int) -> float:
-    """Memory of a crop in a CLIP. Measured: 521 MiB for 64 crops of ViT-B/16."""
+    """Return the memory of a crop in a CLIP, MiB. Measured: 521 MiB for 64 crops in ViT-B/16."""
     tokens = (side_px / _patch_px(vision)) ** 2
     return 2 * _attention_mib(vision, side_px) + 0.03 * tokens
 
 
 SYSTEM = Path("/")
-"""Folder of `proc` and `sys`; tests use others."""
+"""Parent folder of `proc` and `sys`; tests use other folders."""
 
 CGROUP_FILES = {
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     2: ("memory.max", "memory.current", "inactive_file"),
 }
-"""Limit, use, and the key in `memory.stat` of reclaimable file pages, by version of control groups."""
+"""Control group version -> files with limit and use, and the key of reclaimable pages in `memory.stat`."""
 
 
 def machine_mib(system: Path = SYSTEM) -> float:
-    """Return the memory of this machine, or of the container or cluster job of this process."""
+    """Return the memory in MiB available to this process: that of its machine, container or cluster job."""
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB
     return min([physical, *(limit for limit, _ in _cgroups(system))])
 
 
 def available_mib(system: Path = SYSTEM) -> float:
-    """Return the memory that is free now, on this machine and in the container or cluster job."""
+    """Return the memory in MiB that is currently free on the machine and in the container or cluster job."""
     try:
         lines = (system / "proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:  # not Linux
@@ -129,10 +128,10 @@ def available_mib(system: Path = SYSTEM) -> float:
 
 
 def _cgroups(system: Path) -> list[tuple[float, float]]:
-    """Return limit and use in MiB of each control group with a memory limit that contains this process.
+    """Return the limit and use in MiB of each control group that contains this process and limits its memory.
 
-    Groups are nested, and each limit holds. File pages that can be reclaimed do not count as used. Version 1
-    reports a limit of 8 EiB for groups without limit.
+    Groups are nested, and each limit applies. Reclaimable file pages do not count as used. Version 1 reports
+    a limit of 8 EiB for groups without a limit.
     """
     try:
         lines = (system / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
@@ -145,7 +144,7 @@ def _cgroups(system: Path) -> list[tuple[float, float]]:
         mount = system / "sys/fs/cgroup" / ("memory" if controllers else "")
         limit_file, use_file, reclaimable = CGROUP_FILES[1 if controllers else 2]
         own = mount / path.lstrip("/")
-        if ".." in own.parts or not own.is_dir():  # in a container the mount shows the container's group
+        if ".." in own.parts or not own.is_dir():  # inside a container, the mount is the container's group
             own = mount
         for group in (own, *own.parents):
             if not group.is_relative_to(mount):

@@ -1,4 +1,4 @@
-"""One network of a model folder: opening, checking and running it."""
+"""Opening, checking and running of a network in a model folder."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from hilsplat.models.layouts import Axes, NetworkSpec
 logger = logging.getLogger(__name__)
 
 POINTER_BYTES = 1024
-"""Files smaller than this may be the pointers that a clone without Git LFS leaves."""
+"""Size below which a file may be a pointer from a clone without Git LFS."""
 
 DTYPES = {
     "tensor(float)": np.float32,
@@ -27,16 +27,16 @@ DTYPES = {
 
 
 def execution_providers() -> list[str]:
-    """onnxruntime's execution providers in our order of preference: CUDA if there is one, then CPU."""
+    """Return the available onnxruntime execution providers in order of preference: CUDA, then CPU."""
     available = onnxruntime.get_available_providers()
     return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
 
 
 class Network:
-    """One ONNX network: checked names, inputs cast to its types, outputs as float32.
+    """An ONNX network with checked names; inputs are cast to its types, and outputs are float32.
 
-    A call runs in one thread by default: stages are faster when they process several views at once, and the
-    sums inside a call then do not depend on the number of threads. Several threads may call it.
+    By default, a call runs in one thread: stages are faster if they process several views at once, and
+    results then do not depend on the number of threads. Several threads may call a network.
     """
 
     def __init__(
@@ -52,12 +52,12 @@ class Network:
         Args:
             path: the `.onnx` file.
             spec: its inputs and outputs.
-            threads: of one call.
-            graph: a changed graph that takes the file's place (`onnx_graph`).
-            provider: the only execution provider to use; None: the first that works.
+            threads: number of threads per call.
+            graph: a modified graph to use instead of the file (`onnx_graph`).
+            provider: the only execution provider to use, or None for the first that works.
 
         Raises:
-            ModelError: it cannot be read, or its inputs or outputs have other names or axes than expected.
+            ModelError: it cannot be read, or its inputs or outputs have unexpected names or axes.
         """
         self.path = path
         options = onnxruntime.SessionOptions()
@@ -99,7 +99,6 @@ class Network:
     def _check(
         self, what: str, expected: Mapping[str, Axes], found: dict[str, Any], optional: tuple[str, ...]
     ) -> None:
-        """Compare names, axes and types with the expected ones."""
         wrong = [name for name in expected if name not in found]
         wrong += [name for name in found if name not in expected and name not in optional]
         wrong += [
@@ -119,26 +118,26 @@ class Network:
             )
 
     def declared_axis(self, name: str, axis: int) -> int | None:
-        """Length of an output's axis, if the network states it."""
+        """Return the length of an output's axis, or None if the network does not declare it."""
         shape = self.outputs[name].shape
         return shape[axis] if shape and isinstance(shape[axis], int) else None
 
     def fixed_axis(self, name: str, axis: int) -> int | None:
-        """Length of an input's axis, if the network fixes it."""
+        """Return the length of an input's axis, or None if the network does not fix it."""
         shape = self.inputs[name].shape
         return shape[axis] if shape and isinstance(shape[axis], int) else None
 
     def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
-        """Run once; outputs come in the order of the spec.
+        """Run the network once, and return the outputs in the order of the spec.
 
         Raises:
-            ModelError: the network refuses the inputs.
+            ModelError: the network rejects the inputs.
         """
         wanted = {name: value for name, value in feeds.items() if name in self.inputs}
         cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in wanted.items()}
         try:
             outputs = self.session.run(list(self.spec.outputs), cast)
-        except Exception as error:  # as above
+        except Exception as error:  # onnxruntime's errors share no public base class
             shapes = ", ".join(f"{name} {value.shape}" for name, value in cast.items())
             raise ModelError(
                 f"network {self.path} failed: {error}",
@@ -157,7 +156,7 @@ class Network:
 
 
 def _fits(shape: Sequence[Any], axes: Axes) -> bool:
-    """Whether a declared shape, which may be empty or hold names, can be an array of these axes."""
+    """Return whether a declared shape, which may be empty or contain names, is compatible with these axes."""
     if not shape:
         return True
     return len(shape) == len(axes) and all(
@@ -167,10 +166,10 @@ def _fits(shape: Sequence[Any], axes: Axes) -> bool:
 
 
 def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:
-    """Refuse a decoder that does not return three masks per prompt.
+    """Check that a decoder returns three masks per prompt.
 
     Raises:
-        ModelError: the third axis is not 3 long.
+        ModelError: the length of the third axis is not 3.
     """
     if iou_scores.shape[2] != 3 or pred_masks.shape[2] != 3:
         raise ModelError(
@@ -182,7 +181,7 @@ def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarr
 
 
 def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:
-    """Refuse a CLIP whose two networks return vectors of different widths; None means not known yet.
+    """Check that the two networks of a CLIP return vectors of the same width; None if a width is unknown.
 
     Raises:
         ModelError: the widths differ.

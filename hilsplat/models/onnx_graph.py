@@ -1,4 +1,4 @@
-"""Changes to ONNX graphs: parts of a network, and attention among all patches row by row."""
+"""Changes to ONNX graphs: extraction of parts of a network, and row-wise global attention."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def keep_only(model: Any, outputs: Sequence[str]) -> None:
-    """Reduce a model to what leads to the given values, which become its outputs if they are others."""
+    """Reduce a model to the nodes that compute the given values, and make these its outputs."""
     import onnx
 
     graph = model.graph
@@ -34,26 +34,26 @@ def keep_only(model: Any, outputs: Sequence[str]) -> None:
 
 
 def _inputs(node: Any) -> list[str]:
-    """Names that a node reads, also in its inner graphs."""
+    """Return the names that a node and its subgraphs read."""
     inner = [each for attribute in node.attribute for each in (attribute.g, *attribute.graphs)]
     return [*node.input, *(name for graph in inner for part in graph.node for name in _inputs(part))]
 
 
 def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: int) -> bytes | None:
-    """Return SAM's encoder with global attentions that take one row of patches at a time.
+    """Return SAM's encoder with global attention computed for one row of patches at a time.
 
-    As exported, such a layer writes the weights of every two patches, 800 MB, and reads them four times.
-    Those of a row fit into the processor's cache. onnxruntime loops over rows (operator Scan); results differ
-    by rounding at most.
+    As exported, such a layer writes the weights of all pairs of patches (800 MB) and reads them four times.
+    The weights of one row fit into the processor's cache. onnxruntime loops over rows (operator Scan);
+    results differ by rounding at most.
 
     Args:
         path: the `.onnx` file of a ViT encoder exported from transformers.
         layers: layers with global attention.
-        heads: of an attention.
-        side: patches per side of the picture.
+        heads: attention heads per layer.
+        side: patches per side of the image.
 
     Returns:
-        the graph, serialised; None if a layer has another form, weights are in another file, or have 16 bits.
+        the serialised graph, or None if a layer has another form or weights are external or have 16 bits.
     """
     import onnx
 
@@ -92,7 +92,7 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
 
 
 def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]] | None:
-    """Inputs of the product, and terms by position, whose sum a softmax reads."""
+    """Return the inputs of the product and the two positional terms whose sum a softmax reads, or None."""
     product, positions, waiting = None, [], [softmax.input[0]]
     while waiting:
         node = makers.get(waiting.pop())
@@ -119,7 +119,7 @@ def _row_loop(
     heads: int,
     side: int,
 ) -> list[Any]:
-    """Nodes of an attention with a loop over rows of queries; positions have rows on axis 1."""
+    """Return the nodes of an attention that loops over rows of queries; positions have rows on axis 1."""
     from onnx import TensorProto, helper, numpy_helper
 
     def shape(of: str, *sides: int) -> Any:

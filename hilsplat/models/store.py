@@ -1,6 +1,6 @@
-"""The folders of models: the released models that they may hold, those that they do hold, and which answer.
+"""Model folders: released models, models that are present, and the models that `auto` selects.
 
-Light enough to import when a run is planned: it opens no network.
+This module is fast to import when a run is planned, because it opens no network.
 """
 
 import os
@@ -16,29 +16,29 @@ from hilsplat.base.files import project_path
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
-"""Folder of a project's own models, relative to the folder in which a command or a run starts."""
+"""Folder of a project's own models, relative to the working directory of a command or run."""
 
 FOLDER_VARIABLE = "HILSPLAT_MODELS"
-"""Environment variable that names `user_models`."""
+"""Environment variable with the path of `user_models`."""
 
 AUTO = "auto"
-"""Value of a setting: a real model if there is one."""
+"""Setting value that selects a pretrained model if there is one."""
 
 EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
-"""The models of the synthetic world that come with the project."""
+"""Models of the synthetic world that are included in the project."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """A released model that `hilsplat models get` knows by name.
+    """A released model that `hilsplat models get` accepts by name.
 
     Attributes:
-        name: of its folder.
+        name: name of its folder.
         family: "sam" or "clip".
-        repository: on the model hub.
-        megabytes: approximate size of the download; the hub's own number is reported before a transfer.
-        licence: of the weights.
-        use: what it is good for.
+        repository: repository on the model hub.
+        megabytes: approximate size of the download; the exact size is reported before a transfer.
+        licence: licence of the weights.
+        use: recommended use.
     """
 
     name: str
@@ -85,20 +85,20 @@ RELEASES = (
         "clip-vit-base-patch16", "clip", "Xenova/clip-vit-base-patch16", 601, "MIT", "words, ready to use"
     ),
 )
-"""In the order in which `auto` prefers them, within a family."""
+"""Released models, in the order of preference of `auto` within each family."""
 
 RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
-"""What `hilsplat models get` fetches without a name; docs/models.md says why."""
+"""Models that `hilsplat models get` downloads without a name; docs/models.md gives the reasons."""
 
 
 @dataclass(frozen=True)
 class PresentModel:
-    """A model folder that is there; whether it is whole shows when it is opened.
+    """An existing model folder; only opening it checks that it is complete.
 
     Attributes:
-        folder: where it is.
+        folder: path of the folder.
         family: "sam" or "clip".
-        embedded: it knows the synthetic world alone.
+        embedded: whether it was trained on the synthetic world only.
     """
 
     folder: Path
@@ -107,12 +107,12 @@ class PresentModel:
 
 
 def is_embedded(config: Mapping[str, Any]) -> bool:
-    """Whether a model's config.json says that it was trained on the synthetic world and on nothing else."""
+    """Return whether, according to its config.json, a model was trained on the synthetic world only."""
     return config.get("world_only") is True
 
 
 def read_model(folder: Path) -> PresentModel | None:
-    """What a folder holds, by its config.json; None if it has no network or is not a model that we read."""
+    """Return the model in a folder, or None if it has no network or its config.json is not supported."""
     place = model_path(folder)
     try:
         config = parse_json((place / "config.json").read_text(encoding="utf-8"))
@@ -125,15 +125,15 @@ def read_model(folder: Path) -> PresentModel | None:
 
 
 def user_models() -> Path:
-    """Return the folder of fetched models, which all projects of a user share."""
+    """Return the folder of downloaded models, which all projects of a user share."""
     named = os.environ.get(FOLDER_VARIABLE)
     return Path(named).expanduser() if named else platformdirs.user_data_path("hilsplat") / "models"
 
 
 def model_path(path: str | Path) -> Path:
-    """Return where a model folder of the settings is: as named, in the installation, or among the user's.
+    """Find a model folder named in the settings: as given, in the installation, or among the user's models.
 
-    A folder that is in none of these is returned unchanged, so that messages name what the user wrote.
+    A folder that is in none of these is returned unchanged, so that messages show what the user wrote.
     """
     place = project_path(path)
     of_user = user_models() / place.name
@@ -141,11 +141,11 @@ def model_path(path: str | Path) -> Path:
 
 
 def present_models(*stores: Path) -> list[PresentModel]:
-    """Models in folders, best first: released ones in their order, others by name, embedded ones last.
+    """Return the models in folders, best first: released ones in their order, others by name, embedded last.
 
     Args:
-        stores: folders of models; of models of one name, the first counts. Default: the project's, the
-            user's, and the embedded models of the installation.
+        stores: parent folders of models; if several contain the same name, the first counts. Default: the
+            project's models, the user's models, and the embedded models of the installation.
     """
     order = {release.name: number for number, release in enumerate(RELEASES)}
     by_name: dict[str, PresentModel] = {}
@@ -159,7 +159,7 @@ def present_models(*stores: Path) -> list[PresentModel]:
 
 
 def broken_models() -> list[Path]:
-    """Return folders that have networks, but no configuration of a model that we read."""
+    """Return the folders that contain networks but no configuration of a supported model."""
     folders = {folder.resolve(): folder for folder in _folders()}.values()
     return [folder for folder in folders if any(folder.rglob("*.onnx")) and read_model(folder) is None]
 
@@ -172,14 +172,14 @@ def _folders(*stores: Path) -> list[Path]:
 
 
 def real_model(family: str) -> Path | None:
-    """The model that `auto` means: the best one of a family that knows more than the synthetic world."""
+    """Return the model that `auto` selects: the best pretrained model of a family, or None."""
     return next(
         (each.folder for each in present_models() if each.family == family and not each.embedded), None
     )
 
 
 def meaningless(name: str) -> str:
-    """The sentence about an embedded CLIP that is asked about photographs."""
+    """Return the warning for queries of photographs with an embedded CLIP."""
     return (
         f"{name} knows the synthetic world alone: its answers about photographs mean nothing. "
         "For answers that do: hilsplat models get, then run again"

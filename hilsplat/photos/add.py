@@ -1,4 +1,4 @@
-"""Your own photographs: what a folder holds, and adding it to the scene sheet."""
+"""Inspection of a folder of photographs, and its addition to the scene sheet."""
 
 import hashlib
 import shutil
@@ -39,22 +39,22 @@ from hilsplat.scene.sheet import (
 from hilsplat.scene.view_names import require_usable_name
 
 OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
-"""Photographs in formats that are not read; a folder of them deserves a better message than "no images"."""
+"""Suffixes of unsupported photograph formats; skipped files are reported instead of "no images"."""
 
 
 @dataclass(frozen=True)
 class PhotoReport:
-    """What a folder of photographs holds.
+    """Report on a folder of photographs.
 
     Attributes:
-        folder: where the photographs are.
+        folder: folder of the photographs.
         sizes: number of readable photographs per upright size (height, width), px.
         unreadable: (file name, reason) of each image that cannot be read.
-        num_rotated: photographs that an EXIF flag turns upright.
+        num_rotated: number of photographs that an EXIF flag rotates.
         duplicates: groups of file names with identical bytes.
-        passed_over: number of skipped files per suffix: photographs in formats that are not read.
-        doubts: what is likely to fail, and what to do about it (`check`).
-        notes: what was done to make the folder (`intake`).
+        passed_over: number of skipped files in unsupported photograph formats, by suffix.
+        doubts: likely problems and what to do about them (`check`).
+        notes: how the folder was made (`intake`), and which further files are used.
     """
 
     folder: Path
@@ -68,12 +68,12 @@ class PhotoReport:
 
     @property
     def num_readable(self) -> int:
-        """Photographs that can be read, identical copies included."""
+        """Number of readable photographs, including identical copies."""
         return sum(self.sizes.values())
 
     @property
     def num_distinct(self) -> int:
-        """Photographs that can be read, identical copies counted once."""
+        """Number of readable photographs, counting identical copies once."""
         return self.num_readable - sum(len(names) - 1 for names in self.duplicates)
 
     def __str__(self) -> str:
@@ -94,14 +94,14 @@ class PhotoReport:
 
 
 def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
-    """Read every photograph of a folder (or of its `images/`) in full, report what is there, and doubt it.
+    """Read every photograph in a folder (or its `images/`) in full, and report contents and likely problems.
 
     Args:
         folder: folder of the photographs.
         poses: poses that replace those in the folder (`has_known_poses`).
 
     Raises:
-        SceneError: there is no such folder, or two photographs differ only in their suffix.
+        SceneError: the folder does not exist, or two photographs differ only in their suffix.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -165,7 +165,7 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
 
 
 NONE = NO_POSES
-"""What a user passes to leave out what was found."""
+"""Argument value for ignoring files found in the folder."""
 
 
 def add_scene(
@@ -181,27 +181,27 @@ def add_scene(
 ) -> PhotoReport:
     """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
 
-    A folder stays where it is: the sheet points to it, by a relative path if it is inside the project. The
-    frames of a video and the content of an archive go to `photos/<name>/` in the project.
+    A folder is used in place: the sheet refers to it, with a relative path if it is inside the project.
+    Frames of a video and the contents of an archive are written to `photos/<name>/` in the project.
 
     Args:
         sheet: the scene sheet.
         name: name of the new scene.
-        photos: folder of photographs or of videos, a video, or a zip of photographs.
+        photos: folder of photographs or of videos, a video, or a zip archive of photographs.
         unit: unit of lengths, for a folder with metric poses.
-        frames: largest number of frames taken from videos.
-        poses: a COLMAP model or transforms file; None: the poses in the folder, if there are any; `NONE`:
+        frames: maximum number of frames taken from videos.
+        poses: a COLMAP model or transforms file. None uses the poses in the folder, if any; `NONE` runs
             structure from motion.
         gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates, used
-            instead of a fit; None: the one that 3DGS or nerfstudio left in the folder, if any; `NONE`: a fit.
-        features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP; None and `NONE`
-            likewise.
-        labels: folder of label files of LERF-OVS or of `hilsplat annotate`, which evaluation alone reads.
-            They are copied to `annotated/photos/<name>/` in the project. None and `NONE` likewise.
+            instead of a fit. None uses the PLY of 3DGS or nerfstudio in the folder, if any; `NONE` fits.
+        features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP. None uses the one in
+            the folder, if any; `NONE` runs SAM and CLIP.
+        labels: folder of label files of LERF-OVS or `hilsplat annotate`, used only for evaluation and copied
+            to `annotated/photos/<name>/` in the project. None uses those found, if any; `NONE` uses none.
 
     Raises:
-        SceneError: the name cannot be used or is taken, photographs cannot be read, or there are
-            fewer than three different ones and no known poses. The sheet is then unchanged.
+        SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three
+            different ones and no known poses. The sheet is then unchanged.
     """
     sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
     if problem := name_problem(name):
@@ -244,12 +244,12 @@ def add_scene(
 
 
 def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
-    """Return what the user names, or what other programs left in the folder, by column of the sheet.
+    """Return the user's paths, else those of other programs' files in the folder, by sheet column.
 
-    Without known poses, Gaussians of another program are in unknown coordinates and are not used.
+    Without known poses, the coordinates of another program's Gaussians are unknown, so they are not used.
 
     Raises:
-        SceneError: a path that the user names does not exist.
+        SceneError: a path given by the user does not exist.
     """
     for what, path in named.items():
         if path is not None and path != NONE and not path.exists():
@@ -268,10 +268,10 @@ def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
 
 
 def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
-    """Say what is used besides the photographs.
+    """Return notes about the files used in addition to the photographs.
 
     Raises:
-        SceneError: the poses in the folder are incomplete, or those named cannot be used.
+        SceneError: the poses in the folder are incomplete, or those given cannot be used.
     """
     known = find_known_poses(folder, extra.get("poses"))
     notes = [f"poses: {', '.join(map(str, known.files)) if known else 'structure from motion'}"]
@@ -282,10 +282,10 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
 
 
 def _labels(folder: Path, asked: Path | None) -> list[Path]:
-    """Label files that the user names, or that are found.
+    """Return the label files given by the user, or else those found.
 
     Raises:
-        SceneError: the named folder holds none.
+        SceneError: the given folder contains no label file.
     """
     if asked is None or asked == NONE:
         return label_files(folder) if asked is None else []
@@ -298,7 +298,7 @@ def _labels(folder: Path, asked: Path | None) -> list[Path]:
 
 
 def _check(report: PhotoReport, have_poses: bool) -> None:
-    """Refuse photographs that cannot be read, or too few of them."""
+    """Refuse unreadable photographs, and sets with too few photographs."""
     if report.unreadable:
         raise SceneError(
             f"{len(report.unreadable)} photographs in {report.folder} cannot be read",
@@ -317,7 +317,7 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
 
 
 def _append(sheet: Path, name: str, photos: Path, unit: str, extra: dict[str, Path]) -> None:
-    """Write the row of a scene at the end of the sheet, with columns that it did not have yet."""
+    """Append the row of a scene to the sheet, and add missing columns."""
     from hilsplat.base.artifacts import write_text
 
     root = project_root(sheet)
@@ -336,7 +336,7 @@ def _append(sheet: Path, name: str, photos: Path, unit: str, extra: dict[str, Pa
         first = content_lines(sheet)[0][1]
         header = [cell.strip() for cell in first.split("\t")]
         if new := [column for column in extra if column not in header]:
-            header += new  # the rows so far may lack them
+            header += new  # existing rows may lack them
             text = text.replace(first, "\t".join(header), 1)
         if not text.endswith("\n"):
             text += "\n"

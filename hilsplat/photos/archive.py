@@ -1,4 +1,4 @@
-"""Unpacking an archive of photographs that a stranger may have made."""
+"""Unpacking of archives of photographs from untrusted sources."""
 
 import stat
 import zipfile
@@ -10,22 +10,21 @@ from hilsplat.base.files import IMAGE_SUFFIXES
 
 MAX_FILES = 50_000
 MAX_TOTAL_GIB = 20
-"""Limits of what an archive may state; a capture has some hundred files and rarely a gigabyte."""
+"""Limits on the contents of an archive; a capture has a few hundred files and rarely a gigabyte."""
 
 POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
-"""Files that may hold poses or points; `metadata` of Record3D has no suffix."""
+"""Suffixes of files that may contain poses or points; Record3D's `metadata` has no suffix."""
 
 
 def unpack_photographs(archive: Path, folder: Path) -> None:
     """Unpack the images and pose files of a zip archive into an existing, empty folder.
 
-    Nothing is written before every entry was checked. No more is written than the archive states.
+    Every entry is checked before anything is written, and at most the declared sizes are written.
 
     Raises:
-        SceneError: it is not a zip archive, is damaged or encrypted, states too much, or holds links or names
-        that
-            lead out of the folder.
-        DiskSpaceError: the disk cannot hold it.
+        SceneError: it is not a zip archive, is damaged, encrypted or too large, or contains links or names
+            that lead out of the folder.
+        DiskSpaceError: there is too little free space.
     """
     try:
         with zipfile.ZipFile(archive) as opened:
@@ -36,7 +35,7 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
             for entry in wanted:
                 target = folder / PurePosixPath(entry.filename)
                 target.parent.mkdir(parents=True, exist_ok=True)
-                # zipfile stops at the stated size, and checks it and the CRC.
+                # zipfile stops at the declared size, and checks the size and the CRC.
                 with opened.open(entry) as source, target.open("xb") as sink:
                     while block := source.read(1 << 20):
                         sink.write(block)
@@ -49,14 +48,14 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
 
 
 def _is_wanted(name: PurePosixPath) -> bool:
-    """Whether an entry is an image or may hold poses; what systems add themselves is not wanted."""
+    """Return whether an entry is an image or may contain poses; files that operating systems add are not."""
     if any(part.startswith(".") or part == "__MACOSX" for part in name.parts):
         return False
     return name.suffix.lower() in IMAGE_SUFFIXES | POSE_SUFFIXES or name.name == "metadata"
 
 
 def _check(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse an archive that is too large or could write elsewhere."""
+    """Refuse an archive that is too large or could write outside the folder."""
     fix = "unpack it yourself with a program that you trust, look at it, and give the folder"
     total_gib = sum(entry.file_size for entry in entries) / 2**30
     if len(entries) > MAX_FILES or total_gib > MAX_TOTAL_GIB:

@@ -1,8 +1,7 @@
-"""What is likely to fail with a set of photographs, said before the hours are spent.
+"""Checks of a set of photographs for likely problems, before time is spent on it.
 
-Thresholds were chosen on three sets of real photographs that all register, and on copies of them that were
-blurred, darkened, over-exposed, or replaced by pictures of a camera that only turns; docs/scene.md has the
-measured values.
+Thresholds were chosen on three sets of real photographs that all register, on blurred, darkened and
+over-exposed copies of them, and on pictures of a camera that only rotates (values: docs/scene.md).
 """
 
 from collections.abc import Sequence
@@ -13,58 +12,58 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 FEW_PHOTOS = 10
-"""Fewer photographs leave large parts of a scene seen once or never."""
+"""Number of photographs below which large parts of a scene are visible at most once."""
 
 CHECK_SIDE_PX = 800
 FEATURE_SIDE_PX = 640
-"""Longer side of the grey copies on which blur and light, and motion, are measured."""
+"""Longer side of the grey copies for measuring blur and exposure (`CHECK_SIDE_PX`) and motion."""
 
 BLURRED = 0.55
-"""Blur above which a photograph is reported; measured: photographs 0.16 to 0.40, frames of video up to 0.50,
-blurred by a Gaussian of 4 px (of 800) 0.58 to 0.77."""
+"""Blur above which a photograph is reported. Measured: photographs 0.16 to 0.40, video frames up to 0.50,
+photographs blurred by a Gaussian of 4 px (of 800) 0.58 to 0.77."""
 
 REBLUR_PX = 11
 
 DARK_LEVEL = 64
-"""A photograph is dark if 95 % of it is darker. A lit thing before a black wall is not."""
+"""A photograph is dark if 95 % of its pixels are below this level; a lit object on black is not."""
 
 WHITE_LEVEL = 250
 WHITE_SHARE = 0.5
-"""A photograph is over-exposed if more than this share of it is white."""
+"""A photograph is over-exposed if more than this share of its pixels is white."""
 
 SAME_PLACE = 0.01
-"""Displacement of matches (90th percentile), as a share of the diagonal, below which two pictures are one.
-Not the median: around an object that stays in the centre, half of the matches may hardly move."""
+"""Displacement of matches (90th percentile), as a share of the diagonal, below which two pictures count as
+the same. The median would be too small: around a centred object, half of the matches may barely move."""
 
 MAX_PAIRS = 60
-"""Pairs of neighbours that are matched, spread evenly: at 80 ms a photograph, five seconds."""
+"""Maximum number of pairs of neighbours that are matched, spread evenly: 5 s at 80 ms per photograph."""
 
 NUM_FEATURES = 1000
 RATIO = 0.8
 MIN_MATCHES = 40
-"""Verified matches below which a pair says nothing about motion."""
+"""Number of verified matches below which the motion of a pair is unknown."""
 
 MATCH_ERROR_PX = 1.5
 TURN_ERROR_PX = 3.0
 TURN_SHARE = 0.85
-"""Share of verified matches that a mere turn explains; measured: turning cameras 0.96 to 1, moving ones 0.07
-to 0.27 in the median of a set and 0.87 at most."""
+"""Share of verified matches explained by a rotation, above which a pair counts as rotated. Measured: rotating
+cameras 0.96 to 1; moving cameras 0.07 to 0.27 (median of a set) and at most 0.87."""
 
 MIN_TURN_PAIRS = 3
 FOCALS = (0.6, 0.75, 0.9, 1.1, 1.35, 1.7, 2.2, 3.0)
-"""Focal lengths that are tried, in longer sides of the picture."""
+"""Focal lengths to try, as multiples of the picture's longer side."""
 
 NAMED = 5
 
 
 @dataclass(frozen=True)
 class CheckedPhoto:
-    """A photograph as the check sees it.
+    """The data of a photograph that the checks use.
 
     Attributes:
         name: file name.
         size_hw: height and width, upright, px.
-        focal_px: focal length from EXIF, px of the full picture; None if there is none.
+        focal_px: focal length from EXIF, px of the full picture; None if unknown.
         grey: upright grey copy, longer side at most `CHECK_SIDE_PX`.
     """
 
@@ -75,10 +74,10 @@ class CheckedPhoto:
 
 
 def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[str]:
-    """Sentences about what is likely to fail and what to do about it; none for a sound set.
+    """Return sentences about likely problems and what to do about them; empty if there are none.
 
     Args:
-        photos: readable photographs in the order of their names, which is taken for that of the camera's way.
+        photos: readable photographs in the order of their names, which is assumed to be the capture order.
         have_poses: poses are known, so that only the quality of each photograph matters.
     """
     doubts = []
@@ -128,7 +127,7 @@ def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 
 def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
-    """Doubts about the camera's way, from matches of neighbours."""
+    """Return problems of the camera's motion, measured by matching neighbours."""
     last = len(photos) - 1
     rows = sorted(set(np.linspace(0, last - 1, min(last, MAX_PAIRS)).round().astype(int))) if last > 0 else []
     features: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -163,7 +162,7 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 
 def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
-    """ "3 of 40 photographs (a.jpg, b.jpg, c.jpg) are"."""
+    """Format a list, such as "3 of 40 photographs (a.jpg, b.jpg, c.jpg) are"."""
     more = ", ..." if len(names) > NAMED else ""
     verb = "is" if len(names) == 1 else "are"
     return f"{len(names)} of {len(photos)} photographs ({', '.join(names[:NAMED])}{more}) {verb}"
@@ -173,10 +172,10 @@ def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
 
 
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """How blurred a picture is, 0 to 1: how little its steps shrink if it is blurred again.
+    """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that another blur preserves.
 
     Crete et al., "The blur effect" (2007), with a box of 11 px: the larger of the values along x and y.
-    Unlike the variance of the Laplacian it hardly depends on what the picture shows. A flat picture has 1.
+    Unlike the variance of the Laplacian, it barely depends on the content. A flat picture has blur 1.
     """
     values = grey.astype(np.float32)
     shares = []
@@ -193,11 +192,11 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
 
 @dataclass(frozen=True)
 class PairMotion:
-    """What verified matches say about the motion between two pictures.
+    """Motion between two pictures, measured on their verified matches.
 
     Attributes:
-        displacement: 90th percentile of their displacements, as a share of the diagonal.
-        turn_share: share of them that a rotation of the camera about its centre explains.
+        displacement: 90th percentile of the displacements, as a share of the diagonal.
+        turn_share: share of the matches explained by a rotation of the camera about its centre.
     """
 
     displacement: float
@@ -212,7 +211,7 @@ def _feature_size(grey: UInt8[np.ndarray, "h w"]) -> tuple[int, int]:
 def _features(
     grey: UInt8[np.ndarray, "h w"],
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
-    """SIFT positions in px of the feature size, and RootSIFT descriptors."""
+    """Compute SIFT positions, in px of the feature size, and RootSIFT descriptors."""
     height, width = _feature_size(grey)
     small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(small, None)
@@ -227,10 +226,10 @@ def pair_motion(
     other: tuple[Float32[np.ndarray, "m 2"], Float32[np.ndarray, "m 128"]],
     size_hw: tuple[int, int],
 ) -> PairMotion | None:
-    """Compare two pictures; None if too few matches agree with an epipolar geometry.
+    """Measure the motion between two pictures; None if too few matches agree with an epipolar geometry.
 
-    A homography also explains a moving camera before a wall or a carpet (measured: up to 0.97 of the
-    matches), so the turn is fitted as a rotation, three numbers, with the best of some focal lengths.
+    A homography would also explain a camera that moves in front of a wall or a carpet (measured: up to 0.97
+    of the matches), so a rotation (three parameters) is fitted, with the best of several focal lengths.
     """
     if min(len(one[0]), len(other[0])) < MIN_MATCHES:
         return None
@@ -246,7 +245,7 @@ def pair_motion(
     a, b = one[0][[match.queryIdx for match in matches]], other[0][[match.trainIdx for match in matches]]
     try:
         _, inliers = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, MATCH_ERROR_PX, 0.999, 2000)
-    except cv2.error:  # OpenCV 5.0: no model at all ends in a failed assertion
+    except cv2.error:  # OpenCV 5.0 fails an assertion if it finds no model
         return None
     if inliers is None or inliers.sum() < MIN_MATCHES:
         return None
@@ -260,7 +259,7 @@ def pair_motion(
 def _turn_share(
     a: Float64[np.ndarray, "n 2"], b: Float64[np.ndarray, "n 2"], size_hw: tuple[int, int], focal_px: float
 ) -> float:
-    """Share of matches that the best rotation explains (Kabsch, refitted to the better half)."""
+    """Return the share of matches explained by the best rotation (Kabsch, refitted to the better half)."""
     centre = np.array([size_hw[1] / 2, size_hw[0] / 2])
 
     def rays(xy: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

@@ -1,4 +1,4 @@
-"""What people bring, brought into a folder of photographs: videos, archives, or a folder as it is."""
+"""Conversion of videos and archives into a folder of photographs."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ from hilsplat.base.files import VIDEO_SUFFIXES, list_images, list_videos
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
 MARK = ".made_from.json"
-"""Hidden file of a folder that was made, which names the files that it was made from."""
+"""Hidden file that records the source files of a converted folder."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Brought:
 
     Attributes:
         folder: the folder.
-        notes: what was done and left out on the way, in sentences.
+        notes: sentences about the conversion and about skipped files.
     """
 
     folder: Path
@@ -31,17 +31,17 @@ class Brought:
 
 @contextmanager
 def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Brought]:
-    """The folder of photographs that a source gives: itself, or `target`, made from videos or an archive.
+    """Yield the source folder of photographs itself, or `target`, made from videos or an archive.
 
-    If the block ends with an error, a folder that was made is removed again.
+    If the block ends with an error, a folder that was made is removed.
 
     Args:
-        source: a folder with photographs, or with videos alone; a video; or a .zip (or Record3D's .r3d).
-        target: folder to make, if one has to be made.
-        frames: largest number of frames taken from videos.
+        source: a folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d).
+        target: folder to create if the source must be converted.
+        frames: maximum number of frames taken from videos.
 
     Raises:
-        SceneError: the source cannot be used, or the target exists.
+        SceneError: the source cannot be used, or the target exists and was made from other files.
     """
     source = Path(source)
     if not source.exists():
@@ -52,7 +52,7 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
     if videos := _videos_of(source):
 
         def make(folder: Path) -> list[str]:
-            from hilsplat.photos.video import extract_frames  # PyAV takes time to load
+            from hilsplat.photos.video import extract_frames  # PyAV is slow to import
 
             named = ", ".join(video.name for video in videos)
             notes = extract_frames(videos, folder, frames)
@@ -83,7 +83,7 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
             notes = make(folder)
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} is there already, from the same files"]  # this command was killed after it
+        notes = [f"{target} is there already, from the same files"]  # an earlier run was killed later
     else:
         raise SceneError(
             f"{target} is in the way",
@@ -97,13 +97,12 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
 
 
 def _mark(files: list[Path], frames: int) -> dict[str, Any]:
-    """What a folder was made from."""
     found = [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
     return {"files": [list(each) for each in found], "frames": frames}
 
 
 def _videos_of(source: Path) -> list[Path]:
-    """The videos to take frames from: the source itself, or those of a folder without photographs."""
+    """Return the videos to take frames from: the source itself, or those in a folder without photographs."""
     if source.is_file():
         return [source] if source.suffix.lower() in VIDEO_SUFFIXES else []
     if list_images(photo_folder(source)) or has_known_poses(source):

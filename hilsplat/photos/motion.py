@@ -1,4 +1,4 @@
-"""How sharp a picture is, and how far two pictures of one camera are apart."""
+"""Sharpness of a picture, and displacement between two pictures of one camera."""
 
 import cv2
 import numpy as np
@@ -7,26 +7,26 @@ from jaxtyping import UInt8
 NUM_CORNERS = 300
 PYRAMID_LEVELS = 4
 LOST = 0.25
-"""Displacement, as a share of the diagonal, of pictures in which no corner could be followed."""
+"""Displacement, as a share of the diagonal, assumed if too few corners can be tracked."""
 
 MIN_FOLLOWED = 20
-"""Corners that must be followed there and back; fewer say nothing."""
+"""Minimum number of corners tracked forwards and backwards for a valid measurement."""
 
 
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Variance of the Laplacian (Pech-Pacheco et al. 2000): large where edges are steep.
+    """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for steep edges.
 
-    It compares pictures of the same place; between places it depends on what they show.
+    It can compare pictures of the same place only, because it depends on the content.
     """
     return float(cv2.Laplacian(grey, cv2.CV_32F, ksize=3).var())
 
 
 def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"]) -> float:
-    """How far corners moved between two pictures, as a share of the diagonal: their upper quartile.
+    """Return the upper quartile of corner displacements between two pictures, as a share of the diagonal.
 
-    Corners are followed by pyramidal Lucas-Kanade, there and back; those that miss their start by a pixel do
-    not count. The upper quartile, not the median, so that an object on a turntable counts before a still
-    background. If too few corners can be followed, the result is `LOST`, or 0 for pictures without corners.
+    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that miss their start by a
+    pixel are ignored. Unlike the median, the upper quartile captures an object on a turntable before a static
+    background. The result is 0 for pictures with too few corners, and `LOST` if too few can be tracked.
     """
     corners = cv2.goodFeaturesToTrack(one, NUM_CORNERS, qualityLevel=0.01, minDistance=7)
     if corners is None or len(corners) < MIN_FOLLOWED:
@@ -43,7 +43,7 @@ def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"])
 def _followed(
     one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"], corners: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where corners of one picture are in the other, (n, 1, 2), and which of them were found, (n)."""
+    """Return the positions of corners in the other picture, (n, 1, 2), and whether each was found, (n)."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         one, other, corners, np.zeros_like(corners), maxLevel=PYRAMID_LEVELS
     )

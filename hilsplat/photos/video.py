@@ -1,4 +1,4 @@
-"""Photographs from video: the sharpest frame of each stretch of the camera's way."""
+"""Photographs from videos: the sharpest frame of each section of the camera path."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -23,31 +23,31 @@ from hilsplat.photos.video_colours import rgb_pixels
 logger = logging.getLogger(__name__)
 
 CANDIDATES_PER_FRAME = 4
-"""Frames kept per frame that is asked for, from which the camera's way is measured."""
+"""Candidate frames per requested frame; the camera path is measured on the candidates."""
 
 MIN_STEP = 0.01
-"""Displacement between two frames, as a share of the diagonal, below which they show the same: about 0.7
-degrees of a phone's 70. Noise of a still camera measures below 0.001."""
+"""Displacement between two frames, as a share of the diagonal, below which they count as the same: about 0.7
+degrees of a phone's 70. The noise of a static camera is below 0.001."""
 
 GREY_SIDE_PX = 480
 SHARPNESS_SIDE_PX = 960
-"""Longer side of the copies on which motion and sharpness are measured."""
+"""Longer side of the copies for measuring motion and sharpness."""
 
 JPEG_QUALITY = 95
 USUAL_RATE = 30.0
-"""Frames per second, for files that state neither a rate nor times."""
+"""Assumed frames per second for files without a frame rate or time stamps."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame of a video that may become a photograph.
+    """A video frame that may become a photograph.
 
     Attributes:
-        video: position of its video among those given.
-        number: position of the frame among the sound ones of its video.
-        time_s: when it is shown.
+        video: index of its video.
+        number: index of the frame among the intact frames of its video.
+        time_s: presentation time.
         sharpness: variance of the Laplacian.
-        grey: small copy, as stored (not turned).
+        grey: small copy, as stored (not rotated).
     """
 
     video: int
@@ -59,13 +59,13 @@ class Frame:
 
 @dataclass
 class Decoding:
-    """What decoding a video found.
+    """Statistics of decoding a video.
 
     Attributes:
-        stated_s: length that the file states; None if it states none.
-        decoded_s: when its last sound frame is shown.
-        num_frames: sound frames.
-        num_damaged: packets and frames that could not be decoded.
+        stated_s: duration according to the file, or None.
+        decoded_s: presentation time of the last intact frame.
+        num_frames: number of intact frames.
+        num_damaged: number of packets and frames that could not be decoded.
     """
 
     stated_s: float | None = None
@@ -75,26 +75,27 @@ class Decoding:
 
 
 def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str]:
-    """Write the frames of videos that serve as photographs into a folder, and `origin.json`.
+    """Write selected frames of videos as photographs to a folder, with `origin.json`.
 
-    The camera's way through all videos is divided into `count` equal stretches, measured by the displacement
-    of image corners, and the sharpest frame of each is taken (variance of the Laplacian, Pech-Pacheco et al.
-    2000). Where the camera rests, one frame is taken; a short way gives fewer frames. Frames are turned
-    upright by the stream's display matrix and stored as 0001.jpg, 0002.jpg, ... at full size and quality 95.
+    The camera path through all videos, measured by the displacement of image corners, is divided into `count`
+    sections of equal length, and the sharpest frame of each is selected (variance of the Laplacian,
+    Pech-Pacheco et al. 2000). A camera at rest gives one frame; a short path gives fewer frames. Frames are
+    rotated upright according to the stream's display matrix and stored as 0001.jpg, 0002.jpg, ... at full
+    size and quality 95.
 
-    A video is decoded twice, once to choose and once to write, so that only small copies are held in memory.
-    The same videos give the same bytes.
+    A video is decoded twice, once to select and once to write frames, so that memory contains only small
+    copies. The same videos give the same bytes.
 
     Args:
         videos: files, in the order of their frames.
         folder: an existing, empty folder.
-        count: largest number of frames.
+        count: maximum number of frames.
 
     Returns:
-        What a person should know: damaged parts, frames left out.
+        notes for the user: damaged parts, and fewer frames than requested.
 
     Raises:
-        SceneError: a video cannot be read or has no sound frame.
+        SceneError: a video cannot be read or has no intact frame.
     """
     notes: list[str] = []
     candidates: list[Frame] = []
@@ -146,7 +147,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
 
 
 def _damage(video: Path, decoding: Decoding) -> list[str]:
-    """What is wrong with a video of which at least a part could be decoded."""
+    """Return notes about the damage of a partly decoded video."""
     notes = []
     if decoding.num_damaged:
         notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were left out")
@@ -163,10 +164,10 @@ def _damage(video: Path, decoding: Decoding) -> list[str]:
 
 @contextmanager
 def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """The first video stream of a file.
+    """Open the first video stream of a file.
 
     Raises:
-        SceneError: it is not a video, or its header is lost.
+        SceneError: the file is not a video, or its header is missing.
     """
     try:
         container = av.open(str(video), metadata_errors="replace")
@@ -190,7 +191,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def _stated_seconds(container: InputContainer, stream: VideoStream) -> float | None:
-    """Length that a file states; None if it states none, as recordings of browsers do."""
+    """Return the duration according to the file; None if it is missing, as in recordings by browsers."""
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     return container.duration / av.time_base if container.duration is not None else None
@@ -199,9 +200,9 @@ def _stated_seconds(container: InputContainer, stream: VideoStream) -> float | N
 def _decoded(
     container: InputContainer, stream: VideoStream, decoding: Decoding
 ) -> Iterator[tuple[av.VideoFrame, float]]:
-    """Sound frames of a video with their times in seconds, in the order in which they are shown.
+    """Yield the intact frames of a video with their times in seconds, in presentation order.
 
-    Damaged packets are counted and passed over; a file that ends early gives its good part.
+    Damaged packets are counted and skipped; a truncated file yields its intact part.
     """
     rate = float(stream.average_rate or USUAL_RATE)
     start: float | None = None
@@ -230,10 +231,10 @@ def _decoded(
 
 
 def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> list[Frame]:
-    """The sharpest frame of each of at most `most` equal spans of time.
+    """Return the sharpest frame of each of at most `most` equal time spans.
 
-    The stated length may be missing or wrong, so spans double, and their frames compete, when there are too
-    many.
+    The stated duration may be missing or wrong. If there are too many spans, they are therefore merged in
+    pairs, keeping the sharper frame.
     """
     best: dict[int, Frame] = {}
     with _opened(video) as (container, stream):
@@ -259,14 +260,13 @@ def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> li
 
 
 def _grey(frame: av.VideoFrame, side_px: int) -> UInt8[np.ndarray, "h w"]:
-    """A small grey copy of a frame as it is stored."""
     scale = min(1.0, side_px / max(frame.width, frame.height))
     size = {"width": max(2, round(frame.width * scale)), "height": max(2, round(frame.height * scale))}
     return frame.reformat(**size, format="gray", interpolation="AREA", threads=1).to_ndarray()
 
 
 def _write_frames(video: Path, wanted: dict[int, str], folder: Path) -> None:
-    """Write chosen frames of a video upright, at full size."""
+    """Write the selected frames of a video upright, at full size."""
     missing = dict(wanted)
     with _opened(video) as (container, stream):
         for number, (frame, _) in enumerate(_decoded(container, stream, Decoding())):
@@ -283,7 +283,7 @@ def _write_frames(video: Path, wanted: dict[int, str], folder: Path) -> None:
 
 
 def upright(pixels: UInt8[np.ndarray, "H W 3"], rotation_deg: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Turn a stored frame as its display matrix says: anticlockwise, to the nearest quarter turn."""
+    """Rotate a stored frame anticlockwise by its display matrix, rounded to a quarter turn."""
     return np.ascontiguousarray(np.rot90(pixels, round(rotation_deg / 90) % 4))
 
 
@@ -291,10 +291,10 @@ def upright(pixels: UInt8[np.ndarray, "H W 3"], rotation_deg: int) -> UInt8[np.n
 
 
 def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
-    """The sharpest candidate of each of at most `count` equal stretches of the camera's way.
+    """Select the sharpest candidate of each of at most `count` equal sections of the camera path.
 
-    Two frames less than `MIN_STEP` apart show the same, and only the sharper one stays. That also holds for
-    the jitter of a resting hand, whose way adds up though it leads nowhere.
+    Of two selected frames less than `MIN_STEP` apart, only the sharper one is kept. This also removes the
+    jitter of a hand at rest, whose path has length although the camera stays in place.
     """
     kept: list[Frame] = []
     if not candidates:
@@ -310,10 +310,10 @@ def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
 
 
 def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
-    """Number of the stretch that each candidate is in, given the steps between them.
+    """Return the section number of each candidate, given the steps between candidates.
 
-    A stretch is as short as `count` of them allow, but not below `MIN_STEP`. A longer step cannot be divided,
-    so it counts as one stretch.
+    Sections are as short as their maximum number `count` allows, but not shorter than `MIN_STEP`. A longer
+    step cannot be divided, so it counts as one section.
     """
 
     def rows(length: float) -> Int64[np.ndarray, " N"]:
@@ -330,8 +330,7 @@ def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
 
 
 def _step(one: Frame, other: Frame) -> float:
-    """Displacement between two frames as a share of the diagonal; frames of different videos share
-    nothing."""
+    """Return the displacement between two frames (share of the diagonal), `MIN_STEP` across videos."""
     if one.video != other.video or one.grey.shape != other.grey.shape:
         return MIN_STEP
     return displacement(one.grey, other.grey)

@@ -1,4 +1,4 @@
-"""Pixels of video frames as 8-bit sRGB: matrix and range of the stream, HDR tone-mapped."""
+"""Conversion of video frames to 8-bit sRGB by the stream's matrix and range, with tone-mapped HDR."""
 
 import functools
 from typing import TYPE_CHECKING
@@ -16,31 +16,31 @@ UNSPECIFIED, BT709, BT601, BT2020 = 2, 1, 5, 9
 """Colour matrices and primaries (ITU-T H.273)."""
 
 WHITE_NITS = 203.0
-"""Luminance of a white page in HDR video (ITU-R BT.2408)."""
+"""Luminance of reference white in HDR video (ITU-R BT.2408)."""
 
 HLG_PEAK_NITS = 1000.0
 HLG_SYSTEM_GAMMA = 1.2
-"""The display for which HLG is graded (ITU-R BT.2100)."""
+"""Reference display for HLG (ITU-R BT.2100)."""
 
 KNEE = 0.6
 """Linear light, white = 1, above which HDR highlights are compressed towards 1."""
 
 BAND_ROWS = 32
-"""Rows that are tone-mapped at once: they stay in the processor's cache."""
+"""Number of rows tone-mapped at once, so that they fit into the processor's cache."""
 
 BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]
 )
-"""Linear RGB (ITU-R BT.2087, inverted)."""
+"""Conversion of linear RGB (inverse of ITU-R BT.2087)."""
 
 BT2020_LUMA = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
 
 
 def rgb_pixels(frame: "VideoFrame") -> UInt8[np.ndarray, "H W 3"]:
-    """Pixels of a decoded frame as they are stored (not turned), 8-bit sRGB.
+    """Convert a decoded frame as stored (not rotated) to 8-bit sRGB.
 
-    A stream that does not name its matrix is taken as players do: BT.709 from 720 lines on, else BT.601.
-    HDR (PQ or HLG) is brought to linear light, to BT.709 primaries, and its highlights are compressed.
+    If a stream states no matrix, the default of players is used: BT.709 for 720 lines or more, else BT.601.
+    HDR (PQ or HLG) is converted to linear light with BT.709 primaries and compressed highlights.
     """
     from av.video.reformatter import Interpolation
 
@@ -64,11 +64,11 @@ def rgb_pixels(frame: "VideoFrame") -> UInt8[np.ndarray, "H W 3"]:
 def srgb_from_hdr(signal: UInt16[np.ndarray, "H W 3"], *, is_hlg: bool) -> UInt8[np.ndarray, "H W 3"]:
     """Tone-map an HDR picture with BT.2020 primaries, full-range 16-bit RGB, to 8-bit sRGB.
 
-    Light up to 0.6 of white is kept; above, white itself becomes 0.8 and all brighter light less than 1. The
-    strongest channel decides, so that hues stay.
+    Light up to 0.6 of white is unchanged; above that, white becomes 0.8, and all brighter light stays below
+    1. All channels are scaled by the factor of the strongest, which preserves the hue.
     """
     light = _hlg_light()[signal] if is_hlg else _pq_light()[signal]
-    if is_hlg:  # the display's gamma acts on luminance (BT.2100, OOTF)
+    if is_hlg:  # the display's gamma applies to luminance (BT.2100, OOTF)
         luminance = light @ BT2020_LUMA
         light *= (HLG_PEAK_NITS / WHITE_NITS * luminance ** (HLG_SYSTEM_GAMMA - 1))[..., None]
     light = np.maximum(light @ BT709_FROM_BT2020.T.astype(np.float32), 0)
@@ -81,7 +81,7 @@ def srgb_from_hdr(signal: UInt16[np.ndarray, "H W 3"], *, is_hlg: bool) -> UInt8
 
 @functools.cache
 def _pq_light() -> Float32[np.ndarray, "65536"]:
-    """PQ signal -> linear light, white = 1 (SMPTE ST 2084)."""
+    """Return the table from PQ signal to linear light, white = 1 (SMPTE ST 2084)."""
     power = (np.arange(65536) / 65535) ** (1 / 78.84375)
     nits = 10000 * (np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power)) ** (
         1 / 0.1593017578125
@@ -91,7 +91,7 @@ def _pq_light() -> Float32[np.ndarray, "65536"]:
 
 @functools.cache
 def _hlg_light() -> Float32[np.ndarray, "65536"]:
-    """HLG signal -> light of the scene in [0, 1] (ARIB STD-B67)."""
+    """Return the table from HLG signal to scene light in [0, 1] (ARIB STD-B67)."""
     signal = np.arange(65536) / 65535
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     return np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12).astype(np.float32)
@@ -99,7 +99,7 @@ def _hlg_light() -> Float32[np.ndarray, "65536"]:
 
 @functools.cache
 def _srgb_codes() -> UInt8[np.ndarray, "65536"]:
-    """Linear light in 65536 steps -> 8-bit sRGB (IEC 61966-2-1)."""
+    """Return the table from linear light in 65536 steps to 8-bit sRGB (IEC 61966-2-1)."""
     light = np.arange(65536) / 65535
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return (encoded * 255 + 0.5).astype(np.uint8)

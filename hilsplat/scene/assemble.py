@@ -1,4 +1,4 @@
-"""From posed views to the scene artifact: pinhole images, normalised coordinates, split, report."""
+"""Assembly of the scene artifact from posed views: pinhole images, normalised coordinates, split, report."""
 
 import logging
 import shutil
@@ -20,10 +20,10 @@ from hilsplat.scene.scene import Scene
 logger = logging.getLogger(__name__)
 
 MIN_VIEWS_FOR_TEST = 8
-"""With fewer views none is held out: the fit needs every one."""
+"""Number of views below which none is held out, because the fit needs all of them."""
 
 MIN_LEVELNESS_GAP = 3.0
-"""Up is taken from the cameras' x axes if it fits them this many times better than the next direction."""
+"""The cameras' x axes determine up if it fits them this many times better than the next best direction."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,10 @@ class PosedView:
 
 
 def undistort(view: PosedView, folder: Path) -> PosedView:
-    """Write the pinhole image of a view into a folder, and return the view with its pinhole camera.
+    """Write the pinhole image of a view to a folder, and return the view with its pinhole camera.
 
-    An image without distortion is copied byte for byte, so that labels stay aligned with it.
-    Otherwise the image is warped, as large as it can be without blank pixels.
+    An image without distortion is copied byte for byte, so that labels stay aligned with it. Otherwise, the
+    image is warped to the largest size without blank pixels.
     """
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / view.view
@@ -66,11 +66,11 @@ def undistort(view: PosedView, folder: Path) -> PosedView:
 
 
 def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, " 3"]:
-    """Estimate which way is up from cameras that were mostly held level.
+    """Estimate the up direction from cameras that were mostly held level.
 
-    Level cameras have their x axes in the horizontal plane, whatever their tilt, so up is the
-    direction most orthogonal to all of them. If the x axes are nearly parallel (a camera that only
-    moved sideways), that direction is ambiguous, and the mean of the cameras' own up axes is used.
+    The x axes of level cameras are horizontal, whatever their tilt, so up is the direction most orthogonal to
+    all of them. If the x axes are nearly parallel (the camera only moved sideways), that direction is
+    ambiguous, and the mean of the cameras' own up axes is used.
     """
     right, up_of_camera = cam_from_source[:, 0, :3], -cam_from_source[:, 1, :3]
     mean_up = up_of_camera.mean(axis=0)
@@ -84,7 +84,7 @@ def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.nd
 
 
 def rotation_to_z_up(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The shortest rotation that turns a unit vector to +z; +z itself gives the identity."""
+    """Return the shortest rotation from a unit vector to +z; for +z itself, the identity."""
     z = np.array([0.0, 0.0, 1.0])
     axis, cosine = np.cross(up, z), float(up @ z)
     if cosine < -1 + 1e-9:
@@ -100,12 +100,12 @@ def normalising_similarity(
     metric: bool,
     turn: bool,
 ) -> Float64[np.ndarray, "4 4"]:
-    """The similarity `scene_from_source` that normalises the coordinates of a scene.
+    """Return the similarity `scene_from_source` that normalises the coordinates of a scene.
 
-    The origin is the median of the sparse points (of the camera centres if there are none). One
-    unit is the median distance of the cameras from it, so a scene fills a few units whatever its
-    size; metric sources keep the metre. With `turn`, +z is up as the cameras were held: structure
-    from motion leaves the rotation arbitrary, whereas imported poses keep their axes.
+    The origin is the median of the sparse points, or of the camera centres if there are no points. The unit
+    is the median distance of the cameras from the origin, so every scene has a size of a few units; metric
+    sources keep the metre. With `turn`, +z is the cameras' up direction: the rotation from structure from
+    motion is arbitrary, whereas imported poses keep their axes.
     """
     rotations = cam_from_source[:, :3, :3]
     centres = -np.einsum("vji,vj->vi", rotations, cam_from_source[:, :3, 3])
@@ -122,7 +122,7 @@ def normalising_similarity(
 def move_cameras(
     cam_from_source: Float64[np.ndarray, "V 4 4"], scene_from_source: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "V 4 4"]:
-    """World-to-camera transforms in scene coordinates; camera coordinates take the scene's scale."""
+    """Convert world-to-camera transforms to scene coordinates; camera coordinates get the scene's scale."""
     scale = np.cbrt(np.linalg.det(scene_from_source[:3, :3]))
     rotation, offset = scene_from_source[:3, :3] / scale, scene_from_source[:3, 3]
     moved = np.tile(np.eye(4), (len(cam_from_source), 1, 1))
@@ -132,10 +132,9 @@ def move_cameras(
 
 
 def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
-    """Hold out every `test_every`-th view by sorted name, beginning with the first (3DGS: index % 8 == 0).
+    """Hold out every `test_every`-th view by sorted name, starting with the first (3DGS: index % 8 == 0).
 
-    No view is held out if `test_every` is 0 or 1 (1 would leave none to train on), or with fewer than
-    eight views.
+    No view is held out if `test_every` is 0 or 1 (1 would leave no training view), or of fewer than 8 views.
     """
     ordered = sorted(names)
     holds_out = test_every > 1 and len(ordered) >= MIN_VIEWS_FOR_TEST
@@ -158,19 +157,19 @@ def write_scene(
     turn: bool,
     lost: Path | None = None,
 ) -> None:
-    """Write the scene artifact with its registration report; the folder appears whole or not at all.
+    """Write the scene artifact with its registration report, atomically.
 
     Args:
         out: the scene folder.
         name: `<dataset>/<scene>`.
-        unit: "metre" keeps the source's scale; any other unit is normalised.
+        unit: "metre" keeps the source's scale; for any other unit, the scale is normalised.
         views: posed views, at least one.
         points_xyz: sparse points, source coordinates.
         points_rgb: their colours.
         split: "train" or "test" per view.
-        report: what registration found; this function adds split and size per view.
-        turn: turn the scene so that +z is up.
-        lost: picture of the photographs that were not registered, appended to that of the cameras.
+        report: registration report; this function adds split, size and focal length per view.
+        turn: rotate the scene so that +z is up.
+        lost: picture of the photographs that were not registered, appended to the plot of the cameras.
     """
     views = sorted(views, key=lambda view: view.view)
     source_poses = np.stack([view.cam_from_source for view in views])
@@ -219,7 +218,7 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     points = scene.points_xyz.astype(np.float64) @ rotation.T
     colours = scene.points_rgb / 255
     is_test = np.array([scene.split[view] == "test" for view in scene.cameras.names])
-    # Far outliers would shrink the scene to a dot: frame the cameras and the middle 96 % of the points.
+    # The axes cover the cameras and the middle 96 % of the points, because outliers would shrink the scene.
     around = np.percentile(points, [2, 98], axis=0) if len(points) else np.zeros((0, 3))
     framed = np.concatenate([centres, around])
     low, high = framed.min(axis=0), framed.max(axis=0)
@@ -250,5 +249,5 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     figure.suptitle(
         f"{scene.name}: {report['registered']} of {report['images']} views, {len(points)} points{quality}"
     )
-    # No date, no version of the library: the same scene gives the same bytes.
+    # Without date and library version, the same scene gives the same bytes.
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})

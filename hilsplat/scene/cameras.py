@@ -13,12 +13,12 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
 LAST_ROW = (0, 0, 0, 1)
-"""Of a pose."""
+"""Last row of a pose matrix."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One undistorted pinhole camera (OpenCV axes: x right, y down, z forward).
+    """An undistorted pinhole camera (OpenCV axes: x right, y down, z forward).
 
     Attributes:
         name: view name, the image's file name.
@@ -34,12 +34,12 @@ class Camera:
 
     @property
     def centre(self) -> Float[np.ndarray, " 3"]:
-        """Camera centre in the world, scene units."""
+        """Camera centre in world coordinates, scene units."""
         rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
         return -rotation.T @ translation
 
     def scaled(self, size_hw: tuple[int, int]) -> "Camera":
-        """The same camera for a resized image: K scales with each side."""
+        """Return the camera for a resized image, with K scaled along each side."""
         scale = np.array([size_hw[1] / self.size_hw[1], size_hw[0] / self.size_hw[0], 1.0])
         return Camera(self.name, self.cam_from_world, scale[:, None] * self.K, size_hw)
 
@@ -49,7 +49,7 @@ class Cameras:
     """V posed cameras.
 
     Attributes:
-        names: view names (file names of the images), in the order of all rows.
+        names: view names (file names of the images), in the order of the rows.
         cam_from_world: V world-to-camera transforms, scene units.
         K: V intrinsics, px.
         size_hw: V image sizes (height, width), px.
@@ -89,7 +89,7 @@ class Cameras:
         """Read `cameras.npz`.
 
         Raises:
-            ArtifactError: it is missing or damaged, or what it holds cannot be cameras.
+            ArtifactError: the file is missing or damaged, or its content is not valid for cameras.
         """
         arrays = read_npz(path, "names", "cam_from_world", "K", "size_hw")
         numbers = {name: array for name, array in arrays.items() if name != "names"}

@@ -1,7 +1,7 @@
-"""pycolmap, loaded in the one order that works; import it from here, never directly.
+"""pycolmap, loaded after Pillow; import it from here, never directly.
 
-Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillow's core, writing a
-PNG through Pillow corrupts the heap and the process aborts or hangs. The other order works.
+Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillow's core, writing a PNG with
+Pillow corrupts the heap, and the process aborts or hangs. The other order works.
 """
 
 from PIL import Image

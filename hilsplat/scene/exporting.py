@@ -1,4 +1,4 @@
-"""Write a scene for other programs: COLMAP, nerfstudio. All coordinates are those of the scene's source."""
+"""Export of a scene for other programs (COLMAP, nerfstudio), in the coordinates of the scene's source."""
 
 import shutil
 from pathlib import Path
@@ -35,7 +35,7 @@ def write_colmap(scene: Scene, out: Path) -> None:
 
 
 def add_colmap(scene: Scene, folder: Path) -> None:
-    """Write `images/` and `sparse/0` into a folder that is being written."""
+    """Write `images/` and `sparse/0` to an existing folder."""
     (folder / "images").mkdir()
     model = pycolmap.Reconstruction()
     for number, posed in enumerate(source_images(scene), start=1):

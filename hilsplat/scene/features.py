@@ -1,4 +1,4 @@
-"""From photographs to verified matches: upright work images, cameras to estimate, SIFT, pairs."""
+"""Features and verified matches of photographs: upright work images, initial cameras, SIFT, pairs."""
 
 import logging
 from collections import defaultdict
@@ -20,22 +20,22 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 EXHAUSTIVE_UP_TO = 200
-"""matcher = "auto" tries every pair up to this many views; beyond, neighbours by name."""
+"""With matcher = "auto", every pair is tried up to this many views; above, only neighbours by name."""
 
 SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
-"""Distances by name at which sequential matching tries views."""
+"""Distances, in the order of names, at which sequential matching tries views."""
 
 MIN_INLIERS = 12
-"""Verified matches a pair needs (reference block for renders and photographs alike; COLMAP: 15)."""
+"""Minimum number of verified matches per pair (reference block, for renders and photographs; COLMAP: 15)."""
 
 PEAK_THRESHOLD = 0.02 / 3 / 2
-"""SIFT contrast threshold, half of COLMAP's: renders and indoor photographs are low in contrast."""
+"""SIFT contrast threshold, half of COLMAP's, because renders and indoor photographs have low contrast."""
 
 MAX_TRIALS = 1000
-"""Most trials of RANSAC for a pair (COLMAP: 10000): pairs that share nothing take them all."""
+"""Maximum RANSAC trials per pair (COLMAP: 10000); pairs without common content use all of them."""
 
 WORK_COMPRESSION = 1
-"""zlib's level for work images: COLMAP reads them once, and a third of the time of level 6 is saved."""
+"""zlib level of work images: it saves a third of the time of level 6, and COLMAP reads them only once."""
 
 EXIF_35MM_FOCAL = 0xA405
 EXIF_FOCAL = 0x920A
@@ -43,22 +43,22 @@ EXIF_PLANE_RESOLUTION = 0xA20E
 EXIF_PLANE_UNIT = 0xA210
 EXIF_STORED_WIDTH, EXIF_STORED_HEIGHT = 0xA002, 0xA003
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""EXIF's units of the focal plane's resolution (inch by default) in mm."""
+"""EXIF unit of the focal plane resolution -> mm (default: inch)."""
 EXIF_SUB_FOLDER = 0x8769
 EXIF_ORIENTATION = 0x0112
 DIAGONAL_35MM = 43.2666
-"""Diagonal of a 35 mm frame in mm, to which the EXIF equivalent focal length refers."""
+"""Diagonal of a 35 mm frame in mm, the reference of the equivalent focal length in EXIF."""
 
 
 @dataclass(frozen=True)
 class WorkImage:
-    """One input photograph as structure from motion sees it: upright, shrunk, PNG.
+    """Copy of a photograph for structure from motion: upright, shrunk, PNG.
 
     Attributes:
         view: view name, which is the file name of the work image.
-        source: the photograph it was made from.
+        source: the original photograph.
         size_hw: height and width of the work image, px.
-        focal_px: focal length from EXIF, in px of the work image; None if EXIF has none.
+        focal_px: focal length from EXIF, in px of the work image, or None.
     """
 
     view: str
@@ -68,16 +68,16 @@ class WorkImage:
 
 
 def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
-    """Focal length from EXIF, in px of the same picture shrunk to the given size; None if EXIF has none.
+    """Return the focal length from EXIF, in px of the picture shrunk to the given size, or None.
 
-    From the 35 mm equivalent or, without one, from the focal length and the pixels per length of the sensor.
+    It is computed from the 35 mm equivalent or else from the focal length and the focal plane resolution.
     """
     try:
         with open_image(path) as image:
             tags = image.getexif().get_ifd(EXIF_SUB_FOLDER)
             size = image.size
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
-        return None  # EXIF may be damaged; whether the pixels can be read is checked elsewhere
+        return None  # damaged EXIF is ignored; whether the pixels can be read is checked elsewhere
 
     def number(tag: int) -> float:
         try:
@@ -89,16 +89,16 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
     if focal := number(EXIF_35MM_FOCAL):
         return focal / DIAGONAL_35MM * float(np.hypot(*size_hw))
     pixels_per_mm = number(EXIF_PLANE_RESOLUTION) / PLANE_UNIT_MM.get(int(number(EXIF_PLANE_UNIT)), 25.4)
-    # The resolution is that of the picture as the camera stored it; programs that shrink it keep these tags.
+    # The resolution refers to the picture as stored by the camera; programs that shrink it keep these tags.
     stored_px = max(number(EXIF_STORED_WIDTH), number(EXIF_STORED_HEIGHT)) or max(size)
     return number(EXIF_FOCAL) * pixels_per_mm * max(size_hw) / stored_px or None
 
 
 def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:
-    """Write every photograph upright, its longer side at most `max_side_px`, as PNG into a work folder.
+    """Write every photograph as an upright PNG with a longer side of at most `max_side_px` to a work folder.
 
     Raises:
-        ImageError: files cannot be read; all of them are named.
+        ImageError: files cannot be read; the message names all of them.
         SceneError: two files would become the same view.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -127,9 +127,9 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
 
 
 def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[WorkImage]]:
-    """Group the views that share one set of intrinsics, in order of their first view.
+    """Group the views that share intrinsics, in the order of their first view.
 
-    "auto" groups views of equal size and EXIF focal length, "yes" all views, "no" none.
+    "auto" groups views with the same size and EXIF focal length, "yes" groups all views, "no" none.
 
     Raises:
         SceneError: "yes" with images of different sizes.
@@ -154,10 +154,9 @@ def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[
 def register_images(
     database: Path, folder: Path, images: Sequence[WorkImage], camera_model: str, single_camera: str
 ) -> None:
-    """Enter cameras and images into a new database, before any thread works on it.
+    """Add cameras and images to a new database.
 
-    Extraction would enter them as its threads finish; the ids, and with them the result, would
-    depend on timing.
+    Feature extraction would add them as its threads finish, so ids and results would depend on timing.
     """
     pycolmap.Database.open(database).close()  # creates the file
     for group in camera_groups(images, single_camera):
@@ -182,9 +181,9 @@ def find_matches(
     seed: int,
     threads: int,
 ) -> str:
-    """Register images, extract features and match them; returns which matching was used.
+    """Register images, extract features and match them; return the matcher that was used.
 
-    In a process of its own: where its database cannot be written, COLMAP throws in a thread of C++.
+    Call this in a separate process: if the database cannot be written, COLMAP throws in a C++ thread.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     register_images(database, folder, images, camera_model, settings.single_camera)
@@ -194,9 +193,9 @@ def find_matches(
 def features_and_matches(
     database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, seed: int, threads: int
 ) -> str:
-    """Features and matches of registered images; returns which matching was used.
+    """Extract features of registered images and match them; return the matcher that was used.
 
-    In a process of its own, as `find_matches`.
+    Call this in a separate process, as `find_matches`.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     extract_features(database, folder, views, settings, threads)
@@ -206,7 +205,7 @@ def features_and_matches(
 def extract_features(
     database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, threads: int
 ) -> None:
-    """SIFT features of registered images (CPU; the result does not depend on `threads`)."""
+    """Extract SIFT features of registered images (on the CPU; the result does not depend on `threads`)."""
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -219,7 +218,7 @@ def extract_features(
 
 
 def match_features(database: Path, num_views: int, settings: PosesSettings, seed: int, threads: int) -> str:
-    """Match pairs and verify them geometrically; returns which matching was used."""
+    """Match pairs and verify them geometrically; return the matcher that was used."""
     matcher = settings.matcher
     if matcher == "auto":
         matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
@@ -236,7 +235,7 @@ def match_features(database: Path, num_views: int, settings: PosesSettings, seed
 
 
 def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """Options of COLMAP's incremental mapper and triangulator, on one thread with fixed seeds."""
+    """Return the options of COLMAP's incremental mapper and triangulator: one thread and fixed seeds."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -246,12 +245,12 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 @dataclass(frozen=True)
 class MatchCounts:
-    """What matching found for one view.
+    """Numbers of features and matches of a view.
 
     Attributes:
-        features: SIFT features.
-        pairs: other views with at least `MIN_INLIERS` verified matches.
-        best_pair: verified matches with the best of them.
+        features: number of SIFT features.
+        pairs: number of other views with at least `MIN_INLIERS` verified matches.
+        best_pair: number of verified matches with the best of these views.
     """
 
     features: int
@@ -260,7 +259,7 @@ class MatchCounts:
 
 
 def count_matches(database: Path) -> dict[str, MatchCounts]:
-    """Features and verified pairs of every view in the database, by view name."""
+    """Count the features and verified pairs of every view in the database, by view name."""
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in names}

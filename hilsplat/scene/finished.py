@@ -1,4 +1,4 @@
-"""Where the parts of a finished scene are, and which settings made them."""
+"""Locations of a finished scene's artifacts, and the settings that produced them."""
 
 import logging
 from dataclasses import dataclass, fields
@@ -13,23 +13,23 @@ from hilsplat.base.provenance import read_provenance
 from hilsplat.settings import EvaluateSettings, Section
 
 KEY_VIEWS = "key-views"
-"""Variant whose nodes answer while those of `default` are computed: masks of a part of the views."""
+"""Variant computed from the masks of a subset of the views, used for queries until `default` is finished."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class SceneParts:
-    """Paths of the artifacts that together answer queries: one variant of one scene.
+    """Paths of the artifacts that are needed for queries: one variant of one scene.
 
     Attributes:
         scene: cameras, photographs, split.
         gaussians: 3DGS PLY.
         semantic_tree: nodes.
-        field: language field; None: it does not exist yet, and the tree answers without it.
-        autoencoder: decodes the field's features to CLIP vectors; None if there is no field.
-        clip: CLIP vectors of the masks; its index names the model, which also embeds the queries.
-        masks: masks of the train views.
+        field: language field; None if it does not exist yet, in which case queries use the tree alone.
+        autoencoder: decoder from the field's features to CLIP vectors; None if there is no field.
+        clip: CLIP vectors of the masks; its index records the model, which also embeds the queries.
+        masks: masks of the training views.
     """
 
     scene: Path
@@ -41,17 +41,17 @@ class SceneParts:
     masks: Path
 
     def as_inputs(self) -> dict[str, Path]:
-        """The parts that there are, by name, as provenance lists what a stage read."""
+        """Return the existing parts by name, in the form of a provenance record's inputs."""
         named = {part.name: getattr(self, part.name) for part in fields(self)}
         return {name: path for name, path in named.items() if path is not None}
 
 
 @dataclass(frozen=True)
 class FinishedScene:
-    """One variant of a finished scene; it may share some of its parts with another variant.
+    """One variant of a finished scene; it may share artifacts with another variant.
 
     Attributes:
-        folder: `results/<dataset>/<scene>`, or wherever that folder is now.
+        folder: `results/<dataset>/<scene>`, or a moved copy of it.
         variant: named set of settings.
         parts: its artifacts.
     """
@@ -64,9 +64,9 @@ class FinishedScene:
     def locate(folder: Path, variant: str = "default") -> "FinishedScene":
         """Find the parts of a variant, all within the scene's folder.
 
-        Provenance names what a stage read; without it, a part is expected beside the artifact made from it.
-        A variant that has no field was scored with another variant's, named in the provenance of its scores.
-        During a run, CLIP vectors of the variant's own are enough, and `default` falls back to those
+        Inputs are read from provenance; without it, an input is expected beside the artifact made from it. A
+        variant without a field was scored with that of another variant, recorded in the provenance of its
+        scores. During a run, the variant's own CLIP vectors are sufficient, and `default` falls back to those
         of the key views, with a warning.
 
         Raises:
@@ -100,7 +100,7 @@ class FinishedScene:
         if field.exists():
             autoencoder = _input_of(field, "autoencoder", folder)
             clip = _input_of(autoencoder, "clip", folder)
-        elif not clip.exists():  # `default` has vectors of its own; others may share them
+        elif not clip.exists():  # `default` has its own vectors; other variants may share them
             raise _unfinished(folder, clip if variant == "default" else field)
         tree = _input_of(autoencoder or clip, "semantic_tree", folder)
         parts = SceneParts(
@@ -119,14 +119,14 @@ class FinishedScene:
 
     @property
     def naming(self) -> Path:
-        """Where the names of the nodes are, beside the vectors that gave them; they may not exist."""
+        """Folder of the node names, beside the CLIP vectors they were computed from; it may not exist."""
         return self.parts.clip.parent / "names"
 
     def evaluate_settings(self) -> EvaluateSettings:
-        """Canonical phrases, template, scale and selection of the run that made the scene.
+        """Return the canonical phrases, template, scale and selection of the run that made the scene.
 
-        They are in the provenance of its scores. A scene without labels has no scores, but its panel was
-        drawn with the same settings.
+        They are read from the provenance of its scores. A scene without labels has no scores, but its panel
+        was drawn with the same settings.
         """
         scores = self.folder / self.variant / "scores.csv"
         if provenance_path(scores).is_file():
@@ -142,27 +142,26 @@ class FinishedScene:
 
 
 def refining(folder: Path) -> str:
-    """Return a sentence with the number of photographs that the key views are."""
+    """Return a sentence with the number of key views that are used until the run ends."""
     used = len(read_index(folder / KEY_VIEWS / "masks")["views"])
     train = sum(entry["split"] == "train" for entry in read_index(folder / "scene")["views"].values())
     return f"{folder.parent.name}/{folder.name} answers from {used} of {train} photographs until the run ends"
 
 
 def is_drawn(scene: Path) -> bool:
-    """Whether the views of a `Scene` artifact were drawn from the synthetic world, by its provenance."""
+    """Return whether a `Scene` artifact was made from renders of the synthetic world, by its provenance."""
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
     return images is not None and Path(images.path).parts[-2:] == ("world", "images")
 
 
 def _recorded_settings(artifact: Path) -> dict[str, Any]:
-    """Settings in an artifact's provenance; none if it has no provenance."""
     record = read_provenance(artifact)
     return record.settings if record else {}
 
 
 def _section(section: type[Section], found: dict[str, Any]) -> Any:
-    """A section from recorded settings; knobs missing from the record take their defaults."""
+    """Create a section from recorded settings; missing settings get their defaults."""
     try:
         return section(**{name: value for name, value in found.items() if name in section.model_fields})
     except ValidationError as error:
@@ -174,7 +173,7 @@ def _section(section: type[Section], found: dict[str, Any]) -> Any:
 
 
 def finished_variants(folder: Path) -> list[str]:
-    """Variants of a scene that answer: they have a field or CLIP vectors of their own."""
+    """Return the variants of a scene that accept queries: those with their own field or CLIP vectors."""
     made = [path for name in ("field.safetensors", "clip") for path in folder.glob(f"*/{name}")]
     return sorted({path.parent.name for path in made})
 
@@ -184,12 +183,12 @@ def _unfinished(folder: Path, missing: Path) -> ArtifactError:
 
 
 def _input_of(artifact: Path, name: str, folder: Path) -> Path:
-    """Path of an artifact's input: from its provenance, else beside the artifact."""
+    """Return the path of an artifact's input: from its provenance, else beside the artifact."""
     return _recorded_input(artifact, name, folder) or artifact.parent / name
 
 
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
-    """Path of an artifact's input from its provenance, inside the scene's folder, which may have moved."""
+    """Return the path of an artifact's recorded input in the scene folder, which may have moved, or None."""
     record = read_provenance(artifact)
     if record is not None and name in record.inputs:
         path = Path(record.inputs[name].path)
@@ -200,25 +199,25 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse an artifact that was made for another file.
+    """Check that an artifact was made for this file.
 
     Raises:
-        MisalignedArtifactError: the file's digest is another one.
+        MisalignedArtifactError: the file has another digest.
     """
     require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
 
 
 def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
-    """Refuse artifacts that were made for another file.
+    """Check that artifacts were made for this file.
 
     Args:
         path: the file.
         found_sha256: its digest.
-        scene: for the message.
+        scene: name of the scene, for the message.
         made_for: name of each artifact -> digest of the file that it was made for.
 
     Raises:
-        MisalignedArtifactError: the file's digest is another one.
+        MisalignedArtifactError: the file has another digest.
     """
     for what, expected in made_for.items():
         if found_sha256 != expected:

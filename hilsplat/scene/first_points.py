@@ -1,4 +1,4 @@
-"""Sparse points of views whose poses are known: triangulated, or random if that fails."""
+"""Sparse points of views with known poses: triangulated, or random if triangulation fails."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from hilsplat.scene.model import sparse_points
 from hilsplat.settings import PosesSettings
 
 MIN_TRIANGULATED = 100
-"""With fewer triangulated points, random ones in front of the cameras start the fit instead."""
+"""Number of triangulated points below which random points in front of the cameras are used instead."""
 
 NUM_RANDOM_POINTS = 20_000
 
@@ -25,7 +25,7 @@ NUM_RANDOM_POINTS = 20_000
 def triangulate(
     views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sparse points of pinhole views with known poses: features, matches, triangulation at fixed poses."""
+    """Triangulate sparse points of pinhole views at their known poses, after feature matching."""
     if len(views) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     folder, database = views[0].image.parent, work / "triangulation.db"
@@ -54,15 +54,15 @@ def triangulate(
 def random_points(
     views: Sequence[PosedView], seed: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Random points that cameras see, to start a fit if triangulation found too few.
+    """Sample random grey points in front of the cameras, to start a fit if triangulation gives too few.
 
-    Each lies on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the
-    distance from the camera to the point nearest to all optical axes; grey.
+    Each is on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the distance
+    from the camera to the point nearest to all optical axes.
     """
     generator = np.random.default_rng(seed)
     centres = np.stack([view.centre for view in views])
     looks = np.stack([view.cam_from_source[2, :3] for view in views])
-    # Least squares for the point nearest to all axes, weakly drawn to one camera spread ahead.
+    # Least squares for the point nearest to all axes, with a weak prior at one camera spread ahead.
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
     prior = 1e-3

@@ -1,31 +1,31 @@
-"""How folders of photographs are laid out; light enough to import at the start of the workflow."""
+"""Layouts of folders of photographs; fast to import at the start of the workflow."""
 
 from pathlib import Path
 
 from hilsplat.base.files import list_images
 
 TRAINED = ("output", "outputs", "exports", "language_features")
-"""Folders beside photographs that 3DGS, nerfstudio and LangSplat write."""
+"""Folders that 3DGS, nerfstudio and LangSplat write beside photographs."""
 
 MODELS = ("sparse/0", "sparse")
-"""Folders of COLMAP's model, in order of preference."""
+"""Folders of a COLMAP model, in order of preference."""
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
-"""Files with poses that nerfstudio and others write, in order of preference."""
+"""Pose files of nerfstudio and other programs, in order of preference."""
 
 NO_POSES = Path("none")
-"""In place of a path: poses that a folder brings are not used."""
+"""Value instead of a path, which means that poses in the folder are ignored."""
 
 DATAPARSER = "dataparser_transforms.json"
-"""nerfstudio's record of the coordinates in which it trained."""
+"""File in which nerfstudio records its training coordinates."""
 
 
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
-"""Places of a PLY that nerfstudio or a viewer exported; one of 3DGS's own is preferred."""
+"""Paths of a PLY exported by nerfstudio or a viewer; a PLY of 3DGS is preferred."""
 
 
 def trained_gaussians(folder: Path) -> Path | None:
-    """Return the PLY that 3DGS or nerfstudio trained in a folder: of several, that of the most steps."""
+    """Return the PLY that 3DGS or nerfstudio trained in a folder, the one with the most steps, or None."""
     found = [
         path
         for pattern in (
@@ -41,20 +41,20 @@ def trained_gaussians(folder: Path) -> Path | None:
 
 
 def dataparser_of(ply: Path, source: Path) -> Path | None:
-    """Return the record of the coordinates of nerfstudio's PLY, or None for a PLY of another program.
+    """Return the file with the training coordinates of nerfstudio's PLY, or None for other PLYs.
 
-    It is in the PLY's folder, in the source's folder, or in that of the latest training run. The last two
-    count only for a PLY with the name that nerfstudio gives.
+    It is in the PLY's folder, the source's folder, or that of the latest training run. The last two are
+    searched only if the PLY has nerfstudio's file name.
     """
     places = [ply.parent]
     if ply.name == "splat.ply":
-        runs = sorted(Path(source).glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last part is the time
+        runs = sorted(Path(source).glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last folder is a time stamp
         places += [Path(source), *(run.parent for run in runs[-1:])]
     return next((place / DATAPARSER for place in places if (place / DATAPARSER).is_file()), None)
 
 
 def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
-    """Return the transforms file that poses a folder; None if a COLMAP model does, or nothing of the kind."""
+    """Return the transforms file with a folder's poses; None if a COLMAP model has them, or nothing does."""
     if named is not None and named.suffix == ".json":
         return named
     folder = named or folder
@@ -65,13 +65,13 @@ def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
 
 
 def langsplat_features(folder: Path) -> Path | None:
-    """Return the folder of masks and CLIP vectors that LangSplat's preprocessing wrote."""
+    """Return the folder of masks and CLIP vectors written by LangSplat's preprocessing, or None."""
     features = Path(folder) / "language_features"
     return features if any(features.glob("*_s.npy")) else None
 
 
 def label_files(folder: Path) -> list[Path]:
-    """Return the label files of a scene of LERF-OVS: in its `label/`, or in the one beside the scene."""
+    """Return the label files of a LERF-OVS scene, in its `label/` folder or in the one beside the scene."""
     folder = Path(folder).resolve()
     for place in (folder / "label", folder.parent / "label" / folder.name):
         if found := sorted(place.glob("*.json")):
@@ -80,7 +80,7 @@ def label_files(folder: Path) -> list[Path]:
 
 
 def photo_folder(folder: Path) -> Path:
-    """Where the photographs of a source are: the folder itself or, if it has none, where exports put them."""
+    """Return the folder of a source's photographs: the source itself, or else an export's image folder."""
     folder = Path(folder)
     if list_images(folder):
         return folder
@@ -94,7 +94,7 @@ def photo_folder(folder: Path) -> Path:
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
-    """Whether a folder has poses in a form that `find_known_poses` finds, or others are named."""
+    """Return whether a folder has poses that `find_known_poses` supports, or other poses are given."""
     if named is not None:
         return named != NO_POSES
     return (
@@ -107,7 +107,7 @@ def has_known_poses(folder: Path, named: Path | None = None) -> bool:
 
 
 def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Folders of images and of cameras in a raw Polycam export, the corrected ones if there are any."""
+    """Return the folders of images and cameras in a raw Polycam export, preferably the corrected ones."""
     for prefix in ("corrected_", ""):
         images, cameras = (folder / "keyframes" / f"{prefix}{what}" for what in ("images", "cameras"))
         if images.is_dir() and cameras.is_dir():
@@ -116,7 +116,7 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def record3d_export(folder: Path) -> tuple[Path, Path] | None:
-    """Folder of images and file of poses in a Record3D export: an image sequence, or an unpacked .r3d."""
+    """Return image folder and pose file of a Record3D export (image sequence or unpacked .r3d), or None."""
     for metadata in (folder / "metadata.json", folder / "metadata"):
         for images in (folder / "rgb", folder / "rgbd"):
             if metadata.is_file() and images.is_dir():
@@ -125,7 +125,7 @@ def record3d_export(folder: Path) -> tuple[Path, Path] | None:
 
 
 def unwrapped(folder: Path) -> Path:
-    """The folder that holds something: archives often wrap their content in a folder of its own."""
+    """Return the folder of the actual content, because archives often wrap it in a single folder."""
     while photo_folder(folder) == folder and not list_images(folder) and not has_known_poses(folder):
         inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
         if len(inside) != 1 or not inside[0].is_dir():

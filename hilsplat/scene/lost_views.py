@@ -1,4 +1,4 @@
-"""Photographs that were not registered: which they are, and where they would belong."""
+"""Report and picture of photographs that were not registered, with their likely neighbours."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,10 +10,10 @@ from hilsplat.base.images import read_image, resize_to_fit, write_png
 from hilsplat.scene.colmap import pycolmap
 
 NEIGHBOURS = 3
-"""Registered photographs that are named beside a lost one."""
+"""Number of registered photographs reported for each lost one."""
 
 MAX_ROWS = 12
-"""Lost photographs that the picture shows; the rest is in registration.json."""
+"""Maximum number of lost photographs in the picture; registration.json lists all of them."""
 
 THUMBNAIL_PX = 400
 
@@ -24,11 +24,11 @@ ADVICE = (
 
 
 def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
-    """Give every lost view `belongs_near`: the registered views with which it shares most verified matches.
+    """Add `belongs_near` to every lost view: the registered views with the most shared verified matches.
 
     Args:
-        database: COLMAP's, after matching.
-        views: entries of the registration report by view name; those of lost views are completed in place.
+        database: COLMAP's database, after matching.
+        views: entries of the registration report by view name; entries of lost views are modified in place.
     """
     shared: dict[str, dict[str, int]] = {view: {} for view in views}
     with pycolmap.Database.open(database) as opened:
@@ -48,7 +48,7 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
-    """Draw lost photographs, a row each, with the registered ones near which they belong and the advice.
+    """Draw each lost photograph in a row with its registered neighbours, below the advice.
 
     Args:
         path: PNG to write.
@@ -56,7 +56,7 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
         report: registration report with neighbours.
 
     Returns:
-        Whether there was anything to draw; otherwise nothing is written.
+        Whether a picture was written, which is not the case without lost photographs.
     """
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
@@ -87,12 +87,11 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
 
 
 def _short(reason: str) -> str:
-    """The first words of a reason."""
     return reason.split(":")[0]
 
 
 def stack_pictures(upper: Path, lower: Path) -> None:
-    """Append a picture below another one, in place; the narrower one gets a white margin."""
+    """Append a picture below another one, in place, and pad the narrower one with white."""
     pictures = [read_image(path) for path in (upper, lower)]
     width = max(picture.shape[1] for picture in pictures)
     write_png(

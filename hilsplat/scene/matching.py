@@ -1,7 +1,7 @@
-"""Matches of SIFT features between views, and their check by two-view geometry.
+"""Matching of SIFT features between views, and verification by two-view geometry.
 
-The measure and its limits are COLMAP's. Its matcher takes approximate neighbours (FAISS); here every product
-of two descriptors is taken, in whole numbers, in a third of the time.
+Distance and limits are those of COLMAP. COLMAP's matcher uses approximate neighbours (FAISS); here, all inner
+products of descriptors are computed, in integers, in a third of the time.
 """
 
 import copy
@@ -20,17 +20,17 @@ from hilsplat.base.compiled import compiled
 from hilsplat.scene.colmap import pycolmap
 
 MAX_ANGLE = 0.7
-"""Largest angle between matching descriptors, radians (COLMAP's)."""
+"""Largest angle between matching descriptors, radians (as in COLMAP)."""
 
 MAX_RATIO = 0.8
-"""Largest ratio of the angles to the nearest and to the second nearest descriptor (COLMAP's)."""
+"""Largest ratio of the angles to the nearest and the second nearest descriptor (as in COLMAP)."""
 
 MIN_MATCHES = 15
-"""A pair with fewer matches has none (COLMAP's)."""
+"""Number of matches below which a pair counts as unmatched (as in COLMAP)."""
 
 _CHANNELS = 128
-_LENGTH = 512.0  # of a descriptor, as COLMAP stores it
-_BLOCK = 128  # descriptors whose products are taken at once: they stay in the processor's cache
+_LENGTH = 512.0  # length of a descriptor in COLMAP's database
+_BLOCK = 128  # descriptors per block, so that the products fit into the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +38,11 @@ class ViewFeatures:
     """The N features of one view.
 
     Attributes:
-        image_id: of the view in COLMAP's database.
+        image_id: id of the view in COLMAP's database.
         camera: its lens.
         points: positions, px.
-        descriptors: SIFT, of length 512.
-        columns: the same less 128, a feature per column.
+        descriptors: SIFT descriptors of length 512.
+        columns: descriptors minus 128, one feature per column.
     """
 
     image_id: int
@@ -53,7 +53,7 @@ class ViewFeatures:
 
 
 def read_features(database: pycolmap.Database) -> list[ViewFeatures]:
-    """Features of all views of a database, by view name."""
+    """Read the features of all views in a database, sorted by view name."""
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
     views = []
     for image in sorted(database.read_all_images(), key=lambda image: image.name):
@@ -70,13 +70,13 @@ def match_pairs(
     options: pycolmap.TwoViewGeometryOptions,
     threads: int,
 ) -> None:
-    """Match pairs of views, check them, and enter what was found into COLMAP's database.
+    """Match pairs of views, verify the matches, and write both to COLMAP's database.
 
     Args:
-        database: with features, without matches.
-        partners: for each view by name, the rows of the later views that it is matched with.
-        options: of the check; its RANSAC takes fewer trials where few matches leave no other way to pass.
-        threads: the result does not depend on them.
+        database: database with features and without matches.
+        partners: for each view, in the order of names, the rows of the later views to match with.
+        options: verification options; RANSAC makes fewer trials for pairs with few matches (see `_matched`).
+        threads: number of threads; the result does not depend on it.
     """
     with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(threads) as pool:
         views = read_features(opened)
@@ -92,12 +92,12 @@ def match_pairs(
 def _matched(
     one: ViewFeatures, other: ViewFeatures, options: pycolmap.TwoViewGeometryOptions
 ) -> tuple[UInt32[np.ndarray, "M 2"], pycolmap.TwoViewGeometry]:
-    """Matches of a pair of views, and the geometry that they agree on, if any."""
+    """Return the matches of a pair of views, and the geometry on which they agree, if any."""
     matches = mutual_matches(one, other)
     if len(matches) < MIN_MATCHES:
         return matches[:0], pycolmap.TwoViewGeometry()
     options = copy.deepcopy(options)
-    # The fewer the matches, the larger a share of them must agree, and the sooner RANSAC has found it.
+    # With fewer matches, a larger share of them must be inliers, so RANSAC needs fewer trials.
     options.ransac.min_inlier_ratio = max(
         options.ransac.min_inlier_ratio, options.min_num_inliers / len(matches)
     )
@@ -108,7 +108,7 @@ def _matched(
 
 
 def mutual_matches(one: ViewFeatures, other: ViewFeatures) -> UInt32[np.ndarray, "M 2"]:
-    """Rows of features that are each other's nearest, near enough, and clearly nearer than the second."""
+    """Return the rows of mutually nearest features within `MAX_ANGLE` that pass the ratio test."""
     rows, columns = len(one.descriptors), len(other.descriptors)
     if not rows or not columns:
         return np.zeros((0, 2), np.uint32)
@@ -131,19 +131,19 @@ def _is_clear(best: Int32[np.ndarray, " N"], second: Int32[np.ndarray, " N"]) ->
 
 
 def _multiplier(columns: Int8[np.ndarray, "128 N"]) -> Callable[[UInt8[np.ndarray, "R 128"]], np.ndarray]:
-    """What takes inner products of up to `_BLOCK` descriptors with these columns: whole numbers, exactly."""
+    """Return a function for exact inner products of up to `_BLOCK` descriptors with these columns."""
     session = _integer_products()
     if session is not None:
         return lambda rows: session.run(None, {"rows": rows, "columns": columns})[0]
     whole = columns.astype(np.float32) + 128
-    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # fresh memory costs more than the products
-    # below 2**24, so exact in float32
+    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # allocation takes longer than the products
+    # Sums are below 2**24, so float32 is exact.
     return lambda rows: np.matmul(rows.astype(np.float32), whole, out=space[: len(rows)])
 
 
 @cache
 def _integer_products() -> onnxruntime.InferenceSession | None:
-    """A product of 8-bit matrices; None where it is not exact: without VNNI, x86 saturates sums of two."""
+    """Return a session for exact 8-bit matrix products; None on x86 without VNNI, where sums saturate."""
     from onnx import TensorProto, helper
 
     graph = helper.make_graph(
@@ -171,7 +171,7 @@ def _integer_products() -> onnxruntime.InferenceSession | None:
 @compiled
 @no_type_check  # the shape checks of the test-suite cannot be compiled
 def _nearest(products, first, best, second, column, best_of_column, second_of_column, row_of_column):
-    """Take in products of rows from `first` on: the largest two of each row and, so far, of each column."""
+    """Update the two largest products per row and column with a block that starts at row `first`."""
     columns = products.shape[1]
     for r in range(len(products)):
         row, i = products[r], np.int32(first + r)

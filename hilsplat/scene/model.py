@@ -7,20 +7,20 @@ from hilsplat.scene.colmap import pycolmap
 
 
 def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
-    """4 x 4 matrix of a COLMAP pose."""
+    """Return the 4 x 4 matrix of a COLMAP pose."""
     return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 
 def camera_of(image: pycolmap.Image) -> pycolmap.Camera:
-    """Camera of an image that is part of a model."""
-    assert image.camera is not None  # only images outside a model have none
+    """Return the camera of an image that is part of a model."""
+    assert image.camera is not None  # only images outside a model have no camera
     return image.camera
 
 
 def sparse_points(
     model: pycolmap.Reconstruction,
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sparse points and colours of a model, by point id."""
+    """Return the sparse points and colours of a model, sorted by point id."""
     points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
@@ -28,7 +28,7 @@ def sparse_points(
 
 
 def reprojection_errors(model: pycolmap.Reconstruction) -> dict[str, Float64[np.ndarray, " n"]]:
-    """Distance in px between each observation and its point's projection, per registered view."""
+    """Compute the distance in px between each observation and its point's projection, per registered view."""
     errors = {}
     for image_id in model.reg_image_ids():
         image = model.images[image_id]

@@ -1,4 +1,4 @@
-"""Images with known pose and lens, and the folder from which `poses` imports them."""
+"""Images with known pose and lens, and the folder format from which `poses` imports them."""
 
 import json
 import shutil
@@ -16,20 +16,20 @@ from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-"""Added to a K whose pixel centres are whole numbers: here the first pixel's centre is (0.5, 0.5)."""
+"""Offset added to a K with integer pixel centres; here, the centre of the first pixel is (0.5, 0.5)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One image and its camera.
+    """An image and its camera.
 
     Attributes:
-        name: file name in the folder that is imported.
-        image: the file, or its encoded bytes if the data set keeps images inside other files.
+        name: file name in the imported folder.
+        image: the file, or its encoded bytes if the data set stores images inside other files.
         cam_from_world: world-to-camera transform, OpenCV axes, in the unit of the scene.
         K: intrinsics, px; the centre of the first pixel is (0.5, 0.5).
         size_hw: height and width, px.
-        distortion: k1, k2, p1, p2, k3 as OpenCV defines them.
+        distortion: k1, k2, p1, p2, k3 as defined by OpenCV.
     """
 
     name: str
@@ -49,7 +49,7 @@ def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> F
     """Invert a camera-to-world matrix.
 
     Raises:
-        SceneError: it is not a rotation and translation; `where` begins the message.
+        SceneError: the matrix is not a rotation and translation; the message begins with `where`.
     """
     rigid = are_rotations(world_from_cam[:3, :3], RIGID_TOLERANCE)
     if not rigid or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
@@ -68,16 +68,16 @@ def write_posed_images(
     points: Float[np.ndarray, "P 3"] | None = None,
     colours: UInt8[np.ndarray, "P 3"] | None = None,
 ) -> None:
-    """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame): a source for `poses`.
+    """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
-    Images are copied byte for byte; lenses are kept, because `poses` undistorts. Points, if any, are written
-    to `points.ply` and become the scene's sparse points, in their order.
+    Images are copied byte for byte; distortion is kept, because `poses` undistorts. Points, if any, are
+    written to `points.ply` and become the scene's sparse points, in the same order.
 
     Args:
-        folder: written completely or not at all; an existing one is replaced.
-        images: at least one, names all different.
-        points: positions known from the data set, in the unit of the poses.
-        colours: their colours, if known.
+        folder: folder to write atomically; an existing one is replaced.
+        images: at least one image; names must be unique.
+        points: positions from the data set, in the unit of the poses.
+        colours: colours of the points, if known.
 
     Raises:
         SceneError: two images share a name, or there are none.

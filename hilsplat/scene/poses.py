@@ -1,4 +1,4 @@
-"""The poses stage: photographs, or images with known poses, to a posed scene."""
+"""The stage `poses`: a posed scene from photographs, or from images with known poses."""
 
 import logging
 import shutil
@@ -35,16 +35,16 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 INIT_MIN_INLIERS = 50
-"""Matches the first pair of a model needs (reference block; COLMAP: 100)."""
+"""Minimum number of matches of a model's first pair (reference block; COLMAP: 100)."""
 
 POSE_MIN_INLIERS = 15
-"""Points that each further view must see to be posed (reference block; COLMAP: 30)."""
+"""Minimum number of visible points for posing each further view (reference block; COLMAP: 30)."""
 
 LOST_PICTURE = "not_registered.png"
-"""Written beside the scene folder if too few photographs were registered."""
+"""Picture written beside the scene folder if too few photographs were registered."""
 
 WEAK_POINTS_PER_VIEW = 13
-"""Good runs on renders had at least this many points per registered view; useless ones had 4 to 18."""
+"""Minimum points per registered view in good runs on renders; useless runs had 4 to 18."""
 
 
 def run_poses(
@@ -60,12 +60,11 @@ def run_poses(
 ) -> None:
     """Pose the images of one scene and write its Scene artifact with a registration report.
 
-    A folder with a COLMAP model (`sparse/`) or a `transforms*.json` is imported; any other is posed
-    by structure from motion. The result depends on images, settings and seed, not on `threads`:
-    features and matches are computed pair by pair, the mapping itself runs on one thread.
+    A folder with known poses, such as a COLMAP model (`sparse/`) or a `transforms*.json`, is imported; any
+    other is posed by structure from motion. The result depends on images, settings and seed, but not on
+    `threads`: features and matches are computed pair by pair, and the mapping runs on one thread.
 
-    Structure from motion cannot recover the metre, so its scenes have the unit "arbitrary" whatever
-    `unit` says.
+    Structure from motion cannot recover metric scale, so its scenes always have the unit "arbitrary".
 
     Args:
         images: folder of photographs, or of images with known poses.
@@ -74,8 +73,8 @@ def run_poses(
         unit: "metre" or "arbitrary": the unit of imported poses.
         is_render: images are renders of a pinhole camera without distortion.
         settings: the `poses` section.
-        seed: of RANSAC and of the mapper.
-        threads: for feature extraction and matching.
+        seed: seed of RANSAC and the mapper.
+        threads: threads for feature extraction and matching.
         named: poses to use instead of those in the folder (`find_known_poses`).
 
     Raises:
@@ -84,7 +83,7 @@ def run_poses(
         RegistrationError: too few views were registered.
     """
     images, out = Path(images), Path(out)
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # COLMAP narrates each step on stderr
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # by default, COLMAP logs each step
     with stage_log("poses", name) as counts, work_folder(out) as work:
         known = find_known_poses(images, named) if images.is_dir() else None
         if known is None:
@@ -107,7 +106,7 @@ def _reconstruct(
     seed: int,
     threads: int,
 ) -> dict[str, Any]:
-    """Structure from motion on a folder of photographs; returns the registration report."""
+    """Run structure from motion on a folder of photographs, and return the registration report."""
     if not images.is_dir():
         raise SceneError(
             f"image folder {images} of {name} is missing", fix="correct its source in the scene sheet"
@@ -144,7 +143,7 @@ def _reconstruct(
     picture = work / LOST_PICTURE
     has_lost = plot_lost(picture, work / "images", report)
     kept = out.with_name(LOST_PICTURE)
-    kept.unlink(missing_ok=True)  # of an earlier try
+    kept.unlink(missing_ok=True)  # from an earlier run
     try:
         check_registration(images, name, report, settings)
     except RegistrationError as error:
@@ -169,9 +168,9 @@ def _reconstruct(
 def map_views(
     database: Path, images: Path, folder: Path, mapper: str, seed: int
 ) -> list[pycolmap.Reconstruction]:
-    """Run the mapper on one thread with fixed seeds; returns its models, the largest first.
+    """Run the mapper on one thread with fixed seeds, and return its models, the largest first.
 
-    The mapper may end with a model of two views despite `min_model_size`; such models are dropped.
+    Despite `min_model_size`, the mapper may return a model of two views; such models are dropped.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if mapper == "incremental":
@@ -190,7 +189,7 @@ def map_views(
 
 
 def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
-    """Options of COLMAP's global mapper, on one thread with fixed seeds."""
+    """Return the options of COLMAP's global mapper: one thread and fixed seeds."""
     options = pycolmap.GlobalPipelineOptions()
     mapper = options.mapper
     options.num_threads = mapper.num_threads = 1
@@ -210,7 +209,7 @@ def registration_report(
     models: Sequence[pycolmap.Reconstruction],
     settings: PosesSettings,
 ) -> dict[str, Any]:
-    """What registration found: totals, models and, for each view, whether it was posed or why not."""
+    """Return the registration report: totals, models and, for each view, whether it was posed or why not."""
     errors = reprojection_errors(models[0]) if models else {}
     members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     views: dict[str, Any] = {}
@@ -249,7 +248,7 @@ def registration_report(
 
 
 def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
-    """Lenses as estimated, before undistortion."""
+    """Return the estimated lenses, before undistortion."""
     used = sorted({model.images[image_id].camera_id for image_id in model.reg_image_ids()})
     return [
         {
@@ -263,7 +262,6 @@ def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
 
 
 def _why_not(view: str, found: MatchCounts, members: Sequence[set[str]]) -> str:
-    """Why a view is not in the largest model, in words."""
     if found.features == 0:
         return "no features: the image is flat, dark or out of focus"
     if found.pairs == 0:
@@ -275,7 +273,6 @@ def _why_not(view: str, found: MatchCounts, members: Sequence[set[str]]) -> str:
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:
-    """What a person should know before trusting these poses."""
     warnings = []
     lost = report["images"] - report["registered"]
     if report["registered"] and lost:
@@ -294,10 +291,10 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction that holds too few views; log the doubts about one that passes.
+    """Refuse a reconstruction with too few views or separate models, and log warnings about an accepted one.
 
     Raises:
-        RegistrationError: it holds too few; the message names the lost photographs and what to do.
+        RegistrationError: it is refused; the message names the lost photographs and the fix.
     """
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]

@@ -14,15 +14,14 @@ from hilsplat.scene.cameras import Cameras
 
 @dataclass(frozen=True)
 class Scene:
-    """What every stage after `poses` reads, from the folder `scene/`.
+    """A posed scene: the output `scene/` of the stage `poses`, which all later stages read.
 
     Attributes:
         folder: the scene artifact; images are `folder/images/<view name>`.
         name: `<dataset>/<scene>`.
-        unit: what one length unit is: "metre" or "arbitrary".
+        unit: unit of length, "metre" or "arbitrary".
         cameras: V undistorted pinhole cameras.
-        split: "train" or "test" per view name. Test views are held out of every stage between
-            poses and evaluate.
+        split: "train" or "test" per view name. No stage between poses and evaluate uses test views.
         points_xyz: sparse points, scene units.
         points_rgb: their colours.
         scene_from_source: similarity that maps source coordinates to the scene's.
@@ -38,15 +37,15 @@ class Scene:
     scene_from_source: Float[np.ndarray, "4 4"]
 
     def views(self, split: str | None = None) -> list[str]:
-        """View names of a split ("train", "test"), or all, in camera order."""
+        """Return the view names of a split ("train", "test") or all view names, in camera order."""
         return [name for name in self.cameras.names if split is None or self.split[name] == split]
 
     def image_path(self, view: str) -> Path:
-        """File of a view's undistorted image."""
+        """Return the file of a view's undistorted image."""
         return self.folder / "images" / view
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """A view's undistorted image, checked against its camera's size."""
+        """Read a view's undistorted image, and check its size against the camera."""
         pixels = read_image(sealed(self.folder, f"images/{view}"))
         expected = self.cameras[view].size_hw
         if pixels.shape[:2] != expected:
@@ -59,7 +58,7 @@ class Scene:
         return pixels
 
     def save(self) -> None:
-        """Write cameras, points and, last, the index into `folder` (images are already there)."""
+        """Write cameras, points and, last, the index to `folder`, which already contains the images."""
         self.cameras.save(self.folder / "cameras.npz")
         write_npz(
             self.folder / "points.npz",

@@ -1,6 +1,6 @@
 """The scene sheet (config/scenes.tsv), which lists the scenes.
 
-The workflow imports this module at start-up, so nothing heavy is imported at its top.
+The workflow imports this module at start-up, so it does not import slow modules at the top level.
 """
 
 import re
@@ -14,12 +14,12 @@ from hilsplat.base.files import IMAGE_SUFFIXES, NAME_RULE, list_images, name_pro
 from hilsplat.scene.layouts import NO_POSES, has_known_poses, photo_folder
 
 DEFAULT_SHEET = Path("config/scenes.tsv")
-"""Relative to the project."""
+"""Default scene sheet, relative to the project."""
 
 COLUMNS = ("dataset", "scene", "group", "source", "unit")
 OPTIONAL_COLUMNS = ("gaussians", "features", "poses")
 NOTHING = ("", "-")
-"""Contents of an optional cell that is left empty."""
+"""Values of an empty optional cell."""
 GROUPS = (
     "benchmark",
     "development",
@@ -38,16 +38,16 @@ PHOTOS = "photos"
 """Data set and group of your own photographs."""
 
 MIN_PHOTOS = 3
-"""Structure from motion needs at least this many."""
+"""Minimum number of photographs for structure from motion."""
 
 DATA_PREFIX = "data:"
-"""Prefix of a source below the folder of real data sets (`data_root`)."""
+"""Prefix of a source in the folder of real data sets (`data_root`)."""
 WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
 
 
 @dataclass(frozen=True)
 class SceneRow:
-    """One scene of the sheet.
+    """One scene in the sheet.
 
     Attributes:
         dataset: data set, first part of the scene's path under `results/`.
@@ -56,7 +56,7 @@ class SceneRow:
         source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
         folder: the source folder, resolved; None for a world, and for `data:` without a data root.
-        gaussians: a ready-made 3DGS PLY in the source's coordinates, used instead of a fit; None if the
+        gaussians: an existing 3DGS PLY in the source's coordinates, used instead of a fit; None if the
             Gaussians are fitted, and for `data:` without a data root.
         features: a folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP; None if masks
             are computed, and for `data:` without a data root.
@@ -87,7 +87,7 @@ class SceneRow:
 
 
 def project_root(sheet: Path) -> Path:
-    """Folder that relative sources start from: above `config/`, or else the sheet's own folder."""
+    """Return the base folder of relative sources: the parent of `config/`, or else the sheet's own folder."""
     folder = Path(sheet).resolve().parent
     return folder.parent if folder.name == "config" else folder
 
@@ -95,20 +95,20 @@ def project_root(sheet: Path) -> Path:
 def read_sheet(
     path: Path, checked_groups: Collection[str] | None = None, data_root: str = ""
 ) -> list[SceneRow]:
-    """Read and check the scene sheet: tab-separated, one header line, `#` begins a comment line.
+    """Read and check the scene sheet: tab-separated, with one header line and `#` for comment lines.
 
-    The columns `gaussians`, `features` and `poses` may be left out, also at the end of a single row; an empty
+    The columns `gaussians`, `features` and `poses` may be omitted, also at the end of a single row; an empty
     cell or "-" has the same meaning.
 
     Args:
-        path: the sheet; relative sources start from its project root.
-        checked_groups: groups whose source folders must exist and hold images; None for all. A
-            run checks the groups it runs, so that a missing folder of another group does not stop it.
-        data_root: folder of the real data sets, from which `data:` sources start; if it is empty,
-            such rows have no folder. This function does not check that they exist.
+        path: the sheet; relative sources are relative to its project root.
+        checked_groups: groups whose source folders must exist and contain images; None for all. A run checks
+            only the groups it runs, so that a missing folder of another group does not stop it.
+        data_root: folder of the real data sets, the base of `data:` sources; if it is empty, such rows have
+            no folder. This function does not check that these sources exist.
 
     Raises:
-        SceneError: the sheet cannot be used; the message names line, column and what to do.
+        SceneError: the sheet cannot be used; the message names line, column and fix.
     """
     path = Path(path)
     lines = content_lines(path)
@@ -144,7 +144,7 @@ def read_sheet(
 
 
 def row_of_data(name: str, data_root: str) -> SceneRow:
-    """The row of a scene that no sheet lists, such as `waymo/<segment>`, of a data set in metres."""
+    """Return the row of a scene in metres that is not listed in a sheet, such as `waymo/<segment>`."""
     dataset, _, scene = name.partition("/")
     folder = Path(data_root).expanduser() / name
     return SceneRow(dataset, scene, dataset, f"{DATA_PREFIX}{name}", "metre", folder)
@@ -153,16 +153,16 @@ def row_of_data(name: str, data_root: str) -> SceneRow:
 def choose_scenes(
     rows: Sequence[SceneRow], groups: Collection[str], only: Sequence[str]
 ) -> tuple[SceneRow, ...]:
-    """Scenes of a run, in the sheet's order: all those of the groups, or the named ones alone.
+    """Return the scenes of a run in the order of the sheet: all scenes of the groups, or only named ones.
 
     Args:
         rows: the sheet.
         groups: groups of the run.
-        only: names such as `table-1` or `synthetic/table-1`; empty for all scenes of the groups. A
-            short name means scenes of the groups or, if they have none of that name, of any group.
+        only: names such as `table-1` or `synthetic/table-1`; empty for all scenes of the groups. A name
+            selects scenes in the groups or, if there is none of that name, in any group.
 
     Raises:
-        SceneError: no row has a given name.
+        SceneError: no row has one of the names.
     """
     in_groups = [row for row in rows if row.group in groups]
     if not only:
@@ -182,7 +182,7 @@ def choose_scenes(
 
 
 def content_lines(path: Path) -> list[tuple[int, str]]:
-    """Numbered lines of the sheet without comments and empty ones."""
+    """Return the numbered lines of the sheet, without comments and empty lines."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -226,7 +226,6 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
 def _row(
     path: Path, line: int, cells: dict[str, str], checked_groups: Collection[str] | None, data_root: str
 ) -> SceneRow:
-    """Check one line of the sheet and make its row."""
     for column in ("dataset", "scene"):
         if problem := name_problem(cells[column]):
             raise SceneError(
@@ -257,7 +256,7 @@ def _row(
         folder = None
     else:
         folder = _resolved(path, source, data_root)
-        # The workflow skips the missing scenes of a published data set, and says so.
+        # The workflow skips and reports missing scenes of a published data set.
         if folder is not None and is_checked and not source.startswith(DATA_PREFIX):
             _check_source(where, folder)
     gaussians = None
@@ -303,7 +302,7 @@ def _row(
 
 
 def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
-    """A path of the sheet, from the project root or, with `data:`, the data root; None if that is not set."""
+    """Resolve a path from the project root or, for `data:`, from the data root; None if that is not set."""
     start = project_root(sheet)
     if place.startswith(DATA_PREFIX):
         if not data_root:
@@ -313,7 +312,6 @@ def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
 
 
 def _check_gaussians(where: str, ply: Path) -> None:
-    """Refuse a path that is not a PLY file."""
     if not ply.is_file():
         problem = "is a folder" if ply.exists() else "is missing"
     else:
@@ -330,7 +328,6 @@ def _check_gaussians(where: str, ply: Path) -> None:
 
 
 def _check_source(where: str, folder: Path) -> None:
-    """Refuse a source folder that is missing or has no images."""
     if not folder.is_dir():
         raise SceneError(
             f"{where}: folder {folder} {'is a file' if folder.exists() else 'is missing'}",
@@ -347,7 +344,7 @@ def _check_source(where: str, folder: Path) -> None:
 
 
 def _what_else(folder: Path) -> str:
-    """What a folder without readable images holds, in words."""
+    """Describe the content of a folder without readable images."""
     kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
     if kinds:
         return ", ".join(f"{count} files {kind}" for kind, count in sorted(kinds.items()))

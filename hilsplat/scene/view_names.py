@@ -1,4 +1,4 @@
-"""Names of views: those of the photographs that they are made from."""
+"""View names, derived from the file names of the photographs."""
 
 import os
 from collections import Counter, defaultdict
@@ -9,19 +9,19 @@ from hilsplat.base.errors import SceneError
 
 
 def view_name(stem: str) -> str:
-    """Name of the view made from an image file of this stem ("DSC_1" -> "DSC_1.png")."""
+    """Return the name of the view made from an image file with this stem ("DSC_1" -> "DSC_1.png")."""
     return f"{stem}.png"
 
 
 LONGEST_NAME = 200
-"""Most bytes of a photograph's name: names of further files are made from it, and a disk takes 255."""
+"""Maximum bytes of a photograph's name: later files append to it, and file systems allow 255 bytes."""
 
 
 def require_usable_name(photo: Path) -> None:
-    """Refuse a photograph after which files of later stages could not be named.
+    """Check that files of later stages can be named after a photograph.
 
     Raises:
-        SceneError: its name is too long, has braces, which are wildcards to Snakemake, or cannot be shown.
+        SceneError: its name is too long, is not printable, or has braces, which are wildcards in Snakemake.
     """
     if "{" in photo.name or "}" in photo.name or not photo.name.isprintable():
         raise SceneError(
@@ -38,10 +38,10 @@ def require_usable_name(photo: Path) -> None:
 
 
 def view_names(sources: Sequence[Path]) -> list[str]:
-    """View names of image files: the file name with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
+    """Return the view names of image files: the file names with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 
-    Files of the same name in different folders ("train/r_0.png", "test/r_0.png") get their folder
-    as a prefix: "train_r_0.png".
+    Files with the same name in different folders ("train/r_0.png", "test/r_0.png") get their folder as a
+    prefix: "train_r_0.png".
 
     Raises:
         SceneError: two files would get the same view name.

@@ -1,1 +1,1 @@
-"""Images with known poses: COLMAP, nerfstudio, Blender, LLFF, Polycam, Record3D."""
+"""Import of images with known poses: COLMAP, nerfstudio, Blender, LLFF, Polycam, Record3D."""

@@ -1,4 +1,4 @@
-"""Make a scene from images with known poses."""
+"""Creation of a scene from images with known poses."""
 
 import logging
 import math
@@ -25,10 +25,10 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 ASPECT_TOLERANCE = 0.01
-"""An image may be a scaled copy of what its camera describes, but not another crop of it."""
+"""Relative tolerance of an image's aspect ratio: a scaled copy is accepted, another crop is not."""
 
 TRAIN_FOLDER = "images_train"
-"""Folder beside `images` whose names are the training views of Gaussian Grouping's data (LERF-Mask)."""
+"""Folder beside `images` with the training views of Gaussian Grouping's data (LERF-Mask)."""
 
 
 def import_poses(
@@ -41,11 +41,10 @@ def import_poses(
     seed: int,
     threads: int,
 ) -> dict[str, Any]:
-    """Write the Scene artifact of a folder with known poses; returns the registration report.
+    """Write the Scene artifact of a folder with known poses, and return the registration report.
 
-    Images are matched to poses by name; poses without an image and images without a pose are listed
-    in the report. Pixels are used as stored, because COLMAP ignores the EXIF orientation. Coordinates
-    keep the source's axes.
+    Images are matched to poses by name; the report lists poses without an image and images without a pose.
+    Pixels are used as stored, because COLMAP ignores the EXIF orientation. The source's axes are kept.
 
     Raises:
         SceneError: the model or transforms file cannot be used.
@@ -120,7 +119,7 @@ def import_poses(
     names = [view.view for view in views]
     trained = {path.stem for path in (known.root / TRAIN_FOLDER).glob("*")}
     held_out = [view.is_test or (bool(trained) and Path(view.name).stem not in trained) for view in present]
-    if any(held_out):  # the source brings its own split
+    if any(held_out):  # the source has its own split
         split = {name: "test" if is_test else "train" for name, is_test in zip(names, held_out, strict=True)}
     else:
         split = split_views(names, settings.test_every)
@@ -135,7 +134,6 @@ def _check_present(
     missing: Sequence[str],
     settings: PosesSettings,
 ) -> None:
-    """Refuse a source with too few of its images."""
     total = len(present) + len(missing)
     if total == 0:
         raise SceneError(f"{known.files[0]} of {name} does not pose any view", fix="export it again")
@@ -150,14 +148,14 @@ def _check_present(
 
 
 def _images_without_pose(known: KnownPoses, used: Collection[Path]) -> list[Path]:
-    """Images in the folder of a COLMAP model that it does not pose."""
+    """Return the images beside a COLMAP model that have no pose in it."""
     if known.kind != "colmap" or not (known.root / "images").is_dir():
         return []
     return [path for path in list_images(known.root / "images") if path not in used]
 
 
 def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
-    """Read a view's image as its camera describes it, write the work image, and fit the lens to it."""
+    """Read an image in the orientation of its camera, write the work image, and adapt the lens to it."""
     folder.mkdir(parents=True, exist_ok=True)
     pixels = _read_as_described(file, view.camera)
     camera = pycolmap.Camera(view.camera.todict())
@@ -174,7 +172,7 @@ def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_
 def _without_border(
     pixels: UInt8[np.ndarray, "H W 3"], camera: pycolmap.Camera, border_px: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Cut a border off an image; the camera, whose px it is measured in, is fitted in place."""
+    """Crop a border, given in px of the camera, from an image, and adapt the camera in place."""
     border_px = math.ceil(border_px * pixels.shape[1] / camera.width)
     camera.rescale(pixels.shape[1], pixels.shape[0])
     camera.width -= 2 * border_px
@@ -185,7 +183,7 @@ def _without_border(
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Pixels of an image in the orientation whose shape fits the camera; as stored if both fit.
+    """Read an image in the orientation whose shape fits the camera, or as stored if both do.
 
     Raises:
         ImageError: the image cannot be read, or no orientation fits the camera.

@@ -1,4 +1,4 @@
-"""Known poses in a folder: where they are, and the views that they describe."""
+"""Location of known poses in a folder, and the views they describe."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +18,13 @@ MODEL_FILES = ("cameras", "images", "points3D")
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Where a folder has its poses.
+    """Location of the poses of a folder.
 
     Attributes:
         root: folder of the images.
         kind: "colmap", "transforms", "llff", "polycam" or "record3d".
-        files: the model folder; the transforms files (training first, then testing); LLFF's file; Polycam's
-            folders of images and cameras; Record3D's folder of images and its file of poses.
+        files: COLMAP's model folder; the transforms files (training, then test); LLFF's file; Polycam's
+            folders of images and cameras; or Record3D's image folder and pose file.
     """
 
     root: Path
@@ -34,15 +34,15 @@ class KnownPoses:
 
 @dataclass(frozen=True)
 class KnownView:
-    """One posed view as its source describes it, before its image was read.
+    """A posed view as described by its source, before its image is read.
 
     Attributes:
         name: name in the source.
-        image: its file; None if it is missing.
-        camera: its lens, for the size that the source states.
+        image: its file, or None if missing.
+        camera: its lens, for the image size stated by the source.
         cam_from_source: world-to-camera transform, OpenCV axes.
-        is_test: the source holds it out for testing.
-        border_px: width of a border without a picture, px of the camera; it is cut off.
+        is_test: whether it is a test view in the source.
+        border_px: width of a blank border to crop, px of the camera.
     """
 
     name: str
@@ -54,10 +54,10 @@ class KnownView:
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Views whose lenses and poses can be those of cameras.
+    """Return the views after checking their lenses and poses.
 
     Raises:
-        SceneError: one cannot, or several views all have the same pose.
+        SceneError: a lens or pose is invalid, or three or more views all have the same pose.
     """
     for view in views:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
@@ -92,19 +92,19 @@ EXPECTED = {
     "position": "coordinates up to 1e9",
 }
 FARTHEST = 1e9
-"""Largest coordinate, in the source's units: 32-bit numbers cannot resolve a scene beyond it."""
+"""Largest coordinate, in the source's units, up to which 32-bit numbers can resolve a scene."""
 
 
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
-    """Look for a COLMAP model, transforms, LLFF's file, Polycam or Record3D, in this order; None if none.
+    """Search for poses of COLMAP, transforms files, LLFF, Polycam and Record3D, in this order; None if none.
 
     Args:
         folder: folder of the images.
         named: a COLMAP model, a transforms file, or a folder with either, used instead of the poses in
-            `folder`; `layouts.NO_POSES`: none are used.
+            `folder`; `layouts.NO_POSES` to ignore all poses.
 
     Raises:
-        SceneError: there is a `sparse/` folder without a complete model in it, or `named` has no poses.
+        SceneError: there is a `sparse/` folder without a complete model, or `named` has no poses.
     """
     folder = Path(folder)
     if named == NO_POSES:
@@ -136,7 +136,6 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
 
 
 def _named_poses(folder: Path, named: Path) -> KnownPoses:
-    """Poses that a user names for the images of a folder."""
     if named.is_file() and named.suffix == ".json":
         return KnownPoses(folder, "transforms", (named,))
     if _is_model(named):

@@ -1,4 +1,4 @@
-"""Read posed views: COLMAP models, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D."""
+"""Readers of posed views: COLMAP, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D."""
 
 import math
 import os
@@ -23,7 +23,7 @@ from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sp
 
 
 def known_views(known: KnownPoses) -> list[KnownView]:
-    """Posed views of a folder, in whichever format it holds them.
+    """Read the posed views of a folder in any supported format.
 
     Raises:
         SceneError: they cannot be read.
@@ -75,7 +75,7 @@ def read_colmap(
             for name, of_view in reprojection_errors(model).items()
         }
         points = sparse_points(model)
-    except (ValueError, RuntimeError, IndexError) as error:  # also of parts that name what is not there
+    except (ValueError, RuntimeError, IndexError) as error:  # also for references to missing entries
         raise SceneError(
             f"the COLMAP model in {folder} cannot be read: {error}", fix="export it again with COLMAP"
         ) from error
@@ -83,7 +83,7 @@ def read_colmap(
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """File of an image named in a source: as named, or with a suffix added, in the folder or its images/.
+    """Find an image named in a source, with or without a suffix, in the folder or its images/.
 
     Raises:
         SceneError: the name leads out of the folder.
@@ -100,7 +100,7 @@ def _find_image(root: Path, name: str) -> Path | None:
 
 
 def _check_inside(root: Path, name: str) -> None:
-    """Refuse a name in a source that leads out of its folder: a download could then read any file."""
+    """Refuse a name that leads out of the source's folder: downloaded data could otherwise read any file."""
     if Path(name).is_absolute() or Path(os.path.normpath(name)).parts[:1] == ("..",):
         raise SceneError(
             f"the poses in {root} name a file outside it: {name}",
@@ -112,9 +112,9 @@ def _check_inside(root: Path, name: str) -> None:
 def read_transforms(
     known: KnownPoses,
 ) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray] | None]:
-    """Read transforms files: camera-to-world in OpenGL axes, intrinsics for all or per frame.
+    """Read transforms files: camera-to-world in OpenGL axes, with common intrinsics or intrinsics per frame.
 
-    Returns the views and, if a file names a `ply_file_path`, its points.
+    Returns the views and, if a file contains `ply_file_path`, its points.
 
     Raises:
         SceneError: a file is not valid JSON, or a key is missing or unusable.
@@ -139,7 +139,7 @@ def read_transforms(
 
 
 def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, Any]) -> KnownView:
-    """One frame of a transforms file; its own keys override those of the whole file."""
+    """Read one frame of a transforms file; its own keys override those of the file."""
     where = f"{file}, frame {number}"
     try:
         name = str(frame["file_path"]).removeprefix("./")
@@ -168,12 +168,12 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
 
 
 def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> pycolmap.Camera:
-    """The lens of a frame: PINHOLE, or OPENCV if it has distortion (k1, k2, p1, p2)."""
+    """Read the lens of a frame: PINHOLE, or OPENCV if it has distortion (k1, k2, p1, p2)."""
     try:
         width, height = frame.get("w"), frame.get("h")
         if width is None or height is None:
             if image is None:
-                width = height = 2  # never used: the view has no image and is left out
+                width = height = 2  # not used: a view without an image is skipped
             else:
                 with open_image(image) as opened:
                     width, height = opened.size
@@ -218,7 +218,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
 
 
 def _read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points and colours of a PLY file (grey if it has no colours)."""
+    """Read the points and colours of a PLY file (grey if it has no colours)."""
     from plyfile import PlyData, PlyParseError
 
     try:

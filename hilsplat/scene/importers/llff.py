@@ -1,4 +1,4 @@
-"""Poses of LLFF's `poses_bounds.npy`, which 3D-OVS and other forward-facing data sets provide."""
+"""Reader of LLFF's `poses_bounds.npy`, which 3D-OVS and other forward-facing data sets provide."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +18,9 @@ POSES_BOUNDS = "poses_bounds.npy"
 def read_poses_bounds(
     path: Path,
 ) -> tuple[Float64[np.ndarray, "N 4 4"], Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 2"]]:
-    """Read the file: N rows of 17 numbers.
+    """Read the poses, sizes and depths in `poses_bounds.npy`: N rows of 17 numbers.
 
-    The first 15 are a 3 x 5 matrix by rows: rotation columns (down, right, back), translation, and the
+    The first 15 are a 3 x 5 matrix, row by row: rotation columns (down, right, back), translation, and the
     column (height, width, focal). OpenCV's axes are x = right, y = down, z = -back. The last two are the
     near and the far depth.
 
@@ -28,7 +28,7 @@ def read_poses_bounds(
         World-to-camera transforms (OpenCV axes), rows (height, width, focal) in px, rows (near, far).
 
     Raises:
-        SceneError: the file does not hold such an array, or a matrix is not a rotation.
+        SceneError: the file does not contain such an array, or a matrix is not a rotation.
     """
     try:
         rows = read_npy(path)
@@ -60,12 +60,12 @@ def read_poses_bounds(
 def llff_views(
     path: Path, images: Sequence[Path]
 ) -> list[tuple[Path, pycolmap.Camera, Float64[np.ndarray, "4 4"]]]:
-    """Image, lens and world-to-camera transform of every row; row i belongs to the i-th image by name.
+    """Return image, lens and world-to-camera transform of every row; row i is that of the i-th image by name.
 
-    The lens is SIMPLE_PINHOLE with its centre in the middle, for the image as it is on disk.
+    The lens is SIMPLE_PINHOLE with its centre in the middle, for the image size on disk.
 
     Raises:
-        SceneError: as `read_poses_bounds`, or there are more or fewer images than rows.
+        SceneError: as in `read_poses_bounds`, or the number of images differs from the number of rows.
     """
     poses, sizes, _ = read_poses_bounds(path)
     images = sorted(images, key=lambda image: image.stem)

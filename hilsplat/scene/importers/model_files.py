@@ -1,6 +1,6 @@
-"""Whether the binary files of a COLMAP model hold what they announce.
+"""Check that the binary files of a COLMAP model are complete.
 
-pycolmap does not check their counts: given a truncated file or a wrong count, it fills memory without end.
+pycolmap does not check record counts: a truncated file or wrong count makes it allocate memory endlessly.
 """
 
 import mmap
@@ -11,13 +11,13 @@ from pathlib import Path
 from hilsplat.base.errors import SceneError
 
 PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 2, 3, 3, 4, 6, 5)
-"""Number of parameters by COLMAP's number of a camera model."""
+"""Number of lens parameters, by COLMAP's camera model id."""
 POSE_BYTES = 56
-"""A quaternion and a translation."""
+"""Size of a quaternion and a translation."""
 
 
 class _Walk:
-    """A place in a file, that moves over its records."""
+    """A position in a file that advances over its records."""
 
     def __init__(self, data: bytes | mmap.mmap) -> None:
         self.data, self.at = data, 0
@@ -29,7 +29,7 @@ class _Walk:
         return int(found)
 
     def skip(self, count: int) -> None:
-        """Leave bytes out."""
+        """Advance by a number of bytes, and fail beyond the end of the file."""
         self.at += count
         if self.at > len(self.data):
             raise ValueError("it ends too early")
@@ -83,10 +83,10 @@ RECORDS: dict[str, Callable[[_Walk], None]] = {
 
 
 def require_whole_files(folder: Path) -> None:
-    """Check that each binary file of a COLMAP model ends where its records do.
+    """Check that each binary file of a COLMAP model ends exactly after its records.
 
     Raises:
-        SceneError: one is damaged.
+        SceneError: a file is damaged.
     """
     for name, record in RECORDS.items():
         path = folder / f"{name}.bin"

@@ -1,4 +1,4 @@
-"""Coordinates in which nerfstudio trains: its data parser turns, centres and scales the poses."""
+"""nerfstudio's training coordinates: its data parser rotates, centres and scales the poses."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-"""What `ns-process-data` did to COLMAP's coordinates before it recorded `applied_transform`."""
+"""Transform of COLMAP's coordinates in versions of `ns-process-data` that record no `applied_transform`."""
 
 
 def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64[np.ndarray, "4 4"]:
@@ -18,11 +18,11 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
 
     `dataparser_transforms.json` maps original coordinates, usually COLMAP's, to training coordinates:
     `x_training = scale * (transform @ [x_original, 1])`. The poses in `transforms.json` are in a third
-    system, which `applied_transform` and `applied_scale` in that file relate to the original one.
+    coordinate system, which `applied_transform` and `applied_scale` in that file relate to the original one.
 
     Args:
         dataparser: the `dataparser_transforms.json` of the training run.
-        transforms: the `transforms.json` with the source's poses; None if COLMAP's model has them.
+        transforms: the `transforms.json` with the source's poses; None if a COLMAP model has them.
 
     Raises:
         SceneError: a file is damaged, or a transform cannot be inverted.

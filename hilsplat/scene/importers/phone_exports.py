@@ -1,6 +1,6 @@
-"""Poses that phones measured while they recorded: raw exports of Polycam and Record3D.
+"""Poses measured by phones while recording: raw exports of Polycam and Record3D.
 
-Layouts and axes as nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py` read them.
+Layouts and axes are those of nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py`.
 """
 
 from pathlib import Path
@@ -17,19 +17,21 @@ from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
 
 MAX_VIEWS = 300
-"""A recording has many more frames than a scene needs; views are then taken at even distances (nerfstudio:
-300 for Record3D, 600 for Polycam)."""
+"""Maximum number of views, sampled evenly, because a recording has many more frames than a scene needs
+(nerfstudio: 300 for Record3D, 600 for Polycam)."""
 
 POLYCAM_BORDER_PX = 15
-"""Corrected images have black borders where they were undistorted (nerfstudio: `crop_border_pixels`)."""
+"""Width of the black borders of corrected images, from undistortion (nerfstudio: `crop_border_pixels`)."""
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""ARKit's world has y up; scenes here have z up. A cyclic permutation, so nothing is mirrored."""
+"""ARKit's world has y up; scenes here have z up. This is a cyclic permutation, so nothing is mirrored."""
 
 
 def read_polycam(known: KnownPoses) -> list[KnownView]:
-    """Read `keyframes/cameras/<stem>.json`, or the corrected ones: fx, fy, cx, cy, width, height in px, and
+    """Read the posed views of a raw Polycam export.
+
+    `keyframes/cameras/<stem>.json` or its corrected version contains fx, fy, cx, cy, width, height in px, and
     t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
 
     Raises:
@@ -41,7 +43,7 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
     for image in _spread(list_images(images)):
         file = cameras / f"{image.stem}.json"
         if not file.is_file():
-            continue  # Polycam drops cameras that it could not correct
+            continue  # Polycam omits cameras that it could not correct
         content = _json(file)
         try:
             matrix = np.array(
@@ -64,7 +66,9 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
 
 
 def read_record3d(known: KnownPoses) -> list[KnownView]:
-    """Read `metadata`: `K` by columns, `w` and `h` in px, and `poses`, a row for each image <number>.jpg:
+    """Read the posed views of a Record3D export.
+
+    `metadata` contains `K` by columns, `w` and `h` in px, and `poses`, one row per image <number>.jpg:
     quaternion xyzw and position of the camera in the world, metres, OpenGL axes.
 
     Raises:
@@ -105,7 +109,7 @@ def read_record3d(known: KnownPoses) -> list[KnownView]:
 
 
 def _spread(items: list[Any]) -> list[Any]:
-    """At most `MAX_VIEWS` of the items, at even distances, the first and the last among them."""
+    """Sample at most `MAX_VIEWS` items evenly, including the first and the last."""
     if len(items) <= MAX_VIEWS:
         return items
     return [items[row] for row in np.linspace(0, len(items) - 1, MAX_VIEWS).round().astype(int)]
@@ -122,7 +126,7 @@ def _json(file: Path) -> dict[str, Any]:
 
 
 def _pose(world_from_cam: Float64[np.ndarray, "3 4"], where: str) -> Float64[np.ndarray, "4 4"]:
-    """World-to-camera transform (OpenCV axes, z up) of a camera-to-world matrix (OpenGL axes, y up)."""
+    """Convert a camera-to-world matrix (OpenGL axes, y up) to world-to-camera (OpenCV axes, z up)."""
     if not np.isfinite(world_from_cam).all() or not are_rotations(world_from_cam[:, :3], RIGID_TOLERANCE):
         raise SceneError(
             f"{where}: not a rigid pose",
