@@ -2,27 +2,32 @@
 
 import logging
 import shutil
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
+import requests
+
 from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
 from hilsplat.base.errors import DiskSpaceError, DownloadError
-from hilsplat.base.progress import transfer_bar
+from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
-from hilsplat.hub.export import export_networks, require_exporter
-from hilsplat.hub.listing import (
+from hilsplat.hub.catalogue import (
     OUT_OF_REACH,
     Choice,
+    HubFile,
     Listing,
+    Wanted,
     choose_files,
     read_cached_listing,
     read_listing,
 )
-from hilsplat.hub.refusals import told_plainly
-from hilsplat.hub.transfer import fetch, partial, patiently
-from hilsplat.hub.wanted import Wanted
+from hilsplat.hub.export import export_networks, require_exporter
+from hilsplat.hub.refusals import explain_refusals
 from hilsplat.models.clip_split import split_whole
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
@@ -30,6 +35,12 @@ logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
 """File of a model's folder that says where it came from."""
+
+WAITS_S = (1.0, 2.0, 4.0, 8.0)
+"""Waits between attempts to download a file."""
+
+CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
+"""Errors of a connection that breaks."""
 
 SPARE_BYTES = 200_000_000
 """Free space that a transfer leaves."""
@@ -63,12 +74,9 @@ class Prepared:
 
     @property
     def missing_bytes(self) -> int:
-        """Size of what has not been transferred yet."""
-        here = 0
-        for path, place in self.choice.files.items():
-            for grown in (self.staging / place, partial(self.listing.files[path], self.staging / place)):
-                here += grown.stat().st_size if grown.is_file() else 0
-        return max(0, self.num_bytes - here)
+        """Size of the files that have not been transferred."""
+        files = self.listing.files
+        return sum(files[path].size for path in self.choice.files if not (self.staging / path).is_file())
 
 
 def get_models(
@@ -103,7 +111,7 @@ def get_models(
     for name in names or RECOMMENDED:
         wanted = Wanted.named(name, variant)
         target = models / wanted.name
-        with told_plainly(wanted, models):
+        with explain_refusals(wanted, models):
             _require_ours(wanted, target)
             listing = _listing(wanted, revision)
             if _is_present(target, listing):
@@ -113,7 +121,7 @@ def get_models(
     if prepared:
         _require_space(prepared, models)
     for found in prepared:
-        with told_plainly(found.wanted, models), output_lock(found.target):
+        with explain_refusals(found.wanted, models), output_lock(found.target):
             texts.append(_install(found))
     used = [model.name for family in ("sam", "clip") if (model := real_model(family)) is not None]
     return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
@@ -148,7 +156,7 @@ def _is_present(target: Path, listing: Listing) -> bool:
 def _listing(wanted: Wanted, revision: str | None) -> Listing:
     """What the hub has, or its cache on this machine if the hub is out of reach."""
     try:
-        return patiently(lambda: read_listing(wanted.repository, revision), tries=3)
+        return read_listing(wanted.repository, revision)
     except OUT_OF_REACH:
         cached = read_cached_listing(wanted.repository, revision)
         if cached is None:
@@ -161,8 +169,7 @@ def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Pr
     """Choose the files, by the repository's config.json."""
     staging = target.with_name(f".{target.name}.part")
     (config,) = listing.require("config.json")
-    fetch(listing, config, staging / config.path, lambda reached: None)
-    choice = choose_files(listing, (staging / config.path).read_bytes(), variant)
+    choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
     found = Prepared(wanted, listing, choice, staging, target)
     logger.info(
         "%s: %s at %s, %.1f MB in %d files, %.1f MB of them still to fetch; licence: %s",
@@ -201,30 +208,70 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
 def _install(found: Prepared) -> str:
     """Fetch all files, make the model's folder beside its place, check it, and rename it."""
     listing, choice = found.listing, found.choice
-    with transfer_bar(found.wanted.name, found.num_bytes) as tell:
-        before = 0
-        for path, place in choice.files.items():
-            start = before
+    for path in track(list(choice.files), f"files of {found.wanted.name}"):
+        _fetch(listing, listing.files[path], found.staging)
+    if choice.exported:
+        with work_folder(found.target) as temporary:
+            made = temporary / found.target.name
+            with explain_full_disk(made):
+                versions = export_networks(found.staging, made)
+            text = _place(found, made, exported=versions)
+        shutil.rmtree(found.staging)
+        return text
+    for path, place in choice.files.items():
+        (found.staging / path).replace(found.staging / place)
+    for file in [path for path in found.staging.rglob("*") if path.is_file()]:
+        if file.relative_to(found.staging).as_posix() not in choice.files.values():
+            file.unlink()  # what the download keeps, and files of another revision
+    shutil.rmtree(found.staging / ".cache", ignore_errors=True)
+    if choice.split:
+        split_whole(found.staging)
+    return _place(found, found.staging)
 
-            def reached(num_bytes: int, start: int = start) -> None:
-                tell(start + num_bytes)
 
-            fetch(listing, listing.files[path], found.staging / place, reached)
-            before += listing.files[path].size
-    for file in found.staging.rglob("*"):
-        if file.is_file() and file.relative_to(found.staging).as_posix() not in choice.files.values():
-            file.unlink()  # of another revision
-    if not choice.exported:
-        if choice.split:
-            split_whole(found.staging)
-        return _place(found, found.staging)
-    with work_folder(found.target) as temporary:
-        made = temporary / found.target.name
-        with explain_full_disk(made):
-            versions = export_networks(found.staging, made)
-        text = _place(found, made, exported=versions)
-    shutil.rmtree(found.staging)
-    return text
+def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
+    """Fetch one file, continue it if a part is there, and compare its digest.
+
+    Raises:
+        DownloadError: the file is not the one that the hub states; it is deleted.
+        DiskSpaceError: the disk is full.
+    """
+    target = staging / file.path
+    with explain_full_disk(target):
+        if file.cached is None:
+            _download(listing, file, staging)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file.cached, target)
+    found = file.digest_of(target)
+    if found != file.digest:
+        size = target.stat().st_size
+        target.unlink()
+        raise DownloadError(
+            f"{file.path} of {listing.repository} arrived with other bytes than the hub states",
+            expected=f"digest {file.digest}, {file.size} bytes",
+            found=f"digest {found}, {size} bytes; they were deleted",
+            fix="run the command again; if it happens again, a proxy or mirror changes the file",
+        )
+    return target
+
+
+def _download(listing: Listing, file: HubFile, staging: Path) -> None:
+    """Download a file with `huggingface_hub`, which resumes; connections that break are tried again."""
+    if not sys.stderr.isatty():
+        huggingface_hub.utils.disable_progress_bars()
+    for wait_s in (*WAITS_S, None):
+        try:
+            huggingface_hub.hf_hub_download(
+                listing.repository, file.path, revision=listing.revision, local_dir=staging
+            )
+        except CUT as error:
+            if wait_s is None:
+                raise
+            logger.info("%s: the connection was lost (%s); trying again", file.path, type(error).__name__)
+            time.sleep(wait_s)
+        else:
+            return
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:

@@ -6,17 +6,16 @@ from pathlib import Path
 
 import huggingface_hub
 import requests
-from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
+from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 
 from hilsplat.base.errors import DownloadError, HilsplatError
-from hilsplat.hub.listing import OUT_OF_REACH, PARTS
-from hilsplat.hub.wanted import Wanted
+from hilsplat.hub.catalogue import OUT_OF_REACH, PARTS, Wanted
 
 KEPT = "what was transferred is kept, and continued"
 
 
 @contextmanager
-def told_plainly(wanted: Wanted, models: Path) -> Iterator[None]:
+def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
     """Turn what the network and the hub raise into errors that say what to do.
 
     Raises:
@@ -38,9 +37,10 @@ def told_plainly(wanted: Wanted, models: Path) -> Iterator[None]:
             expected=place,
             fix="correct the name (hilsplat models list); for a private one, `hf auth login` or set HF_TOKEN",
         ) from error
-    except requests.HTTPError as error:
-        raise _refused(error, wanted, place) from error
     except (requests.RequestException, *OUT_OF_REACH) as error:
+        answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
+        if isinstance(answered, requests.HTTPError) and answered.response is not None:
+            raise _refused(answered, wanted, place) from error
         raise DownloadError(
             f"{wanted.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
             found="HF_HUB_OFFLINE is set" if huggingface_hub.constants.HF_HUB_OFFLINE else _innermost(error),

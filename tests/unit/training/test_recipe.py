@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from models.training.settings import TrainingSettings
 
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from models.training.card import RECORD, digests
 from models.training.render import MIXTURE, kind_of_seed, phrases_of, scene_of_seed, training_seeds
-from models.training.settings import TrainingSettings
 from models.training.train import train_models
 
 

@@ -1,17 +1,24 @@
-"""What a repository of the hub holds, and which of its files a model needs here."""
+"""Models by name, the files of their repositories on the hub, and which of these a model needs."""
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import huggingface_hub
 import requests
-from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
+from huggingface_hub.errors import (
+    CacheNotFound,
+    HFValidationError,
+    LocalEntryNotFoundError,
+    OfflineModeIsEnabled,
+)
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError
 from hilsplat.models.clip_split import WHOLE
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
+from hilsplat.models.store import RELEASES, Release
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
@@ -23,6 +30,46 @@ SMALL_BYTES = 50_000_000
 
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
 """Places of a whole CLIP."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be fetched.
+
+    Attributes:
+        name: of the folder.
+        repository: owner/name on the hub.
+        release: the line of the table, for a model that has one.
+    """
+
+    name: str
+    repository: str
+    release: Release | None
+
+    @staticmethod
+    def named(name: str, variant: str) -> "Wanted":
+        """By its name in the table, or as owner/name.
+
+        Raises:
+            DownloadError: it is neither.
+        """
+        ending = f"-{variant}" if variant else ""
+        for release in RELEASES:
+            if name in (release.name, release.repository):
+                return Wanted(f"{release.name}{ending}", release.repository, release)
+        try:
+            huggingface_hub.utils.validate_repo_id(name)
+        except HFValidationError as error:
+            raise DownloadError(
+                f"{name!r} cannot be a repository: {error}", fix="write owner/name"
+            ) from error
+        if name.count("/") != 1:
+            raise DownloadError(
+                f"no model is known by the name {name!r}",
+                expected=f"{', '.join(release.name for release in RELEASES)}, or owner/name on the hub",
+                fix="hilsplat models list shows what there is",
+            )
+        return Wanted(f"{name.split('/')[1]}{ending}", name, None)
 
 
 @dataclass(frozen=True)
@@ -74,6 +121,14 @@ class HubFile:
     size: int
     digest: str
     cached: Path | None = None
+
+    def digest_of(self, path: Path) -> str:
+        """Return the digest of a file, of the kind that the hub states for this one."""
+        with path.open("rb") as stream:
+            if len(self.digest) == 64:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+            content = stream.read()
+        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -225,5 +280,5 @@ def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None
     return next((place for place in places if f"{place}{ending}.onnx" in listing.files), None)
 
 
-OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled)
-"""Errors of the way to the hub, which say nothing about the repository."""
+OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
+"""Errors of the connection to the hub."""
