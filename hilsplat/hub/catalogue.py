@@ -7,12 +7,14 @@ from pathlib import Path
 
 import huggingface_hub
 import requests
+from huggingface_hub import constants
 from huggingface_hub.errors import (
     CacheNotFound,
     HFValidationError,
     LocalEntryNotFoundError,
     OfflineModeIsEnabled,
 )
+from huggingface_hub.utils import validate_repo_id
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError
@@ -58,7 +60,7 @@ class Wanted:
             if name in (release.name, release.repository):
                 return Wanted(f"{release.name}{ending}", release.repository, release)
         try:
-            huggingface_hub.utils.validate_repo_id(name)
+            validate_repo_id(name)
         except HFValidationError as error:
             raise DownloadError(
                 f"{name!r} cannot be a repository: {error}", fix="write owner/name"
@@ -194,7 +196,7 @@ def read_listing(repository: str, revision: str | None) -> Listing:
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
             raise DownloadError(
-                f"{huggingface_hub.constants.ENDPOINT} states no size and digest of {each.rfilename}",
+                f"{constants.ENDPOINT} states no size and digest of {each.rfilename}",
                 expected="what the hub's API states about each file (?blobs=true)",
                 fix="unset HF_ENDPOINT, or name a complete mirror",
             )
@@ -206,10 +208,10 @@ def read_listing(repository: str, revision: str | None) -> Listing:
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
     """What the hub's cache on this machine (HF_HOME) holds of a repository; its files are named by digest."""
     try:
-        repositories = huggingface_hub.scan_cache_dir(huggingface_hub.constants.HF_HUB_CACHE).repos
+        repositories = huggingface_hub.scan_cache_dir(constants.HF_HUB_CACHE).repos
     except CacheNotFound:
         return None
-    wanted = revision or huggingface_hub.constants.DEFAULT_REVISION
+    wanted = revision or constants.DEFAULT_REVISION
     for repo in repositories:
         if (repo.repo_type, repo.repo_id) != ("model", repository):
             continue

@@ -11,6 +11,7 @@ from typing import Any
 
 import huggingface_hub
 import requests
+from huggingface_hub.utils import disable_progress_bars
 
 from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
 from hilsplat.base.errors import DiskSpaceError, DownloadError
@@ -259,7 +260,7 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
 def _download(listing: Listing, file: HubFile, staging: Path) -> None:
     """Download a file with `huggingface_hub`, which resumes; connections that break are tried again."""
     if not sys.stderr.isatty():
-        huggingface_hub.utils.disable_progress_bars()
+        disable_progress_bars()
     for wait_s in (*WAITS_S, None):
         try:
             huggingface_hub.hf_hub_download(

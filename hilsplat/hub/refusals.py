@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import huggingface_hub
 import requests
+from huggingface_hub import constants
 from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 
 from hilsplat.base.errors import DownloadError, HilsplatError
@@ -21,7 +21,7 @@ def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
     Raises:
         DownloadError: in their place.
     """
-    place = f"{huggingface_hub.constants.ENDPOINT}/{wanted.repository}"
+    place = f"{constants.ENDPOINT}/{wanted.repository}"
     try:
         yield
     except HilsplatError:
@@ -43,7 +43,7 @@ def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
             raise _refused(answered, wanted, place) from error
         raise DownloadError(
             f"{wanted.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
-            found="HF_HUB_OFFLINE is set" if huggingface_hub.constants.HF_HUB_OFFLINE else _innermost(error),
+            found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again where the hub can be reached ({KEPT}; HF_ENDPOINT names a mirror, "
             f"HTTPS_PROXY a proxy), or put these files into {models / wanted.name} by hand, from {place}: "
             f"{', '.join(_files_by_hand(wanted))}",
