@@ -5,7 +5,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -83,30 +83,6 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
         if now - last >= LOG_EVERY_S:
             logger.info("%s: %d of %s", what, done, total if total is not None else "?")
             last = now
-
-
-@contextmanager
-def transfer_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show the progress of a transfer; yield the function to call with the number of bytes transferred.
-
-    Args:
-        what: name of the transferred file.
-        total: its size in bytes.
-    """
-    if sys.stderr.isatty():
-        with _bar("DownloadColumn", "TransferSpeedColumn") as progress:
-            task = progress.add_task(what, total=total)
-            yield lambda reached: progress.update(task, completed=reached)
-        return
-    last = time.monotonic()
-
-    def tell(reached: int) -> None:
-        nonlocal last
-        if time.monotonic() - last >= LOG_EVERY_S and reached != total:
-            logger.info("%s: %.0f of %.0f MB", what, reached / 1e6, total / 1e6)
-            last = time.monotonic()
-
-    yield tell
 
 
 @contextmanager

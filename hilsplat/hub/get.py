@@ -1,53 +1,65 @@
-"""`hilsplat models get`: download of models from the hub; only complete, checked models are installed."""
+"""`hilsplat models get`: a model from the hub, whole and checked, or not at all."""
 
 import logging
 import shutil
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
+import requests
+from huggingface_hub.utils import disable_progress_bars
+
 from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
 from hilsplat.base.errors import DiskSpaceError, DownloadError
-from hilsplat.base.progress import transfer_bar
+from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
-from hilsplat.hub.export import export_networks, require_exporter
-from hilsplat.hub.listing import (
+from hilsplat.hub.catalogue import (
     OUT_OF_REACH,
     Choice,
+    HubFile,
     Listing,
+    Wanted,
     choose_files,
     read_cached_listing,
     read_listing,
 )
-from hilsplat.hub.refusals import told_plainly
-from hilsplat.hub.transfer import fetch, partial, patiently
-from hilsplat.hub.wanted import Wanted
+from hilsplat.hub.export import export_networks, require_exporter
+from hilsplat.hub.refusals import explain_refusals
 from hilsplat.models.clip_split import split_whole
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
-"""File in a model folder that records its origin."""
+"""File of a model's folder that says where it came from."""
+
+WAITS_S = (1.0, 2.0, 4.0, 8.0)
+"""Waits between attempts to download a file."""
+
+CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
+"""Errors of a connection that breaks."""
 
 SPARE_BYTES = 200_000_000
-"""Disk space that must remain free after a transfer."""
+"""Free space that a transfer leaves."""
 
 EXPORT_FACTOR = 4
-"""Disk space for an export, as a multiple of the weights' size: weights, whole network, and its halves."""
+"""Disk that weights to be exported need, over their size: they, the whole network, and its halves."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A model whose required files are known.
+    """A model of which it is known what to fetch.
 
     Attributes:
         wanted: name and repository.
         listing: the repository at a commit.
-        choice: the required files.
-        staging: folder of the download; kept after a failure, and resumed.
-        target: the model folder.
+        choice: its files that are needed.
+        staging: folder in which they grow; kept after a failure, and continued.
+        target: the model's folder.
     """
 
     wanted: Wanted
@@ -58,37 +70,34 @@ class Prepared:
 
     @property
     def num_bytes(self) -> int:
-        """Total size of the required files."""
+        """Size of all files that are needed."""
         return sum(self.listing.files[path].size for path in self.choice.files)
 
     @property
     def missing_bytes(self) -> int:
-        """Number of bytes not yet transferred."""
-        here = 0
-        for path, place in self.choice.files.items():
-            for grown in (self.staging / place, partial(self.listing.files[path], self.staging / place)):
-                here += grown.stat().st_size if grown.is_file() else 0
-        return max(0, self.num_bytes - here)
+        """Size of the files that have not been transferred."""
+        files = self.listing.files
+        return sum(files[path].size for path in self.choice.files if not (self.staging / path).is_file())
 
 
 def get_models(
     names: Sequence[str], models: Path | None = None, revision: str | None = None, variant: str = ""
 ) -> str:
-    """Download models, check each, and install them.
+    """Fetch models into a folder of models, each whole and checked; say what they are.
 
     Args:
-        names: names of released models, or owner/name; empty for the recommended pair.
-        models: parent folder of the models; None for the user's.
-        revision: branch, tag or commit of a single model; None for the hub's default.
-        variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
+        names: names of the table, or owner/name; empty: the recommended pair.
+        models: folder of the models; None: the user's.
+        revision: branch, tag or commit of a single model; None: the hub's default.
+        variant: networks of another precision, such as "quantized" or "fp16"; empty: full precision.
 
     Returns:
-        the report of `check_model` on each model, and which models are used for photographs.
+        what `check_model` says about each, and which models photographs use.
 
     Raises:
-        DownloadError: the hub is unreachable, refuses, lacks the files, or sends bytes with a wrong digest.
-        DiskSpaceError: the disk is or becomes full; transferred data is kept.
-        ModelError: a downloaded model does not work, or cannot be exported.
+        DownloadError: the hub is out of reach, refuses, lacks the files, or sends others than it states.
+        DiskSpaceError: the disk is or becomes full; what was transferred is kept.
+        ModelError: what was fetched does not work, or cannot be exported.
     """
     models = models or user_models()
     if not names:
@@ -103,7 +112,7 @@ def get_models(
     for name in names or RECOMMENDED:
         wanted = Wanted.named(name, variant)
         target = models / wanted.name
-        with told_plainly(wanted, models):
+        with explain_refusals(wanted, models):
             _require_ours(wanted, target)
             listing = _listing(wanted, revision)
             if _is_present(target, listing):
@@ -113,14 +122,14 @@ def get_models(
     if prepared:
         _require_space(prepared, models)
     for found in prepared:
-        with told_plainly(found.wanted, models), output_lock(found.target):
+        with explain_refusals(found.wanted, models), output_lock(found.target):
             texts.append(_install(found))
     used = [model.name for family in ("sam", "clip") if (model := real_model(family)) is not None]
     return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
 
 
 def _require_ours(wanted: Wanted, target: Path) -> None:
-    """Refuse to replace a folder that was not downloaded from this repository."""
+    """Refuse to replace a folder that was not fetched from this repository."""
     if not target.exists():
         return
     origin = _origin(target)
@@ -137,7 +146,7 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def _is_present(target: Path, listing: Listing) -> bool:
-    """Return whether the target was downloaded at this commit and all its files have their original size."""
+    """Whether the target was fetched at this commit and has every file, as long as it was."""
     origin = _origin(target)
     return origin.get("revision") == listing.revision and all(
         (target / path).is_file() and (target / path).stat().st_size == size
@@ -146,9 +155,9 @@ def _is_present(target: Path, listing: Listing) -> bool:
 
 
 def _listing(wanted: Wanted, revision: str | None) -> Listing:
-    """Return the listing of the hub or, if it is unreachable, that of its cache on this machine."""
+    """What the hub has, or its cache on this machine if the hub is out of reach."""
     try:
-        return patiently(lambda: read_listing(wanted.repository, revision), tries=3)
+        return read_listing(wanted.repository, revision)
     except OUT_OF_REACH:
         cached = read_cached_listing(wanted.repository, revision)
         if cached is None:
@@ -158,11 +167,10 @@ def _listing(wanted: Wanted, revision: str | None) -> Listing:
 
 
 def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Prepared:
-    """Choose the files to download according to the repository's config.json."""
+    """Choose the files, by the repository's config.json."""
     staging = target.with_name(f".{target.name}.part")
     (config,) = listing.require("config.json")
-    fetch(listing, config, staging / config.path, lambda reached: None)
-    choice = choose_files(listing, (staging / config.path).read_bytes(), variant)
+    choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
     found = Prepared(wanted, listing, choice, staging, target)
     logger.info(
         "%s: %s at %s, %.1f MB in %d files, %.1f MB of them still to fetch; licence: %s",
@@ -180,10 +188,10 @@ def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Pr
 
 
 def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
-    """Log the size of the download and the free space, and check that it fits.
+    """Say how much is fetched and how much is free.
 
     Raises:
-        DiskSpaceError: there is too little free space.
+        DiskSpaceError: it does not fit.
     """
     fetched = sum(each.missing_bytes for each in prepared)
     made = sum(each.num_bytes * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
@@ -199,36 +207,76 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
 
 
 def _install(found: Prepared) -> str:
-    """Download all files, prepare the model folder beside its target, check it, and rename it."""
+    """Fetch all files, make the model's folder beside its place, check it, and rename it."""
     listing, choice = found.listing, found.choice
-    with transfer_bar(found.wanted.name, found.num_bytes) as tell:
-        before = 0
-        for path, place in choice.files.items():
-            start = before
+    for path in track(list(choice.files), f"files of {found.wanted.name}"):
+        _fetch(listing, listing.files[path], found.staging)
+    if choice.exported:
+        with work_folder(found.target) as temporary:
+            made = temporary / found.target.name
+            with explain_full_disk(made):
+                versions = export_networks(found.staging, made)
+            text = _place(found, made, exported=versions)
+        shutil.rmtree(found.staging)
+        return text
+    for path, place in choice.files.items():
+        (found.staging / path).replace(found.staging / place)
+    for file in [path for path in found.staging.rglob("*") if path.is_file()]:
+        if file.relative_to(found.staging).as_posix() not in choice.files.values():
+            file.unlink()  # what the download keeps, and files of another revision
+    shutil.rmtree(found.staging / ".cache", ignore_errors=True)
+    if choice.split:
+        split_whole(found.staging)
+    return _place(found, found.staging)
 
-            def reached(num_bytes: int, start: int = start) -> None:
-                tell(start + num_bytes)
 
-            fetch(listing, listing.files[path], found.staging / place, reached)
-            before += listing.files[path].size
-    for file in found.staging.rglob("*"):
-        if file.is_file() and file.relative_to(found.staging).as_posix() not in choice.files.values():
-            file.unlink()  # it belongs to another revision
-    if not choice.exported:
-        if choice.split:
-            split_whole(found.staging)
-        return _place(found, found.staging)
-    with work_folder(found.target) as temporary:
-        made = temporary / found.target.name
-        with explain_full_disk(made):
-            versions = export_networks(found.staging, made)
-        text = _place(found, made, exported=versions)
-    shutil.rmtree(found.staging)
-    return text
+def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
+    """Fetch one file, continue it if a part is there, and compare its digest.
+
+    Raises:
+        DownloadError: the file is not the one that the hub states; it is deleted.
+        DiskSpaceError: the disk is full.
+    """
+    target = staging / file.path
+    with explain_full_disk(target):
+        if file.cached is None:
+            _download(listing, file, staging)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file.cached, target)
+    found = file.digest_of(target)
+    if found != file.digest:
+        size = target.stat().st_size
+        target.unlink()
+        raise DownloadError(
+            f"{file.path} of {listing.repository} arrived with other bytes than the hub states",
+            expected=f"digest {file.digest}, {file.size} bytes",
+            found=f"digest {found}, {size} bytes; they were deleted",
+            fix="run the command again; if it happens again, a proxy or mirror changes the file",
+        )
+    return target
+
+
+def _download(listing: Listing, file: HubFile, staging: Path) -> None:
+    """Download a file with `huggingface_hub`, which resumes; connections that break are tried again."""
+    if not sys.stderr.isatty():
+        disable_progress_bars()
+    for wait_s in (*WAITS_S, None):
+        try:
+            huggingface_hub.hf_hub_download(
+                listing.repository, file.path, revision=listing.revision, local_dir=staging
+            )
+        except CUT as error:
+            if wait_s is None:
+                raise
+            logger.info("%s: the connection was lost (%s); trying again", file.path, type(error).__name__)
+            time.sleep(wait_s)
+        else:
+            return
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
-    """Check a finished folder, write `origin.json` into it, and rename it to the target."""
+    """Check a finished folder, write `origin.json` into it, and rename it to its place."""
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
     origin = {

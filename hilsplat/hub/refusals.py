@@ -1,28 +1,27 @@
-"""Conversion of errors from the network and the hub into errors with a fix."""
+"""What the network and the hub raise, as errors that say what to do."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import huggingface_hub
 import requests
-from huggingface_hub.errors import GatedRepoError, RepositoryNotFoundError
+from huggingface_hub import constants
+from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 
 from hilsplat.base.errors import DownloadError, HilsplatError
-from hilsplat.hub.listing import OUT_OF_REACH, PARTS
-from hilsplat.hub.wanted import Wanted
+from hilsplat.hub.catalogue import OUT_OF_REACH, PARTS, Wanted
 
 KEPT = "what was transferred is kept, and continued"
 
 
 @contextmanager
-def told_plainly(wanted: Wanted, models: Path) -> Iterator[None]:
-    """Convert errors from the network and the hub into errors with a fix.
+def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
+    """Turn what the network and the hub raise into errors that say what to do.
 
     Raises:
-        DownloadError: the network or the hub raised an error.
+        DownloadError: in their place.
     """
-    place = f"{huggingface_hub.constants.ENDPOINT}/{wanted.repository}"
+    place = f"{constants.ENDPOINT}/{wanted.repository}"
     try:
         yield
     except HilsplatError:
@@ -38,12 +37,13 @@ def told_plainly(wanted: Wanted, models: Path) -> Iterator[None]:
             expected=place,
             fix="correct the name (hilsplat models list); for a private one, `hf auth login` or set HF_TOKEN",
         ) from error
-    except requests.HTTPError as error:
-        raise _refused(error, wanted, place) from error
     except (requests.RequestException, *OUT_OF_REACH) as error:
+        answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
+        if isinstance(answered, requests.HTTPError) and answered.response is not None:
+            raise _refused(answered, wanted, place) from error
         raise DownloadError(
             f"{wanted.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
-            found="HF_HUB_OFFLINE is set" if huggingface_hub.constants.HF_HUB_OFFLINE else _innermost(error),
+            found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again where the hub can be reached ({KEPT}; HF_ENDPOINT names a mirror, "
             f"HTTPS_PROXY a proxy), or put these files into {models / wanted.name} by hand, from {place}: "
             f"{', '.join(_files_by_hand(wanted))}",
@@ -57,9 +57,9 @@ def told_plainly(wanted: Wanted, models: Path) -> Iterator[None]:
 
 
 def _refused(error: requests.HTTPError, wanted: Wanted, place: str) -> DownloadError:
-    """Return the error for a response with a status other than 2xx."""
+    """What an answer other than 2xx means."""
     response = error.response
-    assert response is not None  # the hub's client raises an HTTPError only for a response
+    assert response is not None  # an HTTPError is made from an answer
     status = response.status_code
     if status == requests.codes.too_many_requests:
         return DownloadError(
@@ -90,13 +90,13 @@ def _status(error: requests.HTTPError) -> str:
 
 
 def _innermost(error: BaseException) -> str:
-    """Return the message of an error's root cause."""
+    """The first cause of an error, in its own words."""
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return str(error) or type(error).__name__
 
 
 def _files_by_hand(wanted: Wanted) -> list[str]:
-    """Return the files of the model, for a user who must copy them by hand."""
+    """Files that make the model, for someone without a way to the hub."""
     families = [wanted.release.family] if wanted.release else ["sam", "clip"]
     return [name for family in families for name in PARTS[family].usual]

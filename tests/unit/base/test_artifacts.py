@@ -117,6 +117,14 @@ def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
         artifacts.read_npz(tmp_path / "evil.npz")
 
 
+def test_objects_are_never_pickled(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        artifacts.write_npy(tmp_path / "a.npy", np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        artifacts.write_npz(tmp_path / "a.npz", a=np.array([{}], dtype=object))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_without_index_is_incomplete(tmp_path: Path) -> None:
     with pytest.raises(ArtifactError, match=r"incomplete: it has no index\.json"):
         artifacts.read_index(tmp_path)

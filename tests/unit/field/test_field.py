@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
+from scipy.optimize import minimize
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
@@ -201,6 +202,26 @@ def test_contrastive_weights_lower_their_terms():
     _, plain = solve_field(toy.problem, toy.contrast(without), without)
     assert "after_lbfgs" not in plain
     assert plain["after_cg"]["language"] < plain["lifted"]["language"]
+
+
+def test_lbfgs_reaches_the_minimum_of_the_whole_objective():
+    toy = Toy((1.0, 0.3, 0.1))
+    settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=0, lbfgs_steps=200)
+    contrast, problem = toy.contrast(settings), toy.problem
+
+    def objective(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        features = flat.reshape(toy.features.shape).astype(np.float32)
+        curved, right = problem.hessian_product(features), problem.right_side()
+        value, gradient = contrast.weighted(features, (0.5, 0.1))
+        value += float((features * (curved - 2 * right)).sum()) / problem.total_pixels
+        gradient = gradient + 2 / problem.total_pixels * (curved - right)
+        return value, gradient.reshape(-1).astype(np.float64)
+
+    found, _ = solve_field(problem, contrast, settings)
+    start = problem.lifted.reshape(-1).astype(np.float64)
+    best = minimize(objective, start, jac=True, method="L-BFGS-B", options={"maxiter": 500}).fun
+    assert objective(start)[0] > best + 0.01
+    assert objective(found.reshape(-1))[0] == pytest.approx(best, abs=2e-3)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -11,7 +11,7 @@ from huggingface_hub import file_download
 from huggingface_hub.utils import reset_sessions
 from onnx import numpy_helper
 
-from hilsplat.hub import transfer
+from hilsplat.hub import get
 from tests.loopback_hub import LoopbackHub, loopback_hub
 from tests.unit.finished_desk import write_colour_clip
 from tests.unit.segment.conftest import write_disc_sam
@@ -63,6 +63,7 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
         point_at(served.endpoint, monkeypatch)
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
         monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 2**16)
         monkeypatch.setenv("HF_TOKEN", "hf_of_the_user")
         monkeypatch.delenv("HTTP_PROXY", raising=False)
         monkeypatch.delenv("http_proxy", raising=False)
@@ -77,5 +78,5 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
 def waits(monkeypatch) -> list[float]:
     """Seconds that would have been waited."""
     seconds: list[float] = []
-    monkeypatch.setattr(transfer.time, "sleep", seconds.append)
+    monkeypatch.setattr(get.time, "sleep", seconds.append)
     return seconds

@@ -70,6 +70,12 @@ def test_a_box_repeats_a_better_one_unless_it_is_steadier():
     assert distinct_boxes(boxes, score, stability, iou_max=0.85, slack=0.05).tolist() == [1, 3, 4]
 
 
+def test_a_box_that_is_steadier_by_exactly_the_slack_repeats_a_better_one():
+    boxes, score = np.array([[0, 0, 10, 10]] * 3), np.array([0.9, 0.8, 0.7])
+    stability = np.array([0.5, 0.75, 0.75 + 2**-20])  # exact in binary
+    assert distinct_boxes(boxes, score, stability, iou_max=0.85, slack=0.25).tolist() == [0, 2]
+
+
 @given(st.integers(0, 1000), st.sampled_from([0.2, 0.5, 0.8]), st.sampled_from([0.2, 0.5, 0.8]))
 def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, score_min, stability_min):
     rng = np.random.default_rng(seed)

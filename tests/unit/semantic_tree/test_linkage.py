@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.semantic_tree.evidence import Evidence, mask_evidence
-from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.semantic_tree.linkage import ROWS_OF_A_BLOCK, pooled_linkage
 
 
 def dense_evidence(intersection, union):
@@ -150,13 +150,14 @@ def test_evidence_equals_the_rule_pair_by_pair(threads):
                 assert pair(found, a, b) == pytest.approx((intersection[a, b], union[a, b]))
 
 
-def test_linkage_of_many_masks_equals_that_of_dense_sums():
-    # enough merges for the pool of neighbours to be compacted
+@pytest.mark.parametrize("num", [160, 2 * ROWS_OF_A_BLOCK + 40])
+def test_linkage_of_many_masks_equals_that_of_dense_sums(num):
+    # enough merges to compact the pool of neighbours, and more masks than one block of the search holds
     rng = np.random.default_rng(0)
-    thing = rng.integers(0, 12, 160)
+    thing = rng.integers(0, 12, num)
     same = thing[:, None] == thing[None]
-    union = np.triu(rng.uniform(1, 2, (160, 160)), 1)
-    intersection = union * np.where(same, rng.uniform(0.5, 0.9, (160, 160)), 0.05)
+    union = np.triu(rng.uniform(1, 2, (num, num)), 1)
+    intersection = union * np.where(same, rng.uniform(0.5, 0.9, (num, num)), 0.05)
     union, intersection = union + union.T, np.triu(intersection, 1) + np.triu(intersection, 1).T
     cluster, quality = pooled_linkage(dense_evidence(intersection, union), 0.4)
     assert len(quality) == 12

@@ -36,6 +36,12 @@ def test_ious_and_accuracies_of_the_worked_example():
     np.testing.assert_allclose(class_accuracy(example()), [1 / 2, 1, 1 / 2, np.nan])
 
 
+def test_a_class_of_one_point_counts_like_any_other():
+    counts = ClassCounts.of(np.array([1, 1, 1, 2]), np.array([1, 1, 1, 1]), 3)
+    assert miou_over_present(counts) == pytest.approx((3 / 4 + 0) / 2)
+    assert macc_over_present(counts) == pytest.approx(0.5)
+
+
 def test_means_over_the_classes_of_the_truth():
     assert miou_over_present(example()) == pytest.approx(0.522222, abs=1e-6)
     assert macc_over_present(example()) == pytest.approx(0.666667, abs=1e-6)

@@ -1,28 +1,77 @@
-"""Listings of hub repositories, and the choice of the files that a model needs."""
+"""Models by name, the files of their repositories on the hub, and which of these a model needs."""
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import huggingface_hub
 import requests
-from huggingface_hub.errors import CacheNotFound, OfflineModeIsEnabled
+from huggingface_hub import constants
+from huggingface_hub.errors import (
+    CacheNotFound,
+    HFValidationError,
+    LocalEntryNotFoundError,
+    OfflineModeIsEnabled,
+)
+from huggingface_hub.utils import validate_repo_id
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError
 from hilsplat.models.clip_split import WHOLE
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
+from hilsplat.models.store import RELEASES, Release
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers does
-not run code in it (`weights_only`)."""
+"""PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
+nothing (`weights_only`)."""
 
 SMALL_BYTES = 50_000_000
-"""Text files of a PyTorch model above this size are not part of its tokenizer."""
+"""Larger text files of a PyTorch model are not part of its tokenizer."""
 
 
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
-"""Possible paths of a whole CLIP without `.onnx`."""
+"""Places of a whole CLIP."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be fetched.
+
+    Attributes:
+        name: of the folder.
+        repository: owner/name on the hub.
+        release: the line of the table, for a model that has one.
+    """
+
+    name: str
+    repository: str
+    release: Release | None
+
+    @staticmethod
+    def named(name: str, variant: str) -> "Wanted":
+        """By its name in the table, or as owner/name.
+
+        Raises:
+            DownloadError: it is neither.
+        """
+        ending = f"-{variant}" if variant else ""
+        for release in RELEASES:
+            if name in (release.name, release.repository):
+                return Wanted(f"{release.name}{ending}", release.repository, release)
+        try:
+            validate_repo_id(name)
+        except HFValidationError as error:
+            raise DownloadError(
+                f"{name!r} cannot be a repository: {error}", fix="write owner/name"
+            ) from error
+        if name.count("/") != 1:
+            raise DownloadError(
+                f"no model is known by the name {name!r}",
+                expected=f"{', '.join(release.name for release in RELEASES)}, or owner/name on the hub",
+                fix="hilsplat models list shows what there is",
+            )
+        return Wanted(f"{name.split('/')[1]}{ending}", name, None)
 
 
 @dataclass(frozen=True)
@@ -30,10 +79,10 @@ class Parts:
     """Files of a kind of model.
 
     Attributes:
-        networks: possible paths of each network without `.onnx`, the usual one first.
-        described: files required in addition to the networks.
-        whole: possible paths of a single network that contains all of them and can be split.
-        beside: files that are downloaded if they exist.
+        networks: places of each network without `.onnx`, the usual one first.
+        described: files that must be beside them.
+        whole: places of a network that holds all of them, from which they can be split.
+        beside: files that are taken if they are there.
     """
 
     networks: tuple[tuple[str, ...], ...]
@@ -43,7 +92,7 @@ class Parts:
 
     @property
     def usual(self) -> tuple[str, ...]:
-        """Usual paths of all required files."""
+        """Every file, at its usual place."""
         return (*self.described, *(f"{places[0]}.onnx" for places in self.networks))
 
 
@@ -56,24 +105,32 @@ PARTS = {
     )
     for name, layout in LAYOUTS.items()
 }
-"""Layout -> files of its models."""
+"""By the layout of the model."""
 
 
 @dataclass(frozen=True)
 class HubFile:
-    """A file as listed by the hub.
+    """A file as the hub states it.
 
     Attributes:
-        path: path in the repository.
-        size: size in bytes.
+        path: inside the repository.
+        size: bytes.
         digest: SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits).
-        cached: the file in the hub's cache on this machine, if the listing is that of the cache.
+        cached: the file in the hub's cache on this machine, if the listing was made from that.
     """
 
     path: str
     size: int
     digest: str
     cached: Path | None = None
+
+    def digest_of(self, path: Path) -> str:
+        """Return the digest of a file, of the kind that the hub states for this one."""
+        with path.open("rb") as stream:
+            if len(self.digest) == 64:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+            content = stream.read()
+        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -83,8 +140,8 @@ class Listing:
     Attributes:
         repository: owner/name.
         revision: the commit.
-        licence: licence according to the hub; empty if not stated.
-        files: files by path.
+        licence: as the hub states it; empty if it does not.
+        files: by path.
     """
 
     repository: str
@@ -93,10 +150,10 @@ class Listing:
     files: Mapping[str, HubFile]
 
     def require(self, *paths: str) -> list[HubFile]:
-        """Return files by path.
+        """Files by path.
 
         Raises:
-            DownloadError: the repository lacks one or more of them.
+            DownloadError: the repository lacks some of them.
         """
         if missing := [path for path in paths if path not in self.files]:
             raise DownloadError(
@@ -110,12 +167,12 @@ class Listing:
 
 @dataclass(frozen=True)
 class Choice:
-    """The files to download.
+    """The files that are fetched.
 
     Attributes:
-        files: path in the repository -> path in the model folder.
-        exported: whether they are PyTorch weights, to be exported as networks.
-        split: whether they are a whole CLIP, to be split into its two networks.
+        files: file of the repository -> its place in the model's folder.
+        exported: they are PyTorch weights, from which the networks are still to be made.
+        split: they are a whole CLIP, to be split into its two networks.
     """
 
     files: Mapping[str, str]
@@ -124,22 +181,22 @@ class Choice:
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
-    """Request the listing of a repository from the hub.
+    """Ask the hub what a repository holds.
 
     Raises:
-        requests.RequestException: the hub is unreachable, or refuses.
+        requests.RequestException: the hub is out of reach, or refuses.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
-        DownloadError: the hub does not state the size and digest of a file.
+        DownloadError: the hub states no digest of a file.
     """
     info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
     files = {}
     for each in info.siblings or ():
         if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
-            continue  # not a valid repository path, and it would be written outside the folder
+            continue  # no hub has such a file, and it would be written elsewhere
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
             raise DownloadError(
-                f"{huggingface_hub.constants.ENDPOINT} states no size and digest of {each.rfilename}",
+                f"{constants.ENDPOINT} states no size and digest of {each.rfilename}",
                 expected="what the hub's API states about each file (?blobs=true)",
                 fix="unset HF_ENDPOINT, or name a complete mirror",
             )
@@ -149,12 +206,12 @@ def read_listing(repository: str, revision: str | None) -> Listing:
 
 
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
-    """Return a repository's listing from the hub's local cache (HF_HOME; files named by digest), or None."""
+    """What the hub's cache on this machine (HF_HOME) holds of a repository; its files are named by digest."""
     try:
-        repositories = huggingface_hub.scan_cache_dir(huggingface_hub.constants.HF_HUB_CACHE).repos
+        repositories = huggingface_hub.scan_cache_dir(constants.HF_HUB_CACHE).repos
     except CacheNotFound:
         return None
-    wanted = revision or huggingface_hub.constants.DEFAULT_REVISION
+    wanted = revision or constants.DEFAULT_REVISION
     for repo in repositories:
         if (repo.repo_type, repo.repo_id) != ("model", repository):
             continue
@@ -169,16 +226,16 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
-    """Choose the files of a model: separate networks, else a whole CLIP, else PyTorch weights.
+    """Which files of a repository make a model: ready networks, else a whole CLIP, else PyTorch weights.
 
     Args:
         listing: the repository.
         config: its config.json.
-        variant: suffix of the networks, such as "quantized" or "fp16", which is removed from their names;
-            empty for the plain networks.
+        variant: "quantized", "fp16", ...: networks of that ending, which get the plain names; empty: the
+            plain ones.
 
     Raises:
-        DownloadError: the model is not supported, or it has neither networks nor weights.
+        DownloadError: the model is of no kind that is read here, or it has neither networks nor weights.
     """
     try:
         described = parse_json(config)
@@ -201,7 +258,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             listing.require(*parts.described)
             plain = [*parts.described, *(path for path in parts.beside if path in listing.files)]
             files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
-            # a network refers to its weight files by their original names
+            # a network looks for its weights under the names that it was saved with
             weights = [
                 path
                 for path in listing.files
@@ -221,8 +278,9 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
 
 
 def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None:
+    """The first place at which the repository has a network."""
     return next((place for place in places if f"{place}{ending}.onnx" in listing.files), None)
 
 
-OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled)
-"""Errors of the connection to the hub, which do not concern the repository."""
+OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
+"""Errors of the connection to the hub."""
