@@ -23,25 +23,25 @@ from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 from hilsplat.models.store import RELEASES, Release
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""PyTorch weights that can be exported, the preferred one first. Of the second, a pickle, transformers runs
-nothing (`weights_only`)."""
+"""PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers does
+not run code in it (`weights_only`)."""
 
 SMALL_BYTES = 50_000_000
-"""Larger text files of a PyTorch model are not part of its tokenizer."""
+"""Text files of a PyTorch model above this size are not part of its tokenizer."""
 
 
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
-"""Places of a whole CLIP."""
+"""Possible paths of a whole CLIP without `.onnx`."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is to be fetched.
+    """A model to download.
 
     Attributes:
-        name: of the folder.
+        name: name of the folder.
         repository: owner/name on the hub.
-        release: the line of the table, for a model that has one.
+        release: the released model, or None for any other repository.
     """
 
     name: str
@@ -50,10 +50,10 @@ class Wanted:
 
     @staticmethod
     def named(name: str, variant: str) -> "Wanted":
-        """By its name in the table, or as owner/name.
+        """Find a model by its release name or as owner/name.
 
         Raises:
-            DownloadError: it is neither.
+            DownloadError: the name is neither.
         """
         ending = f"-{variant}" if variant else ""
         for release in RELEASES:
@@ -79,10 +79,10 @@ class Parts:
     """Files of a kind of model.
 
     Attributes:
-        networks: places of each network without `.onnx`, the usual one first.
-        described: files that must be beside them.
-        whole: places of a network that holds all of them, from which they can be split.
-        beside: files that are taken if they are there.
+        networks: possible paths of each network without `.onnx`, the usual one first.
+        described: files required in addition to the networks.
+        whole: possible paths of a single network that contains all of them and can be split.
+        beside: files that are downloaded if they exist.
     """
 
     networks: tuple[tuple[str, ...], ...]
@@ -92,7 +92,7 @@ class Parts:
 
     @property
     def usual(self) -> tuple[str, ...]:
-        """Every file, at its usual place."""
+        """Usual paths of all required files."""
         return (*self.described, *(f"{places[0]}.onnx" for places in self.networks))
 
 
@@ -105,18 +105,18 @@ PARTS = {
     )
     for name, layout in LAYOUTS.items()
 }
-"""By the layout of the model."""
+"""Layout -> files of its models."""
 
 
 @dataclass(frozen=True)
 class HubFile:
-    """A file as the hub states it.
+    """A file as listed by the hub.
 
     Attributes:
-        path: inside the repository.
-        size: bytes.
+        path: path in the repository.
+        size: size in bytes.
         digest: SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits).
-        cached: the file in the hub's cache on this machine, if the listing was made from that.
+        cached: the file in the hub's cache on this machine, if the listing is that of the cache.
     """
 
     path: str
@@ -140,8 +140,8 @@ class Listing:
     Attributes:
         repository: owner/name.
         revision: the commit.
-        licence: as the hub states it; empty if it does not.
-        files: by path.
+        licence: licence according to the hub; empty if not stated.
+        files: files by path.
     """
 
     repository: str
@@ -150,10 +150,10 @@ class Listing:
     files: Mapping[str, HubFile]
 
     def require(self, *paths: str) -> list[HubFile]:
-        """Files by path.
+        """Return files by path.
 
         Raises:
-            DownloadError: the repository lacks some of them.
+            DownloadError: the repository lacks one or more of them.
         """
         if missing := [path for path in paths if path not in self.files]:
             raise DownloadError(
@@ -167,12 +167,12 @@ class Listing:
 
 @dataclass(frozen=True)
 class Choice:
-    """The files that are fetched.
+    """The files to download.
 
     Attributes:
-        files: file of the repository -> its place in the model's folder.
-        exported: they are PyTorch weights, from which the networks are still to be made.
-        split: they are a whole CLIP, to be split into its two networks.
+        files: path in the repository -> path in the model folder.
+        exported: whether they are PyTorch weights, to be exported as networks.
+        split: whether they are a whole CLIP, to be split into its two networks.
     """
 
     files: Mapping[str, str]
@@ -181,12 +181,12 @@ class Choice:
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
-    """Ask the hub what a repository holds.
+    """Request the listing of a repository from the hub.
 
     Raises:
-        requests.RequestException: the hub is out of reach, or refuses.
+        requests.RequestException: the hub is unreachable, or refuses.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
-        DownloadError: the hub states no digest of a file.
+        DownloadError: the hub does not state the size and digest of a file.
     """
     info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
     files = {}
@@ -206,7 +206,7 @@ def read_listing(repository: str, revision: str | None) -> Listing:
 
 
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
-    """What the hub's cache on this machine (HF_HOME) holds of a repository; its files are named by digest."""
+    """Return a repository's listing from the hub's local cache (HF_HOME; files named by digest), or None."""
     try:
         repositories = huggingface_hub.scan_cache_dir(constants.HF_HUB_CACHE).repos
     except CacheNotFound:
@@ -226,16 +226,16 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
-    """Which files of a repository make a model: ready networks, else a whole CLIP, else PyTorch weights.
+    """Choose the files of a model: separate networks, else a whole CLIP, else PyTorch weights.
 
     Args:
         listing: the repository.
         config: its config.json.
-        variant: "quantized", "fp16", ...: networks of that ending, which get the plain names; empty: the
-            plain ones.
+        variant: suffix of the networks, such as "quantized" or "fp16", which is removed from their names;
+            empty for the plain networks.
 
     Raises:
-        DownloadError: the model is of no kind that is read here, or it has neither networks nor weights.
+        DownloadError: the model is not supported, or it has neither networks nor weights.
     """
     try:
         described = parse_json(config)

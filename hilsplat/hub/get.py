@@ -1,4 +1,4 @@
-"""`hilsplat models get`: a model from the hub, whole and checked, or not at all."""
+"""`hilsplat models get`: download of models from the hub; only complete, checked models are installed."""
 
 import logging
 import shutil
@@ -35,7 +35,7 @@ from hilsplat.models.store import RECOMMENDED, real_model, user_models
 logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
-"""File of a model's folder that says where it came from."""
+"""File in a model folder that records its origin."""
 
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
 """Waits between attempts to download a file."""
@@ -44,22 +44,22 @@ CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEn
 """Errors of a connection that breaks."""
 
 SPARE_BYTES = 200_000_000
-"""Free space that a transfer leaves."""
+"""Disk space that must remain free after a transfer."""
 
 EXPORT_FACTOR = 4
-"""Disk that weights to be exported need, over their size: they, the whole network, and its halves."""
+"""Disk space for an export, as a multiple of the weights' size: weights, whole network, and its halves."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A model of which it is known what to fetch.
+    """A model whose required files are known.
 
     Attributes:
         wanted: name and repository.
         listing: the repository at a commit.
-        choice: its files that are needed.
-        staging: folder in which they grow; kept after a failure, and continued.
-        target: the model's folder.
+        choice: the required files.
+        staging: folder of the download; kept after a failure, and resumed.
+        target: the model folder.
     """
 
     wanted: Wanted
@@ -70,7 +70,7 @@ class Prepared:
 
     @property
     def num_bytes(self) -> int:
-        """Size of all files that are needed."""
+        """Total size of the required files."""
         return sum(self.listing.files[path].size for path in self.choice.files)
 
     @property
@@ -83,21 +83,21 @@ class Prepared:
 def get_models(
     names: Sequence[str], models: Path | None = None, revision: str | None = None, variant: str = ""
 ) -> str:
-    """Fetch models into a folder of models, each whole and checked; say what they are.
+    """Download models, check each, and install them.
 
     Args:
-        names: names of the table, or owner/name; empty: the recommended pair.
-        models: folder of the models; None: the user's.
-        revision: branch, tag or commit of a single model; None: the hub's default.
-        variant: networks of another precision, such as "quantized" or "fp16"; empty: full precision.
+        names: names of released models, or owner/name; empty for the recommended pair.
+        models: parent folder of the models; None for the user's.
+        revision: branch, tag or commit of a single model; None for the hub's default.
+        variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
 
     Returns:
-        what `check_model` says about each, and which models photographs use.
+        the report of `check_model` on each model, and which models are used for photographs.
 
     Raises:
-        DownloadError: the hub is out of reach, refuses, lacks the files, or sends others than it states.
-        DiskSpaceError: the disk is or becomes full; what was transferred is kept.
-        ModelError: what was fetched does not work, or cannot be exported.
+        DownloadError: the hub is unreachable, refuses, lacks the files, or sends bytes with a wrong digest.
+        DiskSpaceError: the disk is or becomes full; transferred data is kept.
+        ModelError: a downloaded model does not work, or cannot be exported.
     """
     models = models or user_models()
     if not names:
@@ -129,7 +129,7 @@ def get_models(
 
 
 def _require_ours(wanted: Wanted, target: Path) -> None:
-    """Refuse to replace a folder that was not fetched from this repository."""
+    """Refuse to replace a folder that was not downloaded from this repository."""
     if not target.exists():
         return
     origin = _origin(target)
@@ -146,7 +146,7 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 
 def _is_present(target: Path, listing: Listing) -> bool:
-    """Whether the target was fetched at this commit and has every file, as long as it was."""
+    """Return whether the target was downloaded at this commit and all its files have their original size."""
     origin = _origin(target)
     return origin.get("revision") == listing.revision and all(
         (target / path).is_file() and (target / path).stat().st_size == size
@@ -155,7 +155,7 @@ def _is_present(target: Path, listing: Listing) -> bool:
 
 
 def _listing(wanted: Wanted, revision: str | None) -> Listing:
-    """What the hub has, or its cache on this machine if the hub is out of reach."""
+    """Return the listing of the hub or, if it is unreachable, that of its cache on this machine."""
     try:
         return read_listing(wanted.repository, revision)
     except OUT_OF_REACH:
@@ -167,7 +167,7 @@ def _listing(wanted: Wanted, revision: str | None) -> Listing:
 
 
 def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Prepared:
-    """Choose the files, by the repository's config.json."""
+    """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(f".{target.name}.part")
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
@@ -188,10 +188,10 @@ def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Pr
 
 
 def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
-    """Say how much is fetched and how much is free.
+    """Log the size of the download and the free space, and check that it fits.
 
     Raises:
-        DiskSpaceError: it does not fit.
+        DiskSpaceError: there is too little free space.
     """
     fetched = sum(each.missing_bytes for each in prepared)
     made = sum(each.num_bytes * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
@@ -207,7 +207,7 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
 
 
 def _install(found: Prepared) -> str:
-    """Fetch all files, make the model's folder beside its place, check it, and rename it."""
+    """Download all files, prepare the model folder beside its target, check it, and rename it."""
     listing, choice = found.listing, found.choice
     for path in track(list(choice.files), f"files of {found.wanted.name}"):
         _fetch(listing, listing.files[path], found.staging)
@@ -276,7 +276,7 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
-    """Check a finished folder, write `origin.json` into it, and rename it to its place."""
+    """Check a finished folder, write `origin.json` into it, and rename it to the target."""
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
     origin = {

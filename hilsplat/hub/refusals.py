@@ -1,4 +1,4 @@
-"""What the network and the hub raise, as errors that say what to do."""
+"""Conversion of errors from the network and the hub into errors with a fix."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,10 +16,10 @@ KEPT = "what was transferred is kept, and continued"
 
 @contextmanager
 def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
-    """Turn what the network and the hub raise into errors that say what to do.
+    """Convert errors from the network and the hub into errors with a fix.
 
     Raises:
-        DownloadError: in their place.
+        DownloadError: the network or the hub raised an error.
     """
     place = f"{constants.ENDPOINT}/{wanted.repository}"
     try:
@@ -57,7 +57,7 @@ def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
 
 
 def _refused(error: requests.HTTPError, wanted: Wanted, place: str) -> DownloadError:
-    """What an answer other than 2xx means."""
+    """Return the error for a response with a status other than 2xx."""
     response = error.response
     assert response is not None  # an HTTPError is made from an answer
     status = response.status_code
@@ -90,13 +90,13 @@ def _status(error: requests.HTTPError) -> str:
 
 
 def _innermost(error: BaseException) -> str:
-    """The first cause of an error, in its own words."""
+    """Return the message of an error's root cause."""
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return str(error) or type(error).__name__
 
 
 def _files_by_hand(wanted: Wanted) -> list[str]:
-    """Files that make the model, for someone without a way to the hub."""
+    """Return the files of the model, for a user who must copy them by hand."""
     families = [wanted.release.family] if wanted.release else ["sam", "clip"]
     return [name for family in families for name in PARTS[family].usual]
