@@ -26,6 +26,7 @@ def test_the_viewer_asks_walks_names_and_saves(opened, desk_address, desk, tmp_p
     page = opened(desk_address)
     page.keyboard.type("mug > handle")  # the text box has the focus
     press(page, "Enter")
+    page.locator("#answers button").first.wait_for()
     tab_to(page, "#answers button")
     press(page, "Enter", "u")  # the handle is chosen, then the mug that it is part of
     mug = page.locator("#overlay path.chosen").get_attribute("data-node")
@@ -33,11 +34,9 @@ def test_the_viewer_asks_walks_names_and_saves(opened, desk_address, desk, tmp_p
     page.keyboard.type("Souvenir")
     press(page, "Enter")
     page.get_by_text("Named “Souvenir”").wait_for()
-    try:
-        (names,) = read_json(desk / "names.json")["trees"].values()
-        assert names == {mug: "Souvenir"}
-    finally:
-        (desk / "names.json").unlink()
+    (names,) = read_json(desk / "names.json")["trees"].values()
+    (desk / "names.json").unlink()
+    assert names == {mug: "Souvenir"}
     tab_to(page, "#save summary")
     press(page, "Enter")
     tab_to(page, "[data-save=boxes]")

@@ -16,6 +16,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
+from tests.unit.artifact_changes import change_index
 
 SIZE = (6, 8)
 
@@ -207,6 +208,7 @@ def embedded(ours, scene, tmp_path, project) -> ClipModel:
         np.save(
             clip_folder / f"{name}.npy", model.embed_masks(image, nested(), ClipSettings(crop="langsplat"))
         )
+    change_index(scene)
     write_langsplat(masks_folder, clip_folder, tmp_path / "files")
     return model
 
