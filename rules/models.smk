@@ -14,7 +14,12 @@ rule train_models:
     params:
         checkout=str(INSTALLED),
         seed=PLAN.run.seed,
-        code=sha256_of_path(INSTALLED / "models/training"),
+        code=sha256_of_bytes(
+            *(
+                path.read_bytes()
+                for path in sorted((INSTALLED / "models/training").glob("*.py"))
+            )
+        ),
         out=lambda wildcards, output: str(Path(output[0]).parent),
         cache=lambda wildcards, output: str(
             Path(output[0]).parents[1] / ".cache/models"
