@@ -11,6 +11,7 @@ from hilsplat.base.artifacts import atomic_folder, read_json
 from hilsplat.base.images import write_png
 from hilsplat.splat.ply import load_ply
 from tests.browser.conftest import drawn, pixels, serving, wire_camera
+from tests.unit.artifact_changes import change_index
 
 both = pytest.mark.parametrize("painter", ["gl", "server"])
 
@@ -335,6 +336,7 @@ def test_a_scene_that_was_made_anew_is_told_and_loaded_again_without_the_old_cho
         with atomic_folder(folder / "default/semantic_tree") as new:
             shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
             np.savez(new / "tree.npz", **arrays)
+            change_index(new)
         page.get_by_role("alert").get_by_text("The scene was made anew (semantic_tree)").wait_for()
         page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
         page.get_by_role("button", name="Reload").click()

@@ -1,5 +1,7 @@
 """Both pages by the keyboard alone: no test here has a pointer."""
 
+import shutil
+
 from hilsplat.annotate.labels import label_path, read_labels
 from hilsplat.base.artifacts import read_json
 from tests.browser.conftest import serving
@@ -22,8 +24,15 @@ def press(page, *keys: str) -> None:
         page.keyboard.press(key)
 
 
-def test_the_viewer_asks_walks_names_and_saves(opened, desk_address, desk, tmp_path):
-    page = opened(desk_address)
+def test_the_viewer_asks_walks_names_and_saves(opened, desk, tmp_path):
+    folder = tmp_path / "project" / desk.relative_to(desk.parents[2])
+    shutil.copytree(desk.parents[2], tmp_path / "project")  # the names of this test are its own
+    with serving(folder) as address:
+        walk(opened(address), folder, tmp_path)
+
+
+def walk(page, desk, tmp_path) -> None:
+    """Ask, choose, name and save with the keyboard."""
     page.keyboard.type("mug > handle")  # the text box has the focus
     press(page, "Enter")
     page.locator("#answers button").first.wait_for()
@@ -35,7 +44,6 @@ def test_the_viewer_asks_walks_names_and_saves(opened, desk_address, desk, tmp_p
     press(page, "Enter")
     page.get_by_text("Named “Souvenir”").wait_for()
     (names,) = read_json(desk / "names.json")["trees"].values()
-    (desk / "names.json").unlink()
     assert names == {mug: "Souvenir"}
     tab_to(page, "#save summary")
     press(page, "Enter")
@@ -44,6 +52,7 @@ def test_the_viewer_asks_walks_names_and_saves(opened, desk_address, desk, tmp_p
         press(page, "Enter")
     started.value.save_as(tmp_path / "boxes.json")
     assert read_json(tmp_path / "boxes.json")
+    page.close()
 
 
 def test_the_annotator_names_draws_corrects_and_saves(opened, desk, tmp_path):

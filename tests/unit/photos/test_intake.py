@@ -143,7 +143,6 @@ def link(name):
         ("a/../../evil.jpg", "leads out"),
         ("/evil.jpg", "leads out"),
         ("..\\evil.jpg", "leads out"),
-        ("C:evil.jpg", "leads out"),
         (link("evil.jpg"), "is a link"),
         ("0.jpg", "is there twice"),
     ],

@@ -15,6 +15,7 @@ from hilsplat.viewer import exports
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.shown import ShownScene
 from hilsplat.viewer.witness import Witness
+from tests.unit.artifact_changes import change_index
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
 
@@ -141,6 +142,7 @@ def test_an_outline_names_its_tree(page, desk):
     with np.load(desk / "default/semantic_tree/tree.npz") as held:
         arrays = {**held, "quality": held["quality"] * 0.5}
     np.savez(desk / "default/semantic_tree/tree.npz", **arrays)
+    change_index(desk / "default/semantic_tree")
     made_again(desk / "default/semantic_tree")
     load(page)
     assert page.get("/api/variant/default").json()["tree"] != before
