@@ -38,11 +38,11 @@ def walk(page, desk, tmp_path) -> None:
     page.locator("#answers button").first.wait_for()
     tab_to(page, "#answers button")
     press(page, "Enter", "u")  # the handle is chosen, then the mug that it is part of
-    mug = page.locator("#overlay path.chosen").get_attribute("data-node")
     press(page, "n")
     page.keyboard.type("Souvenir")
     press(page, "Enter")
     page.get_by_text("Named “Souvenir”").wait_for()
+    mug = page.locator("#overlay path.chosen").get_attribute("data-node")
     (names,) = read_json(desk / "names.json")["trees"].values()
     assert names == {mug: "Souvenir"}
     tab_to(page, "#save summary")
