@@ -37,16 +37,10 @@ class HilsplatError(Exception):
 
 
 def system_error(error: BaseException) -> HilsplatError | None:
-    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error.
-
-    Libraries report in many ways that they cannot start a thread or be loaded. If memory is limited
-    (`ulimit -v`), the limit is assumed to be the reason.
-    """
+    """Convert a system error that a user can fix into a `HilsplatError`; return None for any other error."""
     is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
-    by_library = isinstance(error, (RuntimeError, ImportError)) or (
-        isinstance(error, OSError) and error.errno is None
-    )
-    if isinstance(error, MemoryError) or (is_limited and by_library):
+    by_library = is_limited and any(words in str(error) for words in NO_MEMORY)
+    if isinstance(error, MemoryError) or by_library:
         return HilsplatError(
             f"there is not enough memory: {error or 'an allocation failed'}",
             fix="end other programs, raise the limit (ulimit -v), or use smaller or fewer images",
@@ -75,11 +69,14 @@ def require_working_directory() -> None:
         ) from None
 
 
+NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/load shared object")
+"""Parts of the messages of libraries that cannot start a thread or be loaded within `ulimit -v`."""
+
 PLACES = {
     errno.EACCES: "may not be read or written",
     errno.EPERM: "may not be read or written",
     errno.EROFS: "is on a disk that can only be read",
-    errno.ENOENT: "does not exist, and cannot be created there",
+    errno.ENOENT: "is missing, or cannot be created",
     errno.ENOTDIR: "cannot be: a part of the path is a file",
     errno.EISDIR: "is a folder, where a file is needed",
     errno.EEXIST: "is in the way",

@@ -90,7 +90,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
             return np.asarray(_to_srgb(upright, path))
     except FileNotFoundError as error:
         raise ImageError(f"image {path} is missing") from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, MemoryError) as error:
+    except (UnidentifiedImageError, EOFError, OSError, SyntaxError, ValueError, MemoryError) as error:
         size = path.stat().st_size if path.exists() else 0
         raise ImageError(
             f"image {path} cannot be read: {error}",

@@ -53,12 +53,13 @@ def query_panel(
     names = list(dict.fromkeys(scene.name_of(int(node)) or "?" for node in hits.ids))
     called = f" ({', '.join([*names[:NAMED], *(['…'] if names[NAMED:] else [])])})" if names else ""
     title = f"“{text}” in {scene.scene.name}: {found}{called}{note}"
-    doubts = [*wrap(scene.caution_about(text), TITLE_LETTERS), *map(str, doubts_of(hits))]
+    caution = wrap(scene.caution_about(text), TITLE_LETTERS)
+    heading = [*wrap(title, TITLE_LETTERS), *caution, *map(str, doubts_of(hits))]
     height, width = scene.scene.cameras[views[0]].size_hw
     row_px = TITLE_PX + round(CELL_PX * height / width) + GAP_PX
-    upper_px = HEADING_PX * (1 + len(doubts)) + GAP_PX + len(views) * row_px
+    upper_px = HEADING_PX * len(heading) + GAP_PX + len(views) * row_px
     page = _Page(LEFT_PX + COLUMNS * (CELL_PX + GAP_PX), upper_px + MAP_PX)
-    for number, line in enumerate([title, *doubts]):
+    for number, line in enumerate(heading):
         page.write(line, page.width_px / 2, (number + 0.5) * HEADING_PX, size=12.0, bold=True)
     for row, view in enumerate(views):
         top = upper_px - (len(views) - row) * row_px

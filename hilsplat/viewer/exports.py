@@ -217,7 +217,7 @@ def film(
         paint: the style; None: the scene's own colours.
         kind: "mp4", or "gif", which has every second frame.
         threads: number of threads for rendering.
-        told: called with the number of rendered frames after each; an exception that it raises ends the film.
+        told: called after each frame with the number of rendered frames; an exception from it ends the film.
     """
 
     def pictures() -> Iterator[np.ndarray]:

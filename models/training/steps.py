@@ -17,7 +17,7 @@ DECAY_SHARE = 0.25
 
 @dataclass
 class Curve:
-    """Learning curve: rows with equal keys, the first of which is `step`."""
+    """Learning curve: rows with equal keys; the first key is `step`."""
 
     rows: list[dict[str, float]] = field(default_factory=list)
 
