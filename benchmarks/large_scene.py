@@ -157,8 +157,8 @@ def front_gaussian(weights) -> np.ndarray:
     return front
 
 
-def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
-    """Return the stages to time."""
+def stages(out: Path, threads: int, device: str) -> dict[str, Callable[[], None]]:
+    """Return the stages to time; `device` applies to contributions, semantic tree and field."""
     code = AutoencoderSettings(code="pca", latent=16)
     return {
         "coverage_tree": lambda: run_coverage_tree(
@@ -170,14 +170,14 @@ def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
             out / "masks",
             out / "contributions",
             out / "cache",
-            ContributionsSettings(),
+            ContributionsSettings(device=device),
             threads,
         ),
         "semantic_tree": lambda: run_semantic_tree(
             out / "contributions",
             out / "masks",
             out / "semantic_tree",
-            SemanticTreeSettings(),
+            SemanticTreeSettings(device=device),
             threads,
         ),
         "autoencoder": lambda: run_autoencoder(
@@ -188,7 +188,7 @@ def stages(out: Path, threads: int) -> dict[str, Callable[[], None]]:
             out / "coverage_tree",
             out / "autoencoder",
             out / "field.safetensors",
-            FieldSettings(),
+            FieldSettings(device=device),
             threads,
         ),
     }
@@ -203,6 +203,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=728)
     parser.add_argument("--masks", type=int, default=300, help="masks of a view, all levels together")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument(
         "--stage", choices=STAGES, help="run this stage in this process and print seconds and MiB"
     )
@@ -210,7 +211,7 @@ def main() -> None:
     asked.out.mkdir(parents=True, exist_ok=True)
     if asked.stage:
         begun = time.perf_counter()
-        stages(asked.out, asked.threads)[asked.stage]()
+        stages(asked.out, asked.threads, asked.device)[asked.stage]()
         print(f"{time.perf_counter() - begun:.1f} {status_mib('VmHWM'):.0f}")
         return
     if not (asked.out / "clip").exists():
@@ -219,7 +220,7 @@ def main() -> None:
     rows = []
     for stage in STAGES:
         command = [sys.executable, "-m", "benchmarks.large_scene", str(asked.out), "--stage", stage]
-        command += ["--threads", str(asked.threads)]
+        command += ["--threads", str(asked.threads), "--device", asked.device]
         environment = {**os.environ, "NUMBA_NUM_THREADS": str(asked.threads)}
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
         seconds, peak = done.stdout.split()[-2:]

@@ -1,6 +1,5 @@
 """CUDA backend: gsplat (extra `gpu`) with the functions and conventions of the CPU backend.
 
-Written for the public interface of gsplat 1.5 and its CUDA sources. It has not been run on a device yet.
 Tests run it on the CPU with gsplat's reference implementation in torch, and on a device if there is one.
 CUDA sums are atomic, so gradients are reproducible only up to rounding.
 
@@ -130,13 +129,16 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
         count = torch.bincount(pixel, minlength=height * width)
         weight = alpha * _light_before(alpha, count)
         kept = (weight >= min_weight) & (weight > 0)
+        pixel, who, weight = pixel[kept], who[kept], weight[kept]
+        # sorting columns on the host would take longer than everything else
+        order = torch.argsort(pixel * len(gaussians) + who)
         row_start = np.zeros(height * width + 1, np.int64)
-        row_start[1:] = torch.bincount(pixel[kept], minlength=height * width).cumsum(0).cpu().numpy()
-        columns, weights = who[kept].int().cpu().numpy(), weight[kept].float().cpu().numpy()
+        row_start[1:] = torch.bincount(pixel, minlength=height * width).cumsum(0).cpu().numpy()
+        columns, weights = who[order].int().cpu().numpy(), weight[order].float().cpu().numpy()
     if row_start[-1] < np.iinfo(np.int32).max:
         row_start = row_start.astype(np.int32)
     matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
-    matrix.sort_indices()
+    matrix.has_sorted_indices = True
     return matrix
 
 

@@ -1,0 +1,94 @@
+"""Times of the rasteriser and of a fit's steps on the CPU and on CUDA, with the same scenes as `test_splat`.
+
+    python -m benchmarks.devices                 # both devices; CUDA needs hilsplat[gpu]
+    python -m benchmarks.devices --devices cpu
+
+Times include all copies between host and device, because callers pass and get NumPy arrays. Medians.
+"""
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from benchmarks.scenes import SIZES, random_scene
+from hilsplat.base.tables import markdown_table
+from hilsplat.scene.cameras import Camera
+from hilsplat.settings import GaussiansSettings
+from hilsplat.splat.densify import ScreenGradients
+from hilsplat.splat.fit import fit_step
+from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.optimise import Adam
+from hilsplat.splat.rasterise.api import draw, pixel_weights
+from hilsplat.splat.rasterise.device import Device
+from hilsplat.splat.rasterise.parity import disagreement
+from hilsplat.splat.state import FitState
+from hilsplat.splat.views import TrainingView
+
+SIZES_TIMED = {**SIZES, "1M 986x728": (1_000_000, (728, 986))}
+HALF_WAY = 500_000
+WARM_UP_S, TIMED_S, MIN_ROUNDS = 0.5, 2.0, 3
+
+
+def median_ms(work: Callable[[], object]) -> float:
+    """Return the median duration of a call after a warm-up, ms."""
+    times: list[float] = []
+    begun = time.perf_counter()
+    work()
+    while time.perf_counter() - begun < WARM_UP_S:
+        work()
+    while sum(times) < TIMED_S or len(times) < MIN_ROUNDS:
+        begun = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - begun)
+    return 1e3 * statistics.median(times)
+
+
+def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int) -> list[float]:
+    """Return the milliseconds of an image, its gradients, pixel weights and a step of a fit."""
+    seen = draw(gaussians, camera, 3, threads=threads, device=device)
+    slope, flat = np.ones_like(seen.image), np.zeros_like(seen.alpha)
+
+    def both_ways() -> None:
+        draw(gaussians, camera, 3, threads=threads, device=device).gradients(slope, flat)
+
+    settings = GaussiansSettings(
+        iterations=2 * HALF_WAY, sh_degree=3, densify_every=4 * HALF_WAY, device=device
+    )
+    view = TrainingView("view", camera, (255 * np.clip(seen.image, 0, 1)).astype(np.uint8))
+    start = {field: getattr(gaussians, field).copy() for field in FIELDS}
+    generator = np.random.default_rng(0)
+    state = FitState(Adam.start(start), ScreenGradients.start(len(gaussians)), generator, step=HALF_WAY)
+    return [
+        median_ms(lambda: draw(gaussians, camera, 3, threads=threads, device=device)),
+        median_ms(both_ways),
+        median_ms(
+            lambda: pixel_weights(gaussians, camera, min_weight=1 / 255, threads=threads, device=device)
+        ),
+        median_ms(lambda: fit_step(state, [view], settings, 1.0, threads)),
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--devices", nargs="+", choices=("cpu", "cuda"), default=("cpu", "cuda"))
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    asked = parser.parse_args(arguments)
+    if "cuda" in asked.devices:
+        print("CUDA against the CPU:", disagreement("cpu", "cuda") or "equal up to rounding", flush=True)
+    rows = []
+    for name, (number, size_hw) in SIZES_TIMED.items():
+        gaussians, camera = random_scene(number, size_hw)
+        for device in asked.devices:
+            times = times_of(gaussians, camera, device, asked.threads)
+            rows.append((name, device, *(f"{value:.1f}" for value in times)))
+            print(*rows[-1], flush=True)
+    head = ("scene", "device", "image", "image and gradients", "pixel weights", "step of a fit")
+    print(markdown_table(head, rows, 2))
+
+
+if __name__ == "__main__":
+    main()
