@@ -158,7 +158,7 @@ def front_gaussian(weights) -> np.ndarray:
 
 
 def stages(out: Path, threads: int, device: str) -> dict[str, Callable[[], None]]:
-    """Return the stages to time; `device` applies to contributions, semantic tree and field."""
+    """Return the stages to time; `device` applies to contributions."""
     code = AutoencoderSettings(code="pca", latent=16)
     return {
         "coverage_tree": lambda: run_coverage_tree(
@@ -177,7 +177,7 @@ def stages(out: Path, threads: int, device: str) -> dict[str, Callable[[], None]
             out / "contributions",
             out / "masks",
             out / "semantic_tree",
-            SemanticTreeSettings(device=device),
+            SemanticTreeSettings(),
             threads,
         ),
         "autoencoder": lambda: run_autoencoder(
@@ -188,7 +188,7 @@ def stages(out: Path, threads: int, device: str) -> dict[str, Callable[[], None]
             out / "coverage_tree",
             out / "autoencoder",
             out / "field.safetensors",
-            FieldSettings(device=device),
+            FieldSettings(),
             threads,
         ),
     }

@@ -22,13 +22,11 @@ if TYPE_CHECKING:
 __all__ = ["Doubt", "HilsplatError", "Hit", "LanguageScene", "Level", "open"]
 
 
-def open(
-    folder: Path | str, variant: str = "default", *, threads: int = 1, device: str = "cpu"
-) -> "LanguageScene":
+def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
     """Open a finished scene, `results/<dataset>/<scene>` or a copy of it: see `LanguageScene.open`."""
     from hilsplat.query.language_scene import LanguageScene
 
-    return LanguageScene.open(folder, variant, threads=threads, device=device)
+    return LanguageScene.open(folder, variant, threads=threads)
 
 
 def __getattr__(name: str) -> Any:

@@ -427,10 +427,6 @@ class SemanticTreeSettings(Section):
         "side",
         gt=0,
     )
-    device: Literal["auto", "cpu", "cuda"] = knob(
-        "cpu",
-        "device that compares masks; cuda: by torch, equal up to rounding; auto: cuda if found",
-    )
 
     @property
     def is_random(self) -> bool:
@@ -526,10 +522,6 @@ class FieldSettings(Section):
         ge=0,
         le=1,
         origin="paper: pruning, no number",
-    )
-    device: Literal["auto", "cpu", "cuda"] = knob(
-        "cpu",
-        "device that multiplies matrices; cuda: by torch, equal up to rounding; auto: cuda if found",
     )
 
     @property

@@ -49,7 +49,6 @@ rule field:
     resources:
         mem_mb=RESOURCES.memory_mb("field"),
         runtime=RESOURCES.minutes("field"),
-        gpu=RESOURCES.gpus("field"),
     params:
         settings=PLAN.settings("field"),
         option=PLAN.field_option,

@@ -17,7 +17,6 @@ rule semantic_tree:
     resources:
         mem_mb=RESOURCES.memory_mb("semantic_tree"),
         runtime=RESOURCES.minutes("semantic_tree"),
-        gpu=RESOURCES.gpus("semantic_tree"),
     params:
         settings=PLAN.settings("semantic_tree"),
         option=PLAN.tree_option,

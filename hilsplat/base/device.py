@@ -1,18 +1,9 @@
-"""Device for the sparse algebra after the fit: our kernels on the CPU, or torch on CUDA."""
+"""Installed packages and torch's threads."""
 
 import importlib.metadata
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import Literal
-
-from hilsplat.base.errors import DeviceError
-
-logger = logging.getLogger(__name__)
-
-ComputeDevice = Literal["cpu", "cuda"]
-WantedDevice = Literal["auto", "cpu", "cuda"]
 
 
 @cache
@@ -23,14 +14,6 @@ def is_installed(distribution: str) -> bool:
     except importlib.metadata.PackageNotFoundError:
         return False
     return True
-
-
-@cache
-def cuda_missing() -> str | None:
-    """Return why torch cannot use CUDA here, or None if it can."""
-    import torch
-
-    return None if torch.cuda.is_available() else f"torch {torch.__version__} finds no CUDA device"
 
 
 @contextmanager
@@ -47,30 +30,3 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@cache
-def compute_device(wanted: WantedDevice) -> ComputeDevice:
-    """Return the device of a stage.
-
-    Args:
-        wanted: `auto` selects cuda if torch finds a device. The default setting is cpu, because sums computed
-            with cuda agree with those of the CPU up to rounding, but not byte for byte.
-
-    Raises:
-        DeviceError: `wanted` is `cuda`, and torch finds no device. There is no fallback.
-    """
-    if wanted == "cpu":
-        return "cpu"
-    problem = cuda_missing()
-    if problem and wanted == "auto":
-        return "cpu"
-    if problem:
-        raise DeviceError(
-            "device: cuda cannot be used here",
-            expected="a CUDA build of torch that finds a device",
-            found=problem,
-            fix="set device: cpu",
-        )
-    logger.info("sparse algebra on cuda")
-    return "cuda"

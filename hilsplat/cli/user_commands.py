@@ -52,7 +52,6 @@ def query(
             help="folder for panel.png and selection.ply; default: queries/TEXT in the scene's folder"
         ),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda, for look-ups of the field")] = "cpu",
     threads: Threads = 2,
 ) -> None:
     """Find the objects or parts that match a text in a finished scene.
@@ -75,7 +74,6 @@ def query(
             view=view,
             threshold=threshold,
             out=out,
-            device=device,
             threads=threads,
         ):
             typer.echo(found)

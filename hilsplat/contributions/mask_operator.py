@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,17 +17,6 @@ MEDIAN_SOFTENING = 1e-4
 
 SPREAD_PARTS = 4
 """Ranges of Gaussians per thread, which balance the load: masks show some Gaussians more often."""
-
-
-@runtime_checkable
-class MaskProducts(Protocol):
-    """The two products with A that the solver needs, on any device."""
-
-    def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
-        """Return A F: the mean rendered feature of each mask at its level."""
-
-    def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
-        """Return A' x at each level: the adjoint of `means`."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ and streamed instead. Both give the same products.
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse as sp
@@ -137,17 +136,6 @@ class StackedWeights:
 
 
 Quadratic = Gram | StackedWeights
-
-
-@runtime_checkable
-class QuadraticProduct(Protocol):
-    """Products with G that the solver needs, on any device."""
-
-    def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
-        """Return G_l F_l for every level."""
-
-    def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Return the sum over levels of tr F'GF, summed in float64."""
 
 
 def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.contributions.mask_operator import MaskProducts
+from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.losses.distances import common_ancestor_depth
 from hilsplat.field.losses.instance import instance_loss_literal, instance_loss_tree
@@ -198,8 +198,8 @@ class Contrast:
         settings: variants and weights of the losses.
     """
 
-    masks: MaskProducts
-    half_masks: MaskProducts
+    masks: MaskOperator
+    half_masks: MaskOperator
     pixels: Float32[np.ndarray, " M"]
     half_pixels: Float32[np.ndarray, " M"]
     relations: list[ViewRelations]

@@ -5,16 +5,14 @@ part, `contrast` for the hierarchy losses and `solver` for their minimisation.
 """
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hilsplat.base.artifacts import read_index, read_npz, sealed, sha256_of_file, write_json
-from hilsplat.base.device import compute_device
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.progress import stage_log
-from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts
+from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.code import autoencoder_file, load_latents
 from hilsplat.field.contrast import Contrast, view_relations
@@ -67,7 +65,6 @@ def run_field(
     latents = load_latents(autoencoder_folder, contributions)
     parents = read_parents(tree_folder, contributions)
     with stage_log("field", scene) as counts:
-        device = compute_device(settings.device)
         masks = MaskOperator.of(contributions.matrix("A"), contributions.level, threads)
         half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level, threads)
         quadratic = contributions.quadratic(threads)
@@ -82,14 +79,8 @@ def run_field(
             seed,
         )
         relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
-        products: tuple[MaskProducts, MaskProducts] = masks, half_masks
-        if device != "cpu":
-            from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
-
-            products = DeviceMasks.of(masks, device), DeviceMasks.of(half_masks, device)
-            problem = replace(problem, masks=products[0], quadratic=DeviceQuadratic.of(quadratic, device))
         half_pixels = contributions.half_pixels.astype(np.float32)
-        contrast = Contrast(*products, pixels, half_pixels, relations, settings)
+        contrast = Contrast(masks, half_masks, pixels, half_pixels, relations, settings)
         if rendered is None:
             features, report = solve_field(problem, contrast, settings)
         else:

@@ -19,8 +19,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from hilsplat.contributions.mask_operator import MaskOperator, MaskProducts, lifted_average, lifted_median
-from hilsplat.contributions.quadratic import Quadratic, QuadraticProduct, level_mass
+from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
+from hilsplat.contributions.quadratic import Quadratic, level_mass
 from hilsplat.field.one_pass import (
     add_by_channel,
     add_scaled,
@@ -45,8 +45,8 @@ class QuadraticProblem:
         weights: weights of the language loss, the clustering loss and the ridge.
     """
 
-    masks: MaskProducts
-    quadratic: QuadraticProduct
+    masks: MaskOperator
+    quadratic: Quadratic
     mass: Float32[np.ndarray, "N 3"]
     pixels: Float32[np.ndarray, " M"]
     latents: Float32[np.ndarray, "M D"]

@@ -33,7 +33,6 @@ def answer(
     view: str | None = None,
     threshold: float | None = None,
     out: Path | None = None,
-    device: str = "cpu",
     threads: int = 1,
 ) -> Iterator[str]:
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
@@ -50,16 +49,14 @@ def answer(
         view: restricts the answers to what this view shows, and is first in the panel; None: the whole scene.
         threshold: minimum score of an answer; None: answers near the best.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
-        device: "cpu" or "cuda" for look-ups in the field.
         threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
-        SettingsError: the level, answerer, view or device is unknown, or the threshold not between 0 and 1.
-        DeviceError: cuda was requested and torch finds no device.
+        SettingsError: the level, answerer or view is unknown, or the threshold not between 0 and 1.
     """
     found = FinishedScene.locate(Path(folder), variant)
-    scene = LanguageScene.of(found, threads=threads, device=device)
+    scene = LanguageScene.of(found, threads=threads)
     nodes = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
     hits = hits_of(scene, nodes, LISTED)
     label = masks_label(found.parts.masks)

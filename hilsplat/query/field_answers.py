@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-from hilsplat.base.device import ComputeDevice
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.rendered_latents import rendered_latents
@@ -31,7 +30,6 @@ class FieldAnswers:
         text_vectors: returns the unit CLIP vectors of texts.
         settings: canonical phrases and relevancy scale.
         threads: number of threads for look-ups.
-        device: device for look-ups.
     """
 
     language: LanguageField
@@ -40,7 +38,6 @@ class FieldAnswers:
     text_vectors: Callable[[Sequence[str]], np.ndarray]
     settings: EvaluateSettings
     threads: int
-    device: ComputeDevice
 
     def relevancy(
         self, texts: Sequence[str], view: str, *, exact: bool = True
@@ -125,7 +122,6 @@ class FieldAnswers:
             self.text_vectors(self.settings.canonical),
             self.settings.relevancy_scale,
             self.threads,
-            self.device,
         )
 
 

@@ -15,7 +15,6 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.field.code import Code
@@ -62,7 +61,6 @@ class LanguageScene:
         pixel_weights: returns the compositing weights of a view (pixels x Gaussians).
         settings: canonical phrases, relevancy scale, and selection of nodes.
         threads: number of threads for look-ups.
-        device: "cpu" or "cuda", for look-ups in the field.
         caution: sentence that explains why CLIP's answers are meaningless here; empty if they are not.
         names: the user's names for nodes, which are matched first.
         naming: vocabulary names of the nodes, and words for absent things; None if the stage has not run.
@@ -80,7 +78,6 @@ class LanguageScene:
     pixel_weights: Callable[[str], sp.csr_matrix]
     settings: EvaluateSettings = field(default_factory=EvaluateSettings)
     threads: int = 1
-    device: ComputeDevice = "cpu"
     caution: str = ""
     names: NodeNames = field(default_factory=NodeNames)
     naming: NodeNaming | None = field(default=None, repr=False)
@@ -92,9 +89,7 @@ class LanguageScene:
     _by_chance: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def open(
-        folder: Path | str, variant: str = "default", *, threads: int = 1, device: str = "cpu"
-    ) -> "LanguageScene":
+    def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
         """Open `results/<dataset>/<scene>`, or a copy of it anywhere, with the settings that made it.
 
         Canonical phrases, template, scale and node selection are read from the provenance of the variant's
@@ -104,29 +99,24 @@ class LanguageScene:
             folder: a finished scene.
             variant: named set of settings whose files are queried.
             threads: number of threads for rasterising and look-ups.
-            device: "cpu" or "cuda", for look-ups in the field (`field_relevancy` with exact=False).
 
         Raises:
             ArtifactError: the scene is not finished.
             MisalignedArtifactError: its parts do not belong together.
             ModelError: the CLIP that embedded its masks is not found.
-            DeviceError: the device is cuda, and torch finds none.
         """
-        scene = LanguageScene.of(FinishedScene.locate(Path(folder), variant), threads=threads, device=device)
+        scene = LanguageScene.of(FinishedScene.locate(Path(folder), variant), threads=threads)
         if scene.caution:
             logger.warning("%s: %s", scene.scene.name, scene.caution)
         return scene
 
     @staticmethod
-    def of(
-        found: FinishedScene, *, threads: int = 1, device: str = "cpu", opened: Opened | None = None
-    ) -> "LanguageScene":
+    def of(found: FinishedScene, *, threads: int = 1, opened: Opened | None = None) -> "LanguageScene":
         """Open a located finished scene with its own settings and its nodes' names."""
         scene = LanguageScene.from_parts(
             found.parts,
             found.evaluate_settings(),
             threads=threads,
-            device=device,
             opened=opened,
             names=read_names(found.folder, found.parts.semantic_tree),
             naming=NodeNaming.load(found.naming, found.parts.semantic_tree, found.parts.clip),
@@ -139,7 +129,6 @@ class LanguageScene:
         settings: EvaluateSettings,
         *,
         threads: int = 1,
-        device: str = "cpu",
         opened: Opened | None = None,
         names: NodeNames | None = None,
         naming: NodeNaming | None = None,
@@ -150,7 +139,6 @@ class LanguageScene:
             parts: paths of the artifacts.
             settings: canonical phrases, template, relevancy scale and selection of nodes.
             threads: as in `open`.
-            device: as in `open`.
             opened: artifacts that other variants of the scene have already opened.
             names: the user's names for nodes; None in evaluation, which scores only the models.
             naming: vocabulary names of the nodes; None in evaluation, which then reports no chance.
@@ -161,10 +149,6 @@ class LanguageScene:
         """
         from hilsplat.splat.rasterise.api import pixel_weights
 
-        if device not in get_args(ComputeDevice):
-            raise SettingsError(
-                f"device {device!r} is unknown", expected=" or ".join(get_args(ComputeDevice)), found=device
-            )
         found = OpenedParts.of(parts, settings.template, threads, opened or Opened())
         return LanguageScene(
             found.scene,
@@ -178,7 +162,6 @@ class LanguageScene:
             ),
             settings,
             threads,
-            compute_device(cast(ComputeDevice, device)),
             found.caution,
             names=names or NodeNames(),
             naming=naming,
@@ -521,9 +504,7 @@ class LanguageScene:
     @cached_property
     def _field(self) -> FieldAnswers:
         language, code = self.trained()
-        return FieldAnswers(
-            language, code, self._shown, self.text_vectors, self.settings, self.threads, self.device
-        )
+        return FieldAnswers(language, code, self._shown, self.text_vectors, self.settings, self.threads)
 
 
 def path_of(text: str) -> tuple[str, ...]:

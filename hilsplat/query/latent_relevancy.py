@@ -6,12 +6,11 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float32
 
-from hilsplat.base.device import ComputeDevice, compute_device
 from hilsplat.field.code import CHUNK_ROWS, Code
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.query.linear_look_up import LinearLookUp, PlacedLinear
@@ -20,10 +19,7 @@ from hilsplat.query.relevancy import relevancy
 
 PIXELS_AT_A_TIME = 1 << 16
 
-if TYPE_CHECKING:
-    from hilsplat.query.device_look_up import PlacedOnDevice
-
-Placed: TypeAlias = "PlacedLinear | PlacedProjected | PlacedOnDevice"
+Placed: TypeAlias = PlacedLinear | PlacedProjected
 
 
 class LatentRelevancy:
@@ -34,7 +30,6 @@ class LatentRelevancy:
         canonical: unit vectors of the generic phrases.
         scale: scale of the cosines.
         threads: number of threads; results do not depend on it.
-        device: "cpu" or "cuda" for `fast`; results are equal up to rounding.
     """
 
     def __init__(
@@ -43,9 +38,7 @@ class LatentRelevancy:
         canonical: Float32[np.ndarray, "K C"],
         scale: float,
         threads: int = 1,
-        device: ComputeDevice = "cpu",
     ) -> None:
-        self._device = compute_device(device)
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
         self._look_up: LinearLookUp | ProjectedLookUp = (
             LinearLookUp(code, canonical, scale)
@@ -70,16 +63,9 @@ class LatentRelevancy:
 
     def prepare(self, latents: Float32[np.ndarray, "P D"]) -> Placed:
         """Prepare the latents of a view for look-ups."""
-        placed: PlacedLinear | PlacedProjected
         if isinstance(self._look_up, LinearLookUp):
-            placed = self._look_up.place(latents)
-        else:
-            placed = self._look_up.place(latents, self._decode_in_parts)
-        if self._device == "cpu":
-            return placed
-        from hilsplat.query.device_look_up import PlacedOnDevice
-
-        return PlacedOnDevice.of(placed, self._device)
+            return self._look_up.place(latents)
+        return self._look_up.place(latents, self._decode_in_parts)
 
     def fast(
         self,
@@ -93,10 +79,6 @@ class LatentRelevancy:
             texts: unit vectors.
         """
         out = np.empty((len(texts), len(placed.generic)), np.float32)
-        if not isinstance(placed, PlacedLinear | PlacedProjected):
-            for text, row in zip(texts, out, strict=True):
-                row[:] = placed.relevancy(*self._text_weights(placed, text), self._scale)
-            return out
 
         def answer(span: slice) -> None:
             if isinstance(self._look_up, LinearLookUp):
@@ -109,14 +91,6 @@ class LatentRelevancy:
         if len(texts):
             self._in_parts(answer, len(placed.generic))
         return out
-
-    def _text_weights(
-        self, placed: "PlacedOnDevice", text: Float32[np.ndarray, " C"]
-    ) -> tuple[np.float32, Float32[np.ndarray, " R"]]:
-        if isinstance(self._look_up, LinearLookUp):
-            return self._look_up.text_weights(text)
-        assert placed.directions is not None  # set for a network's latents
-        return self._look_up.text_weights(placed.directions, text)
 
     def _decode_in_parts(self, work: Callable[[slice], None], count: int) -> None:
         """Run work that decodes in parts of as many rows as `decode_array` processes at once."""

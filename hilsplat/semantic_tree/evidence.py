@@ -43,7 +43,6 @@ def mask_evidence(
     view: Int32[np.ndarray, " M"],
     min_covisible: float,
     threads: int = 1,
-    device: str = "cpu",
 ) -> Evidence:
     """Compute the soft intersection and union of each pair of masks, on the Gaussians that both views see.
 
@@ -64,7 +63,6 @@ def mask_evidence(
         view: view of each mask.
         min_covisible: pairs that see a smaller share of each other are dropped.
         threads: number of threads; the result does not depend on it.
-        device: "cpu", or the torch device of the two products (see `cuda_algebra`).
     """
 
     def like(values: np.ndarray) -> sp.csr_matrix:
@@ -74,10 +72,7 @@ def mask_evidence(
     weight = importance.astype(np.float64)[shares.indices]
     size = weight * np.square(share)
     products = (like(share), like(weight * share), like(size), visible, view, min_covisible)
-    if device == "cpu":
-        upper, seen = _evidence_by_loops(*products, threads)
-    else:
-        upper, seen = _evidence_by_torch(*products, device)
+    upper, seen = _evidence_by_loops(*products, threads)
     shape = (len(view), len(view))
     intersection, union = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
     return Evidence(intersection, union, seen, view)
@@ -126,29 +121,6 @@ def _evidence_by_loops(
     indptr = np.concatenate(([0], np.cumsum(np.concatenate([np.diff(part[0]) for part in parts]))))
     indices, intersection, union = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
     return (indices, indptr, intersection, union), seen
-
-
-def _evidence_by_torch(
-    shares: sp.csr_matrix,
-    weighted: sp.csr_matrix,
-    sizes: sp.csr_matrix,
-    visible: Bool[np.ndarray, "V N"],
-    view: Int32[np.ndarray, " M"],
-    min_covisible: float,
-    device: str,
-) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
-    """Compute `_evidence_by_loops` with the products in torch."""
-    from hilsplat.contributions.cuda_algebra import shared_pairs_on
-
-    pairs, everywhere = shared_pairs_on(weighted, shares, sizes, visible, view, device)
-    seen = _counted(everywhere, view, min_covisible)
-    row = np.repeat(np.arange(len(view)), np.diff(pairs.indptr))
-    column = pairs.indices
-    keep = (seen[row, view[column]] > 0) | (seen[column, view[row]] > 0)
-    row, column, shared = row[keep], column[keep], pairs.data[keep]
-    union = everywhere[row, view[column]] + everywhere[column, view[row]] - shared
-    indptr = np.concatenate(([0], np.cumsum(np.bincount(row, minlength=len(view)))))
-    return (column, indptr, shared, union), seen
 
 
 def _counted(

@@ -6,7 +6,6 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from hilsplat.base.device import compute_device
 from hilsplat.base.levels import NONE
 from hilsplat.semantic_tree.evidence import mask_evidence
 from hilsplat.semantic_tree.linkage import pooled_linkage
@@ -89,7 +88,6 @@ def level_nodes(
         view,
         MIN_COVISIBLE,
         threads,
-        compute_device(settings.device),
     )
     del shares
     cluster, quality = pooled_linkage(evidence, settings.link_threshold)

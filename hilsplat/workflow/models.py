@@ -3,7 +3,6 @@
 import functools
 from pathlib import Path
 
-from hilsplat.base.device import compute_device
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.files import INSTALLED
 from hilsplat.configuration import CONFIG, StageSettings, parse_run, read_config
@@ -42,9 +41,7 @@ def check_device(stages: StageSettings, where: str) -> None:
     for section, values in stages:
         if getattr(values, "device", "") == "cuda":
             try:
-                compute_device("cuda")
-                if section in ("gaussians", "contributions"):
-                    choose_device("cuda")
+                choose_device("cuda")
             except HilsplatError as error:
                 raise HilsplatError(f"{section}.device of {where}: {error}") from error
 

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.base.device import compute_device, cuda_missing
 from hilsplat.contributions.channels import BLOCK
-from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
-from hilsplat.contributions.gram_builder import GramBuilder
 from hilsplat.contributions.mask_operator import (
     MaskOperator,
     _means,
@@ -17,13 +14,6 @@ from hilsplat.contributions.mask_operator import (
     lifted_average,
     lifted_median,
 )
-from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.semantic_tree.evidence import mask_evidence
-
-DEVICES = [
-    "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(cuda_missing() is not None, reason=str(cuda_missing()))),
-]
 
 
 def random_operator(masks: int = 14, gaussians: int = 30) -> tuple[MaskOperator, np.ndarray, np.ndarray]:
@@ -89,54 +79,3 @@ def test_the_median_of_a_triangle_sees_its_sides_under_equal_angles():
     masks, mass, pixels, latents = one_gaussian([[-1, 0], [1, 0], [0, 3]], [1, 1, 1])
     median = lifted_median(masks, pixels, latents, lifted_average(masks, mass, pixels, latents), steps=200)
     assert median[0, 0] == pytest.approx([0, 1 / np.sqrt(3)], abs=1e-4)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_torch_products_equal_the_loops(device):
-    operator, _, _ = random_operator()
-    moved = DeviceMasks.of(operator, device)
-    rng = np.random.default_rng(1)
-    features = rng.normal(size=(30, 3, 4)).astype(np.float32)
-    values = rng.normal(size=(14, 4)).astype(np.float32)
-    assert moved.means(features) == pytest.approx(operator.means(features), abs=1e-5)
-    assert moved.spread(values) == pytest.approx(operator.spread(values), abs=1e-5)
-
-    dense = rng.random((50, 30)) * (rng.random((50, 30)) < 0.3)
-    W = StackedWeights(sp.csr_matrix(dense.astype(np.float32)), rng.random((50, 3)) < 0.7)
-    builder = GramBuilder(30, 1)
-    builder.add(W)
-    for quadratic in (W, builder.finish()):
-        product = DeviceQuadratic.of(quadratic, device).product(features)
-        assert product == pytest.approx(quadratic.product(features), abs=1e-4)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_torch_finds_the_same_evidence(device, monkeypatch):
-    from hilsplat.semantic_tree import evidence as module
-
-    rng = np.random.default_rng(2)
-    view = np.repeat(np.arange(4, dtype=np.int32), 5)
-    shares = sp.random(20, 40, 0.3, random_state=rng, format="csr")
-    visible = rng.random((4, 40)) < 0.8
-    shares = sp.csr_matrix(shares.multiply(visible[view]))
-    arguments = (shares, rng.random(40), visible, view, 0.2)
-    loops = mask_evidence(*arguments)
-    if device == "cpu":  # torch's CPU stands in for the device
-        by_torch = module._evidence_by_torch
-        monkeypatch.setattr(module, "_evidence_by_loops", lambda *a: by_torch(*a[:-1], "cpu"))
-    found = mask_evidence(*arguments, 1, device)
-    assert found.intersection.toarray() == pytest.approx(loops.intersection.toarray(), abs=1e-12)
-    assert found.union.toarray() == pytest.approx(loops.union.toarray(), abs=1e-12)
-    assert found.seen == pytest.approx(loops.seen, abs=1e-12)
-
-
-def test_cuda_is_refused_where_there_is_none():
-    from hilsplat.base.errors import DeviceError
-
-    if cuda_missing() is None:
-        assert compute_device("cuda") == "cuda"
-    else:
-        with pytest.raises(DeviceError, match="finds no CUDA device"):
-            compute_device("cuda")
-    assert compute_device("cpu") == "cpu"
-    assert compute_device("auto") == ("cpu" if cuda_missing() else "cuda")

@@ -1,7 +1,5 @@
 """The sparse solver against dense algebra and autograd, and the stage."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -10,7 +8,6 @@ from scipy.optimize import minimize
 
 from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
-from hilsplat.contributions.cuda_algebra import DeviceMasks, DeviceQuadratic
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.view_matrices import painted_indicator
@@ -222,27 +219,6 @@ def test_lbfgs_reaches_the_minimum_of_the_whole_objective():
     best = minimize(objective, start, jac=True, method="L-BFGS-B", options={"maxiter": 500}).fun
     assert objective(start)[0] > best + 0.01
     assert objective(found.reshape(-1))[0] == pytest.approx(best, abs=2e-3)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_device_solves_the_same_field(device):
-    toy = Toy((1.0, 0.3, 0.1))
-    settings = FieldSettings(weight_instance=0.3, weight_part=0.1, lbfgs_steps=5)
-    contrast = toy.contrast(settings)
-    features, report = solve_field(toy.problem, contrast, settings)
-    moved = replace(
-        toy.problem,
-        masks=DeviceMasks.of(toy.problem.masks, device),
-        quadratic=DeviceQuadratic.of(toy.problem.quadratic, device),
-    )
-    halves = DeviceMasks.of(contrast.half_masks, device)
-    there = Contrast(moved.masks, halves, toy.pixels, toy.half_pixels, contrast.relations, contrast.settings)
-    on_device, told = solve_field(moved, there, settings)
-    assert on_device == pytest.approx(features, abs=1e-4)
-    for step in ("lifted", "after_cg", "after_lbfgs"):
-        assert told[step] == pytest.approx(report[step], rel=1e-3)
-    # losses are small differences of large sums: a device takes them in float64 too
-    assert told["lifted"]["language"] == pytest.approx(report["lifted"]["language"], rel=1e-9)
 
 
 def test_gaussians_that_masks_hardly_hold_keep_no_latent():

@@ -191,11 +191,6 @@ def test_a_copy_that_lost_its_settings_says_so(desk, elsewhere, caplog):
     assert "using the default settings" in caplog.text
 
 
-def test_an_unknown_device_is_named(desk):
-    with pytest.raises(SettingsError, match="device 'tpu' is unknown"):
-        hilsplat.open(desk / SCENE, device="tpu")
-
-
 def test_the_example_of_the_docs_runs(desk, project, monkeypatch, capsys):
     monkeypatch.chdir(desk)
     blocks = re.findall(r"```python\n(.*?)```", (project / "docs/python.md").read_text(), re.DOTALL)

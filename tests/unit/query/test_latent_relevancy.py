@@ -2,20 +2,14 @@
 
 import numpy as np
 import pytest
-import torch
 
-from hilsplat.base.device import compute_device
-from hilsplat.base.errors import DeviceError
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.field.network_training import train_autoencoder
 from hilsplat.query import projected_look_up
-from hilsplat.query.device_look_up import PlacedOnDevice
 from hilsplat.query.latent_relevancy import LatentRelevancy
 from hilsplat.query.projected_look_up import lost_for_error
 from hilsplat.settings import AutoencoderSettings
-
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 def unit(vectors):
@@ -161,30 +155,6 @@ def test_principal_directions_are_those_of_the_largest_spread():
     data = (rng.normal(size=(500, 3)) * [0.1, 3.0, 1.0]).astype(np.float32)
     basis = LinearCode.fit(data, 2).basis
     assert np.abs(basis) == pytest.approx(np.array([[0, 1, 0], [0, 0, 1]]), abs=0.05)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("code", ["pca", "network"])
-def test_torch_looks_up_the_same(vectors, texts, code, device):
-    if code == "pca":
-        model = LinearCode.fit(vectors, 8)
-    else:
-        model = train_autoencoder(
-            vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=200), 0
-        )
-    answer = LatentRelevancy(model, texts[:3], 10.0)
-    placed = answer.prepare(blends(model.encode_array(vectors), 3000))
-    moved = PlacedOnDevice.of(placed, device)
-    assert answer.fast(moved, texts) == pytest.approx(answer.fast(placed, texts), abs=1e-5)
-    assert moved.nbytes == placed.nbytes
-
-
-def test_a_device_that_is_missing_is_told(vectors, texts, monkeypatch):
-    monkeypatch.setattr("hilsplat.base.device.cuda_missing", lambda: "no device here")
-    compute_device.cache_clear()
-    with pytest.raises(DeviceError, match="no device here"):
-        LatentRelevancy(LinearCode.fit(vectors, 4), texts[:3], 10.0, device="cuda")
-    compute_device.cache_clear()
 
 
 def test_texts_looked_up_together_have_the_bytes_of_each_alone(vectors, texts):
