@@ -8,9 +8,10 @@ from types import SimpleNamespace
 from hilsplat.workflow.resources import START_S, JobResources
 
 GPU_GAIN = {"gaussians": 4, "masks": 27, "clip": 60}
-"""Rule -> speed with a GPU relative to one core. Measured for a fit of 100,000 Gaussians (docs/benchmarks.md),
-whose loss and Adam stay on the CPU. The others are from published times on an RTX 3090: SAM ViT-H's
-generator takes 4 s per picture, CLIP B/16 5 ms per crop. Other rules are assumed to run on the CPU."""
+"""Rule -> speed with a GPU relative to one core. Measured for a fit of 100,000 Gaussians
+(docs/benchmarks.md), whose loss and Adam stay on the CPU. The others are from published times on an
+RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop. Other rules are assumed to
+run on the CPU."""
 
 OTHERS = "tables"
 """Name of the row for jobs without a scene."""
