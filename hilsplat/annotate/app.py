@@ -107,7 +107,7 @@ class Annotator:
             StaleSceneError: the page was loaded with another state.
         """
         if request.query_params.get("of") not in (None, self.opened.state):
-            raise StaleSceneError("the scene was made anew since this page was loaded", fix="reload it")
+            raise StaleSceneError("the scene has changed since this page was loaded", fix="reload it")
         return self.opened
 
     # -- the scene --------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ def run_annotate(
     port: int,
     browser: bool,
     threads: int,
-    told: Callable[[str], None],
+    on_ready: Callable[[str], None],
 ) -> None:
     """Serve the annotation page of a scene on this machine until Ctrl-C.
 
@@ -296,7 +296,7 @@ def run_annotate(
         port: TCP port; 0 for any free port.
         browser: whether to open the page in a browser.
         threads: number of threads for rendering.
-        told: called with the address once the page can be opened.
+        on_ready: called with the address once the page can be opened.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.
@@ -308,4 +308,4 @@ def run_annotate(
     annotated = len(annotator.known(scene))
     annotator.drawing.submit(proposals.at, scene.cameras.names[0], 0, 0)  # compiles loops
     about = f"{scene.name}: {annotated} photographs annotated in {labels}, the page"
-    serve(annotator.app, about, port=port, browser=browser, told=told)
+    serve(annotator.app, about, port=port, browser=browser, on_ready=on_ready)

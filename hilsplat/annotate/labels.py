@@ -216,7 +216,8 @@ def write_labels(
     with output_lock(path):
         if version_of(path) != version:
             raise StaleLabelsError(
-                f"the annotations of {view} have changed meanwhile", fix="reload the page, then change them"
+                f"the annotations of {view} have changed since they were read",
+                fix="reload the page, then change them",
             )
         if labels:
             write_text(path, as_file(view, size_hw, labels))

@@ -30,7 +30,7 @@ def view(
     from hilsplat.viewer.app import run_view
 
     folder = scene_folder(scene, results)
-    run_view(folder, variant=variant, port=port, browser=browser, threads=threads, told=typer.echo)
+    run_view(folder, variant=variant, port=port, browser=browser, threads=threads, on_ready=typer.echo)
 
 
 @app.command()
@@ -54,5 +54,5 @@ def annotate(
     folder = scene_folder(scene, results)
     labels = data_root / "annotated" / Scene.load(folder / "scene").name
     run_annotate(
-        folder, labels, variant=variant, port=port, browser=browser, threads=threads, told=typer.echo
+        folder, labels, variant=variant, port=port, browser=browser, threads=threads, on_ready=typer.echo
     )

@@ -106,7 +106,8 @@ def write_names(
     with output_lock(path):
         if _version(path) != version:
             raise StaleNamesError(
-                f"the names in {path} have changed meanwhile", fix="read them again, then change them"
+                f"the names in {path} have changed since they were read",
+                fix="read them again, then change them",
             )
         found = _kept(path)
         found.trees[tree_digest(semantic_tree)] = {node: name for node, name in sorted(given.items()) if name}

@@ -222,7 +222,7 @@ def _picture(text: str) -> np.ndarray:
 
 
 def run_view(
-    folder: Path, *, variant: str, port: int, browser: bool, threads: int, told: Callable[[str], None]
+    folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Callable[[str], None]
 ) -> None:
     """Serve the page of a scene on this machine until Ctrl-C.
 
@@ -232,7 +232,7 @@ def run_view(
         port: TCP port; 0 for any free port.
         browser: whether to open the page in a browser.
         threads: number of threads for rendering.
-        told: called with the address once the page can be opened.
+        on_ready: called with the address once the page can be opened.
 
     Raises:
         ArtifactError: the scene has no Gaussians yet.
@@ -242,4 +242,4 @@ def run_view(
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
     about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"
-    serve(viewer.app, about, port=port, browser=browser, told=told)
+    serve(viewer.app, about, port=port, browser=browser, on_ready=on_ready)

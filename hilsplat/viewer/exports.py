@@ -207,7 +207,7 @@ def film(
     *,
     kind: str = "mp4",
     threads: int = 1,
-    told: Callable[[int], None] = lambda drawn: None,
+    on_frame: Callable[[int], None] = lambda drawn: None,
 ) -> bytes:
     """Render a film in the colours of a style.
 
@@ -217,13 +217,13 @@ def film(
         paint: the style; None: the scene's own colours.
         kind: "mp4", or "gif", which has every second frame.
         threads: number of threads for rendering.
-        told: called after each frame with the number of rendered frames; an exception from it ends the film.
+        on_frame: called after each frame with the frames so far; an exception from it ends the film.
     """
 
     def pictures() -> Iterator[np.ndarray]:
         for number, camera in enumerate(cameras[:: STEP[kind]]):
             yield painted(gaussians, camera, paint, threads)
-            told(number + 1)
+            on_frame(number + 1)
 
     with TemporaryDirectory() as folder:
         out = Path(folder) / f"film.{kind}"

@@ -107,12 +107,12 @@ class SavedFiles:
     async def _filmed(self, film: Callable[..., bytes], of: int) -> AsyncIterator[bytes]:
         loop, made, left = asyncio.get_running_loop(), asyncio.Queue[int | None](), Event()
 
-        def told(number: int) -> None:
+        def on_frame(number: int) -> None:
             if left.is_set():
-                raise CancelledError("nobody waits for this film any more")
+                raise CancelledError("the page that requested this film is closed")
             loop.call_soon_threadsafe(made.put_nowait, number)
 
-        making = loop.run_in_executor(self.films, partial(film, told=told))
+        making = loop.run_in_executor(self.films, partial(film, on_frame=on_frame))
         making.add_done_callback(lambda _: made.put_nowait(None))
         try:
             yield _line(made=0, of=of)
@@ -141,8 +141,8 @@ class SavedFiles:
 
         return _streamed(self._stepped(*await self.thread.do(request, first)))
 
-    async def _stepped(self, steps: exports.Steps, told: tuple[int, int]) -> AsyncIterator[bytes]:
-        found: tuple[int, int] | bytes = told
+    async def _stepped(self, steps: exports.Steps, first: tuple[int, int]) -> AsyncIterator[bytes]:
+        found: tuple[int, int] | bytes = first
         while isinstance(found, tuple):
             yield _line(made=found[0], of=found[1])
             try:
@@ -167,8 +167,8 @@ def _streamed(parts: AsyncIterator[bytes]) -> Response:
     return StreamingResponse(parts, headers={"cache-control": "no-store"})
 
 
-def _line(**told: int | str) -> bytes:
-    return as_json(told) + b"\n"
+def _line(**values: int | str) -> bytes:
+    return as_json(values) + b"\n"
 
 
 def node_of(scene: LanguageScene, node: int) -> int:

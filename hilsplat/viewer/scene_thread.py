@@ -46,7 +46,7 @@ class SceneThread:
 
         def run() -> Made:
             if state not in (None, self.shown.state):
-                raise StaleSceneError("the scene was made anew since this page was loaded", fix="reload it")
+                raise StaleSceneError("the scene has changed since this page was loaded", fix="reload it")
             return work(self.shown)
 
         return await self.run(run)

@@ -171,7 +171,7 @@ def listening_at(port: int) -> socket.socket:
 
 
 def serve(
-    app: Callable[[str], Guard], about: str, *, port: int, browser: bool, told: Callable[[str], None]
+    app: Callable[[str], Guard], about: str, *, port: int, browser: bool, on_ready: Callable[[str], None]
 ) -> None:
     """Serve an application on this machine until Ctrl-C.
 
@@ -180,7 +180,7 @@ def serve(
         about: description of the page for the printed line.
         port: TCP port; 0 for any free port.
         browser: whether to open the page in a browser.
-        told: called with the address once the page can be opened.
+        on_ready: called with the address once the page can be opened.
 
     Raises:
         SettingsError: the port is taken.
@@ -190,7 +190,7 @@ def serve(
     token, listening = secrets.token_urlsafe(24), listening_at(port)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = uvicorn.Config(app(token), log_level="warning", access_log=False, server_header=False)
-    told(f"{about} at {address}\nCtrl-C ends it")
+    on_ready(f"{about} at {address}\nCtrl-C ends it")
     if browser:
         webbrowser.open(address)
     uvicorn.Server(config).run(sockets=[listening])

@@ -130,7 +130,7 @@ class ShownScene:
             if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
                     f"variant {variant!r} cannot answer here",
-                    expected=", ".join(self.variants) or "none yet: the run goes on",
+                    expected=", ".join(self.variants) or "none yet: the scene isn't finished",
                 )
             with self.unchanged():
                 found = FinishedScene.locate(self.folder, variant)

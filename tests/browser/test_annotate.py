@@ -222,7 +222,7 @@ def test_what_somebody_else_saved_meanwhile_is_not_overwritten(page, opened, roo
     page.locator("#view").press("n")
     name(page, "book")
     polygon(page, (22, 2), (36, 2), (36, 20))
-    page.get_by_text("have changed meanwhile").wait_for()
+    page.get_by_text("have changed since they were read").wait_for()
     items(page).first.wait_for()
     assert kept(root) == theirs
     assert [item.get_attribute("aria-label") for item in items(page).all()] == ["cup, whole"]

@@ -337,7 +337,7 @@ def test_a_scene_that_was_made_anew_is_told_and_loaded_again_without_the_old_cho
             shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
             np.savez(new / "tree.npz", **arrays)
             change_index(new)
-        page.get_by_role("alert").get_by_text("The scene was made anew (semantic_tree)").wait_for()
+        page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree)").wait_for()
         page.locator("#overlay path.chosen").first.wait_for(state="attached")  # as it was
         page.get_by_role("button", name="Reload").click()
         page.get_by_role("alert").wait_for(state="hidden")

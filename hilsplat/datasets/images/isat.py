@@ -125,7 +125,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
     category = entry.get("category")
     if not isinstance(category, str) or not category.strip():
         raise SceneError(
-            f"{where} has no category", found=repr(category), fix="give it the text that asks for it"
+            f"{where} has no category", found=repr(category), fix="set the query for it as category"
         )
     where = f"{where} ({category})"
     if not isinstance(entry.get("iscrowd", 0), bool | int):  # 0 in some files, false in others

@@ -30,7 +30,7 @@ export const failed = (error) => {
 // The page goes on to show what it was loaded with; another state comes with a reload and never in parts.
 export function sceneChanged(parts = []) {
   $("changed").hidden = false;
-  $("changed-what").textContent = `The scene was made anew${parts.length ? ` (${parts.join(", ")})` : ""}. You still see it as it was.`;
+  $("changed-what").textContent = `The scene has changed${parts.length ? ` (${parts.join(", ")})` : ""}. You still see it as it was.`;
 }
 
 export async function loadVariant(name, again = false) {

@@ -88,7 +88,7 @@ def test_the_command_answers_by_names_too(desk, tmp_path):
 def test_a_change_must_know_the_version_that_it_changes(desk):
     first = name_nodes(desk, {0: "mug"})
     second = name_nodes(desk, {0: "cup"}, first.version)
-    with pytest.raises(StaleNamesError, match="changed meanwhile"):
+    with pytest.raises(StaleNamesError, match="changed since they were read"):
         name_nodes(desk, {0: "glass"}, first.version)
     with pytest.raises(StaleNamesError):
         name_nodes(desk, {0: "glass"})

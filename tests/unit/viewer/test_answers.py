@@ -413,7 +413,7 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
         assert client.post("/api/frame", json={"camera": view}).status_code == 200
         assert client.post("/api/pick", json={"camera": view, "x": 3, "y": 3}).status_code == 200
         early = client.post("/api/query", json={"text": "mug"})
-        assert early.status_code == 422 and "the run goes on" in early.json()["error"]
+        assert early.status_code == 422 and "the scene isn't finished" in early.json()["error"]
         shutil.copytree(whole / "default/clip", growing / "default/clip")
         assert client.get("/api/scene").json()["variants"] == ["default"]
         assert ask(client, "mug")["hits"]  # before there is a field
