@@ -2,7 +2,7 @@
 rule gaussians:
     input:
         scene="<results>/{dataset}/{scene}/scene",
-        brought=PLAN.data.brought,
+        existing=PLAN.data.existing_gaussians,
     output:
         ply="<results>/{dataset}/{scene}/gaussians.ply",
         coordinates="<results>/{dataset}/{scene}/gaussians.json",
@@ -21,11 +21,11 @@ rule gaussians:
         gpu=RESOURCES.gpus("gaussians"),
     params:
         settings=PLAN.settings("gaussians"),
-        brought=PLAN.data.brought_option,
+        existing=PLAN.data.existing_gaussians_option,
         seed=PLAN.run.seed,
         cache=cache_folder,
         code=PLAN.code("gaussians"),
     shell:
         "python -m hilsplat --log {log:q} gaussians --scene {input.scene:q} --settings {params.settings:q} --seed {params.seed:q}"
-        " {params.brought} --threads {threads} --cache {params.cache:q} --report {output.report:q}"
+        " {params.existing} --threads {threads} --cache {params.cache:q} --report {output.report:q}"
         " --out {output.ply:q}"

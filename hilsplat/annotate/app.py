@@ -27,10 +27,11 @@ from hilsplat.annotate.labels import (
     write_labels,
 )
 from hilsplat.annotate.merging import merged
-from hilsplat.annotate.opened import OpenedScene
+from hilsplat.annotate.opened_scene import OpenedScene
 from hilsplat.annotate.shapes import shaped
 from hilsplat.base.errors import SettingsError
 from hilsplat.scene.scene import Scene
+from hilsplat.viewer.file_changes import StaleSceneError
 from hilsplat.viewer.guard import Guard
 from hilsplat.viewer.server import (
     BYTES,
@@ -45,7 +46,6 @@ from hilsplat.viewer.server import (
     thumbnail,
     view_name,
 )
-from hilsplat.viewer.witness import StaleSceneError
 
 MAX_BODY_BYTES = 16 << 20
 """Maximum size of a request, enough for a COCO file of a whole scene."""

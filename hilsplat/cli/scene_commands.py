@@ -105,7 +105,7 @@ def gaussians(
     out: PathOut,
     report: Annotated[Path, typer.Option(help="folder for the fit's report")],
     settings: Settings = "{}",
-    brought: Annotated[
+    existing: Annotated[
         Path | None,
         typer.Option(help="a 3DGS PLY of your own, in the source's coordinates; replaces the fit"),
     ] = None,
@@ -122,7 +122,7 @@ def gaussians(
 ) -> None:
     """Fit 3D Gaussians to the training views, or use your own; a JSON file records their coordinates."""
     section = section_of("gaussians", settings)
-    optional = {"brought": brought, "dataparser": dataparser, "transforms": transforms}
+    optional = {"existing": existing, "dataparser": dataparser, "transforms": transforms}
     inputs = {"scene": scene, **{name: path for name, path in optional.items() if path}}
     beside = (out.with_suffix(".json"), report)
     with stage(
@@ -137,4 +137,4 @@ def gaussians(
     ):
         from hilsplat.splat.fit import run_gaussians
 
-        run_gaussians(scene, out, report, cache, section, seed, threads, brought, dataparser, transforms)
+        run_gaussians(scene, out, report, cache, section, seed, threads, existing, dataparser, transforms)

@@ -105,11 +105,11 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
         ModelError: the model cannot be opened.
     """
     model = open_model_folder(folder, variant=variant)
-    wanted = "fp32" if precision == "fp32" else _precisions(model)[-1]
-    found = _known(cache).get(_key(folder, variant, wanted))
+    requested = "fp32" if precision == "fp32" else _precisions(model)[-1]
+    found = _known(cache).get(_key(folder, variant, requested))
     if found is None:
-        found = _measure(SamModel(model) if model.kind == "sam" else ClipModel(model), wanted)
-        _remember(folder, variant, wanted, found, cache)
+        found = _measure(SamModel(model) if model.kind == "sam" else ClipModel(model), requested)
+        _remember(folder, variant, requested, found, cache)
     return found
 
 

@@ -211,12 +211,12 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
         repositories = huggingface_hub.scan_cache_dir(constants.HF_HUB_CACHE).repos
     except CacheNotFound:
         return None
-    wanted = revision or constants.DEFAULT_REVISION
+    requested = revision or constants.DEFAULT_REVISION
     for repo in repositories:
         if (repo.repo_type, repo.repo_id) != ("model", repository):
             continue
         for snapshot in repo.revisions:
-            if wanted in snapshot.refs or wanted == snapshot.commit_hash:
+            if requested in snapshot.refs or requested == snapshot.commit_hash:
                 files = {}
                 for each in snapshot.files:
                     path = each.file_path.relative_to(snapshot.snapshot_path).as_posix()

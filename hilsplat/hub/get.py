@@ -55,14 +55,14 @@ class Prepared:
     """A model whose required files are known.
 
     Attributes:
-        wanted: name and repository.
+        requested: name and repository.
         listing: the repository at a commit.
         choice: the required files.
         staging: folder of the download; kept after a failure, and resumed.
         target: the model folder.
     """
 
-    wanted: Wanted
+    requested: Wanted
     listing: Listing
     choice: Choice
     staging: Path
@@ -110,32 +110,32 @@ def get_models(
         )
     prepared, texts = [], []
     for name in names or RECOMMENDED:
-        wanted = Wanted.named(name, variant)
-        target = models / wanted.name
-        with explain_refusals(wanted, models):
-            _require_ours(wanted, target)
-            listing = _listing(wanted, revision)
+        requested = Wanted.named(name, variant)
+        target = models / requested.name
+        with explain_refusals(requested, models):
+            _require_ours(requested, target)
+            listing = _listing(requested, revision)
             if _is_present(target, listing):
                 texts.append(f"{target} is there already, from {listing.repository} at {listing.revision}")
             else:
-                prepared.append(_prepare(wanted, listing, target, variant))
+                prepared.append(_prepare(requested, listing, target, variant))
     if prepared:
         _require_space(prepared, models)
     for found in prepared:
-        with explain_refusals(found.wanted, models), output_lock(found.target):
+        with explain_refusals(found.requested, models), output_lock(found.target):
             texts.append(_install(found))
     used = [model.name for family in ("sam", "clip") if (model := real_model(family)) is not None]
     return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
 
 
-def _require_ours(wanted: Wanted, target: Path) -> None:
+def _require_ours(requested: Wanted, target: Path) -> None:
     """Refuse to replace a folder that was not downloaded from this repository."""
     if not target.exists():
         return
     origin = _origin(target)
-    if origin.get("repository") != wanted.repository:
+    if origin.get("repository") != requested.repository:
         raise DownloadError(
-            f"{target} is there already and was not fetched from {wanted.repository}",
+            f"{target} is there already and was not fetched from {requested.repository}",
             found=f"{ORIGIN} names {origin['repository']}" if origin else f"no {ORIGIN}",
             fix="rename or remove that folder, then run the command again",
         )
@@ -154,36 +154,36 @@ def _is_present(target: Path, listing: Listing) -> bool:
     )
 
 
-def _listing(wanted: Wanted, revision: str | None) -> Listing:
+def _listing(requested: Wanted, revision: str | None) -> Listing:
     """Return the listing of the hub or, if it is unreachable, that of its cache on this machine."""
     try:
-        return read_listing(wanted.repository, revision)
+        return read_listing(requested.repository, revision)
     except OUT_OF_REACH:
-        cached = read_cached_listing(wanted.repository, revision)
+        cached = read_cached_listing(requested.repository, revision)
         if cached is None:
             raise
-        logger.info("the hub is out of reach: %s is taken from its cache here", wanted.repository)
+        logger.info("the hub is out of reach: %s is taken from its cache here", requested.repository)
         return cached
 
 
-def _prepare(wanted: Wanted, listing: Listing, target: Path, variant: str) -> Prepared:
+def _prepare(requested: Wanted, listing: Listing, target: Path, variant: str) -> Prepared:
     """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(f".{target.name}.part")
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
-    found = Prepared(wanted, listing, choice, staging, target)
+    found = Prepared(requested, listing, choice, staging, target)
     logger.info(
         "%s: %s at %s, %.1f MB in %d files, %.1f MB of them still to fetch; licence: %s",
-        wanted.name,
-        wanted.repository,
+        requested.name,
+        requested.repository,
         listing.revision[:12],
         found.num_bytes / 1e6,
         len(choice.files),
         found.missing_bytes / 1e6,
-        listing.licence or (wanted.release.licence if wanted.release else "not stated by the hub"),
+        listing.licence or (requested.release.licence if requested.release else "not stated by the hub"),
     )
     if choice.exported:
-        require_exporter(wanted.repository)
+        require_exporter(requested.repository)
     return found
 
 
@@ -209,7 +209,7 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
 def _install(found: Prepared) -> str:
     """Download all files, prepare the model folder beside its target, check it, and rename it."""
     listing, choice = found.listing, found.choice
-    for path in track(list(choice.files), f"files of {found.wanted.name}"):
+    for path in track(list(choice.files), f"files of {found.requested.name}"):
         _fetch(listing, listing.files[path], found.staging)
     if choice.exported:
         with work_folder(found.target) as temporary:

@@ -15,38 +15,38 @@ KEPT = "what was transferred is kept, and continued"
 
 
 @contextmanager
-def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
+def explain_refusals(requested: Wanted, models: Path) -> Iterator[None]:
     """Convert errors from the network and the hub into errors with a fix.
 
     Raises:
         DownloadError: the network or the hub raised an error.
     """
-    place = f"{constants.ENDPOINT}/{wanted.repository}"
+    place = f"{constants.ENDPOINT}/{requested.repository}"
     try:
         yield
     except HilsplatError:
         raise
     except GatedRepoError as error:
         raise DownloadError(
-            f"{wanted.repository} asks for consent before it is fetched ({_status(error)})",
+            f"{requested.repository} asks for consent before it is fetched ({_status(error)})",
             fix=f"accept its terms at {place}, `hf auth login` or set HF_TOKEN, and run the command again",
         ) from error
     except RepositoryNotFoundError as error:
         raise DownloadError(
-            f"the hub has no repository {wanted.repository}, or does not show it to you ({_status(error)})",
+            f"the hub has no repository {requested.repository}, or hides it from you ({_status(error)})",
             expected=place,
             fix="correct the name (hilsplat models list); for a private one, `hf auth login` or set HF_TOKEN",
         ) from error
     except (requests.RequestException, *OUT_OF_REACH) as error:
         answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
-            raise _refused(answered, wanted, place) from error
+            raise _refused(answered, requested, place) from error
         raise DownloadError(
-            f"{wanted.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
+            f"{requested.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again where the hub can be reached ({KEPT}; HF_ENDPOINT names a mirror, "
-            f"HTTPS_PROXY a proxy), or put these files into {models / wanted.name} by hand, from {place}: "
-            f"{', '.join(_files_by_hand(wanted))}",
+            f"HTTPS_PROXY a proxy), or put these files into {models / requested.name} by hand, from {place}: "
+            f"{', '.join(_files_by_hand(requested))}",
         ) from error
     except OSError as error:
         if error.filename is None:
@@ -56,30 +56,30 @@ def explain_refusals(wanted: Wanted, models: Path) -> Iterator[None]:
         ) from error
 
 
-def _refused(error: requests.HTTPError, wanted: Wanted, place: str) -> DownloadError:
+def _refused(error: requests.HTTPError, requested: Wanted, place: str) -> DownloadError:
     """Return the error for a response with a status other than 2xx."""
     response = error.response
     assert response is not None  # an HTTPError is made from an answer
     status = response.status_code
     if status == requests.codes.too_many_requests:
         return DownloadError(
-            f"the hub has had too many requests to serve {wanted.repository} now ({_status(error)})",
+            f"the hub has had too many requests to serve {requested.repository} now ({_status(error)})",
             found=f"Retry-After: {response.headers.get('Retry-After', 'not stated')}",
             fix=f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit",
         )
     if status in (requests.codes.unauthorized, requests.codes.forbidden):
         return DownloadError(
-            f"the hub refuses {wanted.repository} ({_status(error)})",
+            f"the hub refuses {requested.repository} ({_status(error)})",
             fix=f"look at {place}; `hf auth login` or set HF_TOKEN to one that may read it",
         )
     if status == requests.codes.not_found:
         return DownloadError(
-            f"the hub does not have what was asked of {wanted.repository} ({_status(error)})",
+            f"the hub does not have what was asked of {requested.repository} ({_status(error)})",
             found=str(response.url),
             fix=f"correct the name or --revision; {place} shows what there is",
         )
     return DownloadError(
-        f"the hub does not serve {wanted.repository} ({_status(error)})",
+        f"the hub does not serve {requested.repository} ({_status(error)})",
         found=str(response.url),
         fix=f"run the command again later: {KEPT}",
     )
@@ -96,7 +96,7 @@ def _innermost(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def _files_by_hand(wanted: Wanted) -> list[str]:
+def _files_by_hand(requested: Wanted) -> list[str]:
     """Return the files of the model, for a user who must copy them by hand."""
-    families = [wanted.release.family] if wanted.release else ["sam", "clip"]
+    families = [requested.release.family] if requested.release else ["sam", "clip"]
     return [name for family in families for name in PARTS[family].usual]

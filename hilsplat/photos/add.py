@@ -14,7 +14,7 @@ from hilsplat.base.files import NAME_RULE, list_images, name_problem
 from hilsplat.base.images import open_image, read_image, resize_to_fit
 from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
-from hilsplat.photos.intake import brought_photographs
+from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
 from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.layouts import (
@@ -222,24 +222,24 @@ def add_scene(
             fix="choose another name, or remove its line from the sheet first",
         )
     root = project_root(sheet)
-    with brought_photographs(photos, root / PHOTOS / name, frames) as brought:
-        extra = _trained(brought.folder, {"poses": poses, "gaussians": gaussians, "features": features})
-        notes = _notes(brought.folder, extra)
-        if skipped := sorted(brought.folder.rglob("*.pth"))[:3]:
+    with prepared_photographs(photos, root / PHOTOS / name, frames) as existing:
+        extra = _trained(existing.folder, {"poses": poses, "gaussians": gaussians, "features": features})
+        notes = _notes(existing.folder, extra)
+        if skipped := sorted(existing.folder.rglob("*.pth"))[:3]:
             notes.append(
                 f"not read, because a pickle can run code: {', '.join(path.name for path in skipped)}"
             )
-        files = _labels(brought.folder, labels)
+        files = _labels(existing.folder, labels)
         annotated = root / "annotated" / PHOTOS / name
         if files and not annotated.exists():
             notes.append(f"labels of {len(files)} photographs, for scores: {files[0].parent}")
-        report = replace(inspect_photos(brought.folder, poses), notes=(*brought.notes, *notes))
-        _check(report, has_known_poses(brought.folder, poses))
+        report = replace(inspect_photos(existing.folder, poses), notes=(*existing.notes, *notes))
+        _check(report, has_known_poses(existing.folder, poses))
         if files and not annotated.exists():
             with atomic_folder(annotated) as target:
                 for path in files:
                     shutil.copy2(path, target / path.name)
-        _append(sheet, name, brought.folder, unit, extra)
+        _append(sheet, name, existing.folder, unit, extra)
     return report
 
 

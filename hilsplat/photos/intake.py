@@ -17,7 +17,7 @@ MARK = ".made_from.json"
 
 
 @dataclass(frozen=True)
-class Brought:
+class PreparedFolder:
     """A folder to be registered as a scene's source.
 
     Attributes:
@@ -30,7 +30,7 @@ class Brought:
 
 
 @contextmanager
-def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Brought]:
+def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[PreparedFolder]:
     """Yield the source folder of photographs itself, or `target`, made from videos or an archive.
 
     If the block ends with an error, a folder that was made is removed.
@@ -61,7 +61,7 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
     elif source.is_dir():
         beside = list_videos(photo_folder(source))
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used" if beside else ""
-        yield Brought(source, (note,) if note else ())
+        yield PreparedFolder(source, (note,) if note else ())
         return
     elif source.suffix.lower() in (".zip", ".r3d"):
 
@@ -90,7 +90,7 @@ def brought_photographs(source: Path, target: Path, frames: int) -> Iterator[Bro
             fix="choose another name for the scene, or move that folder away",
         )
     try:
-        yield Brought(unwrapped(target), tuple(notes))
+        yield PreparedFolder(unwrapped(target), tuple(notes))
     except BaseException:
         shutil.rmtree(target, ignore_errors=True)
         raise

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int32, Int64
 from hilsplat.base.levels import Level
 from hilsplat.segment import sam
 from hilsplat.segment.candidates import Candidates, crop_boxes
-from hilsplat.segment.kernels import mended_runs, upscaled_runs
+from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, take_runs
 from hilsplat.segment.sam import HEADS, Frame, SamModel
 from hilsplat.segment.suppression import (
@@ -58,7 +58,7 @@ def masks_from_candidates(
         if settings.crop_layers:
             masks = _suppressed(masks, np.concatenate(ranks), settings)
         # this is the most expensive step, so it follows the suppression by boxes, as in SAM
-        masks, changed = mend_masks(masks, settings.min_area_px, keep_small=official)
+        masks, changed = clean_masks(masks, settings.min_area_px, keep_small=official)
         if changed.any():  # boxes have changed; unchanged masks are preferred (SAM)
             masks = _suppressed(masks, (~changed).astype(np.float64), settings)
         streams.append(masks)
@@ -123,7 +123,7 @@ def _upscale(
     return masks.take(np.flatnonzero(~cut_by_crop(met, crop_box, size_hw)))
 
 
-def mend_masks(
+def clean_masks(
     masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
     """Fill holes and drop islands below `min_area_px` (8-connected), and drop masks below it.
@@ -138,15 +138,15 @@ def mend_masks(
     Returns:
         the remaining masks, and which of them were changed.
     """
-    runs, offsets, changed = mended_runs(masks.runs, masks.offsets, masks.size_hw[1], min_area_px)
-    mended = HierarchicalMasks.from_runs(
+    runs, offsets, changed = cleaned_runs(masks.runs, masks.offsets, masks.size_hw[1], min_area_px)
+    cleaned = HierarchicalMasks.from_runs(
         runs, offsets, masks.level, masks.predicted_iou, masks.stability, masks.size_hw
     )
-    is_small = mended.area_px < min_area_px
+    is_small = cleaned.area_px < min_area_px
     if keep_small:
-        return mended, changed | is_small
+        return cleaned, changed | is_small
     large = np.flatnonzero(~is_small)
-    return mended.take(large), changed[large]
+    return cleaned.take(large), changed[large]
 
 
 def cut_by_crop(

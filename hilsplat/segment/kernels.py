@@ -192,7 +192,7 @@ def _region_areas(row, start, stop, value, of, parent, area):
 
 @compiled
 @no_type_check
-def mended_runs(runs, offsets, width, min_area):
+def cleaned_runs(runs, offsets, width, min_area):
     """Fill holes and drop islands below `min_area` (8-connected); always keep the largest island.
 
     Returns:

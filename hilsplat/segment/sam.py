@@ -304,11 +304,11 @@ class SamModel:
         features = dict(zip(names, (encoder or self.encoder)(pixel_values=pixels), strict=True))
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
-    def prompts_per_call(self, wanted: int, asked: int) -> int:
+    def prompts_per_call(self, requested: int, asked: int) -> int:
         """Return the prompts per decoder call: fixed by the decoder, or at most `asked`."""
         if self.factored:
             return PROMPTS
-        return self.decoder.fixed_axis("input_points", 1) or min(wanted, asked)
+        return self.decoder.fixed_axis("input_points", 1) or min(requested, asked)
 
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]

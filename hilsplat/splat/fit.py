@@ -13,11 +13,11 @@ from hilsplat.base.images import to_float
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.brought import bring_gaussians
 from hilsplat.splat.coordinates import write_coordinates
 from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
 from hilsplat.splat.fit_report import write_report
 from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.import_gaussians import import_gaussians
 from hilsplat.splat.initial import first_gaussians
 from hilsplat.splat.mcmc import add_noise, add_regularisers, relocate_and_grow
 from hilsplat.splat.optimise import Adam, means_rate
@@ -187,7 +187,7 @@ def run_gaussians(
     settings: GaussiansSettings,
     seed: int,
     threads: int,
-    brought: Path | None = None,
+    existing: Path | None = None,
     dataparser: Path | None = None,
     transforms: Path | None = None,
 ) -> None:
@@ -197,17 +197,17 @@ def run_gaussians(
     coordinates) and the report folder (test PSNR and SSIM, curves, pictures, fly-around).
 
     Args:
-        brought: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.
-        dataparser, transforms: for a PLY in nerfstudio's training coordinates (`bring_gaussians`).
+        existing: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.
+        dataparser, transforms: for a PLY in nerfstudio's training coordinates (`import_gaussians`).
 
     Raises:
         SceneError: if there are no training views to fit.
-        ArtifactError: if `brought` cannot be used.
+        ArtifactError: if `existing` cannot be used.
     """
     scene = Scene.load(scene_folder)
     with stage_log("gaussians", scene.name) as counts:
-        if brought is not None:
-            gaussians, origin = bring_gaussians(brought, scene, dataparser, transforms)
+        if existing is not None:
+            gaussians, origin = import_gaussians(existing, scene, dataparser, transforms)
             curve = None
         else:
             # a resumed fit must stay on one device, because sums differ between CPU and CUDA

@@ -14,6 +14,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import StaleNamesError, write_names
 from hilsplat.scene.scene import Scene
 from hilsplat.viewer import answers, exports, wire
+from hilsplat.viewer.file_changes import StaleSceneError
 from hilsplat.viewer.guard import Guard
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.payload import packed_nodes
@@ -33,14 +34,13 @@ from hilsplat.viewer.server import (
     static_files,
     thumbnail,
 )
-from hilsplat.viewer.shown import ShownScene
-from hilsplat.viewer.witness import StaleSceneError
+from hilsplat.viewer.viewer_scene import ViewerScene
 
 
 class Viewer:
     """Request handlers of the viewer page for one scene."""
 
-    def __init__(self, shown: ShownScene) -> None:
+    def __init__(self, shown: ViewerScene) -> None:
         self.thread = SceneThread(shown)
         self.pages = Pages("index.html", static_files())
 
@@ -112,7 +112,7 @@ class Viewer:
         return await self._photograph(request, thumbnail)
 
     async def _photograph(self, request: Request, send: Callable[[Scene, int], Response]) -> Response:
-        def find(shown: ShownScene) -> Response:
+        def find(shown: ViewerScene) -> Response:
             with shown.unchanged():
                 return send(shown.scene, request.path_params["number"])
 
@@ -121,7 +121,7 @@ class Viewer:
     async def crop(self, request: Request) -> Response:
         """Send a crop of a node from the photograph that shows it largest."""
 
-        def draw(shown: ShownScene) -> bytes:
+        def draw(shown: ViewerScene) -> bytes:
             scene = shown.answering(request.path_params["variant"])
             node = node_of(scene, request.path_params["node"])
             with shown.unchanged():
@@ -135,7 +135,7 @@ class Viewer:
         """Send the answers to a text or a path."""
         asked = await read(request, wire.Query)
 
-        def answer(shown: ShownScene) -> answers.Answer:
+        def answer(shown: ViewerScene) -> answers.Answer:
             return answers.answer(shown.answering(asked.variant), asked, asked.answerer)
 
         return answer_json(await self.thread.do(request, answer))
@@ -144,7 +144,7 @@ class Viewer:
         """Send the nodes that look like a node or a picture."""
         asked = await read(request, wire.Like)
 
-        def answer(shown: ShownScene) -> answers.Answer:
+        def answer(shown: ViewerScene) -> answers.Answer:
             scene = shown.answering(asked.variant)
             if asked.node is not None:
                 hits = scene.like_node(asked.node, limit=answers.LISTED)
@@ -159,7 +159,7 @@ class Viewer:
         """Send the field's relevancy of each Gaussian, one byte each."""
         asked = await read(request, wire.FieldRelevancy)
 
-        def answer(shown: ShownScene) -> bytes:
+        def answer(shown: ViewerScene) -> bytes:
             found = shown.field_relevancy(asked.variant, asked.text, asked.level)
             return (found[shown.order] if asked.order == "page" else found).tobytes()
 
@@ -169,7 +169,7 @@ class Viewer:
         """Send the nodes and the 3D point that a pixel shows."""
         asked = await read(request, wire.Pick)
 
-        def find(shown: ShownScene) -> dict[str, Any]:
+        def find(shown: ViewerScene) -> dict[str, Any]:
             has = asked.variant in shown.variants
             nodes = shown.answering(asked.variant).tree.node_of_gaussian if has else None
             found = pick(shown.gaussians, nodes, asked.camera.camera(), asked.x, asked.y, shown.threads)
@@ -183,7 +183,7 @@ class Viewer:
         """Send a rendered picture of the scene."""
         asked = await read(request, wire.Frame)
 
-        def draw(shown: ShownScene) -> bytes:
+        def draw(shown: ViewerScene) -> bytes:
             from hilsplat.viewer.frames import painted
 
             paint = shown.paint(asked.variant, asked.style)
@@ -197,7 +197,7 @@ class Viewer:
         asked = await read(request, wire.Names)
         version = request.headers.get("if-match", "").strip('"')
 
-        def write(shown: ShownScene) -> dict[str, Any]:
+        def write(shown: ViewerScene) -> dict[str, Any]:
             found, scene = shown.found(asked.variant), shown.answering(asked.variant)
             tree = found.parts.semantic_tree
             with shown.unchanged():  # otherwise the names could be assigned to nodes of a rebuilt tree
@@ -238,7 +238,7 @@ def run_view(
         ArtifactError: the scene has no Gaussians yet.
         SettingsError: the port is taken.
     """
-    shown = ShownScene(folder, variant, threads)
+    shown = ViewerScene(folder, variant, threads)
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
     about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"

@@ -10,7 +10,7 @@ import uvicorn
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.server import listening_at
-from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.viewer_scene import ViewerScene
 
 
 class EmbeddedViewer:
@@ -27,7 +27,7 @@ class EmbeddedViewer:
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
         self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text
-        self.viewer = Viewer(ShownScene(found.folder, found.variant, threads))
+        self.viewer = Viewer(ViewerScene(found.folder, found.variant, threads))
         listening = listening_at(0)
         self.port: int = listening.getsockname()[1]
         app = self.viewer.app(self.token, embedded=True)

@@ -14,7 +14,7 @@ from hilsplat.viewer.payload import packed_nodes
 from hilsplat.viewer.server import as_json, encoded
 
 if TYPE_CHECKING:
-    from hilsplat.viewer.shown import ShownScene
+    from hilsplat.viewer.viewer_scene import ViewerScene
     from hilsplat.viewer.wire import Page
 
 PHOTO_PX = 320
@@ -27,7 +27,7 @@ POLICY = (
 )
 
 
-def html_page(shown: "ShownScene", asked: "Page", static: dict[str, bytes]) -> exports.Steps:
+def html_page(shown: "ViewerScene", asked: "Page", static: dict[str, bytes]) -> exports.Steps:
     """Make the page of a scene, with one step per crop; 8 MB for 60,000 Gaussians.
 
     Args:

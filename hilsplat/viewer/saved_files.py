@@ -23,7 +23,7 @@ from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.scene_thread import SceneThread
 from hilsplat.viewer.server import BYTES, answer_json, as_json, plain, read
-from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.viewer_scene import ViewerScene
 
 
 class SavedFiles:
@@ -48,7 +48,7 @@ class SavedFiles:
         """Send the Gaussians of nodes as PLY."""
         asked = await read(request, wire.Selection)
 
-        def make(shown: ShownScene) -> bytes:
+        def make(shown: ViewerScene) -> bytes:
             scene = shown.answering(asked.variant)
             groups = exports.Groups(scene, checked(scene, asked.groups))
             with shown.unchanged():
@@ -60,7 +60,7 @@ class SavedFiles:
         """Send the Gaussians of nodes as SPZ."""
         asked = await read(request, wire.Selection)
 
-        def make(shown: ShownScene) -> bytes:
+        def make(shown: ViewerScene) -> bytes:
             scene = shown.answering(asked.variant)
             rows = exports.Groups(scene, checked(scene, asked.groups)).rows
             return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
@@ -71,7 +71,7 @@ class SavedFiles:
         """Send the boxes of nodes."""
         asked = await read(request, wire.Selection)
 
-        def make(shown: ShownScene) -> dict[str, Any]:
+        def make(shown: ViewerScene) -> dict[str, Any]:
             scene = shown.answering(asked.variant)
             return answers.boxes(scene, checked(scene, asked.groups))
 
@@ -81,7 +81,7 @@ class SavedFiles:
         """Send the masks of nodes in all views."""
         asked = await read(request, wire.Selection)
 
-        def begin(shown: ShownScene) -> exports.Steps:
+        def begin(shown: ViewerScene) -> exports.Steps:
             scene = shown.answering(asked.variant)
             return exports.masks_zip(scene, checked(scene, asked.groups))
 
@@ -91,7 +91,7 @@ class SavedFiles:
         """Send a film in the colours of the page."""
         asked = await read(request, wire.Film)
 
-        def prepared(shown: ShownScene) -> Callable[..., bytes]:
+        def prepared(shown: ViewerScene) -> Callable[..., bytes]:
             return partial(
                 exports.film,
                 shown.gaussians,
@@ -134,8 +134,8 @@ class SavedFiles:
         asked = await read(request, wire.Page)
         return await self._in_steps(request, lambda shown: html_page(shown, asked, self.static))
 
-    async def _in_steps(self, request: Request, begin: Callable[[ShownScene], exports.Steps]) -> Response:
-        def first(shown: ShownScene) -> tuple[exports.Steps, tuple[int, int]]:
+    async def _in_steps(self, request: Request, begin: Callable[[ViewerScene], exports.Steps]) -> Response:
+        def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
             steps = begin(shown)
             return steps, next(steps)  # raises errors before the response starts
 

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 from starlette.requests import Request
 
-from hilsplat.viewer.shown import ShownScene
-from hilsplat.viewer.witness import StaleSceneError
+from hilsplat.viewer.file_changes import StaleSceneError
+from hilsplat.viewer.viewer_scene import ViewerScene
 
 Made = TypeVar("Made")
 
@@ -20,12 +20,12 @@ Made = TypeVar("Made")
 class SceneThread:
     """A scene and the thread on which all code that reads it runs."""
 
-    def __init__(self, shown: ShownScene) -> None:
+    def __init__(self, shown: ViewerScene) -> None:
         self.shown = shown
         self.worker = ThreadPoolExecutor(1, thread_name_prefix="scene")
         self.behind = asyncio.Lock()
 
-    async def do_behind(self, request: Request, work: Callable[[ShownScene], Made]) -> Made:
+    async def do_behind(self, request: Request, work: Callable[[ViewerScene], Made]) -> Made:
         """Run as `do`, but one at a time, so that interactive requests wait for at most one of these.
 
         For example, the outline requests a hundred crops when the page opens.
@@ -33,7 +33,7 @@ class SceneThread:
         async with self.behind:
             return await self.do(request, work)
 
-    async def do(self, request: Request, work: Callable[[ShownScene], Made]) -> Made:
+    async def do(self, request: Request, work: Callable[[ViewerScene], Made]) -> Made:
         """Run on the scene thread if the page shows the current state of the scene.
 
         A page sends the state that it was loaded with as `of`, so that its cameras, nodes and Gaussians are

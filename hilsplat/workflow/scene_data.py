@@ -86,7 +86,7 @@ class SceneData:
         job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
         files = self.image_files(job) if row.folder is not None else []
         files = [files] if isinstance(files, str) else files
-        for path in [*files, *self.brought(job), *self.features(job)]:
+        for path in [*files, *self.existing_gaussians(job), *self.features(job)]:
             if "{" in path or "}" in path:
                 raise SettingsError(
                     f"{path} of {row.name} cannot be read by the workflow: its name has braces",
@@ -105,7 +105,7 @@ class SceneData:
         """Return the reader of the data set from which a scene's images are exported."""
         return readers_of([self.source_name(job)])
 
-    def brought(self, job: Job) -> list[str]:
+    def existing_gaussians(self, job: Job) -> list[str]:
         """Return the input: a PLY that replaces the fit, and files about its coordinates; usually empty."""
         ply = self.row(job).gaussians
         if ply is None:
@@ -114,12 +114,12 @@ class SceneData:
         described = [beside] if beside.is_file() else self._nerfstudio(job).values()
         return [str(path) for path in (ply, *described)]
 
-    def brought_option(self, job: Job) -> str:
+    def existing_gaussians_option(self, job: Job) -> str:
         """Return the options for such a PLY and nerfstudio's files for it, if any."""
         ply = self.row(job).gaussians
         if ply is None:
             return ""
-        named = {"brought": ply, **self._nerfstudio(job)}
+        named = {"existing": ply, **self._nerfstudio(job)}
         return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
 
     def _nerfstudio(self, job: Job) -> dict[str, Path]:

@@ -43,30 +43,30 @@ def _has_driver() -> bool:
 
 
 @cache
-def choose_device(wanted: Literal["auto", "cpu", "cuda"]) -> Device:
+def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting selects on this machine, and log it the first time.
 
-    Imports torch (1.3 to 3 s) only if `wanted` is not `cpu` and both gsplat and a driver are installed.
+    Imports torch (1.3 to 3 s) only if `requested` is not `cpu` and both gsplat and a driver are installed.
 
     Args:
-        wanted: `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with
-            the CPU (`parity`).
+        requested: `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees
+            with the CPU (`parity`).
 
     Raises:
         DeviceError: if `cuda` was requested and cannot be used. There is no fallback.
     """
-    problem = None if wanted == "cpu" else cuda_problem()
-    if wanted == "cuda" and problem:
+    problem = None if requested == "cpu" else cuda_problem()
+    if requested == "cuda" and problem:
         raise DeviceError(
             "device: cuda was requested but cannot be used",
             expected="a CUDA build of torch that finds a device, and gsplat",
             found=problem,
             fix="pip install 'hilsplat[gpu]' on a machine with a CUDA device, or set device: auto or cpu",
         )
-    if wanted == "auto" and problem is None:
+    if requested == "auto" and problem is None:
         from hilsplat.splat.rasterise.parity import cuda_disagreement  # draws on both devices
 
         problem = cuda_disagreement()
-    device: Device = "cuda" if wanted != "cpu" and not problem else "cpu"
-    logger.info("rasterising on %s (device: %s%s)", device, wanted, f"; {problem}" if problem else "")
+    device: Device = "cuda" if requested != "cpu" and not problem else "cpu"
+    logger.info("rasterising on %s (device: %s%s)", device, requested, f"; {problem}" if problem else "")
     return device

@@ -58,7 +58,7 @@ class OneRowOfPixels(MethodInputs):
             rows_of_views=lambda: list(np.arange(2 * len(views)).reshape(-1, 2)),
             level=level,
             pixels=np.tile(pixels, len(views)),
-            rows_of=lambda wanted: np.flatnonzero(level == int(wanted)),
+            rows_of=lambda requested: np.flatnonzero(level == int(requested)),
             matrix={"A": means}.get,
             means=lambda: np.column_stack([np.arange(WIDTH), np.zeros(WIDTH), np.ones(WIDTH)]).astype(
                 np.float32

@@ -11,7 +11,7 @@ from PIL import Image
 from hilsplat.base.errors import SceneError
 from hilsplat.photos import archive
 from hilsplat.photos.add import add_scene
-from hilsplat.photos.intake import brought_photographs
+from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.sheet import read_sheet
 from tests.unit.photos.test_video import pan, write_video
 
@@ -85,7 +85,7 @@ def test_what_is_in_the_way_stays(tmp_path, sheet):
 
 def test_a_command_that_was_killed_after_it_unpacked_goes_on(tmp_path, sheet):
     made, video = tmp_path / "project/photos/desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20))
-    with brought_photographs(video, made, 10):
+    with prepared_photographs(video, made, 10):
         before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))
     report = add_scene(sheet, "desk", video, frames=10)  # the same again: no frame is taken twice
     assert report.num_readable == 10 and "is there already, from the same files" in str(report)

@@ -206,8 +206,8 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     assert f"nerfstudio's, by {latest}" in report
     (row,) = read_sheet(sheet)
     data = SceneData([row], "", str)
-    assert data.brought(row) == [str(row.gaussians), str(latest), str(folder / "transforms.json")]
-    assert f"--dataparser {latest}" in data.brought_option(row)
+    assert data.existing_gaussians(row) == [str(row.gaussians), str(latest), str(folder / "transforms.json")]
+    assert f"--dataparser {latest}" in data.existing_gaussians_option(row)
 
 
 def test_gaussians_without_known_poses_are_not_taken(tmp_path):
@@ -308,8 +308,8 @@ def test_a_ready_made_ply_is_found_from_the_project_folder(tmp_path):
         ("photos", "fitted", "photos", "desk", "arbitrary", "-"),
         ("photos", "too", "photos", "desk", "arbitrary", ""),
     ]
-    brought, fitted, too = read_sheet(write_sheet(tmp_path, *rows, header=WITH_GAUSSIANS))
-    assert brought.gaussians == tmp_path / "theirs.ply"
+    existing, fitted, too = read_sheet(write_sheet(tmp_path, *rows, header=WITH_GAUSSIANS))
+    assert existing.gaussians == tmp_path / "theirs.ply"
     assert fitted.gaussians is None
     assert too.gaussians is None
 

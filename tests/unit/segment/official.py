@@ -117,14 +117,14 @@ def generate(
                 settings.box_nms_iou,
             )
             found = [found[row] for row in rows]
-        mended, unchanged = [], []
+        cleaned, unchanged = [], []
         for mask, *_ in found:
             mask, holes = without_small_regions(mask, settings.min_area_px, "holes")
             mask, islands = without_small_regions(mask, settings.min_area_px, "islands")
-            mended.append(mask)
+            cleaned.append(mask)
             unchanged.append(float(not (holes or islands)))
-        rows = nms(np.array([box_of(mask) for mask in mended]), np.array(unchanged), settings.box_nms_iou)
-        masks = np.stack([mended[row] for row in rows])
+        rows = nms(np.array([box_of(mask) for mask in cleaned]), np.array(unchanged), settings.box_nms_iou)
+        masks = np.stack([cleaned[row] for row in rows])
         quality = np.array([found[row][1] * np.float64(found[row][2]) for row in rows])
         kept = suppress(masks, quality, settings, thresholds.nms_score)
         results.append((masks[kept], np.array([found[rows[row]][1] for row in kept])))

@@ -38,17 +38,17 @@ def unpacked(candidates: Candidates) -> np.ndarray:
 
 def mend(mask: np.ndarray, min_area_px: int) -> np.ndarray:
     """Small holes filled, then small islands dropped but for the largest; 8-connected."""
-    mended = mask.copy()
+    cleaned = mask.copy()
     _, holes, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=8)
     for label in range(1, len(stats)):
         if stats[label, cv2.CC_STAT_AREA] < min_area_px:
-            mended[holes == label] = True
-    _, islands, stats, _ = cv2.connectedComponentsWithStats(mended.astype(np.uint8), connectivity=8)
+            cleaned[holes == label] = True
+    _, islands, stats, _ = cv2.connectedComponentsWithStats(cleaned.astype(np.uint8), connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
     for label, area in enumerate(areas, start=1):
         if area < min_area_px and label != 1 + areas.argmax():
-            mended[islands == label] = False
-    return mended
+            cleaned[islands == label] = False
+    return cleaned
 
 
 def smooth_logits(count: int, side: int, seed: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.levels import Level
 from hilsplat.segment.candidates import Candidates, candidates_key, crop_boxes, decode_candidates, floors
-from hilsplat.segment.generate import masks_from_candidates, mend_masks
+from hilsplat.segment.generate import clean_masks, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel, Thresholds
 from hilsplat.settings import MasksSettings
@@ -130,9 +130,9 @@ def test_crops_find_finer_masks_and_drop_those_they_cut(model):
             assert not (cut & ~(np.abs(box - [0, 0, 128, 128]) <= 20)).any()
 
 
-def mended(mask: np.ndarray, min_area_px: int) -> tuple[np.ndarray, np.ndarray]:
+def cleaned(mask: np.ndarray, min_area_px: int) -> tuple[np.ndarray, np.ndarray]:
     one = np.ones(1, np.float32)
-    masks, changed = mend_masks(
+    masks, changed = clean_masks(
         HierarchicalMasks.from_dense(mask[None], np.ones(1, np.uint8), one, one), min_area_px
     )
     return masks.dense(), changed
@@ -143,7 +143,7 @@ def test_small_islands_go_and_small_holes_close():
     mask[1:6, 1:6] = True
     mask[3, 3] = False
     mask[7, 7] = True
-    found, changed = mended(mask, min_area_px=4)
+    found, changed = cleaned(mask, min_area_px=4)
     expected = np.zeros((8, 8), dtype=bool)
     expected[1:6, 1:6] = True
     assert changed.tolist() == [True]
@@ -153,8 +153,8 @@ def test_small_islands_go_and_small_holes_close():
 def test_a_mask_that_is_small_as_a_whole_goes():
     mask = np.zeros((8, 8), dtype=bool)
     mask[0, 0] = mask[4, 4] = mask[4, 5] = True
-    assert len(mended(mask, min_area_px=30)[0]) == 0
-    found, changed = mended(mask, min_area_px=2)
+    assert len(cleaned(mask, min_area_px=30)[0]) == 0
+    found, changed = cleaned(mask, min_area_px=2)
     assert (found[0].sum(), changed.tolist()) == (2, [True])
 
 
@@ -162,7 +162,7 @@ def test_a_mask_that_is_small_as_a_whole_goes():
 def test_runs_are_mended_as_pictures_are(mask, min_area_px):
     if not mask.any():
         return
-    found, changed = mended(mask, min_area_px)
+    found, changed = cleaned(mask, min_area_px)
     expected = mend(mask, min_area_px)
     if expected.sum() < min_area_px:
         assert len(found) == 0

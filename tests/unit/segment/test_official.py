@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.canned_sam import CannedSam, NetworkClock
 from hilsplat.segment.candidates import decode_candidates, positive_boxes
-from hilsplat.segment.generate import masks_from_candidates, mend_masks
+from hilsplat.segment.generate import clean_masks, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import HEADS, Frame, SamModel, full_stability, read_logits
 from hilsplat.segment.suppression import suppress_boxes, suppress_boxes_officially
@@ -100,7 +100,7 @@ def test_a_mask_that_is_small_as_a_whole_stays_and_counts_as_changed():
     mask = np.zeros((1, 8, 8), bool)
     mask[0, 2:4, 2:4] = True
     one = np.ones(1, np.float32)
-    masks, changed = mend_masks(HierarchicalMasks.from_dense(mask, np.ones(1, np.uint8), one, one), 10, True)
+    masks, changed = clean_masks(HierarchicalMasks.from_dense(mask, np.ones(1, np.uint8), one, one), 10, True)
     np.testing.assert_array_equal(masks.dense(), mask)
     assert changed.tolist() == [True]
 

@@ -106,7 +106,7 @@ def test_a_fit_does_not_resume_on_another_device(scene, tmp_path, monkeypatch):
         return draw(*arguments, **more, device="cpu")
 
     on_the_cpu = stage("whole.ply")
-    monkeypatch.setattr(fit, "choose_device", lambda wanted: device if wanted == "auto" else wanted)
+    monkeypatch.setattr(fit, "choose_device", lambda requested: device if requested == "auto" else requested)
     monkeypatch.setattr(fit, "draw", drawn)
     monkeypatch.setattr(fit, "fit_step", counted)
     with pytest.raises(KeyboardInterrupt):

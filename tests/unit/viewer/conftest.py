@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.finished_desk import SCENE, build_finished_desk
 
 TOKEN = "secret-of-the-test"
@@ -22,8 +22,8 @@ def built_desk(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def shown(built_desk) -> ShownScene:
-    return ShownScene(built_desk / SCENE)
+def shown(built_desk) -> ViewerScene:
+    return ViewerScene(built_desk / SCENE)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.exports import coco_counts, write_gif
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.scene_thread import SceneThread
-from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
 from tests.unit.viewer.conftest import ADDRESS, TOKEN, in_steps, wire_camera
@@ -404,7 +404,7 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
     later = ("clip", "autoencoder", "field.safetensors*", "models")
     shutil.copytree(whole, growing, ignore=shutil.ignore_patterns(*later))
     shutil.copytree(built_desk / "models", tmp_path / "models")
-    shown = ShownScene(growing)
+    shown = ViewerScene(growing)
     with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}) as client:
         client.get(f"/?token={TOKEN}")
         assert client.get("/api/scene").json()["variants"] == []
@@ -426,19 +426,19 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
 
 
 def test_a_scene_that_is_too_large_is_refused_with_advice(built_desk, monkeypatch):
-    monkeypatch.setattr("hilsplat.viewer.shown.MAX_GAUSSIANS", 100)
+    monkeypatch.setattr("hilsplat.viewer.viewer_scene.MAX_GAUSSIANS", 100)
     with pytest.raises(
         ArtifactError, match=r"too large for the page\n.*at most 100 Gaussians\n.*\n.*max_gaussians"
     ):
-        ShownScene(built_desk / SCENE)
+        ViewerScene(built_desk / SCENE)
 
 
 def test_a_scene_without_gaussians_says_what_to_run(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .* is missing"):
-        ShownScene(tmp_path / "nothing")
+        ViewerScene(tmp_path / "nothing")
     (tmp_path / "scene").mkdir()
     with pytest.raises(ArtifactError, match=r"hilsplat run .*gaussians\.ply"):
-        ShownScene(tmp_path)
+        ViewerScene(tmp_path)
 
 
 def test_a_gif_keeps_the_shades_of_a_small_answer_in_grey_surroundings(tmp_path):

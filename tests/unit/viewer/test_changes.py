@@ -13,8 +13,8 @@ from hilsplat.base.artifacts import atomic_folder
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.shown import ShownScene
-from hilsplat.viewer.witness import Witness
+from hilsplat.viewer.file_changes import FileChanges
+from hilsplat.viewer.viewer_scene import ViewerScene
 from tests.unit.artifact_changes import change_index
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
@@ -31,7 +31,7 @@ def desk(built_desk, tmp_path) -> Path:
 def page(desk) -> Iterator[TestClient]:
     """A page that was loaded and asked something."""
     with TestClient(
-        Viewer(ShownScene(desk)).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}
+        Viewer(ViewerScene(desk)).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}
     ) as client:
         client.get(f"/?token={TOKEN}")
         client.state = load(client)
@@ -149,14 +149,14 @@ def test_an_outline_names_its_tree(page, desk):
 
 
 def test_a_witness_sees_files_come_go_and_be_replaced(tmp_path):
-    witness, file, folder = Witness(), tmp_path / "a.npz", tmp_path / "b"
+    changes, file, folder = FileChanges(), tmp_path / "a.npz", tmp_path / "b"
     file.write_bytes(b"one")
-    witness.note([file, folder])
-    assert witness.changed() == []
+    changes.note([file, folder])
+    assert changes.changed() == []
     made_again(file)
-    assert witness.changed() == [file]
-    witness.note([file])  # what was opened is what counts
-    assert witness.changed() == [file]
+    assert changes.changed() == [file]
+    changes.note([file])  # what was opened is what counts
+    assert changes.changed() == [file]
     folder.mkdir()
     (folder / "index.json").write_text("{}")
-    assert witness.changed() == [file, folder]
+    assert changes.changed() == [file, folder]

@@ -14,14 +14,14 @@ from numba.core.dispatcher import Dispatcher
 from hilsplat.viewer import exports
 from hilsplat.viewer.frames import painted
 from hilsplat.viewer.picking import pick
-from hilsplat.viewer.shown import ShownScene
+from hilsplat.viewer.viewer_scene import ViewerScene
 
 def loops():
     modules = [module for name, module in sys.modules.items() if name.startswith("hilsplat")]
     found = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
     return {(loop.__name__, types) for loop in found for types in loop.signatures}
 
-shown = ShownScene(Path(sys.argv[1]))
+shown = ViewerScene(Path(sys.argv[1]))
 shown.warm_up()
 before = loops()
 scene, camera = shown.answering("default"), shown.scene.cameras["001.png"]

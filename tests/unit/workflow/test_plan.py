@@ -298,11 +298,11 @@ def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
         "results/figures/photos/desk/comparison.png",
         "results/photos/desk/default/names",
     ]
-    wanted = targets.default(plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]))
-    assert "results/figures/synthetic/one/comparison.png" in wanted
-    assert "results/figures/synthetic/two/comparison.png" not in wanted
-    assert "results/figures/synthetic/two/masks.png" in wanted
-    assert "results/tables/lerf.csv" in wanted and "results/figures/sweep-theta.png" in wanted
+    requested = targets.default(plan(tmp_path, sweep_scenes=["one"], theta_variants=["theta"]))
+    assert "results/figures/synthetic/one/comparison.png" in requested
+    assert "results/figures/synthetic/two/comparison.png" not in requested
+    assert "results/figures/synthetic/two/masks.png" in requested
+    assert "results/tables/lerf.csv" in requested and "results/figures/sweep-theta.png" in requested
 
 
 def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
@@ -396,7 +396,7 @@ def test_names_match_themselves_alone():
     assert some(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
 
 
-READY = {"params.truth", "params.option", "params.brought", "params.absent", "params.poses"}
+READY = {"params.truth", "params.option", "params.existing", "params.absent", "params.poses"}
 READY |= {"resources.mem_mib", "threads"}
 """What commands take unquoted: options that the plan has quoted, and numbers."""
 

@@ -117,8 +117,8 @@ def test_networks_ask_for_a_gpu_with_onnxruntimes_gpu_build(
 
 def test_a_ply_that_replaces_the_fit_says_how_many_gaussians_there_are(tmp_path):
     header = b"ply\nformat binary_little_endian 1.0\nelement vertex 812430\nproperty float x\nend_header\n"
-    (tmp_path / "brought.ply").write_bytes(header + bytes(10))
-    assert vertex_count(tmp_path / "brought.ply") == 812_430
+    (tmp_path / "existing.ply").write_bytes(header + bytes(10))
+    assert vertex_count(tmp_path / "existing.ply") == 812_430
     (tmp_path / "other.ply").write_bytes(b"element vertexes 3")
     assert vertex_count(tmp_path / "other.ply") is None and vertex_count(tmp_path / "none.ply") is None
 

@@ -14,9 +14,9 @@ from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.brought import bring_gaussians
 from hilsplat.splat.coordinates import write_source_ply
 from hilsplat.splat.fit import run_gaussians
+from hilsplat.splat.import_gaussians import import_gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.splat.similarity import move_gaussians
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians, three_gaussians_scene
@@ -42,11 +42,11 @@ def source_ply(turned_scene, tmp_path) -> Path:
 
 
 def test_source_coordinates_become_the_scenes(turned_scene, source_ply):
-    brought, origin = bring_gaussians(source_ply, turned_scene)
+    existing, origin = import_gaussians(source_ply, turned_scene)
     truth = three_gaussians()
     for name in ("means", "log_scales", "opacity_logits", "sh"):
-        np.testing.assert_allclose(getattr(brought, name), getattr(truth, name), atol=1e-5)
-    assert mean_psnr(turned_scene, brought) > 45
+        np.testing.assert_allclose(getattr(existing, name), getattr(truth, name), atol=1e-5)
+    assert mean_psnr(turned_scene, existing) > 45
     assert origin["kind"] == "imported"
     assert origin["taken_as"] == "in the coordinates of the scene's source"
 
@@ -64,7 +64,7 @@ def test_the_stage_reports_on_brought_gaussians_without_a_fit(
         GaussiansSettings(),
         0,
         1,
-        brought=source_ply,
+        existing=source_ply,
     )
     report = read_json(out / "report" / "report.json")
     assert report["origin"]["kind"] == "imported"
@@ -75,7 +75,7 @@ def test_the_stage_reports_on_brought_gaussians_without_a_fit(
     assert not (out / "report" / "curves.png").exists()
     assert (out / "report" / "flyaround.png").is_file()
     assert read_json(out / "g.json")["origin"]["kind"] == "imported"
-    # the written PLY and its JSON lead back to where the brought one was
+    # the written PLY and its JSON lead back to where the existing one was
     again = move_gaussians(load_ply(out / "g.ply"), np.array(read_json(out / "g.json")["source_from_scene"]))
     np.testing.assert_allclose(again.means, load_ply(source_ply).means, atol=1e-4)
 
@@ -84,23 +84,25 @@ def test_gaussians_elsewhere_are_reported(turned_scene, tmp_path):
     save_ply(tmp_path / "elsewhere.ply", three_gaussians())
     out = tmp_path / "out"
     settings = GaussiansSettings()
-    brought = tmp_path / "elsewhere.ply"
-    run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, brought=brought)
+    existing = tmp_path / "elsewhere.ply"
+    run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, existing=existing)
     assert "other coordinates" in read_json(out / "r" / "report.json")["warnings"][0]
 
 
 def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, source_ply, tmp_path):
-    out = tmp_path / "first"
+    out = tmp_path / "1"
     settings = GaussiansSettings()
-    run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, brought=source_ply)
-    again, origin = bring_gaussians(out / "g.ply", turned_scene)
+    run_gaussians(
+        turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, existing=source_ply
+    )
+    again, origin = import_gaussians(out / "g.ply", turned_scene)
     np.testing.assert_allclose(again.means, three_gaussians().means, atol=1e-5)
     assert "JSON" in origin["taken_as"]
     shutil.copyfile(source_ply, out / "g.ply")
     with pytest.raises(ArtifactError, match="belongs to another PLY"):
-        bring_gaussians(out / "g.ply", turned_scene)
+        import_gaussians(out / "g.ply", turned_scene)
     write_json(out / "g.json", {"something": "else"})
-    again, origin = bring_gaussians(out / "g.ply", turned_scene)
+    again, origin = import_gaussians(out / "g.ply", turned_scene)
     assert "JSON" not in origin["taken_as"]
 
 
@@ -137,10 +139,10 @@ def nerfstudio_run(folder: Path, how: str) -> tuple[np.ndarray, dict[str, Path]]
 def test_nerfstudios_ply_is_as_sharp_as_its_source(turned_scene, source_ply, tmp_path, how):
     training_from_source, files = nerfstudio_run(tmp_path / "run", how)
     save_ply(tmp_path / "splat.ply", move_gaussians(load_ply(source_ply), training_from_source))
-    brought, origin = bring_gaussians(tmp_path / "splat.ply", turned_scene, **files)
-    direct, _ = bring_gaussians(source_ply, turned_scene)
-    np.testing.assert_allclose(brought.means, direct.means, atol=1e-5)
-    assert mean_psnr(turned_scene, brought) == pytest.approx(mean_psnr(turned_scene, direct), abs=0.01)
+    existing, origin = import_gaussians(tmp_path / "splat.ply", turned_scene, **files)
+    direct, _ = import_gaussians(source_ply, turned_scene)
+    np.testing.assert_allclose(existing.means, direct.means, atol=1e-5)
+    assert mean_psnr(turned_scene, existing) == pytest.approx(mean_psnr(turned_scene, direct), abs=0.01)
     assert "nerfstudio" in origin["taken_as"]
 
 
@@ -152,13 +154,20 @@ def test_a_damaged_record_of_nerfstudio_is_named(turned_scene, source_ply, tmp_p
     path = tmp_path / "dataparser_transforms.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(SceneError, match=r"dataparser_transforms\.json"):
-        bring_gaussians(source_ply, turned_scene, path)
+        import_gaussians(source_ply, turned_scene, path)
 
 
 def test_exported_gaussians_are_in_the_sources_coordinates(turned_scene, source_ply, tmp_path):
     out = tmp_path / "out"
     run_gaussians(
-        turned_scene.folder, out / "g.ply", out / "r", tmp_path, GaussiansSettings(), 0, 1, brought=source_ply
+        turned_scene.folder,
+        out / "g.ply",
+        out / "r",
+        tmp_path,
+        GaussiansSettings(),
+        0,
+        1,
+        existing=source_ply,
     )
     assert write_source_ply(out / "g.ply", tmp_path / "exported.ply") == len(three_gaussians())
     exported, theirs = load_ply(tmp_path / "exported.ply"), load_ply(source_ply)
@@ -233,6 +242,6 @@ def test_what_cannot_be_used_is_named(turned_scene, source_ply, tmp_path, change
     path = tmp_path / "broken.ply"
     PlyData([PlyElement.describe(table, "vertex")]).write(path)
     with pytest.raises(ArtifactError, match=message) as caught:
-        bring_gaussians(path, turned_scene)
+        import_gaussians(path, turned_scene)
     assert "broken.ply" in str(caught.value)
     assert "column gaussians" in str(caught.value)

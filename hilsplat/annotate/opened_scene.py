@@ -9,7 +9,7 @@ from hilsplat.annotate.clicks import Clicks
 from hilsplat.annotate.proposals import Proposals
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.scene import Scene
-from hilsplat.viewer.witness import Witness
+from hilsplat.viewer.file_changes import FileChanges
 
 
 class OpenedScene:
@@ -32,7 +32,7 @@ class OpenedScene:
                 expected="results/<dataset>/<scene> of a run, or a copy of it",
                 fix=f"hilsplat run {self.photographs}",
             )
-        self.state, self._witness = secrets.token_hex(4), Witness()
+        self.state, self._witness = secrets.token_hex(4), FileChanges()
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
         self._witness.note((self.photographs, folder / "gaussians.ply", *proposing))
         self.scene = Scene.load(self.photographs)

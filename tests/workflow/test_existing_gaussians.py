@@ -22,7 +22,7 @@ def three_gaussians(seed: int) -> Gaussians:
 
 
 @pytest.fixture
-def brought(project: Path, tmp_path: Path) -> Project:
+def existing(project: Path, tmp_path: Path) -> Project:
     """A project whose tiny scene comes with three Gaussians."""
     copy = copy_project(project, tmp_path / "project", results=False)
     save_ply(copy.root / "their things" / "three.ply", three_gaussians(seed=0))
@@ -37,25 +37,25 @@ def brought(project: Path, tmp_path: Path) -> Project:
     return copy
 
 
-def test_brought_gaussians_take_the_place_of_a_fit(brought: Project) -> None:
-    brought.snakemake("--keep-going", f"{SCENE}/gaussians.ply")
-    report = json.loads((brought.root / SCENE / "gaussians/report.json").read_text())
+def test_brought_gaussians_take_the_place_of_a_fit(existing: Project) -> None:
+    existing.snakemake("--keep-going", f"{SCENE}/gaussians.ply")
+    report = json.loads((existing.root / SCENE / "gaussians/report.json").read_text())
     assert report["origin"]["kind"] == "imported"
     assert report["origin"]["file"] == "three.ply"
     assert report["gaussians"] == 3
     assert report["warnings"]  # three random Gaussians do not show the scene
-    coordinates = json.loads((brought.root / SCENE / "gaussians.json").read_text())
+    coordinates = json.loads((existing.root / SCENE / "gaussians.json").read_text())
     assert coordinates["ply"] == "gaussians.ply"
-    provenance = json.loads((brought.root / f"{SCENE}/gaussians.ply.provenance.json").read_text())
-    assert provenance["inputs"]["brought"]["path"].endswith("their things/three.ply")
+    provenance = json.loads((existing.root / f"{SCENE}/gaussians.ply.provenance.json").read_text())
+    assert provenance["inputs"]["existing"]["path"].endswith("their things/three.ply")
     # other Gaussians rerun the stage
-    save_ply(brought.root / "their things/three.ply", three_gaussians(seed=1))
-    assert "rule gaussians:" in brought.snakemake("-n", f"{SCENE}/gaussians.ply").stdout
+    save_ply(existing.root / "their things/three.ply", three_gaussians(seed=1))
+    assert "rule gaussians:" in existing.snakemake("-n", f"{SCENE}/gaussians.ply").stdout
 
 
-def test_a_lost_ply_stops_the_run_at_once(brought: Project) -> None:
-    (brought.root / "their things/three.ply").unlink()
-    result = brought.snakemake("-n", check=False)
+def test_a_lost_ply_stops_the_run_at_once(existing: Project) -> None:
+    (existing.root / "their things/three.ply").unlink()
+    result = existing.snakemake("-n", check=False)
     assert result.returncode != 0
     assert "column gaussians" in result.stdout + result.stderr
     assert "Traceback" not in result.stderr

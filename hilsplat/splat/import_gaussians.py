@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians of the scene sheet"
 
 
-def bring_gaussians(
+def import_gaussians(
     ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.

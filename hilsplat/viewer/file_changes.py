@@ -14,7 +14,7 @@ class StaleSceneError(ArtifactError):
     """A part of the scene was rewritten since it was opened."""
 
 
-class Witness:
+class FileChanges:
     """States of artifacts from before they were opened.
 
     Writers always replace the whole file, so `stat` detects a rewritten file without reading it. A folder's

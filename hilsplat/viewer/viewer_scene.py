@@ -24,9 +24,9 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
+from hilsplat.viewer.file_changes import FileChanges
 from hilsplat.viewer.frames import Paint
 from hilsplat.viewer.wire import Style
-from hilsplat.viewer.witness import Witness
 
 VIEWS_MIB = 256.0
 """Memory limit for cached results of views, such as their compositing weights."""
@@ -40,7 +40,7 @@ MAX_GAUSSIANS = 4_000_000
 logger = logging.getLogger(__name__)
 
 
-class ShownScene:
+class ViewerScene:
     """The existing parts of a scene. Not thread-safe: use it and all objects it returns on one thread.
 
     Args:
@@ -54,7 +54,7 @@ class ShownScene:
 
     def __init__(self, folder: Path, variant: str = "default", threads: int = 1) -> None:
         self.folder, self.first, self.threads = Path(folder), variant, threads
-        self.opened, self.witness = Opened(), Witness()
+        self.opened, self.changes = Opened(), FileChanges()
         self.state = secrets.token_hex(4)
         """Identifier of this opening of the scene."""
         ply = self.folder / "gaussians.ply"
@@ -69,7 +69,7 @@ class ShownScene:
             raise ArtifactError(
                 f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"hilsplat run {ply}"
             )
-        self.witness.note((self.folder / "scene", ply))
+        self.changes.note((self.folder / "scene", ply))
         self.scene: Scene = self.opened.get(Scene.load, self.folder / "scene")
         self.gaussians: Gaussians = self.opened.get(load_ply, ply)
         if len(self.gaussians) > MAX_GAUSSIANS:
@@ -89,7 +89,7 @@ class ShownScene:
 
     def changed(self) -> list[str]:
         """Return opened parts that were rewritten or deleted; the page still shows what was opened."""
-        return sorted({path.name for path in self.witness.changed()})
+        return sorted({path.name for path in self.changes.changed()})
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -98,16 +98,16 @@ class ShownScene:
         Raises:
             StaleSceneError: a part was rewritten before or during the read.
         """
-        with self.witness.unchanged(self.scene.name):
+        with self.changes.unchanged(self.scene.name):
             yield
 
-    def opened_again(self) -> "ShownScene":
+    def opened_again(self) -> "ViewerScene":
         """Open the scene again, as it is on disk now.
 
         Raises:
             ArtifactError: as in the constructor.
         """
-        return ShownScene(self.folder, self.first, self.threads)
+        return ViewerScene(self.folder, self.first, self.threads)
 
     # -- variants ---------------------------------------------------------------------------------
 
@@ -134,7 +134,7 @@ class ShownScene:
                 )
             with self.unchanged():
                 found = FinishedScene.locate(self.folder, variant)
-                self.witness.note(found.parts.as_inputs().values())
+                self.changes.note(found.parts.as_inputs().values())
                 opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
                 self._trees[variant] = tree_digest(found.parts.semantic_tree)[:16]
             if len(opened.tree) > payload.MAX_NODES:
