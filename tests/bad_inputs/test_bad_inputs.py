@@ -596,7 +596,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.what)
-def test_bad_input_is_told_and_nothing_is_lost(row: Row, project: Path, told: Callable[..., str]) -> None:
+def test_bad_input_is_reported_and_nothing_is_lost(row: Row, project: Path, told: Callable[..., str]) -> None:
     row.lay()
     before = snapshot(project)
     text = told(row.command)
@@ -611,7 +611,7 @@ def test_bad_input_is_told_and_nothing_is_lost(row: Row, project: Path, told: Ca
 
 @pytest.mark.skipif(cuda_problem() is None, reason="this machine has CUDA")
 @pytest.mark.parametrize("section", ["gaussians", "contributions"])
-def test_a_device_that_is_not_here_is_told(section: str, project: Path, told: Callable[..., str]) -> None:
+def test_a_device_that_is_not_here_is_reported(section: str, project: Path, told: Callable[..., str]) -> None:
     assert f"{section}.device" in told(plan(**{section: {"device": "cuda"}}))
 
 

@@ -85,7 +85,7 @@ STAGES = {
 
 
 @pytest.mark.parametrize("case", STAGES)
-def test_a_full_disk_is_told_and_costs_nothing(case: str, disk: Path, told: Callable[..., str]) -> None:
+def test_a_full_disk_is_reported_and_costs_nothing(case: str, disk: Path, told: Callable[..., str]) -> None:
     command, kib = STAGES[case]
     out = Path("disk") / case.partition(",")[0]
     if out.suffix:
@@ -113,9 +113,7 @@ def test_a_full_disk_is_told_and_costs_nothing(case: str, disk: Path, told: Call
     assert not list(disk.rglob(".writing-*"))
 
 
-def test_a_disk_that_can_only_be_read_is_told_with_the_file_of_the_person(
-    disk: Path, told: Callable[..., str]
-) -> None:
+def test_a_read_only_disk_is_reported_with_the_users_file(disk: Path, told: Callable[..., str]) -> None:
     shutil.copy("config/scenes.tsv", disk)
     textured(Path("photos"))
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)

@@ -177,7 +177,7 @@ def test_the_next_thing_does_not_inherit_a_name(page, root):
     assert page.get_by_role("status").inner_text() == ""
 
 
-def test_a_scene_that_was_made_anew_is_told(opened, desk, root, tmp_path_factory):
+def test_a_scene_that_was_rewritten_is_reported(opened, desk, root, tmp_path_factory):
     project = tmp_path_factory.mktemp("changing")
     shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
     folder = project / desk.relative_to(desk.parents[2])
@@ -212,7 +212,7 @@ def test_things_are_carried_into_the_next_photograph(page, root):
     assert (found & expected).sum() / (found | expected).sum() > 0.75
 
 
-def test_what_somebody_else_saved_meanwhile_is_not_overwritten(page, opened, root):
+def test_concurrent_changes_are_not_overwritten(page, opened, root):
     opened.expected.append("412 (Precondition Failed)")
     draw_mug(page)
     path = label_path(root / "annotated/photos/desk", "000.png")

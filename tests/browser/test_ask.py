@@ -66,7 +66,7 @@ def test_a_query_typed_before_the_tree_is_loaded_runs_when_it_is(opened, desk_ad
 
 
 @both
-def test_doubts_are_told(opened, desk_address, painter):
+def test_doubts_are_reported(opened, desk_address, painter):
     page = opened(desk_address, painter)
     page.locator("#text").fill("unicorn")
     page.keyboard.press("Enter")
@@ -165,7 +165,7 @@ def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
     assert page.locator("#answers li").first.get_attribute("data-node") == str(expected)
 
 
-def test_a_picture_or_a_frame_drawn_over_the_view_is_asked_for(opened, desk_address, scene, tmp_path):
+def test_an_image_or_a_frame_drawn_over_the_view_is_requested(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
     write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
@@ -316,7 +316,7 @@ def test_escape_and_letters_do_not_act_while_somebody_types(opened, desk_address
     assert page.get_by_role("dialog", name="Keys").is_visible()
 
 
-def test_a_scene_that_was_made_anew_is_told_and_loaded_again_without_the_old_choice(
+def test_a_scene_that_was_rewritten_is_reported_and_loaded_again_without_the_old_choice(
     opened, desk, tmp_path_factory
 ):
     project = tmp_path_factory.mktemp("changing")

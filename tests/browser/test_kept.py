@@ -60,7 +60,7 @@ def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_ad
     assert chips(page).count() == 1
 
 
-def test_what_two_queries_have_in_common_is_told(opened, desk_address):
+def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
     page = opened(desk_address)
     keep(page, "mug")
     ask(page, "mug > handle")

@@ -66,7 +66,7 @@ def test_nothing_is_drawn_while_nothing_changes(opened, cloud_address):
     assert page.locator("#view").get_attribute("data-drawn") == before
 
 
-def test_a_scene_without_answers_says_that_the_run_goes_on(opened, cloud_address):
+def test_a_scene_without_answers_says_that_it_is_not_finished(opened, cloud_address):
     page = opened(cloud_address)
     assert "The run goes on" in page.get_by_role("status").inner_text()
     assert not page.get_by_role("tree").is_visible()

@@ -68,7 +68,7 @@ def test_of_what_is_alike_the_first_five_are_painted(opened, desk_address, scene
     assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
 
 
-def test_a_caution_about_words_is_not_told_of_names_and_likeness(opened, desk_address):
+def test_names_and_likeness_get_no_caution_about_words(opened, desk_address):
     page = opened(desk_address, "server")
     shown = "own.showAnswers({ caution: 'no word means anything' }, ANSWER, {})"
     said = "document.getElementById('caution').hidden || document.getElementById('caution').textContent"
@@ -95,7 +95,7 @@ def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened,
     assert button.evaluate(f"(each) => {marks}") == ["rgb(255, 138, 31)", "rgb(255, 255, 255)"]
 
 
-def test_masks_are_saved_step_by_step_and_the_size_is_told(opened, desk_address):
+def test_masks_are_saved_step_by_step_and_the_size_is_reported(opened, desk_address):
     page = opened(desk_address, "server")
     page.locator("#view").focus()
     ask(page, "mug > handle")

@@ -15,7 +15,7 @@ def test_a_kill_costs_what_no_cache_kept_and_the_way_to_the_first_view() -> None
     assert (keeps_nothing.lost_s, keeps_nothing.lost_cpu_s) == (10, 5)
 
 
-def test_every_other_byte_of_a_table_and_every_unfinished_file_is_told(tmp_path: Path) -> None:
+def test_every_other_byte_of_a_table_and_every_unfinished_file_is_reported(tmp_path: Path) -> None:
     projects = []
     for name in ("undisturbed", "disturbed"):
         tables = tmp_path / name / "results/tables"

@@ -250,7 +250,7 @@ def copied(desk, tmp_path) -> Path:
     return shutil.copytree(desk, tmp_path / "results/photos/desk")
 
 
-def test_a_tree_that_was_made_anew_is_told_and_proposes_nothing_until_a_reload(copied, labels):
+def test_a_tree_that_was_rewritten_is_reported_and_proposes_nothing_until_a_reload(copied, labels):
     client = opened(copied, labels)
     of = {"of": client.get("/api/scene").json()["of"]}
     assert client.get("/api/changes").json() == {**of, "changed": []}
@@ -281,7 +281,7 @@ def test_nothing_is_drawn_on_photographs_of_before(copied, labels):
     assert put(client, 0, [MUG], "none").status_code == 200
 
 
-def test_a_run_that_goes_on_brings_proposals_after_a_reload(copied, labels):
+def test_a_running_workflow_adds_proposals_after_a_reload(copied, labels):
     tree = copied / "default/semantic_tree"
     shutil.move(tree, copied / "later")
     client = opened(copied, labels)

@@ -15,7 +15,7 @@ from hilsplat.base.arrays import read_into
 from hilsplat.base.errors import ArtifactError, DiskSpaceError
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     artifacts.write_text(path, "old")
     with pytest.raises(RuntimeError), artifacts.atomic_path(path) as temporary:
@@ -86,7 +86,7 @@ def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_on
     assert flushed[4:] == [str(new), str(tmp_path)]
 
 
-def test_a_full_disk_is_told_with_the_file_and_the_way_out(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_with_the_file_and_the_way_out(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     with (
         pytest.raises(DiskSpaceError, match=r"no space left while writing a\.txt in .*\n.*MiB free of"),
@@ -193,7 +193,7 @@ def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, m
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [cache.path(key)]
 
 
-def test_an_entry_that_another_node_prunes_meanwhile_is_still_read(tmp_path: Path, monkeypatch) -> None:
+def test_an_entry_that_another_node_prunes_is_still_read(tmp_path: Path, monkeypatch) -> None:
     cache, key = artifacts.ViewCache(tmp_path), "abc"
     cache.get(key, lambda: {"x": np.arange(3)})
     read = artifacts.read_npz
@@ -228,7 +228,7 @@ def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:
     assert artifacts.sha256_of_path(folder) != first
 
 
-def test_arrays_of_another_version_are_told_from_ours(tmp_path):
+def test_arrays_of_another_version_are_recognised(tmp_path):
     @dataclass
     class Pair:
         left: np.ndarray

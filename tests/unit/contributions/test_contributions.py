@@ -246,7 +246,7 @@ def test_a_resumed_run_writes_the_same_bytes(two_boxes_contributions):
     assert sha256_of_path(out) == before
 
 
-def test_a_killed_run_goes_on_from_its_checkpoint(two_boxes, monkeypatch):
+def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, monkeypatch):
     settings = ContributionsSettings(keep="gram")
     folder = two_boxes.folder
     arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
@@ -287,7 +287,7 @@ def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, monke
 
 
 @pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
-def test_a_builder_goes_on_from_its_state(keep, monkeypatch):
+def test_a_builder_resumes_from_its_state(keep, monkeypatch):
     parts = []
     for seed in range(3):
         raw, masks = random_view(seed)

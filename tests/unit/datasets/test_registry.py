@@ -114,7 +114,7 @@ def test_the_command_checks_scenes(data_root):
     assert "lerf_ovs: missing: ramen, teatime, waldo_kitchen" in output
 
 
-def test_the_command_fails_on_a_scene_that_cannot_be_read_and_goes_on(data_root):
+def test_the_command_fails_on_a_scene_that_cannot_be_read_and_resumes(data_root):
     (data_root / "lerf_ovs" / "ramen" / "images").mkdir(parents=True)
     code, output, _ = run("check", "lerf_ovs", "--data-root", data_root)
     assert code == 1

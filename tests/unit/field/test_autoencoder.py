@@ -136,7 +136,7 @@ def test_the_compiled_layers_are_products_with_relu_between_them(rows, widths):
     assert np.array_equal(packed.through(given)[rows // 2 :], packed.through(given[rows // 2 :]))
 
 
-def test_weights_that_are_missing_are_told(tmp_path):
+def test_weights_that_are_missing_are_reported(tmp_path):
     model = Autoencoder.drawn(16, 3, torch_generator(0))
     del model.arrays["encoder.4.running_var"]
     model.save(autoencoder_file(tmp_path))

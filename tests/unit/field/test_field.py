@@ -361,7 +361,7 @@ def test_the_literal_trainer_lowers_its_loss_and_is_the_same_on_any_number_of_th
     assert LanguageField.load(out).features.shape == (96, 3, 3)
 
 
-def test_a_field_goes_on_from_another_one(flat_boxes):
+def test_a_field_resumes_from_another_one(flat_boxes):
     world, contributions, autoencoder = flat_boxes
     first, out = (world.folder / name / "field.safetensors" for name in ("first", "second"))
     literal_field(

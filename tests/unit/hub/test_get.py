@@ -37,7 +37,7 @@ def files_of(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-def test_without_a_name_the_recommended_pair_arrives_and_is_used(hub, repositories, caplog):
+def test_without_a_name_the_recommended_pair_is_fetched_and_used(hub, repositories, caplog):
     caplog.set_level(logging.INFO)
     hub.repositories["onnx-community/sam2.1-hiera-small-ONNX"] = repositories[SAM]
     target = Path("models/sam2.1-hiera-small")
@@ -153,7 +153,7 @@ def test_other_bytes_than_the_hub_states_are_refused_and_deleted(hub, repositori
     assert visible() == ["sam-vit-base"]
 
 
-def test_a_disk_that_is_too_small_is_told_before_the_transfer(hub, monkeypatch):
+def test_a_disk_that_is_too_small_is_reported_before_the_transfer(hub, monkeypatch):
     monkeypatch.setattr(get.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 100_000_000})())
     with pytest.raises(
         DiskSpaceError, match=r"disk of models\n  expected  0\.2 GB free\n  found     0\.1 GB"
@@ -316,7 +316,7 @@ def test_offline_the_message_says_which_files_to_put_where(hub, monkeypatch):
     assert hub.asked == []
 
 
-def test_a_hub_out_of_reach_is_told_after_a_few_tries(hub, monkeypatch, waits):
+def test_a_hub_out_of_reach_is_reported_after_a_few_tries(hub, monkeypatch, waits):
     point_at("http://127.0.0.1:9", monkeypatch)
     with pytest.raises(
         DownloadError, match=r"no way to http://127.0.0.1:9/Xenova(.|\n)*refused(.|\n)*HTTPS_PROXY"

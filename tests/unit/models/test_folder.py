@@ -92,7 +92,7 @@ def test_variants_are_those_that_all_networks_have(sam):
         open_model_folder(sam, variant="q4")
 
 
-def test_pytorch_weights_are_told_to_be_exported(sam):
+def test_pytorch_weights_must_be_exported(sam):
     shutil.rmtree(sam / "onnx")
     (sam / "model.safetensors").touch()
     with pytest.raises(ModelError, match=r"PyTorch's weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"):
@@ -103,7 +103,7 @@ def test_pytorch_weights_are_told_to_be_exported(sam):
     ("model_type", "words"),
     [("siglip2", "variable resolution"), ("sam3", "take SAM 2.1"), ("blip", "docs/models.md")],
 )
-def test_other_models_are_told_what_can_be_read(sam, model_type, words):
+def test_the_error_for_other_models_lists_readable_ones(sam, model_type, words):
     (sam / "config.json").write_text(json.dumps({"model_type": model_type}))
     with pytest.raises(ModelError, match=rf"SAM 2 or 2.1 \(sam2\)(.|\n)*{model_type}(.|\n)*{words}"):
         open_model_folder(sam)

@@ -51,19 +51,19 @@ def test_a_moving_camera_raises_no_doubt(moving):
     assert doubts_of(moving) == []
 
 
-def test_few_photographs_are_told(moving):
+def test_few_photographs_are_reported(moving):
     (doubt,) = doubts_of(moving[:9])
     assert doubt.startswith("only 9 photographs: take 20 or more")
 
 
-def test_a_camera_that_turns_in_place_is_told_with_its_evidence(moving):
+def test_a_camera_that_turns_in_place_is_reported_with_its_evidence(moving):
     (doubt,) = doubts_of(turning(moving[0], np.linspace(-8, 8, 10)))
     assert "turn in place: a rotation explains 9 of the 9 pairs" in doubt
     assert "walk around the scene" in doubt
     assert doubts_of(turning(moving[0], np.linspace(-8, 8, 10)), have_poses=True) == []
 
 
-def test_a_camera_that_also_moves_is_not_told_to_move(moving):
+def test_a_moving_camera_gets_no_advice_to_move(moving):
     assert doubts_of([*turning(moving[0], np.linspace(-4, 4, 5)), *moving]) == []
 
 
@@ -88,7 +88,7 @@ def test_photographs_from_one_place_are_named(moving):
     )
 
 
-def test_sizes_and_lenses_that_differ_are_told_but_not_a_turned_camera(moving):
+def test_different_sizes_and_lenses_are_reported_but_not_a_turned_camera(moving):
     assert doubts_of(moving, sizes=[(480, 640)] * 6 + [(640, 480)] * 6) == []
     (sizes,) = doubts_of(moving, sizes=[(480, 640)] * 6 + [(600, 800)] * 6)
     assert sizes.startswith("2 sizes of photographs (800 x 600, 640 x 480)")

@@ -83,7 +83,7 @@ def test_what_is_in_the_way_stays(tmp_path, sheet):
     assert len(list(mine.iterdir())) == 1
 
 
-def test_a_command_that_was_killed_after_it_unpacked_goes_on(tmp_path, sheet):
+def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):
     made, video = tmp_path / "project/photos/desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20))
     with prepared_photographs(video, made, 10):
         before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))

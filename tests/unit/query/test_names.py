@@ -110,7 +110,7 @@ def test_names_of_another_tree_wait_until_it_is_back(desk, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a > b", "x" * 81, "\x07"])
-def test_a_name_that_cannot_be_asked_for_is_refused(desk, name):
+def test_a_name_that_cannot_be_requested_is_refused(desk, name):
     with pytest.raises(SettingsError, match="cannot be a name"):
         name_nodes(desk, {0: name})
 

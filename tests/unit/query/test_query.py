@@ -208,7 +208,7 @@ def test_what_holds_no_likely_first_thing_does_not_compete(scene, three_wholes, 
     assert hits.ids.tolist() == [NODE[found]]
 
 
-def test_where_nothing_likely_holds_an_answer_everything_is_searched_and_told(scene, three_wholes):
+def test_if_no_likely_node_has_an_answer_all_are_searched_and_reported(scene, three_wholes):
     # B top, the best whole, holds nothing, and all else is further below it than a quarter of the range
     margin = of_path({"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
     hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
@@ -519,7 +519,7 @@ def test_latents_rendered_at_once_have_the_bytes_of_each_level_alone(scene):
         assert latents.tobytes() == ((weights[pixels] @ own) / share[pixels, None]).tobytes()
 
 
-def test_a_view_that_is_forgotten_is_computed_anew_with_the_same_answers(scene):
+def test_a_view_that_is_forgotten_is_computed_again_with_the_same_answers(scene):
     asked = []
     weights = lambda view: asked.append(view) or scene.pixel_weights(view)  # noqa: E731
     own = replace(scene, pixel_weights=weights, _views=ViewStore())

@@ -159,7 +159,7 @@ def test_a_mask_that_is_small_as_a_whole_goes():
 
 
 @given(hnp.arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))), st.integers(1, 12))
-def test_runs_are_mended_as_pictures_are(mask, min_area_px):
+def test_runs_are_cleaned_like_images(mask, min_area_px):
     if not mask.any():
         return
     found, changed = cleaned(mask, min_area_px)

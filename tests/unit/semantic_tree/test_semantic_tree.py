@@ -137,7 +137,7 @@ def test_second_run_writes_the_same_bytes(tree_of_boxes):
     assert sha256_of_path(out) == before
 
 
-def test_more_views_asked_for_than_there_are_leave_an_empty_tree(two_boxes_contributions, caplog):
+def test_more_views_requested_than_there_are_leave_an_empty_tree(two_boxes_contributions, caplog):
     world, contributions = two_boxes_contributions
     out = world.folder / "empty"
     run_semantic_tree(contributions, world.masks, out, SemanticTreeSettings(min_views=5))

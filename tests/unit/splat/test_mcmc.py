@@ -95,7 +95,7 @@ def test_a_relocated_gaussian_leaves_the_picture_as_it_was():
     assert after.sum() == pytest.approx(before.sum(), rel=0.05)
 
 
-def test_the_dead_move_onto_the_living_and_moments_begin_anew():
+def test_dead_gaussians_move_onto_living_ones_and_moments_are_reset():
     adam = Adam.start(some_gaussians([0.9, 0.004, 0.5, 0.001]))
     for table in (adam.first, adam.second):
         for values in table.values():

@@ -46,7 +46,7 @@ def test_an_unknown_stage_of_training_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_recipe_writes_both_models_and_goes_on_from_its_cache(tmp_path):
+def test_the_recipe_writes_both_models_and_resumes_from_its_cache(tmp_path):
     small = TrainingSettings(
         scenes=4, views=1, validation_scenes=2, sam_minutes=0, sam_steps=2, clip_minutes=0, clip_steps=2,
         segmented_views=1,

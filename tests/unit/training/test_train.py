@@ -64,7 +64,7 @@ def test_a_killed_training_ends_with_the_weights_of_an_uninterrupted_one(tmp_pat
     assert np.array_equal(weights_of(whole), weights_of(resumed))
 
 
-def test_a_finished_training_goes_on_as_if_it_had_been_longer(tmp_path):
+def test_a_finished_training_resumes_as_if_it_had_been_longer(tmp_path):
     views = drawn_views(2, 64)
     tuning = Tuning(peak=2e-3, warmup=2, measure_every=100, save_every=100)
     longer = train_sam(views, views, Budget(steps=8), 3, tmp_path / "a", **WINDOWS, tuning=tuning)

@@ -251,7 +251,7 @@ def test_a_person_is_answered_between_the_steps_of_a_file(shown):
     assert order == ["step 0", "click", "step 1", "step 2"]
 
 
-def test_films_have_the_frames_that_were_asked_for(client, tmp_path):
+def test_films_have_the_frames_that_were_requested(client, tmp_path):
     told, data = in_steps(client, "film", frames=6, side_px=64)
     assert told == [(made, 6) for made in range(7)]
     (tmp_path / "film.mp4").write_bytes(data)
@@ -280,7 +280,7 @@ def encoded_frame(client, camera, size_hw) -> np.ndarray:
 
 
 @pytest.mark.parametrize("side_px", [64, 96])
-def test_a_gif_has_every_other_frame_in_the_size_that_was_asked_for(client, side_px):
+def test_a_gif_has_every_other_frame_in_the_size_that_was_requested(client, side_px):
     told, data = in_steps(client, "film", frames=7, side_px=side_px, format="gif")
     assert told == [(made, 4) for made in range(5)]
     gif = Image.open(io.BytesIO(data))
@@ -305,7 +305,7 @@ def test_a_film_on_a_full_disk_ends_with_the_reason(client, monkeypatch, kind):
     assert "No space left on device" in last["error"]
 
 
-def test_a_film_that_nobody_waits_for_ends(shown):
+def test_a_film_ends_when_its_page_is_closed(shown):
     """Its thread draws at most the picture that it had begun, and is free for the next film."""
     files, drawn, free = SavedFiles(SceneThread(shown), {}), [], threading.Event()
 

@@ -61,7 +61,7 @@ PARTS = ("scene", "gaussians.ply", "default/semantic_tree", "default/field.safet
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_that_was_made_anew_is_noticed_and_gone_after_a_reload(page, desk, part):
+def test_a_part_that_was_rewritten_is_noticed_and_gone_after_a_reload(page, desk, part):
     assert page.get("/api/changes").json() == {"of": page.state, "changed": [], "variants": ["default"]}
     made_again(desk / part)
     assert page.get("/api/changes").json()["changed"] == [Path(part).name]
@@ -70,7 +70,7 @@ def test_a_part_that_was_made_anew_is_noticed_and_gone_after_a_reload(page, desk
     assert page.get("/api/changes").json() == {"of": again, "changed": [], "variants": ["default"]}
 
 
-def test_what_is_in_memory_goes_on_to_answer(page, desk):
+def test_open_parts_still_answer(page, desk):
     before = ask(page).json()["hits"]
     (desk / "gaussians.ply").unlink()
     assert page.get("/api/changes").json()["changed"] == ["gaussians.ply"]

@@ -98,7 +98,7 @@ def test_cores_go_to_jobs_before_threads(tmp_path):
     assert JobResources(many).threads(wildcards()) == 3, "a cluster doesn't know the cores of its nodes"
 
 
-def test_a_gpu_is_asked_for_where_the_settings_say_so(tmp_path):
+def test_a_gpu_is_requested_where_the_settings_say_so(tmp_path):
     found = JobResources(plan(tmp_path, gaussians={"device": "cuda"}))
     assert [found.gpus(section)(wildcards()) for section in ("gaussians", "contributions")] == [1, 0]
 

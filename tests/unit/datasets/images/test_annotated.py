@@ -66,7 +66,7 @@ def test_the_workflow_finds_annotations_of_any_scene(root):
     assert file.name == "DSC_1.json"
 
 
-def test_a_scene_that_nobody_annotated_is_refused_with_its_folder(root):
+def test_a_scene_without_annotations_is_refused_with_its_folder(root):
     with pytest.raises(SceneError, match=r"also photos/shelf"):
         open_labelled("annotated/photos/shelf", root)
 

@@ -70,7 +70,7 @@ def test_foreground_is_above_128(root):
     assert np.argwhere(head.mask()).tolist() == [[0, 0], [0, 1]]
 
 
-def test_masks_are_read_only_when_asked_for(root):
+def test_masks_are_read_only_when_requested(root):
     path = root / "teatime" / "test_mask" / "0" / "head.png"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
