@@ -71,8 +71,8 @@ def test_doubts_are_reported(opened, desk_address, painter):
     page.locator("#text").fill("unicorn")
     page.keyboard.press("Enter")
     answers(page).first.wait_for()
-    told = page.get_by_role("status").inner_text()
-    assert "'unicorn' may not be in the scene: the model does not know 'unicorn'." in told
+    status = page.get_by_role("status").inner_text()
+    assert "'unicorn' may not be in the scene: the model does not know 'unicorn'." in status
 
 
 @both

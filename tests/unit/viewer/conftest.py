@@ -50,11 +50,11 @@ def wire_camera(camera) -> dict:
 
 def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:
     """How far a file was, line by line, and the file."""
-    told, rest = [], client.post(f"/api/export/{kind}", json=sent).content
+    progress, rest = [], client.post(f"/api/export/{kind}", json=sent).content
     while True:
         line, _, rest = rest.partition(b"\n")
         said = json.loads(line)
         if "bytes" in said:
             assert len(rest) == said["bytes"]
-            return told, rest
-        told.append((said["made"], said["of"]))
+            return progress, rest
+        progress.append((said["made"], said["of"]))

@@ -205,8 +205,8 @@ def test_answers_to_several_queries_are_saved_with_their_labels(client, scene, t
 
 def test_saved_masks_are_those_of_the_hits_in_every_view(client, scene):
     (hit,) = scene.query("mug > handle")
-    told, data = in_steps(client, "masks", groups=[{"name": "handle", "nodes": [hit.node]}])
-    assert told == [(made, len(scene.views)) for made in range(len(scene.views) + 1)]
+    progress, data = in_steps(client, "masks", groups=[{"name": "handle", "nodes": [hit.node]}])
+    assert progress == [(made, len(scene.views)) for made in range(len(scene.views) + 1)]
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         coco = json.loads(archive.read("coco.json"))
         assert [image["file_name"] for image in coco["images"]] == list(scene.views)
@@ -252,8 +252,8 @@ def test_a_person_is_answered_between_the_steps_of_a_file(shown):
 
 
 def test_films_have_the_frames_that_were_requested(client, tmp_path):
-    told, data = in_steps(client, "film", frames=6, side_px=64)
-    assert told == [(made, 6) for made in range(7)]
+    progress, data = in_steps(client, "film", frames=6, side_px=64)
+    assert progress == [(made, 6) for made in range(7)]
     (tmp_path / "film.mp4").write_bytes(data)
     with av.open(str(tmp_path / "film.mp4")) as film:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
@@ -281,8 +281,8 @@ def encoded_frame(client, camera, size_hw) -> np.ndarray:
 
 @pytest.mark.parametrize("side_px", [64, 96])
 def test_a_gif_has_every_other_frame_in_the_size_that_was_requested(client, side_px):
-    told, data = in_steps(client, "film", frames=7, side_px=side_px, format="gif")
-    assert told == [(made, 4) for made in range(5)]
+    progress, data = in_steps(client, "film", frames=7, side_px=side_px, format="gif")
+    assert progress == [(made, 4) for made in range(5)]
     gif = Image.open(io.BytesIO(data))
     durations = []
     for number in range(gif.n_frames):  # equal neighbours are one frame that lasts longer
@@ -309,10 +309,10 @@ def test_a_film_ends_when_its_page_is_closed(shown):
     """Its thread draws at most the picture that it had begun, and is free for the next film."""
     files, drawn, free = SavedFiles(SceneThread(shown), {}), [], threading.Event()
 
-    def film(told) -> bytes:
+    def film(on_frame) -> bytes:
         for number in range(1000):
             drawn.append(number)
-            told(number + 1)
+            on_frame(number + 1)
             free.wait(0.01)
         return b""
 
@@ -373,7 +373,7 @@ def test_gaussians_are_sent_once(client, shown):
 
 def test_an_exported_page_holds_all_that_it_needs(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
-    told, data = in_steps(
+    progress, data = in_steps(
         client,
         "page",
         kept=[{"text": "mug > handle", "level": "part", "threshold": 0.3}],
@@ -381,7 +381,7 @@ def test_an_exported_page_holds_all_that_it_needs(client, shown):
         start="v3",
     )
     nodes = len(shown.answering("default").tree)
-    assert told == [(made, nodes) for made in range(nodes + 1)]
+    assert progress == [(made, nodes) for made in range(nodes + 1)]
     page = data.decode()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page) and "http://127" not in page
     held = dict(re.findall(r'<script type="text/plain" id="(\w+)">(.*?)</script>', page, re.S))
