@@ -71,9 +71,9 @@ class CannedSam(SamModel):
             radii = radius * np.exp(0.25 * rng.normal(size=number))
             self.heads.append((centres, blob_logits(centres, radii, (LOW_PX, LOW_PX), rng)))
 
-    def prompts_per_call(self, requested: int, asked: int) -> int:
+    def prompts_per_call(self, limit: int, prompts: int) -> int:
         """Return the smaller of the wanted and the requested number."""
-        return min(requested, asked)
+        return min(limit, prompts)
 
     def encode(self, image: np.ndarray) -> Encoded:
         """Prepare the image without encoding it."""

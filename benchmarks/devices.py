@@ -10,14 +10,14 @@ import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from benchmarks.scenes import SIZES, random_scene
+from benchmarks.test_splat import HALF_WAY, SETTINGS
 from hilsplat.base.tables import markdown_table
 from hilsplat.scene.cameras import Camera
-from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
@@ -29,7 +29,6 @@ from hilsplat.splat.state import FitState
 from hilsplat.splat.views import TrainingView
 
 SIZES_TIMED = {**SIZES, "1M 986x728": (1_000_000, (728, 986))}
-HALF_WAY = 500_000
 WARM_UP_S, TIMED_S, MIN_ROUNDS = 0.5, 2.0, 3
 
 
@@ -55,9 +54,7 @@ def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int)
     def both_ways() -> None:
         draw(gaussians, camera, 3, threads=threads, device=device).gradients(slope, flat)
 
-    settings = GaussiansSettings(
-        iterations=2 * HALF_WAY, sh_degree=3, densify_every=4 * HALF_WAY, device=device
-    )
+    settings = SETTINGS.model_copy(update={"device": device})
     view = TrainingView("view", camera, (255 * np.clip(seen.image, 0, 1)).astype(np.uint8))
     start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     generator = np.random.default_rng(0)
@@ -72,11 +69,11 @@ def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int)
     ]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--devices", nargs="+", choices=("cpu", "cuda"), default=("cpu", "cuda"))
     parser.add_argument("--threads", type=int, default=os.cpu_count())
-    asked = parser.parse_args(arguments)
+    asked = parser.parse_args()
     if "cuda" in asked.devices:
         print("CUDA against the CPU:", disagreement("cpu", "cuda") or "equal up to rounding", flush=True)
     rows = []

@@ -48,12 +48,12 @@ sys.meta_path.insert(0, Finder())
 
 def make_models(store: Path, sam: str) -> dict[str, Path]:
     """Export missing networks, each in its own process, because exporters do not free gigabytes of memory."""
-    requested = {f"sam-{sam}": "sam", "clip": "clip"}
-    for name in requested:
+    kinds = {f"sam-{sam}": "sam", "clip": "clip"}
+    for name in kinds:
         if not (store / name / "config.json").is_file():
             words = [sys.executable, "-m", "benchmarks.rehearsal", str(store), "--export", name]
             subprocess.run(words, env={**os.environ, "HF_HUB_OFFLINE": "1"}, check=True)
-    return {kind: store / name for name, kind in requested.items()}
+    return {kind: store / name for name, kind in kinds.items()}
 
 
 def export(store: Path, name: str) -> None:

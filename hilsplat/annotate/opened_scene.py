@@ -32,16 +32,16 @@ class OpenedScene:
                 expected="results/<dataset>/<scene> of a run, or a copy of it",
                 fix=f"hilsplat run {self.photographs}",
             )
-        self.state, self._witness = secrets.token_hex(4), FileChanges()
+        self.state, self._changes = secrets.token_hex(4), FileChanges()
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
-        self._witness.note((self.photographs, folder / "gaussians.ply", *proposing))
+        self._changes.note((self.photographs, folder / "gaussians.ply", *proposing))
         self.scene = Scene.load(self.photographs)
         self.proposals = Proposals(self.scene, folder, variant, threads)
         self.clicks = Clicks(self.scene, folder / variant / "masks")
 
     def changed(self) -> list[str]:
         """Return the parts that were rewritten, created or deleted since the scene was opened."""
-        return sorted(path.name for path in self._witness.changed())
+        return sorted(path.name for path in self._changes.changed())
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -50,7 +50,7 @@ class OpenedScene:
         Raises:
             StaleSceneError: a part was rewritten before or during the read.
         """
-        with self._witness.unchanged(self.scene.name):
+        with self._changes.unchanged(self.scene.name):
             yield
 
     @contextmanager
@@ -60,5 +60,5 @@ class OpenedScene:
         Raises:
             StaleSceneError: the photographs were rewritten before or during the read.
         """
-        with self._witness.unchanged(self.scene.name, self.photographs):
+        with self._changes.unchanged(self.scene.name, self.photographs):
             yield

@@ -140,8 +140,8 @@ def run_contributions(
                 part = store.get(
                     keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
                 )
-                requested = settings.keep != "none" and number >= summed
-                rows_of_W = labelled_rows(weights(), label_maps(masks)) if requested else None
+                keeps_rows = settings.keep != "none" and number >= summed
+                rows_of_W = labelled_rows(weights(), label_maps(masks)) if keeps_rows else None
                 return _Prepared(masks, part, rows_of_W)
 
             prepared = in_order(prepare, range(len(cameras)), together)

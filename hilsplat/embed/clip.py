@@ -261,7 +261,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         ModelError: no CLIP found has the digest of the one that embedded the masks.
     """
     index = read_full_index(clip_folder, "model", "model_sha256")
-    recorded, requested = Path(index["model"]), index["model_sha256"]
+    recorded, expected = Path(index["model"]), index["model_sha256"]
     variant = index.get("model_variant", "")
     roots = list(dict.fromkeys([Path.cwd(), *Path(clip_folder).resolve().parents, INSTALLED]))
     stores = [place for place in (*(root / MODELS for root in roots), user_models()) if place.is_dir()]
@@ -275,12 +275,12 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
             model = open_model_folder(folder, "clip", variant=variant)
         except ModelError:
             continue  # a SAM, or an incomplete copy
-        if model.digest == requested:
+        if model.digest == expected:
             return ClipModel(model, threads, template)
         seen[place] = model.digest
     raise ModelError(
         f"the CLIP that embedded the masks in {clip_folder} was not found",
-        expected=f"a model folder with digest {requested[:12]}; it was {recorded}",
+        expected=f"a model folder with digest {expected[:12]}; it was {recorded}",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
         or f"no CLIP at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
         fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "

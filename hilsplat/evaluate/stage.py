@@ -105,14 +105,14 @@ def run_evaluate(
         else:
             answers = LanguageScene.from_parts(parts, settings, threads=threads)
             posed, selections = answers.scene, Selections(answers)
-            for data, known, requested in scored:
+            for data, known, protocols in scored:
                 truths = known_truths(known, posed, settings)
                 counts[f"views of {data}"] = len(truths)
                 kept: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
                     of_view, size_hw = truths[view](), posed.cameras[view].size_hw
                     words = relevancy_departures(settings)
-                    also = FlatProtocols(requested.flat, requested.level, words) if requested.flat else None
+                    also = FlatProtocols(protocols.flat, protocols.level, words) if protocols.flat else None
                     kept[view] = PackedMasks(size_hw)
                     rows = measure_view(
                         answers, selections, of_view, view, size_hw, settings, also, kept[view]
@@ -129,7 +129,7 @@ def run_evaluate(
                     )
                     for view, row in found:
                         keep(data, view, row)
-                for each in point_rows(answers, known, requested, settings, threads):
+                for each in point_rows(answers, known, protocols, settings, threads):
                     if isinstance(each, Measured):
                         keep(data, "", each)
                     else:

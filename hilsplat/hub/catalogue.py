@@ -35,7 +35,7 @@ WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ModelRequest:
     """A model to download.
 
     Attributes:
@@ -49,7 +49,7 @@ class Wanted:
     release: Release | None
 
     @staticmethod
-    def named(name: str, variant: str) -> "Wanted":
+    def named(name: str, variant: str) -> "ModelRequest":
         """Find a model by its release name or as owner/name.
 
         Raises:
@@ -58,7 +58,7 @@ class Wanted:
         ending = f"-{variant}" if variant else ""
         for release in RELEASES:
             if name in (release.name, release.repository):
-                return Wanted(f"{release.name}{ending}", release.repository, release)
+                return ModelRequest(f"{release.name}{ending}", release.repository, release)
         try:
             validate_repo_id(name)
         except HFValidationError as error:
@@ -71,7 +71,7 @@ class Wanted:
                 expected=f"{', '.join(release.name for release in RELEASES)}, or owner/name on the hub",
                 fix="hilsplat models list shows what there is",
             )
-        return Wanted(f"{name.split('/')[1]}{ending}", name, None)
+        return ModelRequest(f"{name.split('/')[1]}{ending}", name, None)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from hilsplat.hub.catalogue import (
     Choice,
     HubFile,
     Listing,
-    Wanted,
+    ModelRequest,
     choose_files,
     read_cached_listing,
     read_listing,
@@ -62,7 +62,7 @@ class Prepared:
         target: the model folder.
     """
 
-    requested: Wanted
+    requested: ModelRequest
     listing: Listing
     choice: Choice
     staging: Path
@@ -110,7 +110,7 @@ def get_models(
         )
     prepared, texts = [], []
     for name in names or RECOMMENDED:
-        requested = Wanted.named(name, variant)
+        requested = ModelRequest.named(name, variant)
         target = models / requested.name
         with explain_refusals(requested, models):
             _require_ours(requested, target)
@@ -128,7 +128,7 @@ def get_models(
     return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
 
 
-def _require_ours(requested: Wanted, target: Path) -> None:
+def _require_ours(requested: ModelRequest, target: Path) -> None:
     """Refuse to replace a folder that was not downloaded from this repository."""
     if not target.exists():
         return
@@ -154,7 +154,7 @@ def _is_present(target: Path, listing: Listing) -> bool:
     )
 
 
-def _listing(requested: Wanted, revision: str | None) -> Listing:
+def _listing(requested: ModelRequest, revision: str | None) -> Listing:
     """Return the listing of the hub or, if it is unreachable, that of its cache on this machine."""
     try:
         return read_listing(requested.repository, revision)
@@ -166,7 +166,7 @@ def _listing(requested: Wanted, revision: str | None) -> Listing:
         return cached
 
 
-def _prepare(requested: Wanted, listing: Listing, target: Path, variant: str) -> Prepared:
+def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: str) -> Prepared:
     """Choose the files to download according to the repository's config.json."""
     staging = target.with_name(f".{target.name}.part")
     (config,) = listing.require("config.json")

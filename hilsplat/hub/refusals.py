@@ -9,13 +9,13 @@ from huggingface_hub import constants
 from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 
 from hilsplat.base.errors import DownloadError, HilsplatError
-from hilsplat.hub.catalogue import OUT_OF_REACH, PARTS, Wanted
+from hilsplat.hub.catalogue import OUT_OF_REACH, PARTS, ModelRequest
 
 KEPT = "what was transferred is kept, and continued"
 
 
 @contextmanager
-def explain_refusals(requested: Wanted, models: Path) -> Iterator[None]:
+def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
     """Convert errors from the network and the hub into errors with a fix.
 
     Raises:
@@ -28,7 +28,7 @@ def explain_refusals(requested: Wanted, models: Path) -> Iterator[None]:
         raise
     except GatedRepoError as error:
         raise DownloadError(
-            f"{requested.repository} asks for consent before it is fetched ({_status(error)})",
+            f"{requested.repository} requires consent before a download ({_status(error)})",
             fix=f"accept its terms at {place}, `hf auth login` or set HF_TOKEN, and run the command again",
         ) from error
     except RepositoryNotFoundError as error:
@@ -56,7 +56,7 @@ def explain_refusals(requested: Wanted, models: Path) -> Iterator[None]:
         ) from error
 
 
-def _refused(error: requests.HTTPError, requested: Wanted, place: str) -> DownloadError:
+def _refused(error: requests.HTTPError, requested: ModelRequest, place: str) -> DownloadError:
     """Return the error for a response with a status other than 2xx."""
     response = error.response
     assert response is not None  # an HTTPError is made from an answer
@@ -74,7 +74,7 @@ def _refused(error: requests.HTTPError, requested: Wanted, place: str) -> Downlo
         )
     if status == requests.codes.not_found:
         return DownloadError(
-            f"the hub does not have what was asked of {requested.repository} ({_status(error)})",
+            f"the hub does not have this revision or file of {requested.repository} ({_status(error)})",
             found=str(response.url),
             fix=f"correct the name or --revision; {place} shows what there is",
         )
@@ -96,7 +96,7 @@ def _innermost(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def _files_by_hand(requested: Wanted) -> list[str]:
+def _files_by_hand(requested: ModelRequest) -> list[str]:
     """Return the files of the model, for a user who must copy them by hand."""
     families = [requested.release.family] if requested.release else ["sam", "clip"]
     return [name for family in families for name in PARTS[family].usual]

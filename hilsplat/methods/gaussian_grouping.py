@@ -92,11 +92,11 @@ def identity_of_gaussians(
     of_view = [np.append(identity[rows], NONE) for rows in contributions.rows_of_views()]
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        requested = torch.from_numpy(of_view[view.number][view.labels[:, level.index]])
-        logits = product(view.weights, codes)[requested >= 0] @ classifier
+        target = torch.from_numpy(of_view[view.number][view.labels[:, level.index]])
+        logits = product(view.weights, codes)[target >= 0] @ classifier
         total = classifier.sum() * 0
         if len(logits):
-            total = cross_entropy(logits, requested[requested >= 0]) / max(np.log(num_classes), 1e-9)
+            total = cross_entropy(logits, target[target >= 0]) / max(np.log(num_classes), 1e-9)
         if neighbours.shape[1]:
             chosen = random.integers(len(neighbours), size=min(SAMPLES, len(neighbours)))
             apart = neighbour_loss(

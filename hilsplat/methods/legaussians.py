@@ -122,9 +122,9 @@ def entries_of_gaussians(
             label = view.labels[:, level.index]
             inside = np.flatnonzero(label >= 0)
             if len(inside):
-                requested = torch.from_numpy(entry[of_view[view.number][label[inside]]])
+                target = torch.from_numpy(entry[of_view[view.number][label[inside]]])
                 logits = decoders[level.index](unit(rendered[inside, level.index]))
-                total = total + index_loss(logits, requested, uncertainty[inside, level.index])
+                total = total + index_loss(logits, target, uncertainty[inside, level.index])
         return total
 
     networks = [weight for each in (*decoders, position) for weight in each.parameters()]

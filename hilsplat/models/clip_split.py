@@ -56,8 +56,8 @@ def split_clip(folder: Path) -> list[Path]:
     inputs, outputs = ({value.name for value in part} for part in (model.graph.input, model.graph.output))
     missing = [
         name
-        for requested, given in HALVES.values()
-        for name in [*(set(requested) - inputs - OPTIONAL), *(set(given) - outputs)]
+        for needed, given in HALVES.values()
+        for name in [*(set(needed) - inputs - OPTIONAL), *(set(given) - outputs)]
     ]
     if missing:
         raise ModelError(
@@ -69,10 +69,10 @@ def split_clip(folder: Path) -> list[Path]:
     # Shapes inside the graph are not needed, and inferring them fails above 2 GiB.
     extractor = Extractor(model)
     written = []
-    for name, (requested, given) in HALVES.items():
+    for name, (needed, given) in HALVES.items():
         path = whole.with_name(f"{name}.onnx")
         with atomic_path(path) as temporary:
-            half = extractor.extract_model([input for input in requested if input in inputs], list(given))
+            half = extractor.extract_model([input for input in needed if input in inputs], list(given))
             temporary.write_bytes(half.SerializeToString())
         written.append(path)
     return written

@@ -133,8 +133,8 @@ class Network:
         Raises:
             ModelError: the network rejects the inputs.
         """
-        requested = {name: value for name, value in feeds.items() if name in self.inputs}
-        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in requested.items()}
+        used = {name: value for name, value in feeds.items() if name in self.inputs}
+        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in used.items()}
         try:
             outputs = self.session.run(list(self.spec.outputs), cast)
         except Exception as error:  # onnxruntime's errors share no public base class
@@ -160,8 +160,8 @@ def _fits(shape: Sequence[Any], axes: Axes) -> bool:
     if not shape:
         return True
     return len(shape) == len(axes) and all(
-        requested is None or not isinstance(length, int) or length == requested
-        for length, requested in zip(shape, axes, strict=True)
+        expected is None or not isinstance(length, int) or length == expected
+        for length, expected in zip(shape, axes, strict=True)
     )
 
 

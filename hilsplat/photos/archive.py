@@ -30,9 +30,9 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
         with zipfile.ZipFile(archive) as opened:
             entries = [entry for entry in opened.infolist() if not entry.is_dir()]
             _check(archive, entries)
-            requested = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
-            require_free_space(folder, sum(entry.file_size for entry in requested) / 2**20 + 200)
-            for entry in requested:
+            chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
+            require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
+            for entry in chosen:
                 target = folder / PurePosixPath(entry.filename)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 # zipfile stops at the declared size, and checks the size and the CRC.

@@ -118,8 +118,8 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
         )
     names = {(frame.video, frame.number): f"{row:04d}.jpg" for row, frame in enumerate(chosen, start=1)}
     for position, video in enumerate(videos):
-        requested = {number: name for (of_video, number), name in names.items() if of_video == position}
-        _write_frames(video, requested, folder)
+        name_of_frame = {number: name for (of_video, number), name in names.items() if of_video == position}
+        _write_frames(video, name_of_frame, folder)
     origin = {
         "videos": [
             {
@@ -265,9 +265,9 @@ def _grey(frame: av.VideoFrame, side_px: int) -> UInt8[np.ndarray, "h w"]:
     return frame.reformat(**size, format="gray", interpolation="AREA", threads=1).to_ndarray()
 
 
-def _write_frames(video: Path, requested: dict[int, str], folder: Path) -> None:
+def _write_frames(video: Path, name_of_frame: dict[int, str], folder: Path) -> None:
     """Write the selected frames of a video upright, at full size."""
-    missing = dict(requested)
+    missing = dict(name_of_frame)
     with _opened(video) as (container, stream):
         for number, (frame, _) in enumerate(_decoded(container, stream, Decoding())):
             if number in missing:

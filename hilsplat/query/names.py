@@ -45,8 +45,8 @@ class NodeNames:
 
     def nodes_of(self, text: str) -> list[int]:
         """Return the nodes with this name, ignoring case and extra spaces."""
-        requested = _plain(text)
-        return [node for node, name in self.of_node.items() if _plain(name) == requested]
+        plain = _plain(text)
+        return [node for node, name in self.of_node.items() if _plain(name) == plain]
 
 
 def tree_digest(semantic_tree: Path) -> str:

@@ -218,14 +218,14 @@ def distinct_prompts(
         kept.append({name: rows[:number] for name, rows in rest.items()})
     predicted_iou, stability, boxes = (np.concatenate(each) for each in zip(*found, strict=True))
     likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
-    requested = np.zeros(len(likely), bool)
+    chosen = np.zeros(len(likely), bool)
     for head in range(len(HEADS)):
         rows = np.flatnonzero(likely[:, head])
         at = rows, head
         distinct = distinct_boxes(boxes[at], predicted_iou[at], stability[at], REPEAT_IOU, REPEAT_SLACK)
-        requested[rows[distinct]] = True
-    requested[0] |= not requested.any()
-    return {name: np.concatenate([each.pop(name) for each in kept])[requested] for name in list(kept[0])}
+        chosen[rows[distinct]] = True
+    chosen[0] |= not chosen.any()
+    return {name: np.concatenate([each.pop(name) for each in kept])[chosen] for name in list(kept[0])}
 
 
 def keep_candidates(

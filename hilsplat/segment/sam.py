@@ -304,11 +304,11 @@ class SamModel:
         features = dict(zip(names, (encoder or self.encoder)(pixel_values=pixels), strict=True))
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
-    def prompts_per_call(self, requested: int, asked: int) -> int:
-        """Return the prompts per decoder call: fixed by the decoder, or at most `asked`."""
+    def prompts_per_call(self, limit: int, prompts: int) -> int:
+        """Return the prompts per decoder call: fixed by the decoder, or `limit` and at most `prompts`."""
         if self.factored:
             return PROMPTS
-        return self.decoder.fixed_axis("input_points", 1) or min(requested, asked)
+        return self.decoder.fixed_axis("input_points", 1) or min(limit, prompts)
 
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]

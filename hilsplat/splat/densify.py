@@ -73,13 +73,13 @@ def densify(
 ) -> None:
     """Clone small and split large Gaussians with large screen gradients, the largest first, up to the cap."""
     mean = gradients.mean()
-    requested = np.flatnonzero(mean > settings.densify_gradient)
+    selected = np.flatnonzero(mean > settings.densify_gradient)
     room = max(settings.max_gaussians - len(adam), 0)
-    if len(requested) > room:
-        requested = np.sort(requested[np.argsort(-mean[requested], kind="stable")[:room]])
+    if len(selected) > room:
+        selected = np.sort(selected[np.argsort(-mean[selected], kind="stable")[:room]])
     p = adam.parameters
-    large = np.exp(p["log_scales"][requested].max(axis=1, initial=-np.inf)) > SMALL * extent
-    clone, split = requested[~large], requested[large]
+    large = np.exp(p["log_scales"][selected].max(axis=1, initial=-np.inf)) > SMALL * extent
+    clone, split = selected[~large], selected[large]
     copies = {name: p[name][clone].copy() for name in FIELDS}
     halves = {name: np.repeat(p[name][split], 2, axis=0) for name in FIELDS}
     halves["means"] += _offsets(halves["log_scales"], halves["quats"], generator)

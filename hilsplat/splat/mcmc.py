@@ -143,9 +143,9 @@ def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.ran
     if dead.any() and not dead.all():
         _relocate(adam, dead, settings, generator)
     n = len(adam)
-    requested = min(settings.max_gaussians, int(n * (1 + settings.mcmc_growth)))
-    if requested > n:
-        source = _draw(opacities(adam), requested - n, generator)
+    target = min(settings.max_gaussians, int(n * (1 + settings.mcmc_growth)))
+    if target > n:
+        source = _draw(opacities(adam), target - n, generator)
         shared = _share(adam, source, settings)
         adam.append({name: shared[name] for name in FIELDS})
 

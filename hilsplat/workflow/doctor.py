@@ -56,12 +56,12 @@ def examine() -> Iterator[Finding]:
 
 def python() -> Iterator[Finding]:
     """Check the version of Python."""
-    requested = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
+    required = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     found = platform.python_version()
-    if SpecifierSet(requested).contains(found):
+    if SpecifierSet(required).contains(found):
         yield Finding("python", "ok", f"{found} on {platform.system()} {platform.machine()}")
     else:
-        yield Finding("python", "fault", f"{found}, but {requested} is needed", "use another Python")
+        yield Finding("python", "fault", f"{found}, but {required} is needed", "use another Python")
 
 
 def libraries() -> Iterator[Finding]:

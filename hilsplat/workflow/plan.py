@@ -228,11 +228,11 @@ class Plan:
         return self._first_alike(stage, job.variant, self.scopes(self.row(job)))
 
     def _first_with_equal_settings(self, stage: str, variant: str, scopes: tuple[str, ...]) -> str:
-        requested = self.stages_of(variant, scopes)
-        seed = self.run.seed_of(variant) if requested.depends_on_seed(stage) else None
+        own = self.stages_of(variant, scopes)
+        seed = self.run.seed_of(variant) if own.depends_on_seed(stage) else None
         for name in self.run.every_variant():
             other = self.stages_of(name, scopes)
-            same = all(getattr(other, part) == getattr(requested, part) for part in requested.upstream(stage))
+            same = all(getattr(other, part) == getattr(own, part) for part in own.upstream(stage))
             if same and seed in (None, self.run.seed_of(name)):
                 return name
         return variant

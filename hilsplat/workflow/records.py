@@ -221,9 +221,9 @@ class Records:
                 yield f"stage {stage} made it, not {expected.stage}"
             then, now = record.settings, expected.settings
             for name in sorted(then.keys() | now.keys()):
-                made, requested = then.get(name), now.get(name)
-                if made != requested:
-                    yield f"it was made with {name} {made!r}, and the configuration says {requested!r}"
+                made, configured = then.get(name), now.get(name)
+                if made != configured:
+                    yield f"it was made with {name} {made!r}, and the configuration says {configured!r}"
             if record.seed != expected.seed:
                 yield f"it was made with seed {record.seed}, and the configuration says {expected.seed}"
             stage, plugins = expected.stage, expected.plugins

@@ -54,8 +54,8 @@ def embedded_texts(text: ClipText, tokenizer: Tokenizer, texts: Sequence[str]) -
 
 def coloured_text(phrases: Sequence[str]) -> str | None:
     """Return the phrase that names a node by colour and class, such as "red kettle", or None."""
-    requested = re.compile(rf"({'|'.join(map(re.escape, COLOURS))}) {re.escape(phrases[0])}")
-    return next((phrase for phrase in phrases if requested.fullmatch(phrase)), None)
+    pattern = re.compile(rf"({'|'.join(map(re.escape, COLOURS))}) {re.escape(phrases[0])}")
+    return next((phrase for phrase in phrases if pattern.fullmatch(phrase)), None)
 
 
 def measure_clip(
@@ -93,24 +93,24 @@ def measure_clip(
     vectors = embedded_crops(vision, crops, rows, background)
     similarity = vectors @ embedded_texts(text, tokenizer, texts).T
     yardstick = (vectors @ embedded_texts(text, tokenizer, CANONICAL).T).max(axis=1)
-    requested, hue = of_set[crops.caption[rows]], hue_of_set[crops.caption[rows]]
+    true_text, hue = of_set[crops.caption[rows]], hue_of_set[crops.caption[rows]]
     if hues:
         hue_found = (vectors @ embedded_texts(text, tokenizer, hues).T).argmax(axis=1)
     else:
         hue_found = np.full(len(rows), -2)
     level, rough = crops.level[rows], crops.rough[rows]
-    mine = similarity[np.arange(len(rows)), requested]
+    mine = similarity[np.arange(len(rows)), true_text]
     rank = (similarity > mine[:, None]).sum(axis=1)
-    common = common_texts(requested, np.where(rough, 0, level))
+    common = common_texts(true_text, np.where(rough, 0, level))
     rank_of_common = (similarity[:, common] > mine[:, None]).sum(axis=1)
-    is_common = np.isin(requested, common)
+    is_common = np.isin(true_text, common)
     report = {}
     for kind, is_rough in (("exact", False), ("rough", True)):
         for at in LEVELS:
             group = (level == int(at)) & (rough == is_rough)
             if not group.any():
                 continue
-            same = np.unique(requested[level == int(at)])
+            same = np.unique(true_text[level == int(at)])
             rank_of_level = (similarity[group][:, same] > mine[group, None]).sum(axis=1)
             has_common = group & is_common
             has_hue = group & (hue >= 0)

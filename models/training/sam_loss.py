@@ -39,9 +39,9 @@ def segmentation_loss(
     entropy = (weights * entropy).sum(dim=-1) / (2 * area + 64)
     masks = ((dice + entropy) * known).sum() / known.sum().clamp(min=1.0)
     with torch.no_grad():
-        found, requested = (logits > 0) * weights, truth > 0.5
-        overlap = (found * requested).sum(dim=-1)
-        union = (found + requested * weights).sum(dim=-1) - overlap
+        found, target = (logits > 0) * weights, truth > 0.5
+        overlap = (found * target).sum(dim=-1)
+        union = (found + target * weights).sum(dim=-1) - overlap
         iou = overlap / union.clamp(min=1e-6)
     quality = (scores - iou * known).square().mean()
     return masks, quality
@@ -67,9 +67,9 @@ class Teacher(nn.Module):
         others = torch.randint(0, count, (min(count, SEMANTIC_PIXELS),), generator=generator)
         pixels = torch.cat([prompted, others.to(prompted.device)])
         features = semantic.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, pixels)
-        requested = batch.classes.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, pixels)
+        target = batch.classes.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, pixels)
         logits = self.classify(features).unflatten(-1, (len(HEADS), -1))
-        return functional.cross_entropy(logits.flatten(0, 1), requested.flatten())
+        return functional.cross_entropy(logits.flatten(0, 1), target.flatten())
 
     def bordered(self, sharp: Float[Tensor, "B C h w"], batch: SamBatch) -> Float[Tensor, ""]:
         """Return the cross-entropy of the border maps, in which borders have fourfold weight."""

@@ -32,12 +32,12 @@ def crop_weights(crops: CropTable, nothing: float = 0.03, rough: float = 0.45) -
     weights = np.zeros(len(crops))
     for level in (0, *map(int, LEVELS)):
         at_level = crops.level == level
-        requested = nothing if level == 0 else (1 - nothing) / len(LEVELS)
+        level_share = nothing if level == 0 else (1 - nothing) / len(LEVELS)
         for is_rough, share in ((True, rough), (False, 1 - rough)):
             group = at_level & (crops.rough == is_rough)
             other = at_level & (crops.rough != is_rough)
             if group.any():
-                weights[group] = requested * (share if other.any() else 1.0) / group.sum()
+                weights[group] = level_share * (share if other.any() else 1.0) / group.sum()
     return weights / weights.sum()
 
 

@@ -147,8 +147,8 @@ def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: Figu
         for places in texts.values():
             places.sort(key=lambda place: (-place[0], place[1].view))
         ordered = sorted(texts, key=lambda text: (-texts[text][0][0], text))
-        requested = settings.queries_per_level * (len(LEVELS) if level is None else 1)
-        count = min(requested, len(ordered))
+        limit = settings.queries_per_level * (len(LEVELS) if level is None else 1)
+        count = min(limit, len(ordered))
         for number in range(count):  # the largest, then evenly down the list
             places = texts[ordered[number * len(ordered) // count]]
             rows += [shown for _, shown in places[: settings.views]]

@@ -73,15 +73,15 @@ def measured_blocks(
     scores = with_seeds(scores)
     for data, of_data in scores.groupby("dataset", sort=True):
         rows = []
-        requested = of_data[of_data["protocol"].str.startswith(protocols)]
+        selected = of_data[of_data["protocol"].str.startswith(protocols)]
         keys = ["variant", "masks", "method", "protocol"]
-        for (variant, masks, method, protocol), part in requested.groupby(keys, sort=True):
+        for (variant, masks, method, protocol), part in selected.groupby(keys, sort=True):
             group = protocol if ranked_by_protocol else ""
             place, row = placed_row(variant, masks, method, protocol, part, labels, cells_of, group)
             rows.append((place, replace(row, cells={**row.cells, **over_seeds(part)})))
         distinct = without_repeats(in_order(rows))
         if distinct:
-            columns = tuple(columns_of(requested))
+            columns = tuple(columns_of(selected))
             blocks.append(
                 Block(*kind_and_title(str(data)), distinct, columns, lower_is_better, unranked=unranked)
             )

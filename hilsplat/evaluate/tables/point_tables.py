@@ -90,7 +90,7 @@ def scannet_table(sources: Sources) -> Table:
     blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
     scores = with_seeds(sources.scores)
     names = (*SCANNET_COLUMNS, BENCHMARK)
-    requested = scores[scores["protocol"].str.startswith(names)] if len(scores) else scores
+    selected = scores[scores["protocol"].str.startswith(names)] if len(scores) else scores
     columns = [
         f"{name} {what}" for name in SCANNET_COLUMNS.values() for what in ("mIoU", "95 %", "names", "mAcc")
     ]
@@ -99,7 +99,7 @@ def scannet_table(sources: Sources) -> Table:
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         return {**semantic_cells(part), **split_cells(part), **instance_cells(sources, part)}
 
-    for data, of_data in requested.groupby("dataset", sort=True):
+    for data, of_data in selected.groupby("dataset", sort=True):
         rows = []
         for (variant, masks, method), part in of_data.groupby(["variant", "masks", "method"], sort=True):
             modes = {label.partition("(")[2].rstrip(")") for label in part["protocol"]}

@@ -177,8 +177,8 @@ def test_losses_and_gradients_are_those_of_autograd(name, own, spread):
     expected = getattr(torch_losses, name)(*tensors)
     assert loss == pytest.approx(expected.item(), rel=1e-9)
     by_autograd = torch.autograd.grad(expected, moved, materialize_grads=True)
-    for gradient, requested in zip(gradients, by_autograd, strict=False):
-        assert gradient == pytest.approx(requested.numpy(), rel=1e-6, abs=1e-6 / spread)
+    for gradient, reference in zip(gradients, by_autograd, strict=False):
+        assert gradient == pytest.approx(reference.numpy(), rel=1e-6, abs=1e-6 / spread)
 
 
 def test_gradients_agree_with_finite_differences():

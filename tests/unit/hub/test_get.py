@@ -189,7 +189,7 @@ def test_a_busy_hub_is_named(hub, waits, where):
 @pytest.mark.parametrize(
     ("refusal", "message"),
     [
-        (Refusal(401, {"X-Error-Code": "GatedRepo"}), r"asks for consent(.|\n)*accept its terms at http"),
+        (Refusal(401, {"X-Error-Code": "GatedRepo"}), r"requires consent(.|\n)*accept its terms at http"),
         (Refusal(403), r"refuses Xenova/sam-vit-base \(403"),
         (Refusal(401), r"refuses Xenova/sam-vit-base \(401"),
         (Refusal(404, {"X-Error-Code": "EntryNotFound"}), r"does not have what was asked"),

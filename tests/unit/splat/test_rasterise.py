@@ -90,7 +90,7 @@ def test_long_lists_of_faint_needles_agree_with_the_reference(device, stretch):
     parameters = leaves(gaussians)
     image, _, _ = render_reference(Tensors(*parameters), view, 0)
     (image * torch.from_numpy(by_image)).sum().backward()
-    # gsplat inverts covariances in float32, with fast math; measured on an H200: 8e-5 and 2e-3
+    # gsplat inverts covariances in float32, with fast math; measured on an H200: 8e-5, and 2e-3 for the means
     most, most_of_gradients = {"cpu": (2e-5, 1e-3), "cuda": (2e-4, 1e-2)}[device]
     assert np.quantile(np.abs(seen.image - image.detach().numpy()), 0.99) < most
     for name, leaf in zip(FIELDS, parameters, strict=True):

@@ -121,10 +121,10 @@ def test_the_committed_clip_is_as_good_as_its_card_says(unseen):
         "input_ids": [row.ids for row in encoded],
         "attention_mask": [row.attention_mask for row in encoded],
     }
-    (requested,) = text.run(None, {name: np.array(rows, np.int64) for name, rows in names.items()})
+    (expected,) = text.run(None, {name: np.array(rows, np.int64) for name, rows in names.items()})
     cut = np.stack([crops.cut(row) for row in range(len(crops))])
     (found,) = vision.run(None, {"pixel_values": normalised(cut)})
-    best = (found @ requested.T).argmax(axis=1)
+    best = (found @ expected.T).argmax(axis=1)
     right = np.array(
         [texts[best[row]] == crops.phrase_sets[crops.caption[row]][0] for row in range(len(crops))]
     )

@@ -60,13 +60,13 @@ def test_others_are_unchanged_grey_faint_or_gone(shown, camera, mode):
     inside, outside = own[..., 0] > 0.95, own[..., 1] > 0.95
     assert inside.any() and outside.any()
     assert np.abs(frame[inside].astype(int) - (0, 255, 0)).max() <= 0.06 * 255
-    requested = {
+    expected = {
         "plain": plain,
         "tint": np.repeat((TINT * (plain @ GREY))[..., None], 3, axis=2),
         "isolate": np.zeros_like(plain),
     }
-    if mode in requested:
-        assert np.abs(frame[outside] / 255 - requested[mode][outside]).max() < 0.08
+    if mode in expected:
+        assert np.abs(frame[outside] / 255 - expected[mode][outside]).max() < 0.08
     else:
         assert 0 < frame[outside].mean() < 3 * GHOST * 255 * plain[outside].mean()
 
