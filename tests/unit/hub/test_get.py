@@ -192,7 +192,7 @@ def test_a_busy_hub_is_named(hub, waits, where):
         (Refusal(401, {"X-Error-Code": "GatedRepo"}), r"requires consent(.|\n)*accept its terms at http"),
         (Refusal(403), r"refuses Xenova/sam-vit-base \(403"),
         (Refusal(401), r"refuses Xenova/sam-vit-base \(401"),
-        (Refusal(404, {"X-Error-Code": "EntryNotFound"}), r"does not have what was asked"),
+        (Refusal(404, {"X-Error-Code": "EntryNotFound"}), r"does not have this revision or file"),
     ],
 )
 def test_refusals_say_what_to_do(hub, waits, refusal, message):
@@ -209,7 +209,7 @@ def test_unknown_names_repositories_and_revisions_are_named(hub):
         get_models(["a b/c"])
     with pytest.raises(DownloadError, match="the hub has no repository some/thing"):
         get_models(["some/thing"])
-    with pytest.raises(DownloadError, match=r"does not have what was asked(.|\n)*revision/v9"):
+    with pytest.raises(DownloadError, match=r"does not have this revision or file(.|\n)*revision/v9"):
         get_models(["sam-vit-base"], revision="v9")
     with pytest.raises(DownloadError, match="a revision belongs to one model"):
         get_models([], revision="main")
