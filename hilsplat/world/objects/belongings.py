@@ -3,67 +3,42 @@
 import numpy as np
 
 from hilsplat.world.objects.builder import Builder, Maker
-from hilsplat.world.shapes import (
-    arc,
-    box,
-    cylinder,
-    disc,
-    ellipsoid,
-    extrude,
-    lathe,
-    loft,
-    ring,
-    sweep,
-)
+from hilsplat.world.shapes import arc, box, cylinder, disc, ellipsoid, extrude, lathe, loft, ring, sweep
 
 
 def _backpack(b: Builder) -> None:
-    cloth, second, strap_paint = b.paints.draw("cloth"), b.paints.draw("cloth"), b.paints.draw("cloth")
-    metal = b.paints.draw("metal")
+    cloth, second, strap_paint = b.paint("cloth"), b.paint("cloth"), b.paint("cloth")
+    metal = b.paint("metal")
     w, d, h = b.between(0.52, 0.60), b.between(0.28, 0.33), b.between(0.68, 0.76)
-    bag = b.part("bag", "main compartment", "body")
-    b.put(bag, cloth, box((d, w, h), (0, 0, h / 2), 0.09))
-    b.put(
-        b.subpart(bag, "bottom", "base", at="of"),
-        b.paints.draw("plastic"),
-        box((d + 0.03, w + 0.03, 0.15), (0, 0, 0.075), 0.04),
+    bag = b.part("bag", "main compartment", "body").put(cloth, box((d, w, h), (0, 0, h / 2), 0.09))
+    bag.subpart("bottom", "base", at="of").put(
+        b.paint("plastic"), box((d + 0.03, w + 0.03, 0.15), (0, 0, 0.075), 0.04)
     )
-    sides = b.subpart(bag, "side pockets", "bottle pockets")
+    sides = bag.subpart("side pockets", "bottle pockets")
     for side in (-1, 1):
-        b.put(
-            sides,
-            b.paints.draw("cloth") if side < 0 else strap_paint,
+        sides.put(
+            b.paint("cloth") if side < 0 else strap_paint,
             box((d * 0.66, 0.11, h * 0.34), (0, side * (w / 2 + 0.03), h * 0.32), 0.03),
         )
-    flap = b.part("flap", "top flap", "lid")
-    b.put(
-        flap,
+    flap = b.part("flap", "top flap", "lid").put(
         second,
         box((d + 0.07, w + 0.05, 0.13), (0.02, 0, h + 0.0), 0.05),
         box((0.06, w * 0.96, h * 0.24), (d / 2 + 0.03, 0, h * 0.90), 0.02),
     )
-    buckles = b.subpart(flap, "buckles", "clasps")
+    buckles = flap.subpart("buckles", "clasps")
     for side in (-1, 1):
-        b.put(buckles, metal, box((0.06, 0.11, 0.20), (d / 2 + 0.07, side * w * 0.27, h * 0.76), 0.015))
-    b.put(
-        b.subpart(flap, "loop", "carry loop", at="of"),
-        strap_paint,
-        ring(0.10, 0.038, (-0.02, 0, h + 0.10), "x"),
+        buckles.put(metal, box((0.06, 0.11, 0.20), (d / 2 + 0.07, side * w * 0.27, h * 0.76), 0.015))
+    flap.subpart("loop", "carry loop", at="of").put(strap_paint, ring(0.10, 0.038, (-0.02, 0, h + 0.10), "x"))
+    pocket = b.part("front pocket", "pocket").put(
+        b.paint("cloth"), box((0.15, w * 0.72, h * 0.40), (d / 2 + 0.06, 0, h * 0.36), 0.05)
     )
-    pocket = b.part("front pocket", "pocket")
-    b.put(pocket, b.paints.draw("cloth"), box((0.15, w * 0.72, h * 0.40), (d / 2 + 0.06, 0, h * 0.36), 0.05))
-    b.put(
-        b.subpart(pocket, "zipper", "zip"),
-        metal,
-        box((0.05, w * 0.58, 0.075), (d / 2 + 0.13, 0, h * 0.49), 0.015),
+    pocket.subpart("zipper", "zip").put(
+        metal, box((0.05, w * 0.58, 0.075), (d / 2 + 0.13, 0, h * 0.49), 0.015)
     )
-    b.put(
-        b.subpart(pocket, "badge", "patch"),
-        b.paints.draw("plain"),
-        disc(0.09, 0.0, 0.03, 22, 0.008).moved(d / 2 + 0.125, 0, h * 0.30),
+    pocket.subpart("badge", "patch").put(
+        b.paint("plain"), disc(0.09, 0.0, 0.03, 22, 0.008).moved(d / 2 + 0.125, 0, h * 0.30)
     )
     for side in (-1, 1):
-        strap = b.part("strap", "shoulder strap")
         y = side * w * 0.27
         path = [
             (-d / 2 + 0.02, y, h * 0.92),
@@ -71,29 +46,24 @@ def _backpack(b: Builder) -> None:
             (-d / 2 - 0.15, y, h * 0.45),
             (-d / 2 - 0.02, y, h * 0.16),
         ]
-        b.put(strap, strap_paint, sweep(path, [0.06, 0.075, 0.075, 0.05]))
-        b.put(
-            b.subpart(strap, "pad", "padding"),
-            second,
-            ellipsoid((0.075, 0.10, 0.17), (-d / 2 - 0.15, y, h * 0.60)),
+        strap = b.part("strap", "shoulder strap").put(strap_paint, sweep(path, [0.06, 0.075, 0.075, 0.05]))
+        strap.subpart("pad", "padding").put(
+            second, ellipsoid((0.075, 0.10, 0.17), (-d / 2 - 0.15, y, h * 0.60))
         )
-    roll = b.part("bedroll", "sleeping mat")
-    b.put(
-        roll,
-        b.paints.draw("cloth"),
+    roll = b.part("bedroll", "sleeping mat").put(
+        b.paint("cloth"),
         cylinder(0.115, -w * 0.60, w * 0.60, 24, 0.02).turned("x", 90).moved(0.0, 0, h + 0.16),
     )
-    bands = b.subpart(roll, "bands", "roll straps")
+    bands = roll.subpart("bands", "roll straps")
     for side in (-1, 1):
-        b.put(
-            bands,
-            b.paints.draw("cloth", "brown", "black", "red", "yellow", "white"),
+        bands.put(
+            b.paint("cloth", "brown", "black", "red", "yellow", "white"),
             cylinder(0.13, -0.05, 0.05, 24).turned("x", 90).moved(0, side * w * 0.38, h + 0.16),
         )
 
 
 def _boot(b: Builder) -> None:
-    leather, upper, sole_paint = b.paints.draw("plain"), b.paints.draw("cloth"), b.paints.draw("plastic")
+    leather, upper, sole_paint = b.paint("plain"), b.paint("cloth"), b.paint("plastic")
     length, w, h = b.between(0.80, 0.90), b.between(0.30, 0.34), b.between(0.72, 0.82)
     heel_x, toe_x = -length * 0.36, length * 0.58
 
@@ -110,16 +80,13 @@ def _boot(b: Builder) -> None:
             for c, s in zip(x, y, strict=True)
         ]
 
-    sole = b.part("sole", "bottom")
-    b.put(sole, sole_paint, loft([outline(0.06, 1.05, toe_x), outline(0.13, 1.08, toe_x)]))
-    b.put(
-        b.subpart(sole, "heel", at="of"),
-        b.paints.draw("plastic"),
-        box((0.30, w * 1.02, 0.13), (heel_x + 0.15, 0, 0.065), 0.02),
+    sole = b.part("sole", "bottom").put(
+        sole_paint, loft([outline(0.06, 1.05, toe_x), outline(0.13, 1.08, toe_x)])
     )
-    foot = b.part("foot", "vamp")
-    b.put(
-        foot,
+    sole.subpart("heel", at="of").put(
+        b.paint("plastic"), box((0.30, w * 1.02, 0.13), (heel_x + 0.15, 0, 0.065), 0.02)
+    )
+    foot = b.part("foot", "vamp").put(
         leather,
         loft(
             [
@@ -130,76 +97,60 @@ def _boot(b: Builder) -> None:
             ]
         ),
     )
-    cap = b.subpart(foot, "toe cap", "toe", at="of")
-    b.put(cap, b.paints.draw("plastic"), ellipsoid((0.22, w * 0.50, 0.185), (toe_x - 0.17, 0, 0.15)))
-    shaft = b.part("shaft", "leg")
+    foot.subpart("toe cap", "toe", at="of").put(
+        b.paint("plastic"), ellipsoid((0.22, w * 0.50, 0.185), (toe_x - 0.17, 0, 0.15))
+    )
     cx = heel_x + 0.20
-    b.put(
-        shaft,
+    shaft = b.part("shaft", "leg").put(
         upper,
         lathe([(0.175, 0.20), (0.165, 0.42), (0.19, h), (0.15, h), (0.14, 0.5), (0, 0.45)])
         .scaled(1.1, 0.9, 1)
         .moved(cx),
     )
-    b.put(
-        b.subpart(shaft, "cuff", "fur trim"),
-        b.paints.draw("fur"),
-        ring(0.185, 0.07, (0, 0, h - 0.03)).scaled(1.1, 0.92, 1).moved(cx),
+    shaft.subpart("cuff", "fur trim").put(
+        b.paint("fur"), ring(0.185, 0.07, (0, 0, h - 0.03)).scaled(1.1, 0.92, 1).moved(cx)
     )
-    b.put(
-        b.subpart(shaft, "pull tab", "heel loop"),
-        b.paints.draw("cloth"),
-        box((0.06, 0.14, 0.26), (heel_x + 0.005, 0, h * 0.66), 0.02),
+    shaft.subpart("pull tab", "heel loop").put(
+        b.paint("cloth"), box((0.06, 0.14, 0.26), (heel_x + 0.005, 0, h * 0.66), 0.02)
     )
     laces = b.part("laces", "shoelaces")
-    paint = b.paints.draw("cloth")
+    paint = b.paint("cloth")
     for k in range(4):
         z = 0.37 + 0.085 * k
         x = cx + 0.20 + (0.14 - 0.13 * k if k < 2 else 0.0)
-        b.put(
-            laces,
-            paint,
-            sweep([(x - 0.03, -w * 0.34, z), (x + 0.02, 0, z + 0.03), (x - 0.03, w * 0.34, z)], 0.032),
+        laces.put(
+            paint, sweep([(x - 0.03, -w * 0.34, z), (x + 0.02, 0, z + 0.03), (x - 0.03, w * 0.34, z)], 0.032)
         )
-    bow = b.subpart(laces, "bow", "knot")
+    bow = laces.subpart("bow", "knot")
     bx = cx + 0.26
     for side in (-1, 1):
-        b.put(
-            bow,
-            b.paints.draw("cloth") if side < 0 else paint,
+        bow.put(
+            b.paint("cloth") if side < 0 else paint,
             ellipsoid((0.05, 0.12, 0.07)).turned("x", side * 20).moved(bx, side * 0.12, h - 0.13),
         )
     b.turn(-40)
 
 
 def _lantern(b: Builder) -> None:
-    metal, glass, glow = (
-        b.paints.draw("metal"),
-        b.paints.draw("plastic", "yellow", "white", "orange", "teal"),
-        b.paints.draw("plain", "red", "orange", "yellow"),
-    )
+    metal = b.paint("metal")
+    glass = b.paint("plastic", "yellow", "white", "orange", "teal")
+    glow = b.paint("plain", "red", "orange", "yellow")
     r, h = b.between(0.25, 0.29), b.between(0.40, 0.46)
     low = 0.20
-    base = b.part("base", "oil tank", "foot")
-    b.put(
-        base,
-        metal,
-        lathe([(0, 0), (r * 1.15, 0), (r * 1.15, 0.05), (r * 0.95, 0.10), (r * 0.95, low), (0, low)]),
+    base = b.part("base", "oil tank", "foot").put(
+        metal, lathe([(0, 0), (r * 1.15, 0), (r * 1.15, 0.05), (r * 0.95, 0.10), (r * 0.95, low), (0, low)])
     )
-    b.put(
-        b.subpart(base, "band", "ring"),
-        b.paints.draw("ceramic"),
-        lathe([(r * 0.95, 0.11), (r * 1.06, 0.12), (r * 1.06, 0.185), (r * 0.95, 0.195)]),
+    base.subpart("band", "ring").put(
+        b.paint("ceramic"), lathe([(r * 0.95, 0.11), (r * 1.06, 0.12), (r * 1.06, 0.185), (r * 0.95, 0.195)])
     )
-    knob = b.subpart(base, "knob", "wick wheel")
-    b.put(knob, b.paints.draw("plastic"), disc(0.075, 0, 0.16, 20, 0.02).moved(r * 0.92, 0, 0.085))
-    lamp = b.part("glass", "globe", "window")
-    b.put(
-        lamp,
+    base.subpart("knob", "wick wheel").put(
+        b.paint("plastic"), disc(0.075, 0, 0.16, 20, 0.02).moved(r * 0.92, 0, 0.085)
+    )
+    lamp = b.part("glass", "globe", "window").put(
         glass,
         lathe([(r * 0.62, low), (r * 0.80, low + h * 0.35), (r * 0.80, low + h * 0.6), (r * 0.60, low + h)]),
     )
-    flame = b.subpart(lamp, "flame", "light")
+    flame = lamp.subpart("flame", "light")
     for a in range(0, 360, 90):
         # The flame is on each side of the glass, because the inside of an opaque globe is never visible.
         shape = (
@@ -207,64 +158,53 @@ def _lantern(b: Builder) -> None:
             .scaled(0.30, 1, 1)
             .moved(r * 0.80, 0, low + h * 0.28)
         )
-        b.put(flame, glow, shape.turned("z", a + 45))
+        flame.put(glow, shape.turned("z", a + 45))
     cage = b.part("cage", "bars", "guard")
-    bar = b.paints.draw("plain", "black", "grey", "brown", "red", "blue")
+    bar = b.paint("plain", "black", "grey", "brown", "red", "blue")
     for a in range(0, 360, 90):
-        b.put(cage, bar, box((0.05, 0.05, h), (r * 0.92, 0, low + h / 2), 0.012).turned("z", a))
-    b.put(
-        b.subpart(cage, "hoop", "middle ring"),
-        b.paints.draw("metal"),
-        ring(r * 0.95, 0.032, (0, 0, low + h * 0.16)),
-    )
+        cage.put(bar, box((0.05, 0.05, h), (r * 0.92, 0, low + h / 2), 0.012).turned("z", a))
+    cage.subpart("hoop", "middle ring").put(b.paint("metal"), ring(r * 0.95, 0.032, (0, 0, low + h * 0.16)))
     roof, top = b.part("roof", "cap", "hood"), low + h
-    b.put(
-        roof,
+    roof.put(
         metal,
         lathe(
             [(0, top - 0.01), (r * 1.2, top), (r * 1.12, top + 0.06), (r * 0.55, top + 0.20), (0, top + 0.21)]
         ),
     )
-    b.put(
-        b.subpart(roof, "chimney", "vent"),
-        b.paints.draw("plastic"),
+    roof.subpart("chimney", "vent").put(
+        b.paint("plastic"),
         lathe([(0.085, 0), (0.085, 0.08), (0.14, 0.09), (0.14, 0.145), (0, 0.17)]).moved(z=top + 0.17),
     )
-    handle = b.part("handle", "bail")
     path = [(0, y, top + 0.08 + z) for y, _, z in arc((r * 1.22, 0.42), -4, 184)]
-    b.put(handle, b.paints.draw("metal"), sweep(path, 0.03))
+    handle = b.part("handle", "bail").put(b.paint("metal"), sweep(path, 0.03))
     grip = [(0, y, top + 0.08 + z) for y, _, z in arc((r * 1.22, 0.42), 58, 122)]
-    b.put(b.subpart(handle, "grip", at="of"), b.paints.draw("wood"), sweep(grip, 0.065))
+    handle.subpart("grip", at="of").put(b.paint("wood"), sweep(grip, 0.065))
 
 
 def _chest(b: Builder) -> None:
-    wood, metal, gold = (
-        b.paints.draw("wood"),
-        b.paints.draw("metal"),
-        b.paints.draw("metal", "yellow", "orange"),
-    )
+    wood = b.paint("wood")
+    metal = b.paint("metal")
+    gold = b.paint("metal", "yellow", "orange")
     d, w, h = b.between(0.46, 0.54), b.between(0.74, 0.84), b.between(0.34, 0.40)
-    chest = b.part("box", "trunk", "body")
-    b.put(
-        chest,
+    chest = b.part("box", "trunk", "body").put(
         wood,
         box((d, w, 0.06), (0, 0, 0.05)),
         *[box((0.05, w, h), (s * (d / 2 - 0.025), 0, h / 2 + 0.02)) for s in (-1, 1)],
         *[box((d, 0.05, h), (0, s * (w / 2 - 0.025), h / 2 + 0.02)) for s in (-1, 1)],
     )
-    bands = b.subpart(chest, "bands", "straps", "iron bands")
+    bands = chest.subpart("bands", "straps", "iron bands")
     for side in (-1, 1):
         for x in (-1.0, 1.0):
-            b.put(
-                bands,
+            bands.put(
                 metal,
                 box((0.05, 0.105, h + 0.02), (x * (d / 2 + 0.005), side * w * 0.33, h / 2 + 0.02), 0.01),
             )
-    lock = b.subpart(chest, "lock", "padlock")
-    b.put(lock, b.paints.draw("metal"), box((0.08, 0.19, 0.20), (d / 2 + 0.02, 0, h - 0.08), 0.03))
-    handles = b.subpart(chest, "handles", "side rings")
+    chest.subpart("lock", "padlock").put(
+        b.paint("metal"), box((0.08, 0.19, 0.20), (d / 2 + 0.02, 0, h - 0.08), 0.03)
+    )
+    handles = chest.subpart("handles", "side rings")
     for side in (-1, 1):
-        b.put(handles, b.paints.draw("metal"), ring(0.10, 0.035, (0, side * (w / 2 + 0.03), h * 0.52), "y"))
+        handles.put(b.paint("metal"), ring(0.10, 0.035, (0, side * (w / 2 + 0.03), h * 0.52), "y"))
     lid, r = b.part("lid", "cover"), d / 2
     half = [(r * np.cos(a), r * np.sin(a) * 0.8) for a in np.linspace(0, np.pi, 13)]
     back = (-d / 2, h + 0.02)
@@ -273,23 +213,21 @@ def _chest(b: Builder) -> None:
         """Rotate a mesh by 50 degrees about the hinge at the upper back edge."""
         return mesh.moved(r, 0, 0).turned("y", -50).moved(back[0], 0, back[1])
 
-    b.put(lid, b.paints.draw("wood"), opened(extrude(half, w)))
-    lining = b.subpart(lid, "lining", "inside", at="of")
-    b.put(lining, b.paints.draw("cloth"), opened(box((d * 0.84, w * 0.88, 0.03), (0, 0, -0.01))))
-    lid_bands = b.subpart(lid, "hoops", "lid bands")
+    lid.put(b.paint("wood"), opened(extrude(half, w)))
+    lid.subpart("lining", "inside", at="of").put(
+        b.paint("cloth"), opened(box((d * 0.84, w * 0.88, 0.03), (0, 0, -0.01)))
+    )
+    lid_bands = lid.subpart("hoops", "lid bands")
     wider = [(x * 1.04, z * 1.05) for x, z in half]
     for side in (-1, 1):
-        b.put(lid_bands, metal, opened(extrude(wider, 0.105).moved(0, side * w * 0.33, 0)))
-    treasure = b.part("gold", "coins", "gold coins")
-    b.put(treasure, gold, ellipsoid((d * 0.42, w * 0.44, 0.16), (0, 0, h - 0.04)))
-    gems, jewel = (
-        b.subpart(treasure, "gems", "jewels"),
-        b.paints.draw("ceramic", "red", "green", "blue", "purple", "teal", "pink"),
+        lid_bands.put(metal, opened(extrude(wider, 0.105).moved(0, side * w * 0.33, 0)))
+    treasure = b.part("gold", "coins", "gold coins").put(
+        gold, ellipsoid((d * 0.42, w * 0.44, 0.16), (0, 0, h - 0.04))
     )
+    gems = treasure.subpart("gems", "jewels")
+    jewel = b.paint("ceramic", "red", "green", "blue", "purple", "teal", "pink")
     for x, y in ((0.10, -0.20), (0.12, 0.06), (0.05, 0.25), (-0.02, -0.04)):
-        b.put(
-            gems, jewel, ellipsoid((0.08, 0.085, 0.075), (x, y * w / 0.8, h + 0.06 + 0.05 * (0.12 - x)), 8, 4)
-        )
+        gems.put(jewel, ellipsoid((0.08, 0.085, 0.075), (x, y * w / 0.8, h + 0.06 + 0.05 * (0.12 - x)), 8, 4))
 
 
 MAKERS: dict[str, Maker] = {

@@ -67,14 +67,36 @@ class ObjectModel:
     materials: Float[np.ndarray, "M 14"]
 
 
+class Node(NamedTuple):
+    """A node of an unfinished object; `at` is the preposition before its parent."""
+
+    builder: "Builder"
+    row: int
+    level: int
+    parent: int
+    word: str
+    aliases: tuple[str, ...]
+    at: str = "on"
+
+    def subpart(self, word: str, *aliases: str, at: str = "on") -> "Node":
+        """Add a subpart and return it; `at` is the preposition, as in "knob on the kettle lid"."""
+        return self.builder.added(3, self.row, word, aliases, at)
+
+    def put(self, paint: Paint, *meshes: Mesh) -> "Node":
+        """Add meshes to the node and return it."""
+        self.builder.pieces.append((self.row, joined(*meshes), paint))
+        return self
+
+
 class Builder:
     """Nodes and meshes of one object while its maker runs."""
 
     def __init__(self, name: str, aliases: tuple[str, ...], rng: np.random.Generator) -> None:
         self.name, self.aliases, self.rng = name, aliases, rng
-        self.paints = PaintBox(rng)
-        self._nodes: list[_Named] = [_Named(1, NONE, name, aliases)]
-        self._pieces: list[tuple[int, Mesh, Paint]] = []
+        self.paint = PaintBox(rng).draw
+        self.nodes: list[Node] = []
+        self.pieces: list[tuple[int, Mesh, Paint]] = []
+        self.added(1, NONE, name, aliases)
 
     def between(self, low: float | int, high: float | int) -> float:
         """Draw a uniform random number."""
@@ -84,55 +106,41 @@ class Builder:
         """Return True with the given probability."""
         return bool(self.rng.random() < probability)
 
-    def part(self, word: str, *aliases: str) -> int:
-        """Add a part and return its node; `word` is its name without the object's."""
-        self._nodes.append(_Named(2, 0, word, aliases))
-        return len(self._nodes) - 1
+    def part(self, word: str, *aliases: str) -> Node:
+        """Add a part and return it; `word` is its name without the object's."""
+        return self.added(2, 0, word, aliases)
 
-    def subpart(self, part: int, word: str, *aliases: str, at: str = "on") -> int:
-        """Add a subpart and return its node; `at` is the preposition, as in "knob on the kettle lid"."""
-        self._nodes.append(_Named(3, part, word, aliases, at))
-        return len(self._nodes) - 1
-
-    def put(self, node: int, paint: Paint, *meshes: Mesh) -> None:
-        """Add meshes to a part or subpart."""
-        self._pieces.append((node, joined(*meshes), paint))
-
-    def shift(self, nodes: tuple[int, ...], x: float | int, y: float | int, z: float | int) -> None:
-        """Move everything added to these nodes so far."""
-        self._pieces = [
-            (node, mesh.moved(x, y, z) if node in nodes else mesh, paint)
-            for node, mesh, paint in self._pieces
-        ]
+    def added(self, level: int, parent: int, word: str, aliases: tuple[str, ...], at: str = "on") -> Node:
+        """Add a node and return it."""
+        self.nodes.append(Node(self, len(self.nodes), level, parent, word, aliases, at))
+        return self.nodes[-1]
 
     def turn(self, degrees: float | int) -> None:
         """Rotate everything added so far about the vertical axis."""
-        self._pieces = [(node, mesh.turned("z", degrees), paint) for node, mesh, paint in self._pieces]
+        self.pieces = [(row, mesh.turned("z", degrees), paint) for row, mesh, paint in self.pieces]
 
     def build(self) -> ObjectModel:
         """Return the object with its lowest point at z = 0 and contrast between parts that touch."""
         triples: list[tuple[int, int, int]] = []
-        for level, parent, *_ in self._nodes:
-            row = len(triples)
-            triples.append(
-                (0, NONE, NONE) if level == 1 else (0, row, NONE) if level == 2 else (0, parent, row)
-            )
+        for node in self.nodes:
+            part, subpart = {1: (NONE, NONE), 2: (node.row, NONE), 3: (node.parent, node.row)}[node.level]
+            triples.append((0, part, subpart))
         node_ids = np.array(triples, np.int32)
         pieces = self._contrasted()
         paints = list(dict.fromkeys(paint for _, _, paint in pieces))
         area: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
-        for node, mesh, paint in pieces:
-            for owner in triples[node]:
+        for row, mesh, paint in pieces:
+            for owner in triples[row]:
                 if owner != NONE:
                     area[owner][paint] += _surface(mesh)
         triangles = np.concatenate([mesh.triangles for _, mesh, _ in pieces])
         triangles[..., 2] -= triangles[..., 2].min()
         return ObjectModel(
             self.name,
-            tuple(self._described(row, area[row]) for row in range(len(self._nodes))),
+            tuple(self._described(node, area[node.row]) for node in self.nodes),
             triangles,
             np.concatenate([mesh.normals for _, mesh, _ in pieces]),
-            np.concatenate([np.tile(node_ids[node], (len(mesh), 1)) for node, mesh, _ in pieces]),
+            np.concatenate([np.tile(node_ids[row], (len(mesh), 1)) for row, mesh, _ in pieces]),
             np.concatenate([np.full(len(mesh), paints.index(paint), np.int32) for _, mesh, paint in pieces]),
             np.stack([paint.row() for paint in paints]),
         )
@@ -147,15 +155,15 @@ class Builder:
         groups: dict[tuple[int, str, str], list[int]] = {}
         surface: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
         corners: dict[int, list[np.ndarray]] = defaultdict(list)
-        for row, (level, parent, word, *_) in enumerate(self._nodes[1:], start=1):
-            groups.setdefault((level, self._nodes[parent].word, word), []).append(row)
-        for node, mesh, paint in self._pieces:
-            surface[node][paint] += _surface(mesh)
-            corners[node].append(mesh.triangles.reshape(-1, 3))
+        for node in self.nodes[1:]:
+            groups.setdefault((node.level, self.nodes[node.parent].word, node.word), []).append(node.row)
+        for row, mesh, paint in self.pieces:
+            surface[row][paint] += _surface(mesh)
+            corners[row].append(mesh.triangles.reshape(-1, 3))
         boxes = {}
-        for node, points in corners.items():
-            stacked = np.concatenate(points)
-            boxes[node] = np.stack([stacked.min(axis=0), stacked.max(axis=0)])
+        for row, parts in corners.items():
+            points = np.concatenate(parts)
+            boxes[row] = np.stack([points.min(axis=0), points.max(axis=0)])
         whole = np.stack(list(boxes.values()))
         reach = _TOUCH * float(np.ptp(whole.reshape(-1, 3), axis=0).max())
         settled: dict[tuple[int, str, str], Paint] = {}
@@ -169,7 +177,7 @@ class Builder:
                 for paint, size in surface[row].items():
                     own[paint] += size
             main = max(own, key=own.__getitem__)
-            parents = {self._nodes[row].parent for row in rows}
+            parents = {self.nodes[row].parent for row in rows}
             rivals = []
             for other, paint in settled.items():
                 if parents & set(groups[other]):
@@ -184,39 +192,27 @@ class Builder:
             settled[key] = _distinct(main, rivals)
             for row in rows:
                 repaint[row, main] = settled[key]
-        return [(node, mesh, repaint.get((node, paint), paint)) for node, mesh, paint in self._pieces]
+        return [(row, mesh, repaint.get((row, paint), paint)) for row, mesh, paint in self.pieces]
 
-    def _described(self, row: int, area: dict[Paint, float]) -> ModelNode:
+    def _described(self, node: Node, area: dict[Paint, float]) -> ModelNode:
         """Return a node with its texts: the canonical name, then aliases, relations and attributes."""
-        level, parent, word, aliases, at = self._nodes[row]
-        if level == 1:
-            text, others = self.name, [*self.aliases]
-        else:
-            text = f"{self.name} {word}"
-            others = [f"{self.name} {alias}" for alias in aliases]
-            others += [f"{name} of the {self.name}" for name in (word, *aliases)]
-            others += [f"{word} of the {alias}" for alias in self.aliases]
-            if level == 3:
-                others.append(f"{word} {at} the {self.name} {self._nodes[parent].word}")
-        colour, coloured = _prevailing(area, _PREVAILS[level], lambda paint: paint.colour)
-        material, made = _prevailing(area, _PREVAILS[level], lambda paint: paint.adjective)
+        text, others = self.name, list(self.aliases)
+        if node.level > 1:
+            text = f"{self.name} {node.word}"
+            others = [f"{self.name} {alias}" for alias in node.aliases]
+            others += [f"{name} of the {self.name}" for name in (node.word, *node.aliases)]
+            others += [f"{node.word} of the {alias}" for alias in self.aliases]
+        if node.level == 3:
+            others.append(f"{node.word} {node.at} the {self.name} {self.nodes[node.parent].word}")
+        colour, coloured = _prevailing(area, _PREVAILS[node.level], lambda paint: paint.colour)
+        material, made = _prevailing(area, _PREVAILS[node.level], lambda paint: paint.adjective)
         if coloured:
             others.append(f"{colour} {text}")
         if made and material is not None:
             others.append(f"{material} {text}")
             if coloured:
                 others.append(f"{colour} {material} {text}")
-        return ModelNode(level, parent, text, tuple(dict.fromkeys(others)), colour)
-
-
-class _Named(NamedTuple):
-    """A node of an unfinished object; `at` is the preposition before its parent."""
-
-    level: int
-    parent: int
-    word: str
-    aliases: tuple[str, ...]
-    at: str = "on"
+        return ModelNode(node.level, node.parent, text, tuple(dict.fromkeys(others)), colour)
 
 
 def _surface(mesh: Mesh) -> float:

@@ -9,20 +9,22 @@ from hilsplat.world.shapes import box, cylinder, ellipsoid, extrude, lathe, sphe
 
 
 def _tree(b: Builder) -> None:
-    bark, leaves = b.paints.draw("wood", "brown"), foliage(b, "green", "green", "green", "orange")
+    bark, leaves = b.paint("wood", "brown"), foliage(b, "green", "green", "green", "orange")
     tall, spread = b.between(2.3, 2.6), b.between(1.15, 1.45)
     lean = b.between(-0.12, 0.12)
-    trunk = b.part("trunk", "stem")
-    b.put(trunk, bark, sweep([(0, 0, 0), (lean, 0, tall / 2), (0, lean, tall + 0.5)], [0.2, 0.16, 0.13], 14))
-    grate = b.subpart(trunk, "grate", "pit cover")
-    b.put(grate, b.paints.draw("metal", "grey"), box((0.9, 0.9, 0.06), (0, 0, 0.03)))
-    guard = b.subpart(trunk, "bark guard", "trunk guard")
-    b.put(guard, b.paints.draw("plain", "white", "beige", "teal"), cylinder(0.235, 0.5, 1.1, 14))
-    crown = b.part("crown", "foliage", "leaves")
+    trunk = b.part("trunk", "stem").put(
+        bark, sweep([(0, 0, 0), (lean, 0, tall / 2), (0, lean, tall + 0.5)], [0.2, 0.16, 0.13], 14)
+    )
+    trunk.subpart("grate", "pit cover").put(b.paint("metal", "grey"), box((0.9, 0.9, 0.06), (0, 0, 0.03)))
+    trunk.subpart("bark guard", "trunk guard").put(
+        b.paint("plain", "white", "beige", "teal"), cylinder(0.235, 0.5, 1.1, 14)
+    )
     middle = tall + 0.9 * spread
-    b.put(crown, leaves, ellipsoid((0.74 * spread, 0.74 * spread, 0.8 * spread), (0, 0, middle), 18, 10))
-    fruit = b.subpart(crown, "blossoms", "flowers")
-    petals = b.paints.draw("plain", "pink", "white", "yellow", "red")
+    crown = b.part("crown", "foliage", "leaves").put(
+        leaves, ellipsoid((0.74 * spread, 0.74 * spread, 0.8 * spread), (0, 0, middle), 18, 10)
+    )
+    fruit = crown.subpart("blossoms", "flowers")
+    petals = b.paint("plain", "pink", "white", "yellow", "red")
     for i in range(26):
         up = np.arcsin(1 - 2 * (i + 0.5) / 26)
         around = 2.399963 * i + b.between(-0.3, 0.3)
@@ -33,12 +35,10 @@ def _tree(b: Builder) -> None:
             away * np.cos(up) * np.sin(around),
             middle + 1.08 * away * np.sin(up),
         )
-        b.put(crown, leaves, sphere(radius, centre, 14))
+        crown.put(leaves, sphere(radius, centre, 14))
         if i % 3 == 1:
-            b.put(
-                fruit,
-                petals,
-                sphere(0.17, tuple(np.array(centre) + 0.93 * radius * _outwards(centre, middle)), 10),
+            fruit.put(
+                petals, sphere(0.17, tuple(np.array(centre) + 0.93 * radius * _outwards(centre, middle)), 10)
             )
 
 
@@ -50,39 +50,35 @@ def _outwards(point: tuple[float, float, float], middle: float) -> np.ndarray:
 
 def _bush(b: Builder) -> None:
     leaves = foliage(b, "green")
-    pot = b.part("planter", "flower box")
     w, length = 0.62, b.between(1.1, 1.7)
-    b.put(
-        pot,
-        b.paints.draw("stone", "grey", "beige", "white", "brown"),
-        box((w, length, 0.5), (0, 0, 0.25), 0.03),
+    pot = b.part("planter", "flower box").put(
+        b.paint("stone", "grey", "beige", "white", "brown"), box((w, length, 0.5), (0, 0, 0.25), 0.03)
     )
-    rim = b.subpart(pot, "rim", "edge")
-    b.put(rim, b.paints.draw("wood", "brown", "orange"), box((w + 0.1, length + 0.1, 0.1), (0, 0, 0.5), 0.02))
+    pot.subpart("rim", "edge").put(
+        b.paint("wood", "brown", "orange"), box((w + 0.1, length + 0.1, 0.1), (0, 0, 0.5), 0.02)
+    )
     green = b.part("foliage", "leaves")
-    flowers = b.subpart(green, "flowers", "blossoms")
-    petals = b.paints.draw("plain", "red", "yellow", "pink", "purple", "white", "orange")
+    flowers = green.subpart("flowers", "blossoms")
+    petals = b.paint("plain", "red", "yellow", "pink", "purple", "white", "orange")
     count = 5
     for i in range(count):
         y = length * ((i + 0.5) / count - 0.5)
         radius = b.between(0.27, 0.36)
         z = 0.62 + b.between(0.0, 0.2)
-        b.put(green, leaves, sphere(radius, (b.between(-0.05, 0.05), y, z), 14))
+        green.put(leaves, sphere(radius, (b.between(-0.05, 0.05), y, z), 14))
         for x in (-0.15, 0.16):
-            b.put(flowers, petals, sphere(0.1, (x, y + b.between(-0.1, 0.1), z + 0.86 * radius), 10))
+            flowers.put(petals, sphere(0.1, (x, y + b.between(-0.1, 0.1), z + 0.86 * radius), 10))
 
 
 def _sign(b: Builder) -> None:
-    metal = b.paints.draw("metal", "grey")
-    pole = b.part("pole", "post")
+    metal = b.paint("metal", "grey")
     tall = b.between(2.1, 2.4)
-    b.put(pole, metal, post(0.055, tall))
-    foot = b.subpart(pole, "base", "foot")
-    b.put(foot, b.paints.draw("stone", "grey", "beige"), cylinder(0.16, 0, 0.2, 14, 0.02))
+    pole = b.part("pole", "post").put(metal, post(0.055, tall))
+    pole.subpart("base", "foot").put(b.paint("stone", "grey", "beige"), cylinder(0.16, 0, 0.2, 14, 0.02))
     plate = b.part("plate", "panel", "board")
     shape = str(b.rng.choice(["round", "octagon", "triangle", "square"]))
     size = b.between(0.40, 0.46)
-    symbol = b.subpart(plate, "symbol", "pictogram")
+    symbol = plate.subpart("symbol", "pictogram")
     colour, mark = {
         "round": (("red", "blue"), "white"),
         "octagon": (("red",), "white"),
@@ -98,77 +94,69 @@ def _sign(b: Builder) -> None:
         return [(factor * radius * float(np.cos(a)), factor * radius * float(np.sin(a))) for a in angle]
 
     z = tall - 0.25
-    b.put(
-        plate,
-        plain(b, str(b.rng.choice(colour))),
-        extrude(outline(1.0), 0.05).turned("z", 90).moved(0.08, 0, z),
+    plate.put(
+        plain(b, str(b.rng.choice(colour))), extrude(outline(1.0), 0.05).turned("z", 90).moved(0.08, 0, z)
     )
     if shape in ("octagon", "square"):
-        b.put(symbol, plain(b, mark), panel(0.03, 1.2 * size, 0.2, 0.115, 0, z))
-        b.put(symbol, plain(b, mark), panel(0.03, 0.2, 0.9 * size, 0.116, 0, z))
+        symbol.put(plain(b, mark), panel(0.03, 1.2 * size, 0.2, 0.115, 0, z))
+        symbol.put(plain(b, mark), panel(0.03, 0.2, 0.9 * size, 0.116, 0, z))
     else:
-        b.put(symbol, plain(b, mark), extrude(outline(0.52), 0.03).turned("z", 90).moved(0.115, 0, z))
+        symbol.put(plain(b, mark), extrude(outline(0.52), 0.03).turned("z", 90).moved(0.115, 0, z))
 
 
 def _traffic_light(b: Builder) -> None:
-    pole = b.part("pole", "post")
     tall = b.between(2.5, 2.8)
-    b.put(pole, b.paints.draw("metal", "grey", "white"), post(0.075, tall))
-    foot = b.subpart(pole, "base", "foot")
-    b.put(foot, b.paints.draw("stone", "beige", "grey"), box((0.36, 0.36, 0.42), (0, 0, 0.21), 0.03))
-    housing = b.part("housing", "signal head")
-    z, dark = tall - 0.45, b.paints.draw("plain", "yellow", "green", "black")
-    b.put(housing, dark, box((0.3, 0.42, 1.16), (0.14, 0, z), 0.05))
+    pole = b.part("pole", "post").put(b.paint("metal", "grey", "white"), post(0.075, tall))
+    pole.subpart("base", "foot").put(
+        b.paint("stone", "beige", "grey"), box((0.36, 0.36, 0.42), (0, 0, 0.21), 0.03)
+    )
+    z, dark = tall - 0.45, b.paint("plain", "yellow", "green", "black")
+    housing = b.part("housing", "signal head").put(dark, box((0.3, 0.42, 1.16), (0.14, 0, z), 0.05))
     bright = int(b.rng.integers(3))
     for i, colour in enumerate(("red", "yellow", "green")):
-        lamp = b.subpart(housing, f"{colour} lamp", f"{colour} light")
         paint = plain(b, colour)
         disc = cylinder(0.155, -0.03, 0.04, 18, 0.01).turned("y", 90)
-        b.put(lamp, lit(paint) if i == bright else paint, disc.moved(0.3, 0, z + 0.36 - 0.36 * i))
-    visor = b.subpart(housing, "visor", "hood")
+        housing.subpart(f"{colour} lamp", f"{colour} light").put(
+            lit(paint) if i == bright else paint, disc.moved(0.3, 0, z + 0.36 - 0.36 * i)
+        )
+    visor = housing.subpart("visor", "hood")
     for i in range(3):
-        b.put(visor, plain(b, "black"), box((0.2, 0.36, 0.04), (0.38, 0, z + 0.36 - 0.36 * i + 0.165)))
+        visor.put(plain(b, "black"), box((0.2, 0.36, 0.04), (0.38, 0, z + 0.36 - 0.36 * i + 0.165)))
 
 
 def _street_lamp(b: Builder) -> None:
-    paint = b.paints.draw("metal", "green", "black", "grey", "blue")
-    pole = b.part("pole", "post")
+    paint = b.paint("metal", "green", "black", "grey", "blue")
     tall = b.between(4.0, 4.6)
     path = [(0, 0, 0), (0, 0, tall - 0.5), (0.12, 0, tall - 0.12), (0.5, 0, tall), (0.9, 0, tall)]
-    b.put(pole, paint, sweep(path, [0.09, 0.07, 0.06, 0.05, 0.05], 12))
-    foot = b.subpart(pole, "base", "foot")
-    b.put(
-        foot,
-        b.paints.draw("stone", "grey", "beige"),
-        lathe([(0, 0), (0.24, 0), (0.22, 0.3), (0.12, 0.6), (0, 0.6)], 14),
+    pole = b.part("pole", "post").put(paint, sweep(path, [0.09, 0.07, 0.06, 0.05, 0.05], 12))
+    pole.subpart("base", "foot").put(
+        b.paint("stone", "grey", "beige"), lathe([(0, 0), (0.24, 0), (0.22, 0.3), (0.12, 0.6), (0, 0.6)], 14)
     )
-    head = b.part("head", "lantern")
-    b.put(head, b.paints.draw("plain", "white", "grey"), box((0.8, 0.34, 0.16), (1.1, 0, tall + 0.02), 0.05))
-    bulb = b.subpart(head, "bulb", "light bulb")
-    b.put(bulb, lit(plain(b, "yellow")), ellipsoid((0.28, 0.13, 0.11), (1.15, 0, tall - 0.07), 14, 8))
+    head = b.part("head", "lantern").put(
+        b.paint("plain", "white", "grey"), box((0.8, 0.34, 0.16), (1.1, 0, tall + 0.02), 0.05)
+    )
+    head.subpart("bulb", "light bulb").put(
+        lit(plain(b, "yellow")), ellipsoid((0.28, 0.13, 0.11), (1.15, 0, tall - 0.07), 14, 8)
+    )
 
 
 def _fence(b: Builder) -> None:
-    wood = b.paints.draw("wood") if b.chance(0.5) else b.paints.draw("plain", "white", "green", "teal", "red")
-    rails = (
-        b.paints.draw("wood", "beige") if wood.kind != "wood" else b.paints.draw("plain", "white", "beige")
-    )
+    wood = b.paint("wood") if b.chance(0.5) else b.paint("plain", "white", "green", "teal", "red")
+    rails = b.paint("wood", "beige") if wood.kind != "wood" else b.paint("plain", "white", "beige")
     length = b.between(2.6, 3.6)
-    boards = b.part("panel", "boards")
-    b.put(boards, rails, box((0.05, length, 0.1), (0, 0, 0.28)), box((0.05, length, 0.1), (0, 0, 0.78)))
-    slats = b.subpart(boards, "slats", "pickets")
+    boards = b.part("panel", "boards").put(
+        rails, box((0.05, length, 0.1), (0, 0, 0.28)), box((0.05, length, 0.1), (0, 0, 0.78))
+    )
+    slats = boards.subpart("slats", "pickets")
     count = int(length / 0.22)
     for i in range(count):
         y = length * ((i + 0.5) / count - 0.5)
-        b.put(slats, wood, box((0.05, 0.13, 0.94), (0.04, y, 0.55)))
-    stone = b.paints.draw("stone", "grey", "brown")
+        slats.put(wood, box((0.05, 0.13, 0.94), (0.04, y, 0.55)))
+    stone = b.paint("stone", "grey", "brown")
     for y in (-length / 2, length / 2):
-        pillar = b.part("post", "fence post")
-        b.put(pillar, stone, box((0.22, 0.22, 1.2), (0, y, 0.6), 0.02))
-        b.put(
-            b.subpart(pillar, "cap", "top"),
-            b.paints.draw("plain", "red", "black", "white"),
-            box((0.32, 0.32, 0.12), (0, y, 1.24), 0.03),
+        pillar = b.part("post", "fence post").put(stone, box((0.22, 0.22, 1.2), (0, y, 0.6), 0.02))
+        pillar.subpart("cap", "top").put(
+            b.paint("plain", "red", "black", "white"), box((0.32, 0.32, 0.12), (0, y, 1.24), 0.03)
         )
 
 

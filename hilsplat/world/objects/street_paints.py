@@ -34,13 +34,13 @@ def _faded(colour: Colour, factor: float) -> Colour:
 
 def lacquer(b: Builder, *colours: str) -> Paint:
     """Return a glossy paint of one colour, as on vehicles."""
-    paint = b.paints.draw("plain", *colours)
+    paint = b.paint("plain", *colours)
     return replace(paint, second=_faded(paint.first, 0.86), specular=0.4, shininess=50.0)
 
 
 def glass(b: Builder) -> Paint:
     """Return dark, glossy, slightly cloudy glass, so that a window pane has some visible detail."""
-    paint = b.paints.draw("plain", "black")
+    paint = b.paint("plain", "black")
     first, second = ((0.15, 0.19, 0.26), (0.36, 0.45, 0.55))
     choices = ("black", "grey", "blue", "teal")
     return replace(
@@ -50,7 +50,7 @@ def glass(b: Builder) -> Paint:
 
 def rubber(b: Builder) -> Paint:
     """Return the paint of tyres."""
-    return replace(b.paints.draw("plain", "black"), specular=0.05)
+    return replace(b.paint("plain", "black"), specular=0.05)
 
 
 def lit(paint: Paint) -> Paint:
@@ -60,7 +60,7 @@ def lit(paint: Paint) -> Paint:
 
 def plaster(b: Builder, *colours: str) -> Paint:
     """Return the paint of a stained wall."""
-    paint = b.paints.draw("plain", *(colours or tuple(PASTELS)))
+    paint = b.paint("plain", *(colours or tuple(PASTELS)))
     first = PASTELS[paint.colour]
     return replace(paint, first=first, second=_faded(first, 0.84), scale=5.0, grain=0.34).shaded(
         1.0
@@ -69,14 +69,14 @@ def plaster(b: Builder, *colours: str) -> Paint:
 
 def foliage(b: Builder, *colours: str) -> Paint:
     """Return the paint of leaves, with clumps of light and shade."""
-    paint = b.paints.draw("plain", *(colours or ("green",)))
+    paint = b.paint("plain", *(colours or ("green",)))
     shade, light = FOLIAGE[paint.colour]
     return replace(paint, first=shade, second=light, scale=20.0, grain=0.36, specular=0.03)
 
 
 def plain(b: Builder, colour: str) -> Paint:
     """Return a plain paint in exactly the listed colour."""
-    return replace(b.paints.draw("plain", colour), first=COLOURS[colour])
+    return replace(b.paint("plain", colour), first=COLOURS[colour])
 
 
 def wheel(x: Number, y: Number, radius: Number, width: Number) -> Mesh:

@@ -5,17 +5,14 @@ from hilsplat.world.shapes import box, cylinder, disc, ellipsoid, extrude, lathe
 
 
 def _train(b: Builder) -> None:
-    tank, cab_paint, metal = b.paints.draw("plastic"), b.paints.draw("plain"), b.paints.draw("metal")
-    dark = b.paints.draw("plain", "black", "grey", "brown")
+    tank, cab_paint, metal = b.paint("plastic"), b.paint("plain"), b.paint("metal")
+    dark = b.paint("plain", "black", "grey", "brown")
     r, length = b.between(0.19, 0.22), b.between(0.60, 0.70)
     axis = 0.24 + r
-    frame = b.part("frame", "chassis")
-    b.put(frame, dark, box((length + 0.42, 0.34, 0.12), (0, 0, 0.21), 0.02))
-    catcher = b.subpart(frame, "cowcatcher", "plough")
+    frame = b.part("frame", "chassis").put(dark, box((length + 0.42, 0.34, 0.12), (0, 0, 0.21), 0.02))
     front = length / 2 + 0.20
-    b.put(
-        catcher,
-        b.paints.draw("plastic"),
+    frame.subpart("cowcatcher", "plough").put(
+        b.paint("plastic"),
         loft(
             [
                 [(front, -0.22, 0.04), (front, 0.22, 0.04), (front, 0.16, 0.27), (front, -0.16, 0.27)],
@@ -28,56 +25,43 @@ def _train(b: Builder) -> None:
             ]
         ),
     )
-    boiler = b.part("boiler", "tank")
     back = -length / 2 + 0.22
-    b.put(boiler, tank, disc(r, back, front - 0.04).moved(z=axis))
-    plate = b.subpart(boiler, "front plate", "smokebox door")
-    b.put(plate, metal, disc(r * 0.80, front - 0.05, front + 0.02, bevel=0.02).moved(z=axis))
-    bands = b.subpart(boiler, "bands", "rings")
-    band = b.paints.draw("metal")
+    boiler = b.part("boiler", "tank").put(tank, disc(r, back, front - 0.04).moved(z=axis))
+    boiler.subpart("front plate", "smokebox door").put(
+        metal, disc(r * 0.80, front - 0.05, front + 0.02, bevel=0.02).moved(z=axis)
+    )
+    bands = boiler.subpart("bands", "rings")
+    band = b.paint("metal")
     for share in (0.25, 0.62):
         x = back + share * (front - back)
-        b.put(bands, band, disc(r + 0.022, x - 0.05, x + 0.05).moved(z=axis))
-    dome = b.subpart(boiler, "dome", "bell")
-    b.put(
-        dome,
-        b.paints.draw("metal"),
+        bands.put(band, disc(r + 0.022, x - 0.05, x + 0.05).moved(z=axis))
+    boiler.subpart("dome", "bell").put(
+        b.paint("metal"),
         lathe([(0.13, 0), (0.13, 0.08), (0.08, 0.16), (0, 0.18)]).moved(0.04, 0, axis + r - 0.03),
     )
-    chimney = b.part("chimney", "funnel", "smokestack")
     cx, top = front - 0.16, axis + r
-    b.put(
-        chimney,
-        dark,
-        lathe([(0, -0.05), (0.075, -0.05), (0.075, 0.08), (0.115, 0.2), (0, 0.2)]).moved(cx, 0, top),
+    chimney = b.part("chimney", "funnel", "smokestack").put(
+        dark, lathe([(0, -0.05), (0.075, -0.05), (0.075, 0.08), (0.115, 0.2), (0, 0.2)]).moved(cx, 0, top)
     )
-    b.put(
-        b.subpart(chimney, "rim", "crown", at="of"),
-        b.paints.draw("ceramic"),
-        cylinder(0.145, top + 0.17, top + 0.255, bevel=0.015).moved(cx),
+    chimney.subpart("rim", "crown", at="of").put(
+        b.paint("ceramic"), cylinder(0.145, top + 0.17, top + 0.255, bevel=0.015).moved(cx)
     )
-    cabin = b.part("cabin", "cab")
     x, height = -length / 2 - 0.01, b.between(0.52, 0.60)
-    b.put(cabin, cab_paint, box((0.36, 0.44, height), (x, 0, 0.25 + height / 2), 0.015))
-    b.put(
-        b.subpart(cabin, "roof", "top", at="of"),
-        b.paints.draw("plain"),
-        box((0.48, 0.56, 0.08), (x, 0, 0.28 + height), 0.03),
+    cabin = b.part("cabin", "cab").put(cab_paint, box((0.36, 0.44, height), (x, 0, 0.25 + height / 2), 0.015))
+    cabin.subpart("roof", "top", at="of").put(
+        b.paint("plain"), box((0.48, 0.56, 0.08), (x, 0, 0.28 + height), 0.03)
     )
-    windows = b.subpart(cabin, "windows")
-    glass = b.paints.draw("plastic", "blue", "teal", "yellow", "white", "black")
-    b.put(windows, glass, box((0.22, 0.47, 0.20), (x, 0, 0.25 + height * 0.66), 0.01))
-    b.put(windows, glass, box((0.39, 0.26, 0.18), (x, 0, 0.25 + height * 0.67), 0.01))
-    wheel_r, tyre, hub = 0.165, b.paints.draw("plain"), b.paints.draw("metal")
+    glass = b.paint("plastic", "blue", "teal", "yellow", "white", "black")
+    windows = cabin.subpart("windows").put(glass, box((0.22, 0.47, 0.20), (x, 0, 0.25 + height * 0.66), 0.01))
+    windows.put(glass, box((0.39, 0.26, 0.18), (x, 0, 0.25 + height * 0.67), 0.01))
+    wheel_r, tyre, hub = 0.165, b.paint("plain"), b.paint("metal")
     for i in range(3):
         for side in (-1, 1):
-            wheel = b.part("wheel")
             wx, y = (i - 1) * 0.34, side * 0.22
-            b.put(
-                wheel, tyre, cylinder(wheel_r, -0.045, 0.045, 24, 0.012).turned("x", 90).moved(wx, y, wheel_r)
+            wheel = b.part("wheel").put(
+                tyre, cylinder(wheel_r, -0.045, 0.045, 24, 0.012).turned("x", 90).moved(wx, y, wheel_r)
             )
-            b.put(
-                b.subpart(wheel, "hub", "wheel centre", at="of"),
+            wheel.subpart("hub", "wheel centre", at="of").put(
                 hub,
                 cylinder(wheel_r * 0.68, -0.03, 0.03, 20, 0.01)
                 .turned("x", 90)
@@ -86,7 +70,7 @@ def _train(b: Builder) -> None:
 
 
 def _sailboat(b: Builder) -> None:
-    hull_paint, wood = b.paints.draw("plain"), b.paints.draw("wood")
+    hull_paint, wood = b.paint("plain"), b.paint("wood")
     length, beam = b.between(0.95, 1.1), b.between(0.36, 0.42)
 
     def section(x: float, width: float, low: float, high: float) -> list[tuple[float, float, float]]:
@@ -100,16 +84,15 @@ def _sailboat(b: Builder) -> None:
         (0.42, 0.34, 0.08, 0.35),
         (0.52, 0.04, 0.16, 0.38),
     ]
-    hull = b.part("hull", "body")
-    b.put(hull, hull_paint, loft([section(x * length, w * beam, low, high) for x, w, low, high in stations]))
-    stripe = b.subpart(hull, "stripe", "band")
+    hull = b.part("hull", "body").put(
+        hull_paint, loft([section(x * length, w * beam, low, high) for x, w, low, high in stations])
+    )
     lifted = [
         (x * length * 1.012, (w + 0.045) * beam * 1.03, high - 0.075, high - 0.015)
         for x, w, low, high in stations
     ]
-    b.put(
-        stripe,
-        b.paints.draw("plastic"),
+    hull.subpart("stripe", "band").put(
+        b.paint("plastic"),
         loft(
             [
                 [(x, -w * 0.475, low), (x, w * 0.475, low), (x, w / 2, high), (x, -w / 2, high)]
@@ -117,9 +100,7 @@ def _sailboat(b: Builder) -> None:
             ]
         ),
     )
-    deck = b.subpart(hull, "deck", "floor")
-    b.put(
-        deck,
+    hull.subpart("deck", "floor").put(
         wood,
         loft(
             [
@@ -133,32 +114,25 @@ def _sailboat(b: Builder) -> None:
             ]
         ),
     )
-    rudder = b.subpart(hull, "rudder", "tiller")
-    b.put(rudder, b.paints.draw("wood"), box((0.16, 0.08, 0.42), (-length / 2 - 0.06, 0, 0.23), 0.015))
-    house = b.part("cabin", "deckhouse")
-    b.put(house, b.paints.draw("plain"), box((0.26, beam * 0.5, 0.17), (-length * 0.22, 0, 0.40), 0.02))
-    b.put(
-        b.subpart(house, "roof", "top", at="of"),
-        b.paints.draw("plastic"),
-        box((0.31, beam * 0.58, 0.055), (-length * 0.22, 0, 0.50), 0.02),
+    hull.subpart("rudder", "tiller").put(
+        b.paint("wood"), box((0.16, 0.08, 0.42), (-length / 2 - 0.06, 0, 0.23), 0.015)
+    )
+    house = b.part("cabin", "deckhouse").put(
+        b.paint("plain"), box((0.26, beam * 0.5, 0.17), (-length * 0.22, 0, 0.40), 0.02)
+    )
+    house.subpart("roof", "top", at="of").put(
+        b.paint("plastic"), box((0.31, beam * 0.58, 0.055), (-length * 0.22, 0, 0.50), 0.02)
     )
     mast_x, top = length * 0.06, b.between(1.20, 1.35)
-    mast = b.part("mast", "pole")
-    b.put(mast, b.paints.draw("wood"), cylinder(0.035, 0.28, top + 0.12, 16))
-    flag = b.subpart(mast, "flag", "pennant")
-    b.put(
-        flag,
-        b.paints.draw("cloth"),
-        extrude([(-0.01, 0), (-0.01, 0.17), (-0.26, 0.085)], 0.04).moved(0, 0, top - 0.04),
-    )
-    b.shift((mast, flag), mast_x, 0, 0)
+    mast = b.part("mast", "pole").put(b.paint("wood"), cylinder(0.035, 0.28, top + 0.12, 16).moved(mast_x))
+    flag = extrude([(-0.01, 0), (-0.01, 0.17), (-0.26, 0.085)], 0.04)
+    mast.subpart("flag", "pennant").put(b.paint("cloth"), flag.moved(mast_x, 0, top - 0.04))
     main, low = b.part("mainsail", "big sail"), 0.62
-    cloth, patch = b.paints.draw("cloth"), b.paints.draw("cloth")
+    cloth, patch = b.paint("cloth"), b.paint("cloth")
     tall, foot = top - 0.10 - low, length * 0.50
-    b.put(main, cloth, extrude([(0, 0), (-foot, 0), (0, tall)], 0.035).moved(mast_x - 0.04, 0, low))
+    main.put(cloth, extrude([(0, 0), (-foot, 0), (0, tall)], 0.035).moved(mast_x - 0.04, 0, low))
     cut = 0.34
-    b.put(
-        b.subpart(main, "panel", "sail panel"),
+    main.subpart("panel", "sail panel").put(
         patch,
         extrude(
             [
@@ -170,16 +144,12 @@ def _sailboat(b: Builder) -> None:
             0.055,
         ).moved(mast_x - 0.045, 0, low),
     )
-    jib = b.part("jib", "front sail")
     tall, foot = tall * 0.85, length * 0.36
-    b.put(
-        jib,
-        b.paints.draw("cloth"),
-        extrude([(0, 0), (foot, 0), (0, tall)], 0.035).moved(mast_x + 0.05, 0, low - 0.10),
+    jib = b.part("jib", "front sail").put(
+        b.paint("cloth"), extrude([(0, 0), (foot, 0), (0, tall)], 0.035).moved(mast_x + 0.05, 0, low - 0.10)
     )
-    b.put(
-        b.subpart(jib, "emblem", "badge"),
-        b.paints.draw("plain"),
+    jib.subpart("emblem", "badge").put(
+        b.paint("plain"),
         cylinder(0.115, -0.035, 0.035, 20)
         .turned("x", 90)
         .moved(mast_x + 0.05 + foot * 0.28, 0, low - 0.10 + tall * 0.30),
@@ -188,11 +158,10 @@ def _sailboat(b: Builder) -> None:
 
 
 def _airplane(b: Builder) -> None:
-    skin, wing_paint, tip_paint = b.paints.draw("plain"), b.paints.draw("plastic"), b.paints.draw("plastic")
-    dark, metal = b.paints.draw("plastic", "black", "grey", "brown"), b.paints.draw("metal")
+    skin, wing_paint, tip_paint = b.paint("plain"), b.paint("plastic"), b.paint("plastic")
+    dark, metal = b.paint("plastic", "black", "grey", "brown"), b.paint("metal")
     r, length = b.between(0.15, 0.175), b.between(1.05, 1.2)
     z = 0.36
-    body = b.part("fuselage", "body")
     hull = lathe(
         [
             (0, 0),
@@ -204,22 +173,21 @@ def _airplane(b: Builder) -> None:
             (0, length),
         ]
     )
-    b.put(body, skin, hull.turned("y", 90).moved(-length * 0.58, 0, z))
-    window = b.subpart(body, "cockpit", "windows", "canopy")
-    glass = b.paints.draw("plastic", "blue", "teal", "black", "white")
-    b.put(window, glass, ellipsoid((0.20, 0.115, 0.13), (length * 0.13, 0, z + r * 0.82)))
-    band = b.subpart(body, "band", "stripe")
-    b.put(band, b.paints.draw("plain"), disc(r * 0.90, -length * 0.20, -length * 0.09).moved(z=z))
-    propeller = b.part("propeller", "airscrew")
+    body = b.part("fuselage", "body").put(skin, hull.turned("y", 90).moved(-length * 0.58, 0, z))
+    glass = b.paint("plastic", "blue", "teal", "black", "white")
+    body.subpart("cockpit", "windows", "canopy").put(
+        glass, ellipsoid((0.20, 0.115, 0.13), (length * 0.13, 0, z + r * 0.82))
+    )
+    body.subpart("band", "stripe").put(
+        b.paint("plain"), disc(r * 0.90, -length * 0.20, -length * 0.09).moved(z=z)
+    )
     x = length * 0.42
-    b.put(
-        propeller,
+    propeller = b.part("propeller", "airscrew").put(
         metal,
         *[box((0.045, 0.09, 0.56), (x + 0.07, 0, 0), 0.015).turned("x", a).moved(z=z) for a in (30, 120)],
     )
-    b.put(
-        b.subpart(propeller, "hub", "spinner"),
-        b.paints.draw("plastic"),
+    propeller.subpart("hub", "spinner").put(
+        b.paint("plastic"),
         lathe([(0, 0), (0.125, 0), (0.09, 0.13), (0, 0.19)]).turned("y", 90).moved(x + 0.02, 0, z),
     )
     span = b.between(0.50, 0.58)
@@ -241,38 +209,32 @@ def _airplane(b: Builder) -> None:
         return rows
 
     for side in (-1, 1):
-        wing = b.part("wing")
-        b.put(wing, wing_paint, loft(_mirrored(wing_part(0, 1, 1.0), side)))
-        b.put(
-            b.subpart(wing, "tip", "end", at="of"),
-            tip_paint,
-            loft(_mirrored(wing_part(0.70, 1.02, 1.15), side)),
-        )
-        engine = b.subpart(wing, "engine", "motor", at="under")
+        wing = b.part("wing").put(wing_paint, loft(_mirrored(wing_part(0, 1, 1.0), side)))
+        wing.subpart("tip", "end", at="of").put(tip_paint, loft(_mirrored(wing_part(0.70, 1.02, 1.15), side)))
         y = side * (r * 0.6 + span * 0.42)
-        b.put(engine, metal, disc(0.115, -0.14, 0.27, bevel=0.03).moved(0.05, y, z - 0.05))
-    tail = b.part("tail", "tail unit")
+        wing.subpart("engine", "motor", at="under").put(
+            metal, disc(0.115, -0.14, 0.27, bevel=0.03).moved(0.05, y, z - 0.05)
+        )
     back = -length * 0.58
-    b.put(tail, wing_paint, box((0.19, 0.56, 0.045), (back + 0.10, 0, z + 0.03), 0.015))
-    b.put(
-        b.subpart(tail, "rudder", "tail fin"),
-        b.paints.draw("plain"),
+    tail = b.part("tail", "tail unit").put(
+        wing_paint, box((0.19, 0.56, 0.045), (back + 0.10, 0, z + 0.03), 0.015)
+    )
+    tail.subpart("rudder", "tail fin").put(
+        b.paint("plain"),
         extrude(
             [(back, z + 0.03), (back + 0.26, z + 0.03), (back + 0.10, z + 0.34), (back - 0.03, z + 0.34)],
             0.055,
         ),
     )
     gear = b.part("landing gear", "undercarriage")
-    wheels = b.subpart(gear, "wheels", "tires")
+    wheels = gear.subpart("wheels", "tires")
     for side in (-1, 1):
-        b.put(gear, metal, sweep([(0.16, side * 0.08, z - 0.10), (0.18, side * 0.20, 0.13)], 0.05))
-        b.put(
-            wheels,
-            dark,
-            cylinder(0.13, -0.06, 0.06, 20, 0.015).turned("x", 90).moved(0.18, side * 0.24, 0.13),
+        gear.put(metal, sweep([(0.16, side * 0.08, z - 0.10), (0.18, side * 0.20, 0.13)], 0.05))
+        wheels.put(
+            dark, cylinder(0.13, -0.06, 0.06, 20, 0.015).turned("x", 90).moved(0.18, side * 0.24, 0.13)
         )
-    b.put(gear, metal, sweep([(back + 0.16, 0, z - 0.04), (back + 0.13, 0, 0.06)], 0.03))
-    b.put(wheels, dark, cylinder(0.06, -0.03, 0.03, 16).turned("x", 90).moved(back + 0.13, 0, 0.06))
+    gear.put(metal, sweep([(back + 0.16, 0, z - 0.04), (back + 0.13, 0, 0.06)], 0.03))
+    wheels.put(dark, cylinder(0.06, -0.03, 0.03, 16).turned("x", 90).moved(back + 0.13, 0, 0.06))
 
 
 def _mirrored(
@@ -282,67 +244,45 @@ def _mirrored(
 
 
 def _tractor(b: Builder) -> None:
-    paint, tyre, hub = (
-        b.paints.draw("plastic"),
-        b.paints.draw("plain", "black", "grey"),
-        b.paints.draw("plastic"),
-    )
-    glass, metal = b.paints.draw("plastic", "blue", "teal", "white", "black"), b.paints.draw("metal")
+    paint = b.paint("plastic")
+    tyre = b.paint("plain", "black", "grey")
+    hub = b.paint("plastic")
+    glass, metal = b.paint("plastic", "blue", "teal", "white", "black"), b.paint("metal")
     big, small = b.between(0.28, 0.32), b.between(0.16, 0.19)
-    hood = b.part("hood", "engine cover", "bonnet")
-    b.put(hood, paint, box((0.50, 0.32, 0.26), (0.30, 0, 0.42), 0.03))
-    grille = b.subpart(hood, "grille", "radiator", at="of")
-    b.put(grille, metal, box((0.05, 0.25, 0.19), (0.56, 0, 0.42), 0.015))
-    lights = b.subpart(hood, "headlights", "lamps")
+    hood = b.part("hood", "engine cover", "bonnet").put(paint, box((0.50, 0.32, 0.26), (0.30, 0, 0.42), 0.03))
+    hood.subpart("grille", "radiator", at="of").put(metal, box((0.05, 0.25, 0.19), (0.56, 0, 0.42), 0.015))
+    lights = hood.subpart("headlights", "lamps")
     for side in (-1, 1):
-        b.put(
-            lights,
-            b.paints.draw("plastic", "yellow", "white"),
+        lights.put(
+            b.paint("plastic", "yellow", "white"),
             disc(0.09, -0.04, 0.06, 20, 0.015).moved(0.48, side * 0.19, 0.54),
         )
-    pipe = b.part("exhaust pipe", "exhaust")
-    b.put(pipe, metal, cylinder(0.045, 0.53, 0.84, 16).moved(0.36, 0.0, 0))
-    b.put(
-        b.subpart(pipe, "cap", "end", at="of"),
-        b.paints.draw("plastic"),
-        cylinder(0.095, 0.78, 0.91, 18, 0.015).moved(0.36, 0, 0),
+    pipe = b.part("exhaust pipe", "exhaust").put(metal, cylinder(0.045, 0.53, 0.84, 16).moved(0.36, 0.0, 0))
+    pipe.subpart("cap", "end", at="of").put(
+        b.paint("plastic"), cylinder(0.095, 0.78, 0.91, 18, 0.015).moved(0.36, 0, 0)
     )
-    cabin = b.part("cabin", "cab")
-    b.put(cabin, b.paints.draw("plain"), box((0.46, 0.42, 0.56), (-0.16, 0, 0.62), 0.02))
-    b.put(
-        b.subpart(cabin, "roof", "top", at="of"),
-        b.paints.draw("plastic"),
-        box((0.56, 0.52, 0.085), (-0.16, 0, 0.92), 0.03),
+    cabin = b.part("cabin", "cab").put(b.paint("plain"), box((0.46, 0.42, 0.56), (-0.16, 0, 0.62), 0.02))
+    cabin.subpart("roof", "top", at="of").put(
+        b.paint("plastic"), box((0.56, 0.52, 0.085), (-0.16, 0, 0.92), 0.03)
     )
-    windows = b.subpart(cabin, "windows")
-    b.put(
-        windows,
+    cabin.subpart("windows").put(
         glass,
         box((0.30, 0.45, 0.23), (-0.16, 0, 0.73), 0.01),
         box((0.49, 0.30, 0.23), (-0.16, 0, 0.73), 0.01),
     )
-    frame = b.part("frame", "chassis")
-    b.put(
-        frame,
-        b.paints.draw("plain", "black", "grey", "brown"),
-        box((0.95, 0.24, 0.16), (0.06, 0, 0.25), 0.02),
+    frame = b.part("frame", "chassis").put(
+        b.paint("plain", "black", "grey", "brown"), box((0.95, 0.24, 0.16), (0.06, 0, 0.25), 0.02)
     )
-    b.put(
-        b.subpart(frame, "hitch", "tow hook", at="of"),
-        metal,
-        box((0.20, 0.14, 0.10), (-0.50, 0, 0.24), 0.025),
-    )
+    frame.subpart("hitch", "tow hook", at="of").put(metal, box((0.20, 0.14, 0.10), (-0.50, 0, 0.24), 0.025))
     for radius, x, y, wide in ((big, -0.22, 0.31, 0.15), (small, 0.36, 0.24, 0.11)):
         word = "rear wheel" if radius == big else "front wheel"
         for side in (-1, 1):
-            wheel = b.part(word, "big wheel" if radius == big else "small wheel")
-            b.put(
-                wheel,
+            wheel = b.part(word, "big wheel" if radius == big else "small wheel").put(
                 tyre,
                 cylinder(radius, -wide / 2, wide / 2, 28, 0.03).turned("x", 90).moved(x, side * y, radius),
             )
             cap = cylinder(radius * 0.60, -0.03, 0.03, 22, 0.01).turned("x", 90)
-            b.put(b.subpart(wheel, "hub", "rim", at="of"), hub, cap.moved(x, side * (y + wide / 2), radius))
+            wheel.subpart("hub", "rim", at="of").put(hub, cap.moved(x, side * (y + wide / 2), radius))
 
 
 MAKERS: dict[str, Maker] = {
