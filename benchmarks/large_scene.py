@@ -33,7 +33,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.segment.coverage_stage import run_coverage_tree
 from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.semantic_tree.tree import run_semantic_tree
+from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.settings import (
     AutoencoderSettings,
     ContributionsSettings,

@@ -60,7 +60,7 @@ def semantic_tree(
         )
     if coverage_tree is None:
         with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs):
-            from hilsplat.semantic_tree.tree import run_semantic_tree
+            from hilsplat.semantic_tree.build import run_semantic_tree
 
             run_semantic_tree(contributions, masks, out, section, threads)
         return

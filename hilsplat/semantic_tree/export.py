@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Int32, Int64
@@ -10,12 +9,10 @@ from jaxtyping import Int32, Int64
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.scene.finished import require_same
-
-if TYPE_CHECKING:
-    from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.tree import SemanticTree
 
 
-def readable_nodes(tree: "SemanticTree") -> list[dict]:
+def readable_nodes(tree: SemanticTree) -> list[dict]:
     """Return one human-readable entry per node."""
     members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
     return [
@@ -36,7 +33,7 @@ def readable_nodes(tree: "SemanticTree") -> list[dict]:
     ]
 
 
-def write_tree_ply(gaussians_ply: Path, tree: "SemanticTree", out: Path) -> None:
+def write_tree_ply(gaussians_ply: Path, tree: SemanticTree, out: Path) -> None:
     """Copy a 3DGS PLY and add three properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
 
     Gaussian viewers ignore them; tools that show scalar fields can colour by them. -1 means no node.

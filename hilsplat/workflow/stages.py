@@ -17,7 +17,7 @@ STAGES: dict[str, str] = {
     "langsplat": "hilsplat.embed.langsplat_files",
     "names": "hilsplat.query.node_names:run_names",
     "contributions": "hilsplat.contributions.stage:run_contributions",
-    "semantic_tree": "hilsplat.semantic_tree.tree:run_semantic_tree",
+    "semantic_tree": "hilsplat.semantic_tree.build:run_semantic_tree",
     "feature_tree": "hilsplat.methods.feature_tree:run_feature_tree",
     "autoencoder": "hilsplat.field.autoencoder:run_autoencoder",
     "field": "hilsplat.field.field:run_field",

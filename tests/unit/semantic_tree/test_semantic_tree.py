@@ -9,9 +9,10 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.level_nodes import level_nodes
 from hilsplat.semantic_tree.nodes import gaussian_nodes, node_parents
-from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
+from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import SemanticTreeSettings
 from tests.unit.artifact_changes import change_index
 from tests.unit.two_boxes_world import (

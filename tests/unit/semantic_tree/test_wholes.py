@@ -8,8 +8,9 @@ from hilsplat.base.artifacts import read_index, write_index
 from hilsplat.base.levels import Level
 from hilsplat.contributions.stage import run_contributions
 from hilsplat.semantic_tree import wholes
+from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.level_nodes import LevelNodes
-from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
+from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.wholes import joined, joined_regions, touching
 from hilsplat.settings import ContributionsSettings, SemanticTreeSettings
 

@@ -1,0 +1,216 @@
+"""The semantic tree stage: links the masks of all views by the Gaussians they share.
+
+Masks have no identity across views. Masks of one level in different views are linked by how well they agree
+on the Gaussians that both views see. Clusters of masks become nodes, and each Gaussian joins its best node. A
+coarser node that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores
+the crops that show each node. The clip stage embeds the best crops, and their average is the node's vector.
+"""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Float32, Int64
+
+from hilsplat.base.artifacts import (
+    atomic_folder,
+    read_full_index,
+    read_index,
+    write_index,
+    write_json,
+    write_npz,
+)
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.progress import stage_log
+from hilsplat.contributions.rows import Contributions
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
+from hilsplat.semantic_tree.boxes import node_boxes
+from hilsplat.semantic_tree.crops import crop_ranks
+from hilsplat.semantic_tree.export import readable_nodes
+from hilsplat.semantic_tree.level_nodes import LevelNodes, level_nodes
+from hilsplat.semantic_tree.nodes import mask_fits, nest_nodes, node_parents, renumbered_without_empty
+from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.wholes import joined_regions
+from hilsplat.settings import SemanticTreeSettings
+
+MIN_VISIBLE_PX = 0.3
+"""A Gaussian counts as visible in a view if its mass there exceeds this."""
+
+LEAST_IOU = 1e-3
+"""Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
+
+NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
+"""Function from a level and the rows of its masks to its nodes."""
+
+logger = logging.getLogger(__name__)
+
+
+def build_tree(
+    contributions: Contributions,
+    S: sp.csr_matrix,
+    mass: Float32[np.ndarray, "V N"],
+    means: Float[np.ndarray, "N 3"],
+    centres: Float[np.ndarray, "V 3"],
+    settings: SemanticTreeSettings,
+    threads: int = 1,
+    join_wholes: bool = False,
+    nodes_of: NodesOf | None = None,
+) -> SemanticTree:
+    """Link masks into nodes, compute their Gaussians, parents and boxes, and score the crops that show them.
+
+    Args:
+        contributions: rows of the masks.
+        S: weight of each Gaussian in each raw mask, px.
+        mass: visible mass of each Gaussian in each view, px.
+        means: centres of the Gaussians, scene units.
+        centres: centres of the cameras, scene units.
+        settings: thresholds.
+        threads: number of threads for the evidence; results do not depend on it.
+        join_wholes: join wholes from nodes that touch in 3D, for segmenters that detect only colour regions.
+        nodes_of: finds the nodes of a level; None links masks.
+    """
+    visible = mass > MIN_VISIBLE_PX
+    num_visible = visible.sum(axis=0)
+    total_mass = mass.sum(axis=0, dtype=np.float64)
+    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(num_visible, 1)
+
+    level: list[int] = []
+    quality: list[float] = []
+    cluster_of_mask = np.full(len(contributions), NONE, np.int64)
+    node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
+    membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
+    for each in LEVELS:
+        rows = contributions.rows_of(each)
+        found = (
+            nodes_of(each, rows)
+            if nodes_of
+            else level_nodes(
+                S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
+            )
+        )
+        if join_wholes and each is Level.WHOLE:
+            whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
+            found = found.joined(whole)
+        renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
+        node_of_gaussian[:, each.index] = renumber[found.of_gaussian]
+        membership[:, each.index] = found.membership
+        cluster_of_mask[rows] = renumber[found.of_mask]
+        level += [int(each)] * len(found.quality)
+        quality += found.quality.tolist()
+
+    levels = np.array(level, np.uint8)
+    num = len(levels)
+    parent = node_parents(node_of_gaussian, levels, total_mass, settings.parent_coverage)
+    nested = nest_nodes(node_of_gaussian, levels, parent)
+    membership[nested != node_of_gaussian] = 0
+    node_of_gaussian = nested
+    renumber = renumbered_without_empty(node_of_gaussian, num)
+    kept = np.flatnonzero(renumber[:num] != NONE)
+    node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
+    levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
+    quality = [quality[node] for node in kept]
+    view_area = np.zeros((num, len(contributions.views)), np.float64)
+    own = np.flatnonzero(cluster_of_mask >= 0)
+    np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])
+    centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
+    fits, iou = mask_fits(node_of_gaussian, S, mass, contributions.view, contributions.level, cluster_of_mask)
+    # Nesting may remove from a node the Gaussians that its masks show; the node still needs a crop.
+    score = np.sqrt(contributions.area_px) * np.where(
+        cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU)
+    )
+    if join_wholes:  # the mask of a piece has a low IoU with the joined whole, but shows it
+        pieces = contributions.rows_of(Level.WHOLE)
+        fits[pieces] = cluster_of_mask[pieces]
+    linked = cluster_of_mask.astype(np.int32)
+    towards = centres[contributions.view] - centroid[linked] if num else np.zeros((len(linked), 3))
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    score = score.astype(np.float32)
+    return SemanticTree(
+        level=levels,
+        parent=parent,
+        clip=np.zeros((num, 0), np.float32),
+        centroid=centroid,
+        box=box,
+        oriented_box=oriented,
+        quality=np.array(quality, np.float32),
+        views=(view_area > 0).sum(axis=1).astype(np.int32),
+        node_of_gaussian=node_of_gaussian,
+        membership=membership,
+        node_of_mask=fits,
+        linked_node=linked,
+        crop_score=score,
+        crop_rank=crop_ranks(linked, score, towards),
+        view_area_px=view_area.astype(np.float32),
+        view_names=contributions.views,
+        gaussians_sha256=contributions.gaussians_sha256,
+        cameras_sha256=contributions.cameras_sha256,
+        min_weight=contributions.min_weight,
+    )
+
+
+def run_semantic_tree(
+    contributions_folder: Path,
+    masks_folder: Path,
+    out: Path,
+    settings: SemanticTreeSettings,
+    threads: int = 1,
+    nodes_of: NodesOf | None = None,
+) -> None:
+    """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
+
+    `nodes_of` is as in `build_tree`.
+
+    Raises:
+        MisalignedArtifactError: the contributions belong to other masks.
+        ArtifactError: the masks do not record their segmenter.
+    """
+    contributions = Contributions.load(contributions_folder)
+    scene = read_index(contributions_folder)["scene"]
+    require_same_masks(contributions_folder, masks_folder)
+    with stage_log("semantic tree", scene) as counts:
+        tree = build_tree(
+            contributions,
+            contributions.matrix("S"),
+            contributions.mass(),
+            contributions.means(),
+            contributions.centres(),
+            settings,
+            threads,
+            join_wholes=read_full_index(masks_folder, "segmenter")["segmenter"] == "graph",
+            nodes_of=nodes_of,
+        )
+        per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
+        orphans = {
+            level.label: int((tree.parent[tree.nodes_of(level)] == NONE).sum()) for level in LEVELS[1:]
+        }
+        counts |= {**per_level, "orphans": sum(orphans.values())}
+        if not len(tree):
+            logger.warning(
+                "the semantic tree of %s has no node: no group of linked masks spans %d views; "
+                "lower semantic_tree.min_views or semantic_tree.link_threshold",
+                scene,
+                settings.min_views,
+            )
+        masks = np.bincount(contributions.view, minlength=len(contributions.views)).tolist()
+        digests = digests_in(contributions_folder)
+        with atomic_folder(out) as folder:
+            fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
+            write_npz(folder / "tree.npz", **fields)
+            write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
+            write_index(
+                folder,
+                {
+                    view: {MASKS_SHA256: digests[view], "masks": count}
+                    for view, count in zip(contributions.views, masks, strict=True)
+                },
+                scene=scene,
+                nodes=per_level,
+                orphans=orphans,
+                masks_with_node=int((tree.linked_node >= 0).sum()),
+                masks=len(contributions),
+                gaussians_sha256=contributions.gaussians_sha256,
+                cameras_sha256=contributions.cameras_sha256,
+                min_weight=contributions.min_weight,
+            )
