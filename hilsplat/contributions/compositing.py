@@ -1,45 +1,30 @@
-"""Normalised compositing weights: a pixel's feature is an average over the Gaussians it shows."""
+"""Normalised compositing weights of a view, and the latents that they render at its pixels."""
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32
+from numba.extending import intrinsic
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import LANES, WIDTH, lanes, load, store
 
 MIN_ALPHA = 0.5
 """Pixels with a smaller alpha are ignored, since their features would be extrapolated."""
 
+MIN_LATENT_SHARE = 0.5
+"""A pixel has a latent at a level if more than this share of its weight is of Gaussians with a latent."""
 
-def normalised_weights(weights: sp.csr_matrix, min_alpha: float = MIN_ALPHA) -> sp.csr_matrix:
-    """Divide the weights of each pixel by their sum, the accumulated alpha.
 
-    The weights then sum to 1, so that a rendered feature is an average of features. Weights that the
-    rasteriser dropped as too small are not in the sum.
+def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
+    """Divide the weights of each pixel by their sum, the accumulated alpha; the memory is overwritten.
 
-    Args:
-        weights: compositing weights (pixels x Gaussians), whose memory is overwritten by the result.
-        min_alpha: pixels with a smaller sum become empty rows.
-
-    Returns:
-        the normalised matrix, with sorted columns.
+    The weights then sum to 1, so that a rendered feature is an average of features; pixels with an alpha
+    below `MIN_ALPHA` become empty rows. Weights that the rasteriser dropped as too small are not in the sum.
     """
     weights.sort_indices()
-    kept = _normalise(weights.indptr, weights.indices, weights.data, min_alpha)
+    kept = _normalise(weights.indptr, weights.indices, weights.data, MIN_ALPHA)
     arrays = (weights.data[:kept], weights.indices[:kept], weights.indptr)
     return sp.csr_matrix(arrays, shape=weights.shape, copy=False)
-
-
-def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
-    """Return the sum of each Gaussian's weights over the pixels, px; summed in float64."""
-    out = np.zeros(weights.shape[1], np.float64)
-    _add_columns(weights.indices, weights.data, out)
-    return out.astype(np.float32)
-
-
-@compiled
-def _add_columns(indices, data, out):
-    for k in range(len(indices)):
-        out[indices[k]] += data[k]
 
 
 @compiled
@@ -57,3 +42,80 @@ def _normalise(indptr, indices, data, min_alpha):
                 done += 1
         begin, indptr[row + 1] = end, done
     return done
+
+
+def visible_mass(weights: sp.csr_matrix) -> Float32[np.ndarray, " N"]:
+    """Return the sum of each Gaussian's weights over the pixels, px; summed in float64."""
+    out = np.zeros(weights.shape[1], np.float64)
+    _add_columns(weights.indices, weights.data, out)
+    return out.astype(np.float32)
+
+
+@compiled
+def _add_columns(indices, data, out):
+    for k in range(len(indices)):
+        out[indices[k]] += data[k]
+
+
+def rendered_latents(
+    weights: sp.csr_matrix, features: Float32[np.ndarray, "N 3 D"]
+) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
+    """Return, per level, the pixels that mostly show Gaussians with a latent, and their rendered latents.
+
+    Gaussians without a latent have zeros, which a code would decode like any latent. They are omitted, and
+    the normalised weights of the others are divided by their sum. The bytes are those of sparse products.
+    """
+    rows = weights.indptr, weights.indices, weights.data
+    shares = np.zeros((weights.shape[0], features.shape[1]), np.float32)
+    _add_shares(*rows, (features != 0).any(axis=2), shares)
+    shown = []
+    for level in range(features.shape[1]):
+        pixels = np.flatnonzero(shares[:, level] > MIN_LATENT_SHARE)
+        wide = padded(features[:, level])
+        found = np.empty((len(pixels), wide.shape[1]), np.float32)
+        share = shares[pixels, level]
+        _render(*rows, pixels, share, wide.reshape(-1), wide.shape[1], found.reshape(-1))
+        shown.append((pixels, found[:, : features.shape[2]]))
+    return shown
+
+
+@compiled
+def _add_shares(indptr, indices, data, has, shares):
+    for p in range(len(shares)):
+        a, b, c = np.float32(0), np.float32(0), np.float32(0)
+        for k in range(np.uint64(indptr[p]), np.uint64(indptr[p + 1])):
+            g = np.uint64(indices[k])  # unsigned: skips the check for negative indices
+            a += data[k] if has[g, 0] else np.float32(0)
+            b += data[k] if has[g, 1] else np.float32(0)
+            c += data[k] if has[g, 2] else np.float32(0)
+        shares[p, 0], shares[p, 1], shares[p, 2] = a, b, c
+
+
+@compiled
+def _render(indptr, indices, data, pixels, share, features, wide, out):
+    for row in range(len(pixels)):
+        p = pixels[row]
+        begin, end = np.uint64(indptr[p]), np.uint64(indptr[p + 1])
+        for c in range(0, wide, WIDTH):
+            total = lanes(np.float32(0))
+            for k in range(begin, end):
+                total = plus(total, lanes(data[k]), load(features, np.int64(indices[k]) * wide + c))
+            store(out, row * wide + c, total / lanes(share[row]))
+
+
+def padded(rows: Float32[np.ndarray, "*rows D"]) -> Float32[np.ndarray, "*rows E"]:
+    """Pad channels with zeros to a multiple of sixteen, the lanes of a vector, and make rows contiguous."""
+    missing = -rows.shape[-1] % WIDTH
+    if missing:
+        rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], missing), np.float32)], axis=-1)
+    return np.ascontiguousarray(rows)
+
+
+@intrinsic
+def plus(typingctx, total, scales, row):
+    """Return total + scales * row; each product is rounded before it is added, as in the plain loops."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fadd(args[0], builder.fmul(args[1], args[2]))  # without flags, so never fused
+
+    return LANES(LANES, LANES, LANES), codegen

@@ -6,9 +6,12 @@ from queue import SimpleQueue
 
 import numpy as np
 import scipy.sparse as sp
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
+from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS
-from hilsplat.contributions.gram_kernels import SUMS, add_to_block, enlarged, merge_rows, transpose
 from hilsplat.contributions.quadratic import Gram, StackedWeights
 
 BLOCKS = 64
@@ -17,6 +20,9 @@ whose Gaussians a part does not show are skipped, which a Morton order makes fre
 
 MERGE_AT = 8
 """Late pairs of a block are merged with its rows once they exceed one in this many."""
+
+SUMS = 4
+"""Numbers that are summed together: three sums, and the number of products added, 0 for a new pair."""
 
 
 class _Rows:
@@ -45,7 +51,7 @@ class _Rows:
     def merge(self, late: "_Rows") -> None:
         """Add pairs that these rows don't contain."""
         self._make_room(self.nonzeros + late.nonzeros, self.nonzeros)
-        merge_rows(self.indptr, self._indices, self._values, *late.arrays())
+        _merge_rows(self.indptr, self._indices, self._values, *late.arrays())
 
     def _make_room(self, needed: int, kept: int) -> None:
         if needed > len(self._indices):
@@ -95,10 +101,6 @@ class GramBuilder:
 
     Entries are summed in float64 in the order of the pixels, so the bytes depend neither on the division of
     pixels into parts nor on the number of threads.
-
-    Args:
-        num_gaussians: N.
-        threads: threads that share the blocks of rows.
     """
 
     def __init__(self, num_gaussians: int, threads: int) -> None:
@@ -129,7 +131,7 @@ class GramBuilder:
             block, own, indptr = self._blocks[number], self._idle.get(), np.zeros(end - begin + 1, np.int64)
             known = block.rows.arrays(), block.late.arrays()
             scratch = own.sums, own.fresh, indptr, own.indices, own.values
-            own.indices, own.values = add_to_block(begin, end, arrays, columns, *known, *scratch)
+            own.indices, own.values = _add_to_block(begin, end, arrays, columns, *known, *scratch)
             block.replace_late(indptr, own.indices, own.values)
             self._idle.put(own)
 
@@ -147,7 +149,7 @@ class GramBuilder:
             self._pixels = np.empty(weights.nnz * 9 // 8, np.int32)
             self._places = np.empty(len(self._pixels), dtype)
         begins = np.zeros(weights.shape[1] + 1, np.int64)
-        transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
+        _transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
         return begins, self._pixels, self._places
 
     def state(self) -> dict[str, np.ndarray]:
@@ -178,3 +180,156 @@ class GramBuilder:
             values[done : done + len(some_indices)] = some_values
             done += len(some_indices)
         return Gram(indptr, indices, values)
+
+
+@compiled
+def _transpose(indptr, indices, begins, pixels, places):
+    """Return each column's start, and the row and place of its values; `begins` must be zero."""
+    for k in range(indptr[-1]):
+        begins[indices[k] + 1] += 1
+    begins[:] = np.cumsum(begins)
+    filled = begins[:-1].copy()
+    for p in range(len(indptr) - 1):
+        for k in range(indptr[p], indptr[p + 1]):
+            at = filled[indices[k]]
+            pixels[at] = p
+            places[at] = k
+            filled[indices[k]] += 1
+
+
+@intrinsic
+def add_products(typingctx, sums, at, whole, part, subpart, value):
+    """Add three numbers times `value`, and 1, to the sums from `at` on, as one vector; nothing is fused.
+
+    Returns the number of previous additions.
+    """
+
+    def codegen(context, builder, sig, args):
+        number, lane = ir.DoubleType(), ir.IntType(32)
+        four = ir.VectorType(number, SUMS)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
+        weights = values = ir.Constant(four, [ir.Constant(number, 1.0)] * SUMS)
+        for index, each in enumerate(args[2:5]):
+            weights = builder.insert_element(weights, each, ir.Constant(lane, index))
+            values = builder.insert_element(values, args[5], ir.Constant(lane, index))
+        before = builder.load(place, align=8)
+        builder.store(builder.fadd(before, builder.fmul(weights, values)), place, align=8)
+        return builder.extract_element(before, ir.Constant(lane, SUMS - 1))
+
+    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
+
+
+@compiled
+def enlarged(indices, values, kept, room):
+    """Return larger copies of both arrays with their first `kept` entries."""
+    more_indices = np.empty(room, np.int32)
+    more_values = np.empty((room, values.shape[1]), np.float64)
+    more_indices[:kept], more_values[:kept] = indices[:kept], values[:kept]
+    return more_indices, more_values
+
+
+@compiled
+def _load(first, last, indices, values, sums):
+    """Load pairs of a row into the sums, and mark them as known."""
+    levels = values.shape[1]
+    for k in range(first, last):
+        at = np.int64(indices[k]) * SUMS
+        for level in range(levels):
+            sums[at + level] = values[k, level]
+        sums[at + levels] = 1
+
+
+@compiled
+def _add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr, out_indices, out_values):
+    """Add the pixels of a part to rows begin..end of G.
+
+    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output.
+
+    Args:
+        part: row starts, columns and values of W, and whether a pixel counts at each level.
+        columns: output of `_transpose` for the part: starts, pixels and places.
+        rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
+        sums: zero before and after the call; SUMS for each Gaussian.
+        fresh: buffer for all columns.
+        out_indptr, out_indices, out_values: late pairs, with columns sorted within rows.
+
+    Returns:
+        `out_indices` and `out_values`, or larger copies if they were too small.
+    """
+    indptr, indices, data, valid = part
+    begins, pixels, places = columns
+    row_indptr, row_indices, row_values = rows
+    late_indptr, late_indices, late_values = late
+    levels = row_values.shape[1]
+    done = 0
+    for i in range(begin, end):
+        first, last = row_indptr[i - begin], row_indptr[i - begin + 1]
+        old, old_end = late_indptr[i - begin], late_indptr[i - begin + 1]
+        count, shown = 0, begins[i] < begins[i + 1]
+        if shown:
+            _load(first, last, row_indices, row_values, sums)
+            _load(old, old_end, late_indices, late_values, sums)
+        for t in range(begins[i], begins[i + 1]):
+            p = pixels[t]
+            weight = np.float64(data[places[t]])
+            whole = weight if valid[p, 0] else 0.0
+            part_weight = weight if valid[p, 1] else 0.0
+            subpart = weight if valid[p, 2] else 0.0
+            for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
+                j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
+                at, value = np.int64(j) * SUMS, np.float64(data[k])
+                if add_products(sums, at, whole, part_weight, subpart, value) == 0:
+                    fresh[count] = np.int32(j)
+                    count += 1
+        if count:
+            fresh[:count] = np.sort(fresh[:count])
+        size = old_end - old + count
+        if done + size > len(out_indices):
+            out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
+        if shown:
+            for k in range(first, last):
+                at = np.int64(row_indices[k]) * SUMS
+                for level in range(levels):
+                    row_values[k, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
+            new = 0
+            for place in range(done, done + size):
+                if new < count and (old == old_end or fresh[new] < late_indices[old]):
+                    column = fresh[new]
+                    new += 1
+                else:
+                    column = late_indices[old]
+                    old += 1
+                at = np.int64(column) * SUMS
+                out_indices[place] = column
+                for level in range(levels):
+                    out_values[place, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
+        else:
+            out_indices[done : done + size] = late_indices[old:old_end]
+            out_values[done : done + size] = late_values[old:old_end]
+        done += size
+        out_indptr[i - begin + 1] = done
+    return out_indices, out_values
+
+
+@compiled
+def _merge_rows(indptr, indices, values, late_indptr, late_indices, late_values):
+    """Merge late pairs into the rows, in place from the end; `indices` and `values` have room for all."""
+    at = indptr[-1] + late_indptr[-1]
+    for i in range(len(indptr) - 2, -1, -1):
+        k, t = indptr[i + 1] - 1, late_indptr[i + 1] - 1
+        if at == k + 1:
+            break  # no late pair is left
+        indptr[i + 1] = at
+        while k >= indptr[i] or t >= late_indptr[i]:
+            at -= 1
+            if t < late_indptr[i] or (k >= indptr[i] and indices[k] > late_indices[t]):
+                indices[at] = indices[k]
+                values[at] = values[k]
+                k -= 1
+            else:
+                indices[at] = late_indices[t]
+                values[at] = late_values[t]
+                t -= 1

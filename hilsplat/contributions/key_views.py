@@ -33,11 +33,7 @@ def run_key_masks(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Segment only the key views; see `segment.stage.run_masks`.
-
-    Args:
-        gaussians_ply: Gaussians of the scene, by which views are chosen.
-    """
+    """Segment only the key views; see `segment.stage.run_masks`."""
     views = key_views(Scene.load(scene_folder), gaussians_ply, settings.key_views, threads)
     run_masks(scene_folder, out, cache, settings, threads, memory_mib, views)
 
@@ -49,8 +45,6 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
     the views cover the scene before they repeat.
 
     Args:
-        scene: scene whose cameras are used; images are not read.
-        gaussians_ply: Gaussians of the scene.
         share: share of the training views to choose, rounded up.
         threads: views rendered in parallel; the result does not depend on it.
 

@@ -1,4 +1,8 @@
-"""Mask means as a linear map of the field, its adjoint, and averages of latents over masks."""
+"""Mask means as a linear map of the field, its adjoint, and averages of latents over masks.
+
+Rows of a multiple of sixteen float32 channels take the loops `_wide_means` and `_wide_spread`, which give the
+bytes of the plain loops.
+"""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,11 +13,14 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float32, Int64, UInt8
 
 from hilsplat.base.compiled import compiled
-from hilsplat.base.lanes import WIDTH
-from hilsplat.contributions.channels import columns_below, mask_means, mask_spread
+from hilsplat.base.lanes import WIDTH, lanes, load, store
+from hilsplat.contributions.compositing import plus
 
 MEDIAN_SOFTENING = 1e-4
 """Minimum distance of a latent to the median, which avoids division by zero."""
+
+BLOCK = 2**15
+"""Gaussians per pass of a wide product with A, so that their features stay in the processor's cache."""
 
 SPREAD_PARTS = 4
 """Ranges of Gaussians per thread, which balance the load: masks show some Gaussians more often."""
@@ -27,12 +34,8 @@ class MaskOperator:
     the number of threads.
 
     Attributes:
-        indptr: row starts of A in CSR form; rows are masks, with sorted columns.
-        indices: Gaussians of the stored values.
-        data: the stored values, mean weights.
+        indptr, indices, data: A in CSR form; rows are masks, with sorted columns.
         level_index: level of each mask, from 0.
-        num_gaussians: N.
-        threads: threads that share a product.
     """
 
     indptr: np.ndarray
@@ -56,7 +59,7 @@ class MaskOperator:
         edges = [0, *shares.tolist(), len(out)]
         if _fills_lanes(out):
             flat = features.reshape(-1), out.shape[1], out.reshape(-1)
-            self._share(lambda first, last: mask_means(first, last, *A, *flat), edges)
+            self._share(lambda first, last: _wide_means(first, last, *A, *flat), edges)
         else:
             self._share(lambda first, last: _means(first, last, *A, features, out), edges)
         return out
@@ -70,7 +73,7 @@ class MaskOperator:
         edges = np.linspace(0, self.num_gaussians, parts + 1).astype(np.int64).tolist()
         if _fills_lanes(out):
             flat = values.reshape(-1), values.shape[1], out.reshape(-1)
-            self._share(lambda begin, end: mask_spread(begin, end, *A, *flat), edges)
+            self._share(lambda begin, end: _wide_spread(begin, end, *A, *flat), edges)
         else:
             self._share(lambda begin, end: _spread(begin, end, *A, values, out), edges)
         return out
@@ -94,8 +97,8 @@ def lifted_average(
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Average the latents of the pixels that show each Gaussian, weighted by its share of them.
 
-    This is exact, takes one sparse product and is within about a tenth of the regression's optimum.
-    Gaussians that no labelled pixel shows get 0.
+    This takes one sparse product and is within about a tenth of the regression's optimum. Gaussians that no
+    labelled pixel shows get 0.
     """
     sums = masks.spread(pixels[:, None] * latents)
     return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
@@ -114,27 +117,15 @@ def lifted_median(
     one pass over A, averages with the weights divided by the distance to the latest estimate.
 
     Args:
-        masks: A.
-        pixels: n.
-        latents: h.
         start: lifted average; Gaussians that no mask shows keep it.
         steps: iterations; 15 give about three correct digits.
     """
-    features = np.ascontiguousarray(start, np.float32).copy()
+    A = masks.indptr, masks.indices, masks.data, masks.level_index
+    features = np.array(start, np.float32, order="C")
     for _ in range(steps):
         sums = np.zeros(features.shape, np.float64)
         weights = np.zeros(features.shape[:2], np.float64)
-        _median_step(
-            masks.indptr,
-            masks.indices,
-            masks.data,
-            masks.level_index,
-            pixels,
-            latents,
-            features,
-            sums,
-            weights,
-        )
+        _median_step(*A, pixels, latents, features, sums, weights)
         seen = weights > 0
         features[seen] = sums[seen] / weights[seen][:, None]
     return features
@@ -155,10 +146,55 @@ def _spread(begin, end, indptr, indices, data, level_index, values, out):
     for m in range(len(level_index)):
         level = level_index[m]
         first = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
-        for k in range(first, columns_below(end, first, indptr[m + 1], indices)):
+        for k in range(first, _columns_below(end, first, indptr[m + 1], indices)):
             g, weight = indices[k], data[k]
             for c in range(values.shape[1]):
                 out[g, level, c] += weight * values[m, c]
+
+
+@compiled
+def _wide_means(first, last, indptr, indices, data, level_index, features, width, out):
+    """Compute `_means` for flat features and `out`, with `width` channels per row."""
+    num_gaussians = len(features) // (3 * width)
+    at = indptr[first:last].copy()
+    for begin in range(0, num_gaussians, BLOCK):
+        for m in range(first, last):
+            some = at[m - first]
+            stop = at[m - first] = _columns_below(begin + BLOCK, some, indptr[m + 1], indices)
+            for c in range(0, width if some < stop else 0, WIDTH):
+                place = level_index[m] * width + c
+                total = load(out, m * width + c)
+                for k in range(some, stop):
+                    there = np.int64(indices[k]) * 3 * width + place
+                    total = plus(total, lanes(data[k]), load(features, there))
+                store(out, m * width + c, total)
+
+
+@compiled
+def _wide_spread(begin, end, indptr, indices, data, level_index, values, width, out):
+    """Compute `_spread` for flat values and `out`, with `width` channels per row."""
+    masks = len(level_index)
+    at = np.empty(masks, np.int64)
+    for m in range(masks):
+        at[m] = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
+    for block in range(begin, end, BLOCK):
+        for m in range(masks):
+            some = at[m]
+            stop = at[m] = _columns_below(min(block + BLOCK, end), some, indptr[m + 1], indices)
+            for c in range(0, width if some < stop else 0, WIDTH):
+                place = level_index[m] * width + c
+                value = load(values, m * width + c)
+                for k in range(some, stop):
+                    there = np.int64(indices[k]) * 3 * width + place
+                    store(out, there, plus(load(out, there), lanes(data[k]), value))
+
+
+@compiled
+def _columns_below(limit, begin, end, indices):
+    """Return the end of the columns below `limit` in a row, begin..end of `indices`, which are sorted."""
+    while begin < end and indices[begin] < limit:
+        begin += 1
+    return begin
 
 
 @compiled

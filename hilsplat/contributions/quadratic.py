@@ -14,10 +14,9 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float32
 
 from hilsplat.base.compiled import compiled
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lanes import WIDTH, lanes, load, store
 from hilsplat.base.levels import LEVELS
-from hilsplat.contributions.channels import gram_product, padded
-from hilsplat.contributions.streams import mapped
+from hilsplat.contributions.compositing import padded, plus
 
 PRODUCT_PARTS = 4
 """A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that the
@@ -29,10 +28,8 @@ class Gram:
     """Upper triangle of G for all levels, which share one sparsity pattern.
 
     Attributes:
-        indptr: row starts of the CSR pattern (N, N).
-        indices: columns of the pattern, starting at the diagonal.
+        indptr, indices: CSR pattern (N, N); the columns of a row start at the diagonal.
         values: G of each level at each pair of the pattern.
-        threads: threads that share a product.
     """
 
     indptr: np.ndarray
@@ -62,7 +59,7 @@ class Gram:
             rows = begin, end, self.indptr, self.indices, self.values
             if is_single:
                 flat, width = features.reshape(-1), features.shape[2]
-                gram_product(*rows, flat, width, out.reshape(-1))
+                _wide_gram_product(*rows, flat, width, out.reshape(-1))
             else:
                 _gram_product(*rows, features, out)
             return out
@@ -85,12 +82,7 @@ class Gram:
 
 @dataclass(frozen=True)
 class StackedWeights:
-    """W of all labelled pixels of all views, and the levels at which each pixel has a mask.
-
-    Attributes:
-        weights: CSR (P, N); rows sum to 1.
-        valid: whether a pixel has a mask at each level.
-    """
+    """W (P x N, rows sum to 1) of labelled pixels, and whether each pixel has a mask at each level."""
 
     weights: sp.csr_matrix
     valid: Bool[np.ndarray, "P 3"]
@@ -107,15 +99,8 @@ class StackedWeights:
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """Return W' diag(valid_l) W F_l for every level, in the precision of F, on one thread."""
-        out = np.zeros_like(features)
-        _weights_product(
-            self.weights.indptr,
-            self.weights.indices,
-            self.weights.data,
-            self.valid,
-            np.ascontiguousarray(features),
-            out,
-        )
+        out, W = np.zeros_like(features), self.weights
+        _weights_product(W.indptr, W.indices, W.data, self.valid, np.ascontiguousarray(features), out)
         return out
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
@@ -125,14 +110,9 @@ class StackedWeights:
 
     def save(self, folder: Path) -> None:
         """Write the folder `W`, whose arrays are memory-mapped when read."""
-        _save(
-            folder / "W",
-            indptr=self.weights.indptr,
-            indices=self.weights.indices,
-            data=self.weights.data,
-            columns=np.array([self.weights.shape[1]]),
-            valid=self.valid,
-        )
+        W = self.weights
+        arrays = {"indptr": W.indptr, "indices": W.indices, "data": W.data, "valid": self.valid}
+        _save(folder / "W", columns=np.array([self.num_gaussians]), **arrays)
 
 
 Quadratic = Gram | StackedWeights
@@ -142,29 +122,6 @@ def level_mass(quadratic: Quadratic) -> Float32[np.ndarray, "N 3"]:
     """Return each Gaussian's visible mass in the labelled pixels of each level: G_l 1 (W's rows sum to 1)."""
     ones = np.ones((quadratic.num_gaussians, len(LEVELS), 1), np.float32)
     return quadratic.product(ones)[:, :, 0]
-
-
-def load_quadratic(folder: Path, threads: int = 1) -> Quadratic:
-    """Memory-map G or W from the contributions artifact, whichever the stage kept.
-
-    Args:
-        folder: contributions artifact.
-        threads: threads that share a product with G; products with W use one.
-
-    Raises:
-        ArtifactError: if the folder contains neither, or a file of it is missing or damaged.
-    """
-    if (folder / "G").is_dir():
-        indptr, indices, values = (
-            mapped(folder, f"G/{name}.npy") for name in ("indptr", "indices", "values")
-        )
-        return Gram(indptr, indices, values, threads)
-    if (folder / "W").is_dir():
-        names = ("indptr", "indices", "data", "columns", "valid")
-        indptr, indices, data, columns, valid = (mapped(folder, f"W/{name}.npy") for name in names)
-        shape = (len(indptr) - 1, int(columns[0]))
-        return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=shape, copy=False), valid)
-    raise ArtifactError(f"{folder} holds neither G nor W", fix="run the contributions stage again")
 
 
 def _save(folder: Path, **arrays: np.ndarray) -> None:
@@ -187,6 +144,37 @@ def _gram_product(begin, end, indptr, indices, values, features, out):
                 if j != i:
                     for c in range(channels):
                         out[j - begin, level, c] += value * features[i, level, c]
+
+
+@compiled
+def _wide_gram_product(begin, end, indptr, indices, values, features, width, out):
+    """Compute `_gram_product` for flat features and `out`, with `width` padded channels per row.
+
+    For a loop over the few channels of a row, numba's vector code keeps sums in memory and checks in every
+    pass that arrays do not overlap. Here the sums stay in registers: 62 ms instead of 168 ms at d = 16 and
+    6.7 million pairs of Gaussians.
+    """
+    row, origin = 3 * width, 3 * width * begin
+    for i in range(begin, end):
+        for c in range(0, width, WIDTH):
+            here = i * row + c
+            a, b, d = load(features, here), load(features, here + width), load(features, here + 2 * width)
+            own = here - origin
+            whole, part, subpart = load(out, own), load(out, own + width), load(out, own + 2 * width)
+            for k in range(indptr[i], indptr[i + 1]):
+                there = np.int64(indices[k]) * row + c
+                u, v, w = lanes(values[k, 0]), lanes(values[k, 1]), lanes(values[k, 2])
+                whole = plus(whole, u, load(features, there))
+                part = plus(part, v, load(features, there + width))
+                subpart = plus(subpart, w, load(features, there + 2 * width))
+                if there != here:
+                    other = there - origin
+                    store(out, other, plus(load(out, other), u, a))
+                    store(out, other + width, plus(load(out, other + width), v, b))
+                    store(out, other + 2 * width, plus(load(out, other + 2 * width), w, d))
+            store(out, own, whole)
+            store(out, own + width, part)
+            store(out, own + 2 * width, subpart)
 
 
 @compiled

@@ -45,7 +45,8 @@ class _Waiting:
 
     def __init__(self, num_gaussians: int) -> None:
         self._num_gaussians = num_gaussians
-        self._indices, self._data = np.empty(0, np.int32), np.empty(0, np.float32)
+        room = CHUNK_WEIGHTS + LARGE_PART  # parts are smaller than the latter, and added beyond the former
+        self._indices, self._data = np.empty(room, np.int32), np.empty(room, np.float32)
         self._clear()
 
     def _clear(self) -> None:
@@ -56,9 +57,6 @@ class _Waiting:
     def append(self, part: StackedWeights) -> None:
         """Append a copy of a part."""
         before, after = self.nonzeros, self.nonzeros + part.nonzeros
-        if after > len(self._data):
-            room = max(after, CHUNK_WEIGHTS * 9 // 8)
-            self._indices, self._data = (_enlarged(old, before, room) for old in (self._indices, self._data))
         self._indices[before:after] = part.weights.indices
         self._data[before:after] = part.weights.data
         self._indptr.append(part.weights.indptr[1:].astype(np.int64) + before)
@@ -79,13 +77,6 @@ class _Waiting:
         return held
 
 
-def _enlarged(array: np.ndarray, kept: int, room: int) -> np.ndarray:
-    """Return a larger array with the first `kept` entries of an array."""
-    larger = np.empty(room, array.dtype)
-    larger[:kept] = array[:kept]
-    return larger
-
-
 class QuadraticBuilder:
     """Builder of G or W, part by part; it keeps whichever has fewer non-zeros.
 
@@ -93,7 +84,6 @@ class QuadraticBuilder:
     than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far.
 
     Args:
-        num_gaussians: N.
         keep: "auto", or "gram" or "weights" to force one.
         threads: threads that build G.
     """
@@ -172,7 +162,6 @@ class QuadraticCheckpoint:
     """Checkpoint of the sums, kept on disk during a long pass.
 
     Args:
-        folder: folder of checkpoints.
         keys: digests of the contributions of each view, in order.
         keep: as in `QuadraticBuilder`.
     """

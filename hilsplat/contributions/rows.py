@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -9,9 +10,12 @@ from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.arrays import read_into
 from hilsplat.base.artifacts import read_full_index, read_npy, sealed
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.contributions.quadratic import Quadratic, load_quadratic
-from hilsplat.contributions.streams import mapped
+from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
+
+HEADER_BYTES = 128
+"""Size of the header of our .npy files; empty arrays have nothing else and cannot be mapped."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +25,7 @@ class Contributions:
     The M rows are the masks of all training views, view by view, in the order of each view.
 
     Attributes:
-        folder: folder of the artifact.
         views: training views in the order of `view`.
-        num_gaussians: N.
         gaussians_sha256: digest of the Gaussians' PLY.
         cameras_sha256: digest of the scene's cameras.
         min_weight: smaller weights of a Gaussian at a pixel are dropped.
@@ -61,12 +63,12 @@ class Contributions:
 
     def matrix(self, name: str) -> sp.csr_matrix:
         """Memory-map `A`, `A_half` or `S` (M x N) from its files."""
-        parts = (mapped(self.folder, f"{name}/{part}.npy") for part in ("data", "indices", "indptr"))
-        return sp.csr_matrix(tuple(parts), shape=(len(self), self.num_gaussians), copy=False)
+        parts = tuple(self._mapped(f"{name}/{part}") for part in ("data", "indices", "indptr"))
+        return sp.csr_matrix(parts, shape=(len(self), self.num_gaussians), copy=False)
 
     def mass(self) -> Float32[np.ndarray, "V N"]:
         """Memory-map the visible mass of each Gaussian in each training view, px."""
-        return mapped(self.folder, "mass.npy")
+        return self._mapped("mass")
 
     def means(self) -> Float32[np.ndarray, "N 3"]:
         """Read the centres of the Gaussians, scene units."""
@@ -77,8 +79,29 @@ class Contributions:
         return read_npy(sealed(self.folder, "centres.npy"))
 
     def quadratic(self, threads: int = 1) -> Quadratic:
-        """Memory-map G, or the stacked weights if those are smaller."""
-        return load_quadratic(self.folder, threads)
+        """Memory-map G or W, whichever the stage kept; products with W use one thread.
+
+        Raises:
+            ArtifactError: if the folder contains neither.
+        """
+        if (self.folder / "G").is_dir():
+            return Gram(*(self._mapped(f"G/{name}") for name in ("indptr", "indices", "values")), threads)
+        if (self.folder / "W").is_dir():
+            names = ("indptr", "indices", "data", "columns", "valid")
+            indptr, indices, data, columns, valid = (self._mapped(f"W/{name}") for name in names)
+            shape = (len(indptr) - 1, int(columns[0]))
+            return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=shape, copy=False), valid)
+        raise ArtifactError(f"{self.folder} holds neither G nor W", fix="run the contributions stage again")
+
+    def _mapped(self, name: str) -> np.ndarray:
+        """Memory-map an array from its file, read-only.
+
+        Raises:
+            ArtifactError: if the file is missing or has changed since it was written.
+        """
+        path = sealed(self.folder, f"{name}.npy")
+        mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
+        return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)
 
     @staticmethod
     def load(folder: Path) -> "Contributions":

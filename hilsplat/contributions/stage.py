@@ -14,7 +14,6 @@ The losses of the language field and the semantic tree need nothing else from th
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache as cache_calls
 from pathlib import Path
 
@@ -36,9 +35,8 @@ from hilsplat.base.identity import code_digest
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
+from hilsplat.contributions.quadratic import Gram, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
-from hilsplat.contributions.streams import ArrayStream, MatrixStream
 from hilsplat.contributions.view_matrices import MATRICES, label_maps, labelled_rows, view_contributions
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
@@ -58,13 +56,58 @@ MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights are prepared one at a time; each takes 256 MiB, and up to four are waiting."""
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """Masks and matrices of a view, and the rows of W not yet in G."""
+class ArrayStream:
+    """A .npy file written row by row, so that the stage never holds all of its output."""
 
-    masks: HierarchicalMasks
-    part: dict[str, np.ndarray]
-    labelled: StackedWeights | None
+    def __init__(self, path: Path, dtype: type, row_shape: tuple[int, ...] = ()) -> None:
+        self._dtype, self._row_shape, self._rows = np.dtype(dtype), row_shape, 0
+        self._stream = path.open("wb")
+        self._write_header()
+
+    def _write_header(self) -> None:
+        # its size does not depend on the number of rows
+        shape = (self._rows, *self._row_shape)
+        header = {"descr": self._dtype.str, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(self._stream, header)
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def append(self, values: np.ndarray) -> None:
+        """Add rows."""
+        values = np.ascontiguousarray(values, self._dtype)
+        self._rows += len(values)
+        self._stream.write(values.data)
+
+    def close(self) -> None:
+        """Complete the header."""
+        self._stream.seek(0)
+        self._write_header()
+        self._stream.close()
+
+
+class _MatrixStream:
+    """A CSR matrix that grows by rows, in a folder with `data.npy`, `indices.npy` and `indptr.npy`."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        self._data = ArrayStream(folder / "data.npy", np.float32)
+        self._indices = ArrayStream(folder / "indices.npy", np.int32)
+        self._indptr = ArrayStream(folder / "indptr.npy", np.int64)
+        self._indptr.append(np.zeros(1))
+
+    @property
+    def nonzeros(self) -> int:
+        return len(self._data)
+
+    def append(self, data: np.ndarray, indices: np.ndarray, indptr: np.ndarray) -> None:
+        self._indptr.append(indptr[1:] + self.nonzeros)
+        self._data.append(data)
+        self._indices.append(indices)
+
+    def close(self) -> None:
+        for stream in (self._data, self._indices, self._indptr):
+            stream.close()
 
 
 def views_together(scene: Scene, threads: int) -> int:
@@ -116,52 +159,58 @@ def run_contributions(
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
         summed = checkpoint.resume(builder)
-        matrices = {name: MatrixStream(folder / name) for name in MATRICES}
-        with ArrayStream(folder / "mass.npy", np.float32, len(gaussians)) as mass:
-            together = views_together(scene, threads)
-            threads_each = max(1, threads // together)
+        matrices = {name: _MatrixStream(folder / name) for name in MATRICES}
+        mass = ArrayStream(folder / "mass.npy", np.float32, (len(gaussians),))
+        together = views_together(scene, threads)
+        threads_each = max(1, threads // together)
 
-            def prepare(number: int) -> _Prepared:
-                camera = cameras[number]
-                masks = load_masks(masks_folder, camera.name, digests)
-                _require_fit(masks, camera)
-
-                @cache_calls
-                def weights() -> sp.csr_matrix:
-                    raw = pixel_weights(
-                        gaussians,
-                        camera,
-                        min_weight=settings.min_weight,
-                        threads=threads_each,
-                        device=device,
-                    )
-                    return normalised_weights(raw)
-
-                part = store.get(
-                    keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
+        def prepare(
+            number: int,
+        ) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
+            """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
+            camera = cameras[number]
+            masks = load_masks(masks_folder, camera.name, digests)
+            if masks.size_hw != camera.size_hw:
+                raise MisalignedArtifactError(
+                    f"masks of view {camera.name} do not fit its camera",
+                    expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
+                    found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+                    fix="run the masks stage again",
                 )
-                keeps_rows = settings.keep != "none" and number >= summed
-                rows_of_W = labelled_rows(weights(), label_maps(masks)) if keeps_rows else None
-                return _Prepared(masks, part, rows_of_W)
 
-            prepared = in_order(prepare, range(len(cameras)), together)
-            for number, made in enumerate(track(prepared, "contributions of views", len(cameras))):
-                masks, part = made.masks, made.part
-                for name, matrix in matrices.items():
-                    matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
-                mass.append(part["mass"][None])
-                rows["view"].append(np.full(len(masks), number, np.int32))
-                rows["mask"].append(np.arange(len(masks), dtype=np.int32))
-                rows["level"].append(masks.level)
-                rows["area_px"].append(masks.area_px)
-                rows["pixels"].append(part["pixels"])
-                rows["half_pixels"].append(part["half_pixels"])
-                if made.labelled is not None:
-                    builder.add(made.labelled)
-                    checkpoint.offer(builder, number + 1)
-        for matrix in matrices.values():
-            matrix.close()
-        if not sum(len(part) for part in rows["view"]):
+            @cache_calls
+            def weights() -> sp.csr_matrix:
+                least = settings.min_weight
+                return normalised_weights(
+                    pixel_weights(gaussians, camera, min_weight=least, threads=threads_each, device=device)
+                )
+
+            part = store.get(
+                keys[number], lambda: view_contributions(camera.name, weights(), masks, threads_each)
+            )
+            if settings.keep == "none" or number < summed:
+                return masks, part, None
+            return masks, part, labelled_rows(weights(), label_maps(masks))
+
+        prepared = in_order(prepare, range(len(cameras)), together)
+        for number, made in enumerate(track(prepared, "contributions of views", len(cameras))):
+            masks, part, labelled = made
+            for name, matrix in matrices.items():
+                matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
+            mass.append(part["mass"][None])
+            rows["view"].append(np.full(len(masks), number, np.int32))
+            rows["mask"].append(np.arange(len(masks), dtype=np.int32))
+            rows["level"].append(masks.level)
+            rows["area_px"].append(masks.area_px)
+            rows["pixels"].append(part["pixels"])
+            rows["half_pixels"].append(part["half_pixels"])
+            if labelled is not None:
+                builder.add(labelled)
+                checkpoint.offer(builder, number + 1)
+        for stream in (mass, *matrices.values()):
+            stream.close()
+        num_masks = sum(len(part) for part in rows["view"])
+        if not num_masks:
             raise ArtifactError(
                 f"no train view of {scene.name} has a mask",
                 fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
@@ -169,13 +218,14 @@ def run_contributions(
         np.save(folder / "means.npy", gaussians.means)
         np.save(folder / "centres.npy", np.stack([camera.centre for camera in cameras]))
         write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
-        counts |= {"views": len(cameras), "masks": sum(len(part) for part in rows["view"])}
+        counts |= {"views": len(cameras), "masks": num_masks}
         nonzeros = {name: matrix.nonzeros for name, matrix in matrices.items()}
         if settings.keep != "none":
             quadratic = builder.finish()
             quadratic.save(folder)
-            nonzeros |= {"W": builder.weights_nonzeros, _name(quadratic): quadratic.nonzeros}
-            counts |= {"kept": _name(quadratic), "nonzeros": quadratic.nonzeros}
+            kept = "G" if isinstance(quadratic, Gram) else "W"
+            nonzeros |= {"W": builder.weights_nonzeros, kept: quadratic.nonzeros}
+            counts |= {"kept": kept, "nonzeros": quadratic.nonzeros}
         counts["from_cache"] = store.hits
         write_index(
             folder,
@@ -188,15 +238,10 @@ def run_contributions(
             gaussians_sha256=gaussians_sha256,
             cameras_sha256=sha256_of_file(scene_folder / "cameras.npz"),
             min_weight=settings.min_weight,
-            num_masks=counts["masks"],
+            num_masks=num_masks,
             nonzeros=nonzeros,
         )
     checkpoint.forget()
-
-
-def _name(quadratic: Quadratic) -> str:
-    """Return "G" or "W"."""
-    return "G" if isinstance(quadratic, Gram) else "W"
 
 
 def _key(camera: Camera, digests: Mapping[str, str], about: dict) -> str:
@@ -209,13 +254,3 @@ def _key(camera: Camera, digests: Mapping[str, str], about: dict) -> str:
             "view": camera.name,
         }
     )
-
-
-def _require_fit(masks: HierarchicalMasks, camera: Camera) -> None:
-    if masks.size_hw != camera.size_hw:
-        raise MisalignedArtifactError(
-            f"masks of view {camera.name} do not fit its camera",
-            expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
-            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-            fix="run the masks stage again",
-        )

@@ -9,11 +9,11 @@ from jaxtyping import Float32, Int64, UInt8
 
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.contributions.rendered_latents import rendered_latents
+from hilsplat.contributions.compositing import rendered_latents
 from hilsplat.field.code import Code
 from hilsplat.field.language_field import LanguageField
-from hilsplat.query.latent_relevancy import LatentRelevancy
-from hilsplat.query.look_up_kernels import fill_maps
+from hilsplat.query.relevancy import LatentRelevancy
+from hilsplat.query.relevancy_kernels import fill_maps
 from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.settings import EvaluateSettings

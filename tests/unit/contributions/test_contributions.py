@@ -1,6 +1,7 @@
 """A and G against their definitions, and what the stage writes."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +11,18 @@ from hilsplat.base.artifacts import read_index, sha256_of_path, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions import gram_builder, quadratic_builder, stage
-from hilsplat.contributions.channels import gram_product, padded
-from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.contributions.compositing import normalised_weights, padded
 from hilsplat.contributions.gram_builder import GramBuilder
-from hilsplat.contributions.quadratic import _gram_product, level_mass, load_quadratic
+from hilsplat.contributions.quadratic import (
+    Gram,
+    StackedWeights,
+    _gram_product,
+    _wide_gram_product,
+    level_mass,
+)
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import run_contributions
-from hilsplat.contributions.streams import ArrayStream
+from hilsplat.contributions.stage import ArrayStream, run_contributions
 from hilsplat.contributions.view_matrices import (
     label_maps,
     labelled_rows,
@@ -30,8 +35,10 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from tests.unit.two_boxes_world import (
     HEIGHT,
+    NUM_GAUSSIANS,
     REGIONS,
     WIDTH,
+    TwoBoxes,
     build_contributions,
     reverse_masks,
     two_boxes_weights,
@@ -39,6 +46,7 @@ from tests.unit.two_boxes_world import (
 
 SIZE = (9, 7)
 PIXELS = 63
+FEATURES = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
 
 
 def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, HierarchicalMasks]:
@@ -51,6 +59,12 @@ def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, Hier
     level = np.array([1, 1, 1, 2, 2, 3, 3, 3], np.uint8)
     ones = np.ones(8, np.float32)
     return weights.astype(np.float32).tocsr(), HierarchicalMasks.from_dense(dense, level, ones, ones)
+
+
+def labelled_part(seed: int) -> StackedWeights:
+    """The labelled rows of a random view."""
+    raw, masks = random_view(seed)
+    return labelled_rows(normalised_weights(raw), label_maps(masks))
 
 
 def matrix(arrays: dict[str, np.ndarray], name: str, columns: int) -> np.ndarray:
@@ -96,25 +110,40 @@ def test_matrices_of_a_view_do_not_depend_on_threads(threads):
     }
 
 
+def built_gram(parts: list[StackedWeights], threads: int = 1) -> Gram:
+    builder = GramBuilder(40, threads)
+    for part in parts:
+        builder.add(part)
+    return builder.finish()
+
+
+def built(keep: str, parts: list[StackedWeights]) -> Gram | StackedWeights:
+    builder = QuadraticBuilder(40, keep, threads=1)
+    for part in parts:
+        builder.add(part)
+    return builder.finish()
+
+
+def assert_same_gram(one: Gram, other: Gram) -> None:
+    for name in ("indptr", "indices", "values"):
+        assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+
+
 def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     stacked, dense = [], np.zeros((3, 40, 40))
     for seed in range(3):
         raw, masks = random_view(seed)
-        weights = normalised_weights(raw)
-        labels = label_maps(masks)
-        stacked.append(labelled_rows(weights.copy(), labels))
+        weights, labels = normalised_weights(raw), label_maps(masks)
         full = weights.toarray().astype(np.float64)
+        stacked.append(labelled_rows(weights, labels))
         for index in range(3):
             valid = labels[:, index] >= 0
             dense[index] += full[valid].T @ full[valid]
-    everything = stack_weights(stacked)
     gram = built_gram(stacked)
-    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
-    expected = np.einsum("lij,jld->ild", dense, features)
-    assert gram.product(features) == pytest.approx(expected, abs=1e-5)
-    assert everything.product(features) == pytest.approx(expected, abs=1e-5)
-    for each in (gram, everything):
-        assert each.form(features) == pytest.approx((features * expected).sum(), rel=1e-6)
+    expected = np.einsum("lij,jld->ild", dense, FEATURES)
+    for each in (gram, stack_weights(stacked)):
+        assert each.product(FEATURES) == pytest.approx(expected, abs=1e-5)
+        assert each.form(FEATURES) == pytest.approx((FEATURES * expected).sum(), rel=1e-6)
     # entry by entry: unit vectors pick columns
     columns = np.repeat(np.eye(40, dtype=np.float32)[:, None], 3, axis=1)
     assert gram.product(columns).transpose(1, 0, 2) == pytest.approx(dense, abs=1e-6)
@@ -122,10 +151,9 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
     assert level_mass(gram) == pytest.approx(dense.sum(axis=2).T, abs=1e-5)
 
 
-@pytest.mark.parametrize("channels", [1, 3, 16, 17, 32])
+@pytest.mark.parametrize("channels", [1, 16, 17, 32])
 def test_a_product_of_sixteen_channels_at_a_time_has_the_bytes_of_the_plain_loop(channels):
-    raw, masks = random_view(7)
-    gram = built_gram([labelled_rows(normalised_weights(raw), label_maps(masks))])
+    gram = built_gram([labelled_part(7)])
     features = np.random.default_rng(channels).normal(size=(40, 3, channels)).astype(np.float32)
     arrays = gram.indptr, gram.indices, gram.values
     for begin, end in ((0, 40), (13, 31)):
@@ -133,84 +161,56 @@ def test_a_product_of_sixteen_channels_at_a_time_has_the_bytes_of_the_plain_loop
         _gram_product(begin, end, *arrays, features, plain)
         wide = padded(features)
         fast = np.zeros_like(wide[begin:])
-        gram_product(begin, end, *arrays, wide.reshape(-1), wide.shape[2], fast.reshape(-1))
+        _wide_gram_product(begin, end, *arrays, wide.reshape(-1), wide.shape[2], fast.reshape(-1))
         assert plain.any()
         assert fast[:, :, :channels].tobytes() == plain.tobytes()
         assert not fast[:, :, channels:].any()
 
 
-def built_gram(parts, threads=1):
-    builder = GramBuilder(parts[0].num_gaussians, threads)
-    for part in parts:
-        builder.add(part)
-    return builder.finish()
-
-
-def chosen_quadratic(part, keep):
-    builder = QuadraticBuilder(part.num_gaussians, keep, threads=1)
-    builder.add(part)
-    return builder.finish()
-
-
-def test_gram_does_not_depend_on_threads():
-    raw, masks = random_view(0)
-    weights = normalised_weights(raw)
-    part = labelled_rows(weights, label_maps(masks))
-    one, two = built_gram([part], threads=1), built_gram([part], threads=2)
-    assert one.values.tobytes() == two.values.tobytes()
-    assert one.indices.tobytes() == two.indices.tobytes()
-
-
 @pytest.mark.parametrize("merge_at", [0, 1, 8])
-def test_gram_does_not_depend_on_how_the_pixels_are_parted(merge_at, monkeypatch):
+def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge_at, monkeypatch):
     monkeypatch.setattr(gram_builder, "MERGE_AT", merge_at)
-    parts = []
-    for seed in range(4):
-        raw, masks = random_view(seed)
-        weights = normalised_weights(raw)
-        parts.append(labelled_rows(weights, label_maps(masks)))
-    one, four = built_gram([stack_weights(parts)]), built_gram(parts)
-    for name in ("indptr", "indices", "values"):
-        assert getattr(one, name).tobytes() == getattr(four, name).tobytes()
+    parts = [labelled_part(seed) for seed in range(4)]
+    one = built_gram([stack_weights(parts)])
+    assert_same_gram(built_gram(parts), one)
+    assert_same_gram(built_gram(parts, threads=2), one)
     # too many weights to hold: G, whatever its size
     monkeypatch.setattr(quadratic_builder, "MAX_WEIGHTS", parts[0].nonzeros)
-    builder = QuadraticBuilder(40, "auto", threads=1)
-    for part in parts:
-        builder.add(part)
-    assert builder.finish().values.tobytes() == one.values.tobytes()
+    assert_same_gram(built("auto", parts), one)
 
 
 def test_large_parts_join_g_in_their_turn(monkeypatch):
-    parts = []
-    for seed in range(4):
-        raw, masks = random_view(seed)
-        parts.append(labelled_rows(normalised_weights(raw), label_maps(masks)))
+    parts = [labelled_part(seed) for seed in range(4)]
     sizes = sorted(part.nonzeros for part in parts)
     monkeypatch.setattr(quadratic_builder, "LARGE_PART", sizes[2])  # two of them
-    builder = QuadraticBuilder(40, "gram", threads=1)
-    for part in parts:
-        builder.add(part)
-    found, one = builder.finish(), built_gram(parts)
-    for name in ("indptr", "indices", "values"):
-        assert getattr(found, name).tobytes() == getattr(one, name).tobytes()
+    assert_same_gram(built("gram", parts), built_gram(parts))
 
 
-def test_the_smaller_quadratic_is_kept_and_read_back_equal(tmp_path):
-    raw, masks = random_view(0)
-    weights = normalised_weights(raw)
-    part = labelled_rows(weights, label_maps(masks))
-    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
-    for keep in ("gram", "weights"):
-        kept = chosen_quadratic(part, keep)
-        folder = tmp_path / keep
-        kept.save(folder)
-        write_index(folder, {})
-        again = load_quadratic(folder)
-        assert type(again) is type(kept)
-        assert np.array_equal(again.product(features), kept.product(features))
-    gram = built_gram([part])
-    chosen = chosen_quadratic(part, "auto")
-    assert chosen.nonzeros == min(gram.nonzeros, part.nonzeros)
+@pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
+def test_a_builder_resumes_from_its_state(keep, monkeypatch):
+    parts = [labelled_part(seed) for seed in range(3)]
+    monkeypatch.setattr(quadratic_builder, "CHUNK_WEIGHTS", parts[0].nonzeros + 1)
+    first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(2))
+    first.add(parts[0])
+    first.add(parts[1])
+    second.restore(first.state())
+    second.add(parts[2])
+    whole, resumed = built(keep, parts), second.finish()
+    assert type(whole) is type(resumed)
+    assert whole.product(FEATURES).tobytes() == resumed.product(FEATURES).tobytes()
+
+
+def test_the_smaller_quadratic_is_kept_and_read_back_equal(two_boxes):
+    read = {}
+    for keep in ("gram", "weights", "auto"):
+        out = two_boxes.folder / keep
+        run_contributions(*inputs_of(two_boxes), out, out / "cache", ContributionsSettings(keep=keep), 1)
+        read[keep] = Contributions.load(out).quadratic()
+    assert (type(read["gram"]), type(read["weights"])) == (Gram, StackedWeights)
+    assert read["auto"].nonzeros == min(read["gram"].nonzeros, read["weights"].nonzeros)
+    features = np.random.default_rng(5).normal(size=(NUM_GAUSSIANS, 3, 4)).astype(np.float32)
+    expected = read["gram"].product(features)
+    assert read["weights"].product(features) == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
 def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
@@ -234,23 +234,37 @@ def test_stage_writes_rows_in_view_order_and_masses(two_boxes_contributions):
     assert mask_embeddings(world.clip, found.folder).shape == (24, 16)
 
 
+def inputs_of(world: TwoBoxes) -> tuple[Path, Path, Path]:
+    return world.scene, world.ply, world.masks
+
+
 def test_a_resumed_run_writes_the_same_bytes(two_boxes_contributions):
     world, out = two_boxes_contributions
     before = sha256_of_path(out)
-    arguments = (world.scene, world.ply, world.masks, out, world.folder / "cache", ContributionsSettings())
     cached = sorted((world.folder / "cache").rglob("*.npz"))
     assert len(cached) == 4
     cached[0].unlink()  # as if the run had been killed before one view
     shutil.rmtree(out)
-    run_contributions(*arguments, 2)
+    run_contributions(*inputs_of(world), out, world.folder / "cache", ContributionsSettings(), 2)
     assert sha256_of_path(out) == before
 
 
-def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, monkeypatch):
-    settings = ContributionsSettings(keep="gram")
-    folder = two_boxes.folder
-    arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
-    run_contributions(*arguments, folder / "whole", folder / "other cache", settings, 1)
+@pytest.fixture
+def checkpointed(two_boxes, monkeypatch):
+    """A function that runs the stage with a checkpoint after each view, and the digest of its result."""
+    settings, folder = ContributionsSettings(keep="gram"), two_boxes.folder
+
+    def run(out: str, cache: str) -> str:
+        run_contributions(*inputs_of(two_boxes), folder / out, folder / cache, settings, 1)
+        return sha256_of_path(folder / out)
+
+    whole = run("whole", "other cache")
+    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
+    return run, whole
+
+
+def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, checkpointed, monkeypatch):
+    run, whole = checkpointed
     drawn = []
     weights = stage.pixel_weights
 
@@ -260,61 +274,37 @@ def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, monkeypatch):
             raise KeyboardInterrupt
         return weights(gaussians, camera, **more)
 
-    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(stage, "pixel_weights", counted)
     with pytest.raises(KeyboardInterrupt):
-        run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
-    run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
+        run("out", "cache")
+    assert run("out", "cache") == whole
     # the first two views are neither drawn nor summed again
     assert drawn[3:] == list(two_boxes.views[2:])
-    assert sha256_of_path(folder / "out") == sha256_of_path(folder / "whole")
-    assert not list((folder / "cache").rglob("*.npy"))  # the checkpoint is gone
+    assert not list((two_boxes.folder / "cache").rglob("*.npy"))  # the checkpoint is gone
 
 
-def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, monkeypatch):
-    settings, folder = ContributionsSettings(keep="gram"), two_boxes.folder
-    arguments = (two_boxes.scene, two_boxes.ply, two_boxes.masks)
-    run_contributions(*arguments, folder / "whole", folder / "other cache", settings, 1)
-    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
+def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, checkpointed, monkeypatch):
+    run, whole = checkpointed
     with monkeypatch.context() as killed:
         killed.setattr(stage, "write_npz", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
-    lost, *_ = sorted((folder / "cache").rglob("*.npy"))
+            run("out", "cache")
+    lost, *_ = sorted((two_boxes.folder / "cache").rglob("*.npy"))
     lost.unlink()
-    run_contributions(*arguments, folder / "out", folder / "cache", settings, 1)
-    assert sha256_of_path(folder / "out") == sha256_of_path(folder / "whole")
-
-
-@pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
-def test_a_builder_resumes_from_its_state(keep, monkeypatch):
-    parts = []
-    for seed in range(3):
-        raw, masks = random_view(seed)
-        parts.append(labelled_rows(normalised_weights(raw), label_maps(masks)))
-    monkeypatch.setattr(quadratic_builder, "CHUNK_WEIGHTS", parts[0].nonzeros + 1)
-    whole, first, second = (QuadraticBuilder(40, keep, threads=1) for _ in range(3))
-    for part in parts:
-        whole.add(part)
-    first.add(parts[0])
-    first.add(parts[1])
-    second.restore(first.state())
-    second.add(parts[2])
-    features = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
-    one, two = whole.finish(), second.finish()
-    assert type(one) is type(two)
-    assert one.product(features).tobytes() == two.product(features).tobytes()
+    assert run("out", "cache") == whole
 
 
 def test_streams_are_files_of_numpy(tmp_path):
     rows = np.arange(12, dtype=np.float32).reshape(4, 3)
-    with ArrayStream(tmp_path / "rows.npy", np.float32, 3) as stream:
-        stream.append(rows[:1])
-        stream.append(rows[1:])
-    assert np.array_equal(np.load(tmp_path / "rows.npy"), rows)
+    for path, parts, row_shape in (
+        (tmp_path / "rows.npy", (rows[:1], rows[1:]), (3,)),
+        (tmp_path / "none.npy", (), ()),
+    ):
+        stream = ArrayStream(path, np.float32, row_shape)
+        for part in parts:
+            stream.append(part)
+        stream.close()
     assert np.array_equal(np.load(tmp_path / "rows.npy", mmap_mode="r"), rows)
-    with ArrayStream(tmp_path / "none.npy", np.int64) as stream:
-        pass
     assert np.load(tmp_path / "none.npy").shape == (0,)
 
 
@@ -326,15 +316,7 @@ def test_masks_of_another_size_are_refused(two_boxes):
     index = read_index(two_boxes.masks)["views"]
     write_index(two_boxes.masks, {**index, view: index_entry(wrong)}, segmenter="sam")
     with pytest.raises(MisalignedArtifactError, match=r"masks of view 001.png do not fit its camera"):
-        run_contributions(
-            two_boxes.scene,
-            two_boxes.ply,
-            two_boxes.masks,
-            two_boxes.folder / "out",
-            two_boxes.folder / "cache",
-            ContributionsSettings(),
-            1,
-        )
+        build_contributions(two_boxes)
 
 
 def test_masks_that_their_index_does_not_record_are_refused(two_boxes_contributions):

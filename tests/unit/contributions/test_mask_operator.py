@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from hilsplat.contributions.channels import BLOCK
 from hilsplat.contributions.mask_operator import (
+    BLOCK,
     MaskOperator,
     _means,
     _spread,
