@@ -15,8 +15,7 @@ from hilsplat.base.files import INSTALLED
 from hilsplat.configuration import merged_config
 from hilsplat.evaluate.tables.build import TABLES, published_values
 from hilsplat.workflow import targets
-from hilsplat.workflow.jobs import any_of
-from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.plan import Plan, any_of
 from hilsplat.workflow.progress import estimates
 from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.run import mark_run, prepare_process, unmark_run

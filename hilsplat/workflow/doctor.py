@@ -5,10 +5,9 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Literal
 
 from packaging.requirements import Requirement
@@ -20,7 +19,7 @@ from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.resources import COSTS, JobResources
+from hilsplat.workflow.resources import JobResources
 
 PACKAGE = "hilsplat"
 
@@ -33,16 +32,19 @@ class Finding:
     """Result of a check.
 
     Attributes:
-        check: name of the check.
         state: "ok"; "note" if something optional is missing; "fault" if runs fail or give wrong results.
-        found: what was found.
-        fix: how to fix it; empty if no action is needed.
+        fix: empty if no action is needed.
     """
 
     check: str
     state: Literal["ok", "note", "fault"]
     found: str
     fix: str = ""
+
+
+def verdict(check: str, problem: str | None, sound: str, fix: str) -> Finding:
+    """Return a fault with its fix, or what was found if there is no problem."""
+    return Finding(check, "fault", problem, fix) if problem else Finding(check, "ok", sound)
 
 
 def examine() -> Iterator[Finding]:
@@ -58,10 +60,9 @@ def python() -> Iterator[Finding]:
     """Check the version of Python."""
     required = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     found = platform.python_version()
-    if SpecifierSet(required).contains(found):
-        yield Finding("python", "ok", f"{found} on {platform.system()} {platform.machine()}")
-    else:
-        yield Finding("python", "fault", f"{found}, but {required} is needed", "use another Python")
+    problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is needed"
+    sound = f"{found} on {platform.system()} {platform.machine()}"
+    yield verdict("python", problem, sound, "use another Python")
 
 
 def libraries() -> Iterator[Finding]:
@@ -81,27 +82,20 @@ def libraries() -> Iterator[Finding]:
             continue
         if not requirement.specifier.contains(found, prereleases=True):
             wrong.append(f"{requirement.name} {found} is not {requirement.specifier}")
-    if wrong:
-        fix = f"pip install --upgrade {PACKAGE}, with the constraints.txt of the repository"
-        yield Finding("libraries", "fault", "; ".join(wrong), fix)
-    else:
-        yield Finding("libraries", "ok", f"{number} libraries in the required versions")
+    fix = f"pip install --upgrade {PACKAGE}, with the constraints.txt of the repository"
+    yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
 
 
 def onnx() -> Iterator[Finding]:
     """Report onnxruntime's providers, and whether two builds of it overwrite each other."""
     import onnxruntime
 
+    problem = ""
     if is_installed("onnxruntime") and is_installed("onnxruntime-gpu"):
-        yield Finding(
-            "onnxruntime",
-            "fault",
-            "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other",
-            "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu",
-        )
-        return
-    providers = onnxruntime.get_available_providers()
-    yield Finding("onnxruntime", "ok", f"{onnxruntime.__version__}: {', '.join(providers)}")
+        problem = "onnxruntime and onnxruntime-gpu are both installed; their files overwrite each other"
+    sound = f"{onnxruntime.__version__}: {', '.join(onnxruntime.get_available_providers())}"
+    fix = "pip uninstall onnxruntime onnxruntime-gpu, then pip install onnxruntime-gpu"
+    yield verdict("onnxruntime", problem, sound, fix)
 
 
 def cuda() -> Iterator[Finding]:
@@ -112,10 +106,9 @@ def cuda() -> Iterator[Finding]:
     if problem := cuda_problem():
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
-    elif apart := cuda_disagreement():
-        yield Finding("cuda", "fault", apart, "set device: cpu, and report what this command prints")
-    else:
-        yield Finding("cuda", "ok", "gsplat draws what the CPU draws: image, gradients, pixel weights")
+        return
+    sound = "gsplat draws what the CPU draws: image, gradients, pixel weights"
+    yield verdict("cuda", cuda_disagreement(), sound, "set device: cpu, and report what this command prints")
 
 
 def kernels() -> Iterator[Finding]:
@@ -123,12 +116,9 @@ def kernels() -> Iterator[Finding]:
     from hilsplat.splat.rasterise.parity import disagreement
 
     begin = time.monotonic()
-    if apart := disagreement("cpu", "cpu"):
-        yield Finding("kernels", "fault", apart, "reinstall numba and llvmlite")
-    else:
-        yield Finding(
-            "kernels", "ok", f"a small scene is drawn, {time.monotonic() - begin:.1f} s with compiling"
-        )
+    apart = disagreement("cpu", "cpu")
+    sound = f"a small scene is drawn, {time.monotonic() - begin:.1f} s with compiling"
+    yield verdict("kernels", apart, sound, "reinstall numba and llvmlite")
 
 
 def video() -> Iterator[Finding]:
@@ -137,15 +127,9 @@ def video() -> Iterator[Finding]:
 
     needed: tuple[tuple[str, Literal["r", "w"]], ...] = (("h264", "r"), ("hevc", "r"), ("libx264", "w"))
     missing = [f"{mode} {name}" for name, mode in needed if not _codec(name, mode)]
-    if missing:
-        yield Finding(
-            "video",
-            "fault",
-            f"PyAV {av.__version__} lacks {', '.join(missing)}",
-            "pip install --force-reinstall av",
-        )
-    else:
-        yield Finding("video", "ok", f"PyAV {av.__version__} reads H.264 and HEVC and writes H.264")
+    problem = f"PyAV {av.__version__} lacks {', '.join(missing)}" if missing else ""
+    sound = f"PyAV {av.__version__} reads H.264 and HEVC and writes H.264"
+    yield verdict("video", problem, sound, "pip install --force-reinstall av")
 
 
 def models() -> Iterator[Finding]:
@@ -162,10 +146,9 @@ def models() -> Iterator[Finding]:
         except HilsplatError as error:
             yield Finding("models", "fault", str(error), f"hilsplat models get {folder.name}")
             continue
-        if apart:
-            yield Finding("models", "fault", f"{folder}: {apart}", "pip install onnxruntime instead")
-        else:
-            yield Finding("models", "ok", f"{folder} works on {' and '.join(execution_providers())}")
+        sound = f"{folder} works on {' and '.join(execution_providers())}"
+        problem = f"{folder}: {apart}" if apart else ""
+        yield verdict("models", problem, sound, "pip install onnxruntime instead")
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
         yield Finding(
@@ -187,29 +170,20 @@ def space() -> Iterator[Finding]:
         return
     resources, disk_mb, memory = JobResources(plan), 0.0, (0.0, "", "")
     for row in plan.scenes:
-        job = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant="default")
-        disk_mb += sum(resources.disk_mb(rule, job) for rule in RULES)
-        needs = (
-            (resources.memory_mb(rule)(job, threads=1, attempt=1), rule, row.name)
-            for rule in RULES
-            if rule in COSTS
-        )
-        memory = max(memory, *needs)
+        disk_mb += sum(resources.disk_mb(rule, row) for rule in RULES)
+        for rule in RULES:
+            memory = max(memory, (resources.memory_mb(rule)(row, threads=1, attempt=1), rule, row.name))
     folder = _existing(plan.results)
     free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30
     text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes take about {needed:.1f}"
-    if free > needed:
-        yield Finding("disk", "ok", text)
-    else:
-        yield Finding("disk", "fault", text, "free space, or set results to a folder on another disk")
+    problem = "" if free > needed else text
+    yield verdict("disk", problem, text, "free space, or set results to a folder on another disk")
     most, rule, scene = memory
     text = (
         f"{machine_mib() / 1024:.1f} GiB; the largest job, {rule} of {scene}, takes about {most / 1024:.1f}"
     )
-    if machine_mib() > most:
-        yield Finding("memory", "ok", text)
-    else:
-        yield Finding("memory", "fault", text, "lower poses.max_side_px or gaussians.max_gaussians")
+    problem = "" if machine_mib() > most else text
+    yield verdict("memory", problem, text, "lower poses.max_side_px or gaussians.max_gaussians")
 
 
 def writing() -> Iterator[Finding]:
@@ -225,25 +199,11 @@ def writing() -> Iterator[Finding]:
             yield Finding("writing", "ok", f"{what}: {folder}")
         else:
             state: Literal["note", "fault"] = "fault" if folder == Path.cwd() else "note"
-            yield Finding(
-                "writing",
-                state,
-                f"{what}: {existing} is read-only",
-                f"make {existing} writable for this user",
-            )
+            fix = f"make {existing} writable for this user"
+            yield Finding("writing", state, f"{what}: {existing} is read-only", fix)
 
 
-CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    python,
-    libraries,
-    onnx,
-    cuda,
-    kernels,
-    video,
-    models,
-    space,
-    writing,
-)
+CHECKS = (python, libraries, onnx, cuda, kernels, video, models, space, writing)
 
 
 def _existing(folder: Path) -> Path:

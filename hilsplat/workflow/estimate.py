@@ -2,8 +2,8 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import NamedTuple
 
 from hilsplat.workflow.resources import START_S, JobResources
 
@@ -16,90 +16,65 @@ run on the CPU."""
 OTHERS = "tables"
 """Name of the row for jobs without a scene."""
 
-
-@dataclass
-class Totals:
-    """Sums over the jobs of a data set."""
-
-    scenes: set[str] = field(default_factory=set)
-    jobs: int = 0
-    disk_mb: float = 0.0
-    memory_mb: int = 0
-    core_s: float = 0.0
-    gpu_s: float = 0.0
-    beside_gpu_s: float = 0.0
-
-    def __add__(self, other: "Totals") -> "Totals":
-        return Totals(
-            self.scenes | other.scenes,
-            self.jobs + other.jobs,
-            self.disk_mb + other.disk_mb,
-            max(self.memory_mb, other.memory_mb),
-            self.core_s + other.core_s,
-            self.gpu_s + other.gpu_s,
-            self.beside_gpu_s + other.beside_gpu_s,
-        )
-
-
-class RunEstimate:
-    """Jobs of a dry run, summed by data set.
-
-    Args:
-        resources: estimates of the plan's jobs.
-    """
-
-    def __init__(self, resources: JobResources) -> None:
-        self.resources = resources
-        self._totals = defaultdict[str, Totals](Totals)
-
-    def add(self, rule: str, wildcards: Mapping[str, str], memory_mb: int) -> None:
-        """Add a job to the totals of its data set."""
-        job = SimpleNamespace(**wildcards)
-        of_scene = "scene" in wildcards
-        core_s = self.resources.core_seconds(rule, job) if of_scene else START_S
-        gain = GPU_GAIN.get(rule, 0)
-        found = Totals(
-            {f"{job.dataset}/{job.scene}"} if of_scene else set(),
-            1,
-            self.resources.disk_mb(rule, job) if of_scene else 0.0,
-            memory_mb,
-            core_s,
-            core_s / gain if gain else 0.0,
-            0.0 if gain else core_s,
-        )
-        name = self.resources.plan.row(job).dataset if of_scene else OTHERS
-        self._totals[name] = self._totals[name] + found
-
-    def lines(self) -> list[str]:
-        """Return the table; empty if nothing would run."""
-        if not self._totals:
-            return []
-        total, cores = sum(self._totals.values(), Totals()), self.resources.cores or 1
-        rows: list[tuple[str, ...]] = [
-            ("", "scenes", "jobs", "disk", "memory", f"hours, {cores} cores", "hours, GPU")
-        ]
-        rows += [
-            (name, *_cells(found, cores))
-            for name, found in sorted(self._totals.items(), key=lambda each: (each[0] == OTHERS, each[0]))
-        ]
-        rows.append(("all", *_cells(total, cores)))
-        return ["This run would take about:", *_aligned(rows), *NOTES]
-
-
 NOTES = (
     "Hours can be wrong by a factor of two on another machine. Memory is that of the largest job.",
     "GPU: published times of a 24 GB card for fits, SAM and CLIP; the cores do the rest.",
 )
 
 
-def _cells(found: Totals, cores: int) -> tuple[str, ...]:
-    gpu = found.gpu_s + found.beside_gpu_s / cores
+class JobEstimate(NamedTuple):
+    """Estimate of one job; `scene` is empty for jobs without a scene."""
+
+    scene: str
+    disk_mb: float
+    memory_mb: int
+    core_s: float
+    gpu_gain: int
+
+
+class RunEstimate:
+    """Jobs of a dry run, by data set."""
+
+    def __init__(self, resources: JobResources) -> None:
+        self.resources = resources
+        self._jobs = defaultdict[str, list[JobEstimate]](list)
+
+    def add(self, rule: str, wildcards: Mapping[str, str], memory_mb: int) -> None:
+        """Add a job to its data set."""
+        gain = GPU_GAIN.get(rule, 0)
+        if "scene" not in wildcards:
+            self._jobs[OTHERS].append(JobEstimate("", 0.0, memory_mb, START_S, gain))
+            return
+        job = SimpleNamespace(**wildcards)
+        scene = f"{job.dataset}/{job.scene}"
+        disk_mb, core_s = self.resources.disk_mb(rule, job), self.resources.core_seconds(rule, job)
+        self._jobs[job.dataset].append(JobEstimate(scene, disk_mb, memory_mb, core_s, gain))
+
+    def lines(self) -> list[str]:
+        """Return the table; empty if nothing would run."""
+        if not self._jobs:
+            return []
+        cores = self.resources.cores or 1
+        rows: list[tuple[str, ...]] = []
+        rows.append(("", "scenes", "jobs", "disk", "memory", f"hours, {cores} cores", "hours, GPU"))
+        for name, jobs in sorted(self._jobs.items(), key=lambda each: (each[0] == OTHERS, each[0])):
+            rows.append(_row(name, jobs, cores))
+        rows.append(_row("all", [job for jobs in self._jobs.values() for job in jobs], cores))
+        return ["This run would take about:", *_aligned(rows), *NOTES]
+
+
+def _row(name: str, jobs: Sequence[JobEstimate], cores: int) -> tuple[str, ...]:
+    scenes = {job.scene for job in jobs if job.scene}
+    core_s = sum(job.core_s for job in jobs)
+    with_gpu_s = sum(job.core_s / (job.gpu_gain or cores) for job in jobs)
     return (
-        str(len(found.scenes)) if found.scenes else "",
-        str(found.jobs),
-        f"{found.disk_mb / 1000:.1f} GB",
-        f"{found.memory_mb / 1000:.1f} GB",
-        *(f"{seconds / 3600:.2f}" for seconds in (found.core_s / cores, gpu)),
+        name,
+        str(len(scenes)) if scenes else "",
+        str(len(jobs)),
+        f"{sum(job.disk_mb for job in jobs) / 1000:.1f} GB",
+        f"{max(job.memory_mb for job in jobs) / 1000:.1f} GB",
+        f"{core_s / cores / 3600:.2f}",
+        f"{with_gpu_s / 3600:.2f}",
     )
 
 

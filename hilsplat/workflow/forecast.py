@@ -1,8 +1,6 @@
 """Forecast of the time until a scene of photographs accepts queries, from one timing of SAM and CLIP."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 from hilsplat.configuration import StageSettings
 from hilsplat.models.store import read_model
@@ -11,24 +9,20 @@ from hilsplat.scene.sheet import PHOTOS, SceneRow
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import duration
 from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, JobResources
+from hilsplat.workflow.scene_data import of_variant
 
 KEPT_PROMPTS = 0.3
 """Share of the previewed prompts whose masks are decoded."""
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:
-    """Predict the times of scenes of photographs that a full-size SAM and CLIP have not yet processed.
-
-    Returns:
-        a line per scene.
-    """
+    """Return a line per scene of photographs that a full-size SAM and CLIP have not yet processed."""
     resources = JobResources(plan)
     lines = []
     for row in plan.scenes:
-        job = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant="default")
-        stages = plan.stages(job)
-        if row.group == PHOTOS and _is_real(stages) and not Path(plan.path(job, "default", "clip")).exists():
-            lines.append(_forecast(plan, resources, row, job, stages, cores))
+        is_done = Path(plan.path(row, "default", "clip")).exists()
+        if row.group == PHOTOS and _is_real(plan.stages(row)) and not is_done:
+            lines.append(_forecast(plan, resources, row, cores))
     return lines
 
 
@@ -37,13 +31,10 @@ def _is_real(stages: StageSettings) -> bool:
     return stages.masks.segmenter == "sam" and all(model and not model.embedded for model in models)
 
 
-def _forecast(
-    plan: Plan, resources: JobResources, row: SceneRow, job: Any, stages: StageSettings, cores: int
-) -> str:
-    """Return the forecast of one scene."""
+def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) -> str:
     from hilsplat.embed.model_check import seconds_of  # onnxruntime takes a while to import
 
-    files = plan.data.image_files(job)
+    files, stages = plan.data.image_files(row), plan.stages(row)
     sam, clip, cache = stages.masks, stages.clip, plan.results / ".cache"
     view_s = seconds_of(Path(sam.model), sam.variant, sam.precision, cache)
     crop_s = seconds_of(Path(clip.model), clip.variant, clip.precision, cache)["crop"]
@@ -55,12 +46,11 @@ def _forecast(
     prompts = stages.masks.points_per_side**2
     base_s = view_s["image"] + PICTURE_S
     full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED * prompts * prompt_s
-    before_s = sum(resources.core_seconds(rule, job) for rule in ("poses", "gaussians"))
-    after_s = sum(resources.core_seconds(rule, job) for rule in ("contributions", "semantic_tree"))
-    key = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)
+    before_s = sum(resources.core_seconds(rule, row) for rule in ("poses", "gaussians"))
+    after_s = sum(resources.core_seconds(rule, row) for rule in ("contributions", "semantic_tree"))
     said, rest_s = "", views * full_s
-    if plan.first_answer(job):
-        settings = plan.stages(key)
+    if plan.first_answer(of_variant(row, "default")):
+        settings = plan.stages(of_variant(row, KEY_VIEWS))
         first = views * settings.masks.key_views
         key_s = base_s + settings.masks.points_per_side**2 * prompt_s
         before_s += first * key_s + after_s / 2 + NODES * settings.clip.crops_per_node * crop_s

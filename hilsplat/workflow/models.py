@@ -13,9 +13,7 @@ from hilsplat.scene.sheet import PHOTOS
 def check_models(stages: StageSettings, where: str) -> None:
     """Raise an error if a model folder is missing or contains another kind of model.
 
-    Args:
-        stages: settings without `auto` (`StageSettings.with_models`).
-        where: scene and variant, for the message.
+    The settings have no `auto` (`StageSettings.with_models`); `where` names scene and variant in the message.
 
     Raises:
         HilsplatError: the message names the setting.
@@ -77,10 +75,7 @@ def doubt_about_photographs(stages: StageSettings) -> str:
 def models_of_photographs(config: Path, scene: str, features: Path | None = None) -> list[str]:
     """Return lines about the models that a scene of photographs will use.
 
-    Args:
-        config: configuration of the project; the installed one is used if it does not exist.
-        scene: name of the scene.
-        features: LangSplat's files in place of SAM and CLIP.
+    If the project has no such configuration, the installed one is read.
 
     Raises:
         SettingsError: the configuration is invalid.

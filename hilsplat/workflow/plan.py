@@ -1,16 +1,11 @@
-"""The plan of a run: its scenes, and the settings, shared inputs and parameters of each job.
-
-A *job* is any object with the attributes `dataset` and `scene`, and in the stages of a variant `variant`,
-such as the wildcards of a rule.
-"""
+"""The plan of a run: its scenes, and the settings, shared inputs and parameters of each job."""
 
 import difflib
 import functools
 import json
-import shlex
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from hilsplat.base.errors import SettingsError
@@ -18,8 +13,7 @@ from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.configuration import SECTIONS, RunSettings, StageSettings, parse_run, require_known
 from hilsplat.datasets.sources import unlisted
 from hilsplat.methods.registry import METHODS, OURS, require_method
-from hilsplat.models.digests import model_digest
-from hilsplat.models.store import AUTO, model_path, read_model
+from hilsplat.models.store import AUTO, model_digest, model_path, read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import (
     DEFAULT_SHEET,
@@ -30,13 +24,22 @@ from hilsplat.scene.sheet import (
     read_sheet,
     row_of_data,
 )
-from hilsplat.workflow.jobs import Job, VariantJob, any_of, inert
 from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
-from hilsplat.workflow.scene_data import SceneData, truth_argument
+from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant, options_of, truth_argument
 from hilsplat.workflow.stages import stage_code
 
 LEAST_PHOTOGRAPHS = 16
 """Minimum number of photographs of a scene with key views; half of fewer would link too few masks."""
+
+
+def any_of(names: Iterable[str]) -> str:
+    """Return a regular expression that matches exactly these names."""
+    return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
+
+
+def inert(text: str) -> str:
+    """Return the same JSON without `<`; Snakemake copies parameters unescaped into a script in its report."""
+    return text.replace("<", "\\u003c")
 
 
 class Plan:
@@ -93,10 +96,7 @@ class Plan:
             self.data.require_no_braces(row)
 
     def require_usable(self, *, devices: bool) -> None:
-        """Check that the models exist, and that this machine has the devices in the settings.
-
-        Args:
-            devices: check devices too; False if other machines run the jobs.
+        """Check that the models exist and, with `devices`, that this machine has the devices in the settings.
 
         Raises:
             HilsplatError: the message names the setting, and a scene and variant that use it.
@@ -120,11 +120,7 @@ class Plan:
         return "/".join([self.run.results, job.dataset, job.scene, *parts])
 
     def variants(self, by_baseline: bool | None = None) -> str:
-        """Return the regular expression of the wildcard `variant`.
-
-        Args:
-            by_baseline: True for variants whose field a baseline computes, False for ours, None for all.
-        """
+        """Return a regular expression of all variants, or of those with or without a baseline's field."""
         return any_of(
             name
             for name in self.run.every_variant()
@@ -219,9 +215,8 @@ class Plan:
         """Return the input: every variant's scores in the main tables."""
         return [self.path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
 
-    def _main_jobs(self, job: Job) -> list[SimpleNamespace]:
-        scene = {"dataset": job.dataset, "scene": job.scene}
-        return [SimpleNamespace(**scene, variant=name) for name in self.run.main_variants]
+    def _main_jobs(self, job: Job) -> list[VariantJob]:
+        return [of_variant(job, name) for name in self.run.main_variants]
 
     def shared_variant(self, stage: str, job: VariantJob) -> str:
         """Return the first variant whose settings up to a stage equal those of the job's variant."""
@@ -238,8 +233,8 @@ class Plan:
         return variant
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:
-        """Return the keys of `overrides` that apply to a scene and exist."""
-        return tuple(scope for scope in scopes_of(row) if scope in self.run.overrides)
+        """Return the keys of `overrides` that apply to a scene and exist, the general one first."""
+        return tuple(scope for scope in (row.group, row.name) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
         """Return the stage of the masks; imported masks, key views and the diagnostic have their own."""
@@ -259,8 +254,8 @@ class Plan:
 
     def key_parts(self, job: VariantJob, stage: str) -> list[str]:
         """Return the input of masks: masks or semantic tree of the key views, if they guide the prompts."""
-        own = SimpleNamespace(dataset=job.dataset, scene=job.scene, variant=KEY_VIEWS)
-        return [self.shared(stage, stage)(own)] if self.masks_stage(job) == "guided_masks" else []
+        is_guided = self.masks_stage(job) == "guided_masks"
+        return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
         """Return an input of masks that only orders jobs: what must exist before all views are segmented.
@@ -268,19 +263,13 @@ class Plan:
         It is the CLIP output of `key-views`, for photographs whose masks take a full-size SAM minutes.
         """
         row, masks = self.row(job), self.stages(job).masks
-        if (
-            job.variant != "default"
-            or row.group != PHOTOS
-            or row.features
-            or KEY_VIEWS not in self.run.variants
-        ):
+        of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
+        if not of_photographs or KEY_VIEWS not in self.run.variants:
             return []
         model = read_model(Path(masks.model)) if masks.segmenter == "sam" else None
-        files = self.data.image_files(job)
-        if model is None or model.embedded or len(files) < LEAST_PHOTOGRAPHS:
+        if model is None or model.embedded or len(self.data.image_files(job)) < LEAST_PHOTOGRAPHS:
             return []
-        own = SimpleNamespace(dataset=row.dataset, scene=row.scene, variant=KEY_VIEWS)
-        return [self.shared("clip", "clip")(own)]
+        return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
     def masks_truth(self, job: VariantJob) -> list[str]:
         """Return the input of masks: the true labels, for the diagnostic segmenter only.
@@ -304,16 +293,12 @@ class Plan:
         if self.masks_stage(job) == "langsplat":
             return self.data.features_option(job)
         if input.gaussians:
-            named = {
-                "gaussians": input.gaussians,
-                "key-masks": input.key_masks,
-                "semantic-tree": input.key_tree,
-            }
-            return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items() if path)
+            masks, tree = input.key_masks, input.key_tree
+            return options_of({"gaussians": input.gaussians, "key-masks": masks, "semantic-tree": tree})
         if self.masks_stage(job) != "truth_masks":
             return ""
         faults = self.stages(job).perturb.model_dump_json()
-        return f"{truth_argument(input)} --perturb {shlex.quote(faults)}"
+        return f"{truth_argument(input)} {options_of({'perturb': faults})}"
 
     def crops_tree(self, job: VariantJob) -> list[str]:
         """Return the input of clip: the semantic tree that selects crops; empty if all masks are embedded."""
@@ -324,7 +309,7 @@ class Plan:
         """Return the option of clip for `crops_tree`, or for imported vectors."""
         if self.row(job).features:
             return self.data.features_option(job)
-        return f"--semantic-tree {shlex.quote(str(input.semantic_tree))}" if input.semantic_tree else ""
+        return options_of({"semantic-tree": input.semantic_tree})
 
     def tree_stage(self, job: VariantJob) -> str:
         """Return the stage of the semantic tree: linked masks, or clustered features."""
@@ -339,9 +324,9 @@ class Plan:
         """Return the options of semantic-tree for `tree_parents`."""
         if not input.coverage_tree:
             return ""
-        field = shlex.quote(self._section("field", *self.which(job))[0])
-        tree = shlex.quote(str(input.coverage_tree))
-        return f"--coverage-tree {tree} --field-settings {field} --seed {self.seed(job)}"
+        field = self.settings("field")(job)
+        options = options_of({"coverage-tree": input.coverage_tree, "field-settings": field})
+        return f"{options} --seed {self.seed(job)}"
 
     def rendered(self, job: VariantJob) -> list[str]:
         """Return the input of field: scene, Gaussians and masks, if the literal trainer renders them."""
@@ -373,10 +358,8 @@ class Plan:
 
     def field_option(self, job: VariantJob, input: Any) -> str:
         """Return the options of field for `rendered` and `first_field`."""
-        named = dict(zip(("scene", "gaussians", "masks"), input.rendered, strict=False))
-        if input.start:
-            named["start"] = input.start
-        return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
+        rendered = dict(zip(("scene", "gaussians", "masks"), input.rendered, strict=False))
+        return options_of({**rendered, "start": input.start})
 
     def field_seed(self, job: VariantJob) -> int:
         """Return the seed of a field; 0 if nothing in it is random, so that other seeds do not rerun it."""
@@ -408,7 +391,6 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
     """Raise an error for a misspelt scene in `overrides`, `queries` or `sweep_scenes`.
 
     Args:
-        run: the configuration.
         rows: scenes of the sheet and of the default sheet, because settings for the latter are allowed too.
 
     Raises:
@@ -433,11 +415,6 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
                 expected=f"did you mean {near[0]!r}?",
                 fix="correct the name, or take it out",
             )
-
-
-def scopes_of(row: SceneRow) -> tuple[str, str]:
-    """Return the keys of `overrides` that apply to a scene, the general one first."""
-    return (row.group, f"{row.dataset}/{row.scene}")
 
 
 def some(names: list[str]) -> str:

@@ -21,8 +21,8 @@ from rich.text import Text
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.progress import last_progress, warnings_in
 from hilsplat.scene.finished import KEY_VIEWS, refining
-from hilsplat.workflow.jobs import Job
 from hilsplat.workflow.resources import START_S, JobResources
+from hilsplat.workflow.scene_data import Job
 
 REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_info"})
 """Events that are not printed, besides the start and end of a job."""
@@ -47,15 +47,7 @@ LOOPS = {
 
 @dataclass(frozen=True)
 class RunningJob:
-    """A running job.
-
-    Attributes:
-        rule: name of its rule.
-        wildcards: values of its wildcards by name.
-        threads: number of cores.
-        log: its log, or None.
-        start_s: start time on the run's clock.
-    """
+    """A running job; `start_s` is on the run's clock."""
 
     rule: str
     wildcards: Mapping[str, str]
@@ -81,8 +73,7 @@ class RunningJob:
 class Estimates:
     """Core seconds of jobs: estimates by rule, scaled by the measured times of finished jobs.
 
-    Args:
-        resources: estimates of the plan's jobs; None if there is no plan.
+    Without `resources`, which needs a plan, each job is estimated at `START_S`.
     """
 
     def __init__(self, resources: JobResources | None = None) -> None:
@@ -131,11 +122,7 @@ estimates = Estimates()
 
 
 class RunProgress:
-    """Waiting, running and finished jobs of a run, and the time left.
-
-    Args:
-        clock: monotonic clock, s.
-    """
+    """Waiting, running and finished jobs of a run, and the time left; `clock` returns seconds."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
@@ -235,13 +222,7 @@ class RunProgress:
 
 
 class ProgressDisplay:
-    """Output of progress, warnings and errors to a terminal or a file.
-
-    Args:
-        stream: output stream.
-        text: formats other log records.
-        run: the progress.
-    """
+    """Output of progress, warnings and errors to a terminal or a file; `text` formats other log records."""
 
     def __init__(
         self, stream: TextIOBase, text: Callable[[logging.LogRecord], str], run: RunProgress

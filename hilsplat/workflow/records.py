@@ -9,17 +9,17 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-from hilsplat.base.artifacts import lock_path, provenance_path, sha256_of_path
+from hilsplat.base.artifacts import provenance_path, sha256_of_path, was_interrupted
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.progress import track
 from hilsplat.base.provenance import Provenance, read_provenance, sizes_of
 from hilsplat.datasets.sources import is_exported
 from hilsplat.methods.registry import OURS
-from hilsplat.models.digests import model_digest
+from hilsplat.models.store import model_digest
 from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.scene_data import of_variant
 from hilsplat.workflow.stages import stage_code
 from hilsplat.workflow.targets import tables
 
@@ -55,8 +55,7 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
     """Return how the plan makes each artifact that the run can write, by path."""
     found: dict[str, Expected] = {}
     for row in plan.scenes:
-        scene = SimpleNamespace(dataset=row.dataset, scene=row.scene)
-        readers = plan.data.label_readers(scene)
+        readers = plan.data.label_readers(row)
 
         def add(
             name: str,
@@ -72,15 +71,15 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
             found.setdefault(plan.path(job, *variant, name), Expected(stage, settings, seed, plugins, **more))
 
         if row.world:
-            add("world", "world", scene, output=plan.path(scene, "world/images"))
+            add("world", "world", row, output=plan.path(row, "world/images"))
         if is_exported(row.source):
-            add("source", "source", scene, plugins=plan.data.source_reader(scene))
-        add("scene", "poses", scene, seed=plan.run.seed)
-        add("gaussians.ply", "gaussians", scene, seed=plan.run.seed)
+            add("source", "source", row, plugins=plan.data.source_reader(row))
+        add("scene", "poses", row, seed=plan.run.seed)
+        add("gaussians.ply", "gaussians", row, seed=plan.run.seed)
         for variant in plan.run.variant_names():
-            own = SimpleNamespace(**vars(scene), variant=variant)
+            own = of_variant(row, variant)
             for stage in SHARED:
-                job = SimpleNamespace(**vars(scene), variant=plan.shared_variant(stage, own))
+                job = of_variant(row, plan.shared_variant(stage, own))
                 settings, seed = plan.stages(job), plan.seed(job)
                 if stage == "masks" and plan.masks_stage(job) == "truth_masks":
                     both = {name: plan.values(name, job) for name in ("masks", "perturb")}
@@ -97,9 +96,9 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
                 else:
                     add(stage, stage, job, seed=seed if stage == "autoencoder" else None)
             add("scores.csv", "evaluate", own, plugins=readers)
-        words = {name: plan.values(name, scene) for name in ("query", "evaluate")}
-        found[plan.path(scene, "default/names")] = Expected("names", words)
-        drawn = {name: plan.values(name, scene) for name in ("figures", "evaluate")}
+        words = {name: plan.values(name, row) for name in ("query", "evaluate")}
+        found[plan.path(row, "default/names")] = Expected("names", words)
+        drawn = {name: plan.values(name, row) for name in ("figures", "evaluate")}
         figures = f"{plan.run.results}/figures/{row.name}"
         found[f"{figures}/panel.png"] = Expected("figures", drawn, None, readers)
         found[f"{figures}/comparison.png"] = Expected("comparison", drawn, None, readers)
@@ -129,8 +128,7 @@ def verify(results: Path) -> tuple[str, bool]:
     An artifact is damaged if its files differ from what was written. It is stale if other code made it or its
     inputs have changed. Missing inputs outside the folder are ignored.
 
-    Args:
-        results: the results folder, or a copy of it anywhere.
+    The folder may have been moved or copied.
 
     Returns:
         A report that ends with the Snakemake command that repairs the folder, and whether all is whole.
@@ -151,9 +149,8 @@ def verify(results: Path) -> tuple[str, bool]:
         counts[state] += 1
         if state != WHOLE:
             lines.append(f"{state:<8} {artifact}: {reason}")
-            output = (
-                artifact / "images" if artifact.name == "world" else artifact
-            )  # its rule declares two folders
+            # The rule of `world` declares two folders in it.
+            output = artifact / "images" if artifact.name == "world" else artifact
             again.append("/".join(("results", *output.relative_to(results).parts)))
     states = ", ".join(f"{counts[state]} {state}" for state in (WHOLE, STALE, DAMAGED) if counts[state])
     lines.append(f"{len(paths)} artifacts in {results}: {states}")
@@ -176,12 +173,7 @@ class Records:
         self._digests: dict[Path, str | None] = {}
 
     def state(self, artifact: Path, expected: Expected | None = None) -> tuple[str, str]:
-        """Return the state of an artifact, and why it is not whole.
-
-        Args:
-            artifact: file or folder.
-            expected: how the plan makes it; None compares only code and inputs.
-        """
+        """Return an artifact's state, and why it is not whole; None compares code and inputs only."""
         try:
             record = read_provenance(artifact)
         except ArtifactError:
@@ -196,8 +188,6 @@ class Records:
 
     def _damage(self, artifact: Path, record: Provenance) -> str | None:
         """Return the first file that is missing or differs from what was written, or None."""
-        lock = lock_path(artifact)
-        unfinished = lock.is_file() and lock.stat().st_size > 0
         for name, written in record.outputs.items():
             path, sizes = artifact.parent / name, written.bytes
             if not path.exists():
@@ -207,7 +197,7 @@ class Records:
                 return f"{gone[0]} is missing in {path.name}"
             if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
                 return f"{path.name if wrong[0] == '.' else wrong[0]} is not as it was written"
-            if not self.every_byte and not unfinished:
+            if not self.every_byte and not was_interrupted(artifact):
                 self._digests[path] = written.sha256
             elif self._digest(path) != written.sha256:
                 return f"{path.name} is not as it was written"

@@ -14,7 +14,6 @@ import functools
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +26,8 @@ from hilsplat.models.store import model_path, read_model
 from hilsplat.scene.sheet import SceneRow
 from hilsplat.settings import MasksSettings
 from hilsplat.splat.ply import vertex_count
-from hilsplat.workflow.jobs import Job
 from hilsplat.workflow.plan import Plan
+from hilsplat.workflow.scene_data import Job
 
 with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
     _rows = list(csv.DictReader(_stream, delimiter="\t"))
@@ -92,7 +91,6 @@ class JobResources:
     """Resources of the jobs of a plan, as functions of wildcards that Snakemake calls.
 
     Args:
-        plan: the plan of the run.
         cores: cores of this machine if it runs the jobs; they get one thread each if there are jobs for all
             cores. None on a cluster, where resources must not depend on the machine, because a job recomputes
             them on its node.
@@ -200,24 +198,22 @@ class JobResources:
 
     def _size(self, row: SceneRow) -> Size:
         """Return the size of a scene from its cameras, or from its settings or image headers."""
-        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
         try:
-            with np.load(Path(self.plan.path(job, "scene")) / "cameras.npz") as cameras:
+            with np.load(Path(self.plan.path(row, "scene")) / "cameras.npz") as cameras:
                 sizes = cameras["size_hw"].astype(np.float64)
             return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
         except (OSError, ValueError, KeyError):  # the poses stage has not written it yet
-            stages = self.plan.stages(job)
+            stages = self.plan.stages(row)
         if row.world:
             return Size(stages.world.views, stages.world.image_px**2 / 1e6)
-        files = self.plan.data.image_files(job)
-        images = self.plan.data.source_files(job) if isinstance(files, str) else files
+        files = self.plan.data.image_files(row)
+        images = self.plan.data.source_files(row) if isinstance(files, str) else files
         return Size(len(images), _first_mp(images, stages.poses.max_side_px))
 
     def _gaussians(self, row: SceneRow) -> int:
         """Return the number of Gaussians in the PLY that replaces the fit, or the limit of the fit."""
         known = vertex_count(row.gaussians) if row.gaussians is not None else None
-        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
-        return known or self.plan.stages(job).gaussians.max_gaussians
+        return known or self.plan.stages(row).gaussians.max_gaussians
 
     def _model_mb(self, rule: str, wildcards: Job, threads: int) -> int:
         """Return the memory of a model with one view per thread, MB; the stage uses less if less is free."""

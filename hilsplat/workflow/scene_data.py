@@ -1,14 +1,15 @@
 """External files that the jobs of a scene read: photographs, Gaussians and labels.
 
-Only evaluation and figures get labels.
+A *job* is any object with the attributes `dataset` and `scene`, and in the stages of a variant `variant`: the
+wildcards of a rule, or a row of the sheet. Only evaluation and figures get labels.
 """
 
 import functools
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.registry import readers_of
@@ -22,20 +23,46 @@ from hilsplat.datasets.sources import (
 )
 from hilsplat.scene.layouts import TRAINED, dataparser_of, transforms_of
 from hilsplat.scene.sheet import SceneRow
-from hilsplat.workflow.jobs import Job
+
+
+@runtime_checkable  # for the type checker of the tests
+class Job(Protocol):
+    """Wildcards of a scene's rules."""
+
+    @property
+    def dataset(self) -> str: ...
+    @property
+    def scene(self) -> str: ...
+
+
+@runtime_checkable
+class VariantJob(Job, Protocol):
+    """Wildcards of a variant's rules."""
+
+    @property
+    def variant(self) -> str: ...
+
+
+def of_variant(job: Job, variant: str) -> VariantJob:
+    """Return the job of a variant of a job's scene."""
+    return SimpleNamespace(dataset=job.dataset, scene=job.scene, variant=variant)
+
+
+def options_of(named: Mapping[str, Any]) -> str:
+    """Return quoted command-line options, without those whose value is empty."""
+    return " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in named.items() if value)
 
 
 class SceneData:
-    """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels."""
+    """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels.
+
+    Args:
+        rows: scenes of the sheet.
+        data_root: folder of the published data sets.
+        path: returns a path in the results folder of a job's scene.
+    """
 
     def __init__(self, rows: Iterable[SceneRow], data_root: str, path: Callable[..., str]) -> None:
-        """Store the scenes of a sheet.
-
-        Args:
-            rows: scenes of the sheet.
-            data_root: folder of the published data sets.
-            path: returns a path in the results folder of a job's scene.
-        """
         self.data_root, self.path = data_root, path
         self._row_of = {(row.dataset, row.scene): row for row in rows}
         # A thousand scenes have tens of thousands of jobs, so folders are read once.
@@ -79,14 +106,13 @@ class SceneData:
         row = self.row(job)
         if row.world:
             return "--render"
-        return "--no-render" + (f" --poses {shlex.quote(str(row.poses))}" if row.poses else "")
+        return f"--no-render {options_of({'poses': row.poses})}".rstrip()
 
     def require_no_braces(self, row: SceneRow) -> None:
         """Raise an error for file names with braces, which Snakemake reads as wildcards and cannot quote."""
-        job = SimpleNamespace(dataset=row.dataset, scene=row.scene)
-        files = self.image_files(job) if row.folder is not None else []
+        files = self.image_files(row) if row.folder is not None else []
         files = [files] if isinstance(files, str) else files
-        for path in [*files, *self.existing_gaussians(job), *self.features(job)]:
+        for path in [*files, *self.existing_gaussians(row), *self.features(row)]:
             if "{" in path or "}" in path:
                 raise SettingsError(
                     f"{path} of {row.name} cannot be read by the workflow: its name has braces",
@@ -116,23 +142,17 @@ class SceneData:
 
     def existing_gaussians_option(self, job: Job) -> str:
         """Return the options for such a PLY and nerfstudio's files for it, if any."""
-        ply = self.row(job).gaussians
-        if ply is None:
-            return ""
-        named = {"existing": ply, **self._nerfstudio(job)}
-        return " ".join(f"--{name} {shlex.quote(str(path))}" for name, path in named.items())
+        return options_of({"existing": self.row(job).gaussians, **self._nerfstudio(job)})
 
     def _nerfstudio(self, job: Job) -> dict[str, Path]:
         """Return files that relate the coordinates of nerfstudio's PLY to those of the poses, by option."""
         row = self.row(job)
         if row.gaussians is None or row.folder is None:
             return {}
-        dataparser = dataparser_of(row.gaussians, row.folder)
-        files = {
-            "dataparser": dataparser,
-            "transforms": transforms_of(row.folder, row.poses) if dataparser else None,
-        }
-        return {name: path for name, path in files.items() if path is not None}
+        if (dataparser := dataparser_of(row.gaussians, row.folder)) is None:
+            return {}
+        transforms = transforms_of(row.folder, row.poses)
+        return {"dataparser": dataparser, **({"transforms": transforms} if transforms else {})}
 
     def features(self, job: Job) -> list[str]:
         """Return the input of masks and clip: LangSplat's files that replace SAM and CLIP; usually empty."""
@@ -141,8 +161,7 @@ class SceneData:
 
     def features_option(self, job: Job) -> str:
         """Return the option for the folder of LangSplat's files, if there is one."""
-        folder = self.row(job).features
-        return f"--features {shlex.quote(str(folder))}" if folder is not None else ""
+        return options_of({"features": self.row(job).features})
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Return the labels of a scene, as `data set/scene`: published ones and your own annotations."""
@@ -171,8 +190,8 @@ class SceneData:
         row = self.row(job)
         if row.world:
             return f"{truth_argument(input)} --kind {row.world[0]}"
-        options = [f"--labels {shlex.quote(labels)}" for labels in self.labels(row)]
-        return " ".join([*options, self._data_root_option()])
+        options = [options_of({"labels": labels}) for labels in self.labels(row)]
+        return " ".join([*options, options_of({"data-root": Path(self.data_root)})])
 
     def figure_truth_option(self, job: Job, input: Any) -> str:
         """Return the options of figures: the truth or labels for queries and outlines, if any."""
@@ -182,12 +201,9 @@ class SceneData:
         on_images = [labels for labels in self.labels(row) if not is_exported(f"{DATA_PREFIX}{labels}")]
         if not on_images:
             return ""
-        return f"--labels {shlex.quote(on_images[-1])} {self._data_root_option()}"
-
-    def _data_root_option(self) -> str:
-        return f"--data-root {shlex.quote(str(Path(self.data_root)))}"
+        return options_of({"labels": on_images[-1], "data-root": Path(self.data_root)})
 
 
 def truth_argument(input: Any) -> str:
     """Return the option for the input `truth`, with the job's own path, because a module may prefix it."""
-    return f"--truth {shlex.quote(str(input.truth if isinstance(input.truth, str) else input.truth[0]))}"
+    return options_of({"truth": input.truth if isinstance(input.truth, str) else input.truth[0]})

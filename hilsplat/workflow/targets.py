@@ -51,6 +51,11 @@ def labelled(plan: Plan) -> list[SceneRow]:
     return [row for row in plan.scenes if row.world or plan.data.labels(row)]
 
 
+def annotated(plan: Plan) -> list[SceneRow]:
+    """Return the scenes with your own labels only."""
+    return [row for row in labelled(plan) if not data_of(row)]
+
+
 def data_of(row: SceneRow) -> str:
     """Return a scene's data as named in tables: its kind of synthetic scene, or its published data set."""
     if row.world:
@@ -79,9 +84,8 @@ def default(plan: Plan) -> list[str]:
         for name in ("theta", "omega")
         if getattr(plan.run, TABLES[name].variants)
     ]
-    own = [row for row in labelled(plan) if not data_of(row)]
-    scores = [path for row in own for path in own_scores(plan, row).values()]
-    has_tables = len(labelled(plan)) > len(own)
+    scores = [path for row in annotated(plan) for path in own_scores(plan, row).values()]
+    has_tables = len(labelled(plan)) > len(annotated(plan))
     return [*figures(plan), *scores, *(tables(plan) + plots if has_tables else [])]
 
 
@@ -103,15 +107,11 @@ def own_scores(plan: Plan, row: SceneRow) -> dict[str, str]:
 
 def summary(plan: Plan) -> list[str]:
     """Return a readable table of scores for each finished scene with your own labels."""
-    own = [row for row in labelled(plan) if not data_of(row)]
-    return [
-        line
-        for row in own
-        for line in score_summary(
-            row.name,
-            {name: Path(path) for name, path in own_scores(plan, row).items() if Path(path).is_file()},
-        )
-    ]
+    lines: list[str] = []
+    for row in annotated(plan):
+        paths = {name: Path(path) for name, path in own_scores(plan, row).items()}
+        lines += score_summary(row.name, {name: path for name, path in paths.items() if path.is_file()})
+    return lines
 
 
 def figures(plan: Plan) -> list[str]:

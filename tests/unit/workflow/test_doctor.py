@@ -4,7 +4,7 @@ import importlib.metadata
 import json
 import os
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -48,19 +48,28 @@ def test_an_old_python_is_a_fault(monkeypatch):
     assert found.state == "fault" and "3.9.1" in found.found
 
 
-def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
-    versions = {"numpy": "1.20.0"}
+def install(monkeypatch, missing: str, **versions: str) -> None:
+    """Pretend that a library is missing and that others have these versions."""
 
     def version(name: str) -> str:
-        if name == "scipy":
+        if name == missing:
             raise importlib.metadata.PackageNotFoundError(name)
         return versions.get(name) or known(name)
 
     known = importlib.metadata.version
     monkeypatch.setattr(importlib.metadata, "version", version)
+
+
+def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
+    install(monkeypatch, "scipy", numpy="1.20.0")
     found = only(doctor.libraries)
     assert found.state == "fault"
     assert "scipy is missing" in found.found and "numpy 1.20.0 is not >=2.1" in found.found
+
+
+def test_the_gpu_build_of_onnxruntime_takes_the_place_of_the_other(monkeypatch):
+    install(monkeypatch, "onnxruntime", **{"onnxruntime-gpu": "1.20"})
+    assert only(doctor.libraries).state == "ok"
 
 
 def test_two_builds_of_onnxruntime_are_a_fault(monkeypatch):
@@ -123,18 +132,6 @@ def test_a_model_must_give_the_same_on_every_provider(project, monkeypatch, shif
     assert {finding.state for finding in findings} == {state} and len(findings) == 2
 
 
-def test_the_gpu_build_of_onnxruntime_takes_the_place_of_the_other(monkeypatch):
-    known = importlib.metadata.version
-
-    def version(name: str) -> str:
-        if name == "onnxruntime":
-            raise importlib.metadata.PackageNotFoundError(name)
-        return "1.20" if name == "onnxruntime-gpu" else known(name)
-
-    monkeypatch.setattr(importlib.metadata, "version", version)
-    assert only(doctor.libraries).state == "ok"
-
-
 @pytest.mark.parametrize(("what", "value"), [("disk", 2**20), ("memory", 100.0)])
 def test_too_little_disk_or_memory_is_a_fault(project, monkeypatch, what, value):
     monkeypatch.chdir(project)
@@ -157,9 +154,7 @@ def test_the_command_prints_json_and_fails_with_a_fault(monkeypatch):
     monkeypatch.setattr(doctor, "examine", lambda: iter([broken]))
     done = CliRunner().invoke(app, ["doctor", "--json"])
     assert done.exit_code == 1
-    assert json.loads(done.output) == [
-        {"check": "models", "state": "fault", "found": "broken", "fix": "get it again"}
-    ]
+    assert json.loads(done.output) == [asdict(broken)]
 
 
 def test_a_check_that_fails_unexpectedly_does_not_stop_the_others(monkeypatch):

@@ -22,6 +22,7 @@ def resources(tmp_path, monkeypatch):
 
 def test_jobs_are_summed_by_data_set(resources):
     estimate = RunEstimate(resources)
+    assert estimate.lines() == [], "nothing would run"
     for scene in SCENES:
         estimate.add("poses", scene, 1000)
         estimate.add("gaussians", scene, 4000)
@@ -33,10 +34,6 @@ def test_jobs_are_summed_by_data_set(resources):
     assert rows[1] == ["synthetic", "2", "4", "1.0 GB", "4.0 GB", "2.20", f"{gpu:.2f}"]
     assert [row[0] for row in rows[2:]] == ["tables", "all"]
     assert rows[3][1:5] == ["2", "5", "1.0 GB", "4.0 GB"]
-
-
-def test_nothing_to_run_prints_nothing(resources):
-    assert RunEstimate(resources).lines() == []
 
 
 def test_more_steps_prompts_and_crops_take_longer(tmp_path):

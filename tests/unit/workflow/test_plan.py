@@ -10,11 +10,10 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.configuration import SECTIONS
-from hilsplat.models.digests import model_digest
+from hilsplat.models.store import model_digest
 from hilsplat.workflow import targets
-from hilsplat.workflow.jobs import any_of
 from hilsplat.workflow.models import models_of_photographs
-from hilsplat.workflow.plan import Plan, some
+from hilsplat.workflow.plan import Plan, any_of, some
 from hilsplat.workflow.records import expected_artifacts
 
 SHEET = """dataset\tscene\tgroup\tsource\tunit

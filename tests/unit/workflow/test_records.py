@@ -10,7 +10,7 @@ import pytest
 from hilsplat.base.artifacts import lock_path, output_lock, provenance_path
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import Inputs, write_provenance
-from hilsplat.models.digests import model_digest
+from hilsplat.models.store import model_digest
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import Expected, Records, expected_artifacts, outdated, verify
 from hilsplat.workflow.stages import stage_code
@@ -55,10 +55,6 @@ def problems(expected: dict[Path, Expected] | None = None) -> dict[str, str]:
     records = Records(Path("results"), every_byte=False)
     found = {path.name: records.state(path, how)[1] for path, how in (expected or EXPECTED).items()}
     return {name: reason for name, reason in found.items() if reason}
-
-
-def test_artifacts_made_as_planned_have_no_problem(results):
-    assert problems() == {}
 
 
 @pytest.mark.parametrize(

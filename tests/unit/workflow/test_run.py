@@ -70,11 +70,11 @@ def value(command: list[str], option: str) -> str:
     return command[command.index(option) + 1]
 
 
-def test_a_run_takes_the_cores_of_the_machine(folder, started):
+def test_a_run_takes_the_cores_of_the_machine_and_a_cluster_sets_its_own(folder, started):
     assert runs.run([], [], []) == 3, "Snakemake's exit status"
-    [command] = started
-    assert value(command, "--cores") == "4"
-    assert value(command, "--snakefile") == str(folder / "Snakefile")
+    runs.run([], [], ["--workflow-profile", "profiles/slurm"])
+    here, cluster = started
+    assert value(here, "--cores") == "4" and "--cores" not in cluster
 
 
 def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
@@ -100,11 +100,6 @@ def test_a_misspelt_scene_is_refused(folder, started):
     assert started == []
 
 
-def test_a_cluster_sets_its_own_cores(folder, started):
-    runs.run([], [], ["--workflow-profile", "profiles/slurm"])
-    assert "--cores" not in started[0]
-
-
 def test_what_the_targets_need_and_does_not_match_is_made_again(folder, started, monkeypatch):
     folder = Path("results/synthetic/one")
     folder.mkdir(parents=True)
@@ -114,12 +109,8 @@ def test_what_the_targets_need_and_does_not_match_is_made_again(folder, started,
     answer = subprocess.CompletedProcess([], 0, summary, "")
     monkeypatch.setattr(runs.subprocess, "run", lambda words, **kwargs: answer)
     runs.run([f"{folder}/gaussians.ply"], [], [])
-    command = started[0]
-    assert command[command.index("--forcerun") + 1 :] == [
-        f"{folder}/gaussians.ply",
-        "--",
-        f"{folder}/gaussians.ply",
-    ]
+    file = f"{folder}/gaussians.ply"
+    assert started[0][-4:] == ["--forcerun", file, "--", file]
 
 
 def test_a_second_run_of_the_folder_is_refused(folder, started):
@@ -190,7 +181,5 @@ def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
     monkeypatch.chdir("elsewhere")
     runs.run([], [folder / "config/config.yaml"], ["-n"])
     runs.run([], [], ["-n"])
-    assert [value(command, "--snakefile") for command in started] == [
-        str(folder / "Snakefile"),
-        str(project / "Snakefile"),
-    ]
+    found = [value(command, "--snakefile") for command in started]
+    assert found == [str(folder / "Snakefile"), str(project / "Snakefile")]
