@@ -32,7 +32,6 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
         maker: the dataclass; its arrays are annotated with jaxtyping.
         arrays: arrays by field name.
         path: their file, for the error message.
-        limits: limits of the values.
 
     Raises:
         ArtifactError: an array has the wrong type or shape, or a value that is not finite or is out of range.
@@ -74,8 +73,6 @@ def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **mor
 
     Args:
         maker: the dataclass; its field names are those of the arrays and of `more`.
-        path: the file.
-        limits: limits of the values.
         more: fields that are not in the file.
 
     Raises:

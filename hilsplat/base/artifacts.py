@@ -30,6 +30,7 @@ INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
 
 DAMAGE = (
+    AttributeError,  # an .npy file where an .npz file is expected
     EOFError,
     MemoryError,
     NotImplementedError,
@@ -65,7 +66,6 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary file that replaces `path` when the block ends without error.
 
     Args:
-        path: the file to write.
         durable: flush the file to the disk, so that it survives a power failure.
 
     Raises:
@@ -215,12 +215,13 @@ LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
 
 def _lasting_folder(path: Path) -> Path:
     """Return the innermost existing folder of a path that is not part of an unfinished artifact."""
-    path = Path(path)
     hidden = [place for place in path.parents if UNFINISHED.fullmatch(place.name)]
-    folder = hidden[-1].parent if hidden else path.parent
-    while not folder.exists():
-        folder = folder.parent
-    return folder
+    return _existing(hidden[-1].parent if hidden else path.parent)
+
+
+def _existing(folder: Path) -> Path:
+    """Return a folder, or its innermost parent that exists."""
+    return next(place for place in (folder, *folder.parents) if place.exists())
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:
@@ -229,9 +230,7 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
     Raises:
         DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
     """
-    folder = Path(folder)
-    while not folder.exists():
-        folder = folder.parent
+    folder = _existing(Path(folder))
     free_mib = shutil.disk_usage(folder).free / 2**20
     if free_mib < needed_mib:
         raise DiskSpaceError(
@@ -279,6 +278,17 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Convert errors from a missing or damaged file into one with the command that rebuilds it."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
+    except DAMAGE as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+
+
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
     """Write a compressed .npz file atomically, with fixed time stamps: same arrays, same bytes."""
     _write_zip(path, arrays, zipfile.ZIP_DEFLATED)
@@ -300,22 +310,14 @@ def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durabl
 def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
     """Read an .npz file into a dict, without unpickling anything.
 
-    Args:
-        path: the file.
-        needed: names of the required arrays.
-
     Raises:
-        ArtifactError: the file is missing or damaged, contains objects, or lacks a required array.
+        ArtifactError: the file is missing or damaged, contains objects, or lacks a needed array.
     """
-    try:
+    with _readable(path):
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         if any(isinstance(array, bytes) for array in arrays.values()):  # numpy found no header
             raise ValueError("it contains other data than arrays")
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except (*DAMAGE, AttributeError) as error:  # AttributeError: it is an .npy file
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
     if lacking := [name for name in needed if name not in arrays]:
         raise ArtifactError(
             f"{path} lacks {', '.join(lacking)}",
@@ -337,15 +339,11 @@ def read_npy(path: Path) -> np.ndarray:
     Raises:
         ArtifactError: the file is missing or damaged, or contains anything else.
     """
-    try:
+    with _readable(path):
         array = np.load(path, allow_pickle=False)
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise ValueError(f"it holds {getattr(array, 'dtype', 'an archive')}, not numbers")
-        return array
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except DAMAGE as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+    return array
 
 
 def sha256_of_bytes(*parts: bytes) -> str:
@@ -565,5 +563,11 @@ def output_lock(output: Path) -> Iterator[None]:
 
 
 def lock_path(output: Path) -> Path:
-    """Return the lock file of an output; it is not empty if the last writer was killed or failed."""
+    """Return the lock file of an output."""
     return output.parent / f".{output.name}.lock"
+
+
+def was_interrupted(output: Path) -> bool:
+    """Return whether the last writer of an output was killed or failed."""
+    lock = lock_path(output)
+    return lock.is_file() and lock.stat().st_size > 0

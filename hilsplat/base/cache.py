@@ -1,7 +1,6 @@
 """Cache sizes, and pruning of finished views and checkpoints."""
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.artifacts import visible_files
@@ -18,40 +17,20 @@ FIT_DAYS = 1.0
 """Age below which a checkpoint is kept: its fit may still be running. Fits write them far more often."""
 
 
-@dataclass(frozen=True)
-class Entries:
-    """Files of one cache.
-
-    Attributes:
-        name: name of the cache's folder or single file.
-        files: complete entries, without unfinished files.
-        size_mib: total size.
-    """
-
-    name: str
-    files: tuple[Path, ...]
-    size_mib: float
-
-
-def _mib(files: tuple[Path, ...]) -> float:
-    return sum(path.stat().st_size for path in files) / 2**20
-
-
-def caches(folder: Path) -> list[Entries]:
-    """Return the caches in a cache folder, by name."""
-    found = []
-    for cache in sorted(Path(folder).glob("[!.]*")):
-        files = tuple(visible_files(cache)) if cache.is_dir() else (cache,)
-        found.append(Entries(cache.name, files, _mib(files)))
-    return found
+def caches(folder: Path) -> dict[str, list[Path]]:
+    """Return the complete entries of each cache in a cache folder, by name of its folder or single file."""
+    places = sorted(Path(folder).glob("[!.]*"))
+    return {place.name: visible_files(place) if place.is_dir() else [place] for place in places}
 
 
 def size_table(folder: Path) -> str:
     """Return a text table with the size of each cache."""
-    found = caches(folder)
-    lines = [f"{cache.name:<14} {len(cache.files):>7} files {cache.size_mib:>9.1f} MiB" for cache in found]
-    total = sum(cache.size_mib for cache in found)
-    return "\n".join([f"{folder}", *lines, f"{'all':<14} {'':>13} {total:>9.1f} MiB"])
+    lines, total = [f"{folder}"], 0.0
+    for name, files in caches(folder).items():
+        size_mib = sum(path.stat().st_size for path in files) / 2**20
+        total += size_mib
+        lines.append(f"{name:<14} {len(files):>7} files {size_mib:>9.1f} MiB")
+    return "\n".join([*lines, f"{'all':<14} {'':>13} {total:>9.1f} MiB"])
 
 
 def prune_cache(
@@ -60,7 +39,6 @@ def prune_cache(
     """Delete unfinished files of killed jobs, and cache entries starting with the least recently used.
 
     Args:
-        folder: cache folder.
         stages: caches to prune, from `VIEW_CACHES` and `CHECKPOINTS`. An empty list selects the view caches
             and, with `days`, also the checkpoints.
         days: delete entries not used for this many days.
@@ -82,7 +60,7 @@ def prune_cache(
     remove_leftovers(folder.parent if Path(folder).name == ".cache" else folder)
     chosen = set(stages or (VIEW_CACHES if days is None else known))
     now, freed, deleted = time.time(), 0, 0
-    used = {path: path.stat() for cache in caches(folder) if cache.name in chosen for path in cache.files}
+    used = {path: path.stat() for name, files in caches(folder).items() if name in chosen for path in files}
     oldest_first = sorted(used, key=lambda path: (used[path].st_mtime, str(path)))
     total = sum(stat.st_size for stat in used.values())
     for path in oldest_first:

@@ -72,7 +72,7 @@ class _Notice(event.Listener):
             logger.info("compiling kernels, once: about 15 s; later runs load them from disk")
 
     def on_end(self, happening: Any) -> None:
-        """Do nothing: only the start is logged."""
+        pass
 
 
 event.register("numba:compile", _Notice())

@@ -95,18 +95,14 @@ def _parse(text: str, package: str) -> Module:
     for node in ast.parse(text).body:
         if _is_bare_string(node):
             continue
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            imports = _imports(node, package)
-            for name in imports:
-                facts.bindings[name] = Statement(imports=imports)
-            continue
-        if isinstance(node, ast.If) and _chain(node.test)[-1:] == ("TYPE_CHECKING",):
-            for inner in node.body:
+        for_types = isinstance(node, ast.If) and _chain(node.test)[-1:] == ("TYPE_CHECKING",)
+        if for_types or isinstance(node, ast.Import | ast.ImportFrom):
+            for inner in getattr(node, "body", [node]):
                 imports = _imports(inner, package)
                 facts.bindings.update({name: Statement(imports=imports) for name in imports})
             continue
         statement = _statement(node, package)
-        names = _bound_at_top(node)
+        names = sorted(_bound_in([node]))
         for name in names:
             if (earlier := facts.bindings.get(name)) is not None:  # bound twice: both count
                 statement = _both(earlier, statement)
@@ -120,8 +116,9 @@ def _statement(node: ast.stmt, package: str) -> Statement:
     signature: list[tuple[str, ...]] = []
     for inner in (node, *getattr(node, "body", ())):  # a function, or the methods of a class
         if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef):
-            for annotation in _annotations(inner):
-                signature += _Names(package).of(annotation)[0]
+            for argument in _arguments(inner.args):
+                if argument.annotation is not None:
+                    signature += _Names(package).of(argument.annotation)[0]
     _strip(node)
     names, inner = _Names(package).of(node)
     return Statement(ast.dump(node).encode(), names, inner, signature=signature)
@@ -158,13 +155,6 @@ def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
     return {alias.asname or alias.name: Import(base, alias.name) for alias in node.names}
 
 
-def _bound_at_top(node: ast.stmt) -> list[str]:
-    """Return the names that a statement, including its blocks, binds in its module."""
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        return [node.name]
-    return sorted(_bound(node))
-
-
 def _registers(node: ast.stmt) -> bool:
     """Return whether a decorator may register the definition."""
     decorators = getattr(node, "decorator_list", ())
@@ -183,10 +173,8 @@ def _is_bare_string(node: ast.AST) -> bool:
     )
 
 
-def _annotations(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.expr]:
-    args = node.args
-    every = [*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg]
-    return [each.annotation for each in every if each is not None and each.annotation is not None]
+def _arguments(arguments: ast.arguments) -> list[ast.arg]:
+    return [each for each in ast.walk(arguments) if isinstance(each, ast.arg)]
 
 
 def _strip(top: ast.AST) -> None:
@@ -200,10 +188,8 @@ def _strip(top: ast.AST) -> None:
                 kept = [each for each in statements if not _is_bare_string(each)]
                 setattr(node, block, kept or ([ast.Pass()] if statements else []))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            args = node.args
-            for each in (*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg):
-                if each is not None:
-                    each.annotation = None
+            for argument in _arguments(node.args):
+                argument.annotation = None
             node.returns = None
             is_local = True
         elif isinstance(node, ast.ClassDef):
@@ -293,8 +279,7 @@ class _Names:
             for outside in (*getattr(node, "decorator_list", ()), *filter(None, defaults)):
                 self._visit(outside)
             body = node.body if isinstance(node.body, list) else [node.body]
-            arguments = {each.arg for each in ast.walk(node.args) if isinstance(each, ast.arg)}
-            bound = arguments | _bound_in(body) - _declared_global(body)
+            bound = {each.arg for each in _arguments(node.args)} | _bound_in(body)
             self._inside(_Scope(bound, self._imported(body)), body)
         elif isinstance(node, ast.ClassDef):
             for outside in (*node.decorator_list, *node.bases, *node.keywords):
@@ -302,7 +287,7 @@ class _Names:
             scope = _Scope(_bound_in(node.body), self._imported(node.body), is_class=True)
             self._inside(scope, node.body)
         elif isinstance(node, _COMPREHENSIONS):
-            self._inside(_Scope(_bound(node), {}), list(_children(node)))
+            self._inside(_Scope(_bound_in([node]), {}), list(_children(node)))
         else:
             for child in _children(node):
                 self._visit(child)
@@ -343,7 +328,9 @@ def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
 
 
 def _bound_in(body: Iterable[ast.AST]) -> set[str]:
+    """Return the names that a block binds in its own scope."""
     names: set[str] = set()
+    declared_global: set[str] = set()
     for node in _own(body):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
             names.add(node.id)
@@ -355,12 +342,6 @@ def _bound_in(body: Iterable[ast.AST]) -> set[str]:
             names.add(node.name)
         elif isinstance(node, ast.MatchMapping) and node.rest:
             names.add(node.rest)
-    return names
-
-
-def _bound(node: ast.AST) -> set[str]:
-    return _bound_in([node])
-
-
-def _declared_global(body: Iterable[ast.AST]) -> set[str]:
-    return {name for node in _own(body) if isinstance(node, ast.Global) for name in node.names}
+        elif isinstance(node, ast.Global):
+            declared_global |= set(node.names)
+    return names - declared_global

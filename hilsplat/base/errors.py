@@ -12,9 +12,6 @@ class HilsplatError(Exception):
 
     Args:
         message: one sentence that names the file, scene, view or key.
-        expected: what was expected there.
-        found: what was found instead.
-        fix: how to fix it.
     """
 
     def __init__(

@@ -37,9 +37,6 @@ def end_with_parent(parent: int) -> None:
 
     Otherwise the jobs of a killed Snakemake would continue, and write outputs with old settings during the
     next run. Linux kills the process if no shell is in between; otherwise a thread checks every second.
-
-    Args:
-        parent: id of the process that started this one, possibly through a shell.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -172,23 +169,22 @@ def in_processes(
     Args:
         work: a module-level function, or a `functools.partial` of one.
         items: arguments of each call.
-        workers: number of processes.
         chunk: number of items that a process takes at a time.
     """
     if workers <= 1 or len(items) <= 1:
         for item in items:
             yield work(*item)
         return
+    with _pool(min(workers, len(items)), end_with_parent, os.getpid()) as pool:
+        yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
+
+
+def _pool(workers: int, initializer: Callable[..., None], *given: Any) -> Any:
+    """Return a pool of spawned processes that each begin with `initializer(*given)`."""
     from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need none
     from multiprocessing import get_context
 
-    with ProcessPoolExecutor(
-        min(workers, len(items)),
-        mp_context=get_context("spawn"),
-        initializer=end_with_parent,
-        initargs=(os.getpid(),),
-    ) as pool:
-        yield from pool.map(work, *zip(*items, strict=True), chunksize=chunk)
+    return ProcessPoolExecutor(workers, get_context("spawn"), initializer, given)
 
 
 def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
@@ -198,22 +194,17 @@ def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
 
     Args:
         work: a module-level function.
-        given: its arguments.
 
     Raises:
         ChildProcessError: the process ended without a result.
     """
-    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need none
     from concurrent.futures.process import BrokenProcessPool
-    from multiprocessing import get_context
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as folder:
         said = Path(folder) / "said"
         try:
-            with ProcessPoolExecutor(
-                1, mp_context=get_context("spawn"), initializer=_begin_alone, initargs=(os.getpid(), said)
-            ) as pool:
+            with _pool(1, _begin_alone, os.getpid(), said) as pool:
                 return pool.submit(work, *given).result()
         except BrokenProcessPool:
             last = said.read_text(errors="replace")[-2000:] if said.exists() else ""

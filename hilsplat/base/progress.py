@@ -63,7 +63,6 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
     """Yield the items and show how many are done.
 
     Args:
-        items: what to iterate over.
         what: label of a few words, such as "masks of views".
         total: number of items, if `len(items)` is not available.
     """

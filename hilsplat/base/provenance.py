@@ -13,12 +13,12 @@ from PIL import Image
 from pydantic import BaseModel, ValidationError
 
 from hilsplat.base.artifacts import (
-    lock_path,
     provenance_path,
     read_json,
     remake,
     sha256_of_path,
     visible_files,
+    was_interrupted,
     write_json,
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError
@@ -127,12 +127,8 @@ def write_provenance(
     """Write an artifact's provenance record: how and from what it was made, and the digests of the outputs.
 
     Args:
-        artifact: the output.
         stage: key of `STAGES`.
         code: digest of the stage's code.
-        command: command line.
-        settings: sections of the settings.
-        seed: the random seed, or None.
         inputs: inputs with their digests from before the stage ran.
         beside: further outputs.
         plugins: import paths of the readers or baselines that the stage used.
@@ -163,12 +159,7 @@ def write_provenance(
 
 
 class Written(BaseModel):
-    """An output as it was written.
-
-    Attributes:
-        sha256: digest from `sha256_of_path`.
-        bytes: sizes from `sizes_of`.
-    """
+    """An output as it was written: its digest from `sha256_of_path`, and sizes from `sizes_of`."""
 
     sha256: str
     bytes: dict[str, int]
@@ -178,7 +169,6 @@ class Read(BaseModel):
     """An input as a stage read it.
 
     Attributes:
-        path: file or folder.
         sha256: digest from `sha256_of_path`, or None if the path did not exist or was empty.
         files: for a list of files, the digest of each.
     """
@@ -262,7 +252,6 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     Args:
         outputs: the artifact, whose provenance lists all of them, and further outputs.
         stage: key of `STAGES`.
-        inputs: files and folders that the stage reads.
 
     Raises:
         ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
@@ -281,21 +270,15 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
                 raise ArtifactError(
                     f"output {out} is the {name} folder, or holds it", fix="name a new file or folder"
                 )
-        if not _is_something(out) or place in own or _was_interrupted(out):
+        if not _is_something(out) or place in own or was_interrupted(out):
             continue
-        raise ArtifactError(
-            f"output {out} exists, and {stage} did not write it",
-            expected=f"nothing there, or an earlier output of {stage} with its provenance",
-            found=_described(out),
-            fix="name another output, or remove this one first",
-        )
+        raise _foreign(out, stage, f"nothing there, or an earlier output of {stage} with its provenance")
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
     """Check that a picture replaces only an earlier picture by this program.
 
     Args:
-        path: path of the picture.
         beside: a file that is always written with it.
 
     Raises:
@@ -334,9 +317,10 @@ def require_beginning(path: Path, line: str) -> None:
         raise _foreign(path)
 
 
-def _foreign(path: Path) -> ArtifactError:
+def _foreign(path: Path, writer: str = "hilsplat", expected: str | None = None) -> ArtifactError:
     return ArtifactError(
-        f"output {path} exists, and hilsplat did not write it",
+        f"output {path} exists, and {writer} did not write it",
+        expected=expected,
         found=_described(path),
         fix="name another output, or remove this one first",
     )
@@ -363,13 +347,6 @@ def _is_something(path: Path) -> bool:
 
 def _visible(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
-
-
-def _was_interrupted(out: Path) -> bool:
-    try:
-        return lock_path(out).stat().st_size > 0
-    except OSError:
-        return False
 
 
 def _described(path: Path) -> str:

@@ -20,7 +20,6 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
     """Read the rows of a CSV file as dicts keyed by column.
 
     Args:
-        path: the file.
         columns: the required columns, in order.
         fix: what to do if the file is missing or has other columns.
 
