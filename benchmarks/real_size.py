@@ -195,7 +195,7 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     absolute logit there exceeds `tie`. Random logits cluster around 0, where a trained SAM's are steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
-    from hilsplat.segment.sam import SamModel, ask_network, in_input, one_point_each, point_grid
+    from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
 
     model, rounds, many = SamModel.load(models), 8, 64
     assert model.factored is not None
@@ -207,10 +207,7 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     apart = {"iou": 0.0, "logits": 0.0}
     for _ in range(rounds):
         clock = time.process_time()
-        plain = [
-            ask_network(model.decoder, encoded.features, *one_point_each(at[k : k + 8]))
-            for k in range(0, many, 8)
-        ]
+        plain = [ask_network(model.decoder, encoded.features, at[k : k + 8, None]) for k in range(0, many, 8)]
         found["plain_ms"].append(time.process_time() - clock)
         clock = time.process_time()
         calls = [model.factored.decode(encoded.terms, at[k : k + 16], fine=False) for k in range(0, many, 16)]

@@ -1,7 +1,6 @@
 """CLIP with onnxruntime: unit vectors of mask crops and texts in one space."""
 
 import logging
-import time
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,8 +32,11 @@ MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
 class ClipModel:
     """A loaded CLIP model.
 
+    Args:
+        threads: number of batches of crops embedded at once; results do not depend on it.
+        template: prompt template, in which each text replaces `{}`.
+
     Attributes:
-        digest: SHA-256 of the model's files.
         side_px: side of the vision network's square input.
         max_tokens: maximum text length of the text network; None if the folder specifies no limit.
         precision: precision of the vision network, "fp32" or "int8".
@@ -85,9 +87,19 @@ class ClipModel:
         """
         opened = self.model.network("vision_model")
         (vector,) = opened.spec.outputs
-        numbers = opened.declared_axis(vector, 1), self.text.declared_axis(self.words, 1)
+        numbers = opened.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
         require_one_space(self.model.folder, *numbers)
         return opened
+
+    @property
+    def pixels(self) -> str:
+        """Name of the vision network's input."""
+        return next(iter(self.vision.spec.inputs))
+
+    @property
+    def crops_per_call(self) -> int | None:
+        """Crops per call of the vision network if it fixes them; open_clip's exports take one."""
+        return self.vision.fixed_axis(self.pixels, 0)
 
     def use_int8(self, network: Network) -> None:
         """Replace the vision network with its int8 version."""
@@ -107,16 +119,10 @@ class ClipModel:
 
     @staticmethod
     def load(folder: Path, threads: int = 1, template: str = "{}", variant: str = "") -> "ClipModel":
-        """Open a model folder.
+        """Open a model folder (`open_model_folder`).
 
-        Args:
-            folder: model folder in a layout of `models.layouts`.
-            threads: number of batches of crops embedded at once; results do not depend on it.
-            template: prompt template, in which each text replaces `{}`.
-            variant: suffix of the network names, such as `fp16`.
-
-            Raises:
-                ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
+        Raises:
+            ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
         """
         model = ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
         _ = model.vision  # open and check it now
@@ -125,14 +131,10 @@ class ClipModel:
     @property
     def width(self) -> int:
         """Length of a vector."""
-        return self.text.declared_axis(self.words, 1) or self.embed_texts(["object"]).shape[1]
+        return self.text.fixed_axis(self.words, 1) or self.embed_texts(["object"]).shape[1]
 
     def require_width(self, numbers: int, what: str) -> None:
-        """Check that an artifact was made for vectors of this CLIP's width.
-
-        Raises:
-            MisalignedArtifactError: the widths differ.
-        """
+        """Raise a MisalignedArtifactError unless an artifact was made for vectors of this CLIP's width."""
         if self.width != numbers:
             raise MisalignedArtifactError(
                 f"{what} does not belong to the CLIP in {self.model.folder}",
@@ -148,19 +150,9 @@ class ClipModel:
 
     def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
         """Return the unit vectors of square crops of `side_px`."""
-        pixels = next(iter(self.vision.spec.inputs))
-        step = self.vision.fixed_axis(pixels, 0) or len(crops)  # open_clip's exports take one image per call
+        step = self.crops_per_call or len(crops)
         pieces = np.split(self.prepare(crops), range(step, len(crops), step))
-        return unit(np.concatenate([self.vision(**{pixels: piece})[0] for piece in pieces]))
-
-    def seconds(self, network: Network) -> float:
-        """Measure the seconds per crop of the vision network or a version of it."""
-        pixels = next(iter(self.vision.spec.inputs))
-        crops = np.zeros((self.vision.fixed_axis(pixels, 0) or 1, self.side_px, self.side_px, 3), np.uint8)
-        network(**{pixels: self.prepare(crops)})
-        start = time.perf_counter()
-        network(**{pixels: self.prepare(crops)})
-        return (time.perf_counter() - start) / len(crops)
+        return unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
 
     def embed_picture(self, picture: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, " C"]:
         """Return the unit vector of a whole image, centred in a black square like mask crops."""
@@ -174,14 +166,7 @@ class ClipModel:
         settings: ClipSettings | None = None,
         rows: Int64[np.ndarray, " m"] | None = None,
     ) -> Float16[np.ndarray, "m C"]:
-        """Return a unit vector for each mask of a view, computed from its crop (`segment.crops`).
-
-        Args:
-            image: the view.
-            masks: its masks.
-            settings: background outside the mask and crops per network call; None for the defaults.
-            rows: rows of the masks to embed; None for all.
-        """
+        """Return a unit vector for each mask of a view, or for the given rows (see `crop`)."""
         settings = settings or ClipSettings()
         chosen = range(len(masks)) if rows is None else rows.tolist()
 
@@ -204,12 +189,9 @@ class ClipModel:
         return crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px, as_langsplat)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
-        """Return the unit vectors of texts, in order, each inserted into the template.
+        """Return the unit vectors of texts, each inserted into the template (ModelError: one has no token).
 
         Texts are embedded one by one, so a vector never depends on other queries. Vectors are cached.
-
-        Raises:
-            ModelError: a text has no token.
         """
         for text in texts:
             if text not in self._known_texts:
@@ -251,11 +233,6 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
     The model is identified by its digest. The search covers the recorded path and every folder in `models/`,
     each relative to the working directory, to the parent folders of the artifact (such as the project of the
     results) and to the installation, and the user's models. The vision network is opened on first use.
-
-    Args:
-        clip_folder: output of the clip stage.
-        threads: as in `ClipModel.load`.
-        template: as in `ClipModel.load`.
 
     Raises:
         ModelError: no CLIP found has the digest of the one that embedded the masks.

@@ -37,7 +37,6 @@ def export_langsplat(scene: Scene, masks: Path, clip: Path, gaussians: Path, out
     """Export a scene as LangSplat's input: images, `sparse/0`, `language_features/` and `point_cloud.ply`.
 
     Args:
-        scene: the posed scene.
         masks, clip: masks of its training views, and a CLIP vector for each mask.
         gaussians: the scene's PLY.
         out: folder to write; an existing one is replaced.
@@ -53,12 +52,7 @@ def export_langsplat(scene: Scene, masks: Path, clip: Path, gaussians: Path, out
 
 
 def write_langsplat(masks_folder: Path, clip_folder: Path, folder: Path) -> None:
-    """Write `<stem>_s.npy` and `<stem>_f.npy` of every view that has masks.
-
-    Raises:
-        MisalignedArtifactError: the vectors were computed from other masks.
-        ArtifactError: a mask has no vector.
-    """
+    """Write `<stem>_s.npy` and `<stem>_f.npy` of all views with masks; errors as in `export_langsplat`."""
     folder.mkdir(parents=True, exist_ok=True)
     digests = digests_in(masks_folder)
     require_same_masks(clip_folder, masks_folder)

@@ -19,11 +19,7 @@ from hilsplat.base.levels import Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, unit
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.digests import (
-    MASKS_SHA256,
-    digest_of,
-    index_entry,
-)
+from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 from hilsplat.segment.stage import train_views
 from hilsplat.settings import ClipSettings
@@ -50,11 +46,7 @@ def stem_of(view: str) -> str:
 
 
 def stems_of(views: list[str]) -> dict[str, str]:
-    """Return the stem of each view.
-
-    Raises:
-        ArtifactError: two views have the same stem.
-    """
+    """Return the stem of each view, or raise an ArtifactError if two views have the same one."""
     stems = {view: stem_of(view) for view in views}
     twins = [view for view in views if list(stems.values()).count(stems[view]) > 1]
     if twins:
@@ -76,7 +68,6 @@ def read_view(
 
     Args:
         folder: folder of `<stem>_s.npy` and `<stem>_f.npy`.
-        view: name of the view.
         size_hw: size of the view; maps of another size with the same aspect ratio, such as LangSplat's 1080
             rows, are read at the nearest pixel.
 
@@ -116,37 +107,33 @@ def read_view(
                 found=f"{labels.shape[1:]}",
                 fix="make both from the same image; poses that undistort an image change its shape",
             )
-        at = [
-            ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size_hw, labels.shape[1:], strict=True)
-        ]
-        labels = labels[:, at[0][:, None], at[1][None, :]]
-    parts, rows = [], []
+        rows, columns = (
+            ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size_hw, (height, width), strict=True)
+        )
+        labels = labels[:, rows[:, None], columns]
+    parts, vector_rows = [], []
     for place, level in enumerate(MAPS):
         if level is None:
             continue
         chosen = np.unique(labels[place])
         chosen = chosen[chosen >= 0]
         ones = np.ones(len(chosen), np.float32)
-        runs, offsets = runs_of_labels(labels[place], chosen)
-        levels = np.full(len(chosen), int(level), np.uint8)
-        parts.append(HierarchicalMasks.from_runs(runs, offsets, levels, ones, ones, size_hw))
-        rows.append(chosen)
+        runs = runs_of_labels(labels[place], chosen)
+        parts.append(HierarchicalMasks.from_runs(*runs, level, ones, ones, size_hw))
+        vector_rows.append(chosen)
     masks = HierarchicalMasks.concatenate(parts, size_hw)
     order = masks.content_order()
-    return masks.take(order), unit(vectors[np.concatenate(rows)[order]].astype(np.float32)).astype(np.float16)
+    found = vectors[np.concatenate(vector_rows)[order]].astype(np.float32)
+    return masks.take(order), unit(found).astype(np.float16)
 
 
 def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Read the masks and vectors of the training views that have files.
-
-    Raises:
-        ArtifactError: fewer than half of the training views have files.
-    """
-    stems = stems_of(train_views(scene))
-    views = [view for view, stem in stems.items() if (folder / f"{stem}_s.npy").is_file()]
-    missing = [f"{stem}_s.npy" for view, stem in stems.items() if view not in views]
-    lacking = f"{folder} lacks the maps of {len(missing)} of {len(stems)} training views of {scene.name}"
-    if len(views) < LEAST_SHARE * len(stems):
+    """Read the training views that have files; raise an ArtifactError if these are less than half of them."""
+    maps = {view: f"{stem}_s.npy" for view, stem in stems_of(train_views(scene)).items()}
+    views = [view for view, name in maps.items() if (folder / name).is_file()]
+    missing = [name for view, name in maps.items() if view not in views]
+    lacking = f"{folder} lacks the maps of {len(missing)} of {len(maps)} training views of {scene.name}"
+    if len(views) < LEAST_SHARE * len(maps):
         raise ArtifactError(
             lacking,
             expected=", ".join(missing[:5]),
@@ -218,8 +205,7 @@ def _require_model(
 ) -> None:
     """Embed some masks of a view again, as LangSplat does, and compare the vectors.
 
-    Raises:
-        MisalignedArtifactError: the vectors differ. Comparing widths alone would not distinguish all CLIPs.
+    Comparing widths alone would not distinguish all CLIPs.
     """
     view = max(found, key=lambda view: len(found[view][0]))
     masks, vectors = found[view]

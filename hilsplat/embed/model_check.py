@@ -1,6 +1,9 @@
 """Checks and descriptions of model folders, and measurements of their speed on this machine."""
 
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,14 +26,7 @@ Seconds = dict[str, float]
 
 
 def check_model(folder: Path, variant: str = "") -> str:
-    """Run each network of a model on an empty input, also in int8, and describe the model.
-
-    Args:
-        folder: model folder in a layout of `models.layouts`.
-        variant: suffix of the network names, such as `fp16`.
-
-    Returns:
-        kind, image size, shapes, digest, execution provider and time, one per line.
+    """Run each network of a model on an empty input, also in int8, and describe the model line by line.
 
     Raises:
         ModelError: as in `open_model_folder` and `Network`.
@@ -68,18 +64,14 @@ def check_model(folder: Path, variant: str = "") -> str:
 
 
 def provider_disagreement(folder: Path) -> str | None:
-    """Describe how outputs of the image network for a random image differ between providers, or return None.
-
-    Raises:
-        ModelError: as in `open_model_folder` and `Network`.
-    """
+    """Describe how the image network differs between providers on a random image; None if it agrees."""
     model = open_model_folder(folder)
-    name = "vision_encoder" if model.kind == "sam" else "vision_model"
-    side = input_side_px(model)
-    pixels = np.random.default_rng(0).normal(size=(1, 3, side, side)).astype(np.float32)
     providers = execution_providers()
     if len(providers) < 2:
         return None
+    name = "vision_encoder" if model.kind == "sam" else "vision_model"
+    side = input_side_px(model)
+    pixels = np.random.default_rng(0).normal(size=(1, 3, side, side)).astype(np.float32)
     outputs = {
         provider: model.network(name, provider=provider)(pixel_values=pixels) for provider in providers
     }
@@ -96,13 +88,8 @@ def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Secon
     """Return the timings of a model, from an earlier measurement if there is one.
 
     Args:
-        folder: the model folder.
-        variant: as in `check_model`.
         precision: "fp32", or "auto" or "int8" for int8 where possible.
         cache: folder of the measurements.
-
-    Raises:
-        ModelError: the model cannot be opened.
     """
     model = open_model_folder(folder, variant=variant)
     requested = "fp32" if precision == "fp32" else _precisions(model)[-1]
@@ -118,13 +105,28 @@ def _precisions(model: ModelFolder) -> list[str]:
 
 
 def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
-    if isinstance(model, SamModel):
-        encoder = model.int8_encoder(CACHE) if precision == "int8" else model.encoder
-        side = input_side_px(model.model)
-        return model.seconds(np.zeros((side, side, 3), np.uint8), encoder)
-    is_int8 = precision == "int8"
-    network = int8_network(model.model, "vision_model", CACHE) if is_int8 else model.vision
-    return {"crop": model.seconds(network)}
+    side, is_int8 = input_side_px(model.model), precision == "int8"
+    if isinstance(model, ClipModel):
+        network = int8_network(model.model, "vision_model", CACHE) if is_int8 else model.vision
+        crops = np.zeros((model.crops_per_call or 1, side, side, 3), np.uint8)
+        _, seconds = _second_call(lambda: network(**{model.pixels: model.prepare(crops)}))
+        return {"crop": seconds / len(crops)}
+    encoder = model.int8_encoder(CACHE) if is_int8 else model.encoder
+    encoded, seconds = _second_call(lambda: model.encode(np.zeros((side, side, 3), np.uint8), encoder))
+    found = {"image": seconds}
+    prompts = model.prompts_per_call(1, 1)
+    for name, decode in (("masks", model.decode), ("preview", model.preview)):
+        if name == "masks" or model.previews:
+            _, seconds = _second_call(decode, encoded, np.full((prompts, 2), side / 2))
+            found[name] = seconds / prompts
+    return found
+
+
+def _second_call(call: Callable[..., Any], *given: object) -> tuple[Any, float]:
+    """Return the result and seconds of a second call; the first compiles, allocates memory, fills caches."""
+    call(*given)
+    start = time.perf_counter()
+    return call(*given), time.perf_counter() - start
 
 
 def _key(folder: Path, variant: str, precision: str) -> str:

@@ -61,14 +61,11 @@ def run_clip(
     """Embed the crops selected by the settings.
 
     Args:
-        scene_folder: the `Scene` artifact.
-        masks_folder: output of the masks stage.
         semantic_tree_folder: output of the semantic tree stage, with crop ranks; None to embed every mask.
         out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, zero for masks
             that were not selected, and `index.json` with C and the model.
         cache: folder of the view cache. Entries accumulate: a run that selects other masks embeds only masks
             that no earlier run embedded.
-        settings: model and cropping.
         threads: views embedded at once, if they fit into the memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None for all free memory.
 
@@ -92,7 +89,7 @@ def run_clip(
         require_same_masks(semantic_tree_folder, masks_folder)
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
     model = ClipModel(open_model_folder(Path(settings.model), "clip", variant=settings.variant))
-    _choose_precision(model, scene, masks_folder, chosen, cache, settings, threads)
+    _choose_precision(model, scene, masks_folder, digests, chosen, cache, settings, threads)
     needs = needs_of(model.model, settings.batch)
     threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
     view_cache = ViewCache(Path(cache) / "clip")
@@ -165,6 +162,7 @@ def _choose_precision(
     model: ClipModel,
     scene: Scene,
     masks_folder: Path,
+    digests: Mapping[str, str],
     chosen: Mapping[str, Int64[np.ndarray, " m"]] | None,
     cache: Path,
     settings: ClipSettings,
@@ -173,7 +171,6 @@ def _choose_precision(
     """Switch the model to int8 if the settings require it or it agrees with float32 on crops of the scene."""
     if settings.precision == "fp32" or not may_be_int8(model.model):
         return
-    digests = digests_in(masks_folder)
     entries = read_index(masks_folder)["views"]
     rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}
     places = [(view, row) for view in digests for row in rows[view].tolist()]
@@ -192,15 +189,14 @@ def _choose_precision(
         return int8_network(model.model, "vision_model", cache)
 
     def measure() -> Agreement:
-        pixels = next(iter(model.vision.spec.inputs))
-        quantised()  # computed once, before the threads start
+        network = quantised()  # computed once, before the threads start
 
         def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return model.embed_crops(one[None]), unit(quantised()(**{pixels: model.prepare(one[None])})[0])
+            (found,) = network(**{model.pixels: model.prepare(one[None])})
+            return model.embed_crops(one[None]), unit(found)
 
-        full, found = (
-            np.concatenate(each) for each in zip(*in_order(both, list(crops), threads), strict=True)
-        )
+        pairs = zip(*in_order(both, list(crops), threads), strict=True)
+        full, found = (np.concatenate(each) for each in pairs)
         return agreement_of_vectors(full, found, model.embed_texts(list(WORDS)))
 
     inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
@@ -209,19 +205,14 @@ def _choose_precision(
 
 
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:
-    """Return the rows of each view's masks that are among a node's best crops; all masks if there are none.
+    """Return the rows of each view's masks that are among a node's `per_node` best crops by rank.
 
-    Args:
-        semantic_tree_folder: output of the semantic tree stage.
-        per_node: maximum number of crops per node, by rank.
+    If there are none, all masks are returned.
     """
     rank = read_npz(sealed(semantic_tree_folder, "tree.npz"), "crop_rank")["crop_rank"]
     is_chosen = (rank >= 0) & (rank < per_node)
     if not is_chosen.any():
         is_chosen[:] = True
     counts = {view: entry["masks"] for view, entry in read_index(semantic_tree_folder)["views"].items()}
-    ends = np.cumsum(list(counts.values()))
-    return {
-        view: np.flatnonzero(is_chosen[end - count : end])
-        for (view, count), end in zip(counts.items(), ends.tolist(), strict=True)
-    }
+    parts = np.split(is_chosen, np.cumsum(list(counts.values())))
+    return {view: np.flatnonzero(part) for view, part in zip(counts, parts, strict=False)}

@@ -21,15 +21,15 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
-    parts = [read_npy(sealed(clip_folder, f"{view}.npy")) for view in views]
-    widths = {part.shape[1] if part.ndim == 2 else -1 for part in parts}
+    parts = {view: read_npy(sealed(clip_folder, f"{view}.npy")) for view in views}
+    widths = {part.shape[1] if part.ndim == 2 else -1 for part in parts.values()}
     if len(widths) > 1 or -1 in widths:
         raise ArtifactError(
             f"the CLIP vectors in {clip_folder} differ in width",
-            found=", ".join(f"{view}: {part.shape}" for view, part in zip(views, parts, strict=True))[:300],
+            found=", ".join(f"{view}: {part.shape}" for view, part in parts.items())[:300],
             fix=remake(Path(clip_folder)),
         )
-    for view, part in zip(views, parts, strict=True):
+    for view, part in parts.items():
         lengths = np.linalg.norm(part.astype(np.float32), axis=1)
         wrong = ~((lengths == 0) | (np.abs(lengths - 1) < UNIT_TOLERANCE))  # also NaN
         if wrong.any():
@@ -39,15 +39,11 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
                 found=f"length {lengths[wrong][0]}",
                 fix=remake(Path(clip_folder)),
             )
-    return np.concatenate(parts, dtype=np.float32)
+    return np.concatenate(list(parts.values()), dtype=np.float32)
 
 
 def require_every_vector(vectors: Shaped[np.ndarray, "M C"], clip_folder: Path, purpose: str) -> None:
-    """Check that every mask has a vector, not only the best crops of nodes.
-
-    Raises:
-        ArtifactError: a mask has no vector.
-    """
+    """Raise an ArtifactError unless every mask has a vector, not only the best crops of nodes."""
     without = int((~vectors.any(axis=1)).sum())
     if without:
         raise ArtifactError(

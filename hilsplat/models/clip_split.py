@@ -1,7 +1,7 @@
-"""Splitting of an exported CLIP's single network into an image and a text network.
+"""Splitting of the single network that optimum exports for a CLIP or a SigLIP.
 
-Optimum exports a CLIP or a SigLIP as `model.onnx`, which takes an image and a text together. The image
-vectors depend only on the image and the text vectors only on the text, so each half is a subgraph.
+`model.onnx` takes an image and a text together. The image vectors depend only on the image and the text
+vectors only on the text, so each half is a subgraph.
 """
 
 from pathlib import Path
@@ -31,11 +31,8 @@ def whole_clip(folder: Path) -> Path | None:
 def split_clip(folder: Path) -> list[Path]:
     """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP's `model.onnx`.
 
-    A network above 2 GiB has its weights in a separate file (`model.onnx_data`). They are not read or copied:
-    both halves refer to that file.
-
-    Returns:
-        the two files. `model.onnx` is kept but not needed; its weight file is still needed.
+    A network above 2 GiB has its weights in a separate file (`model.onnx_data`), to which both halves refer.
+    `model.onnx` itself is kept but not needed.
 
     Raises:
         ModelError: there is no `model.onnx`, it cannot be read, or it lacks an input or output.
@@ -54,11 +51,9 @@ def split_clip(folder: Path) -> list[Path]:
     except Exception as error:  # protobuf and onnx raise errors without a common base
         raise ModelError(f"network {whole} cannot be read: {error}", fix="export it again") from error
     inputs, outputs = ({value.name for value in part} for part in (model.graph.input, model.graph.output))
-    missing = [
-        name
-        for needed, given in HALVES.values()
-        for name in [*(set(needed) - inputs - OPTIONAL), *(set(given) - outputs)]
-    ]
+    missing = set[str]()
+    for needed, given in HALVES.values():
+        missing |= (set(needed) - inputs - OPTIONAL) | (set(given) - outputs)
     if missing:
         raise ModelError(
             f"network {whole} is not a whole CLIP: it lacks {', '.join(sorted(missing))}",
@@ -79,12 +74,6 @@ def split_clip(folder: Path) -> list[Path]:
 
 
 def split_whole(folder: Path) -> None:
-    """Replace a CLIP's `model.onnx` with the two networks; its separate weight file, if any, is kept.
-
-    Raises:
-        ModelError: as in `split_clip`.
-    """
-    whole = whole_clip(folder)
-    split_clip(folder)
-    if whole is not None:
-        whole.unlink()
+    """Replace a CLIP's `model.onnx` with the networks of `split_clip`; its weight file, if any, is kept."""
+    vision, _ = split_clip(folder)
+    vision.with_name(WHOLE).unlink()

@@ -22,7 +22,6 @@ from hilsplat.models.layouts import (
     SECTIONS,
     SUPPORTED,
     TORCH_SUFFIXES,
-    NetworkSpec,
     layout_of,
 )
 from hilsplat.models.network import Network
@@ -37,9 +36,7 @@ class ModelFolder:
     """A complete model folder.
 
     Attributes:
-        folder: path of the folder, as returned by `model_path`.
         layout: key of `LAYOUTS`.
-        config: content of `config.json`.
         preprocessing: image preprocessing, with the keys of `preprocessor_config.json`.
         networks: file of each network by name, including optional networks that exist.
         files: all files included in the digest.
@@ -69,11 +66,9 @@ class ModelFolder:
             [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
         )
 
-    def network(
-        self, name: str, threads: int = 1, graph: bytes | None = None, provider: str | None = None
-    ) -> Network:
+    def network(self, name: str, graph: bytes | None = None, provider: str | None = None) -> Network:
         """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
-        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], threads, graph, provider)
+        return Network(self.networks[name], LAYOUTS[self.layout].usable[name], graph, provider)
 
 
 def open_model_folder(
@@ -82,13 +77,12 @@ def open_model_folder(
     """Find the files of a model and check that they are complete.
 
     Args:
-        folder: the model folder.
         kind: "sam" or "clip"; None accepts either.
         variant: suffix of the network names, such as `fp16` for `vision_encoder_fp16.onnx`; "" for none.
         fix: alternative fix, added to the message about missing files.
 
-        Raises:
-            ModelError: the folder or some of its files are missing, or it contains another kind of model.
+    Raises:
+        ModelError: the folder or some of its files are missing, or it contains another kind of model.
     """
     folder = model_path(folder)
     way_out = "name a folder in a layout that docs/models.md lists" + (f", or {fix}" if fix else "")
@@ -96,39 +90,27 @@ def open_model_folder(
         raise ModelError(f"model folder {folder} is missing", fix=way_out)
     name, config = _layout_of(folder, kind, way_out)
     layout = LAYOUTS[name]
-    networks = {
-        network: found
-        for network, spec in layout.usable.items()
-        if (found := _network_file(folder, spec, variant)) is not None
-    }
-    missing = [
-        f"{spec.places[-1]}{_ending(variant)}.onnx"
-        for network, spec in layout.networks.items()
-        if network not in networks
-    ]
+    ending = f"_{variant}.onnx" if variant else ".onnx"
+    networks, missing = {}, []
+    for network, spec in layout.usable.items():
+        places = [folder / f"{place}{ending}" for place in spec.places]
+        found = next((place for place in places if place.is_file()), None)
+        if found is not None:
+            networks[network] = found
+        elif network in layout.networks:
+            missing.append(f"{spec.places[-1]}{ending}")
     missing += [file for file in layout.described if not (folder / file).is_file()]
     if missing:
         raise _incomplete(folder, name, missing, variant, fix)
     preprocessing = _preprocessing_of(folder / layout.preprocessing)
-    weights = {path for network in networks.values() for path in external_weights(network, folder)}
-    beside = [folder / file for file in layout.beside if (folder / file).is_file()]
-    described = [folder / file for file in layout.described]
-    return ModelFolder(
-        folder,
-        name,
-        config,
-        preprocessing,
-        networks,
-        tuple(sorted({*described, *beside, *networks.values(), *weights})),
-    )
+    weights = [path for network in networks.values() for path in external_weights(network, folder)]
+    described = [folder / file for file in (*layout.described, *layout.beside) if (folder / file).is_file()]
+    files = tuple(sorted({*described, *networks.values(), *weights}))
+    return ModelFolder(folder, name, config, preprocessing, networks, files)
 
 
 def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[str, Any]]:
-    """Return the layout and configuration of a folder.
-
-    Raises:
-        ModelError: it does not contain a supported model, or contains one of another kind.
-    """
+    """Return the layout and configuration of a folder, or raise a ModelError if it is of another kind."""
     supported = "; ".join(SUPPORTED[each] for each in ([kind] if kind else SUPPORTED))
     try:
         config = read_json(folder / "config.json")
@@ -149,15 +131,6 @@ def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[
             fix=OTHER_TYPES.get(str(model_type), way_out),
         )
     return name, config
-
-
-def _ending(variant: str) -> str:
-    return f"_{variant}" if variant else ""
-
-
-def _network_file(folder: Path, spec: NetworkSpec, variant: str) -> Path | None:
-    places = (folder / f"{place}{_ending(variant)}.onnx" for place in spec.places)
-    return next((place for place in places if place.is_file()), None)
 
 
 def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: str) -> ModelError:
@@ -191,17 +164,17 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: 
 
 def variants_of(folder: Path, layout: str) -> list[str]:
     """Return the suffixes, such as `fp16`, for which a folder has all networks; "" for the plain names."""
-    endings: set[str] | None = None
+    found = []
     for spec in LAYOUTS[layout].networks.values():
-        have = set()
+        endings = set()
         for place in spec.places:
             stem = Path(place).name
             for path in (folder / place).parent.glob(f"{stem}*.onnx"):
-                rest = path.stem[len(stem) :]
+                rest = path.stem.removeprefix(stem)
                 if not rest or rest.startswith("_"):
-                    have.add(rest[1:])
-        endings = have if endings is None else endings & have
-    return sorted(endings or ())
+                    endings.add(rest[1:])
+        found.append(endings)
+    return sorted(set.intersection(*found))
 
 
 def _preprocessing_of(path: Path) -> dict[str, Any]:
@@ -288,18 +261,12 @@ def _tensors(graph: Any) -> Iterator[Any]:
 def side_px(size: Any, default: int) -> int:
     """Return the side of a square input, given a preprocessor's size (a number or a dict in any form)."""
     if isinstance(size, dict):
-        for key in ("longest_edge", "shortest_edge", "height"):
-            if key in size:
-                return int(size[key])
-        return default
+        size = next((size[key] for key in ("longest_edge", "shortest_edge", "height") if key in size), None)
     return int(size) if size else default
 
 
 def input_side_px(model: ModelFolder) -> int:
     """Return the side of the image network's square input, px."""
-    keys = ("pad_size", "size") if model.layout == "sam" else ("crop_size", "size")
-    default = 1024 if model.kind == "sam" else 224
-    for key in keys:
-        if model.preprocessing.get(key):
-            return side_px(model.preprocessing[key], default)
-    return default
+    key = "pad_size" if model.layout == "sam" else "crop_size"
+    size = model.preprocessing.get(key) or model.preprocessing.get("size")
+    return side_px(size, 1024 if model.kind == "sam" else 224)

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,6 +13,7 @@ from jaxtyping import Bool, Float
 from hilsplat.base.artifacts import ViewCache, atomic_path, sha256_of_bytes, sha256_of_file, sha256_of_json
 from hilsplat.models.folder import ModelFolder
 from hilsplat.models.network import Network, execution_providers
+from hilsplat.models.onnx_graph import needed_names
 
 logger = logging.getLogger(__name__)
 
@@ -49,10 +51,8 @@ def int8_network(
     It is stored beside the model folder, in `.int8`, under a digest of its source.
 
     Args:
-        model: the model folder.
-        name: name of the network.
         cache: folder to use instead if the model's parent folder is read-only.
-        graph: a modified graph to use instead of the file.
+        graph: a modified graph to use instead of the network's file.
         exact: outputs that stay in float32, such as sines of large arguments.
 
     Raises:
@@ -88,31 +88,20 @@ def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
         logging.disable(logging.NOTSET)
 
 
-def _leading_only_to(graph: object, outputs: Sequence[str]) -> list[str]:
+def _leading_only_to(graph: Any, outputs: Sequence[str]) -> list[str]:
     """Return the names of nodes that are needed for the given outputs only."""
-    makers = {name: node for node in graph.node for name in node.output}  # type: ignore[attr-defined]
-
-    def needed(names: Sequence[str]) -> set[str]:
-        found, waiting = set[str](), list(names)
-        while waiting:
-            node = makers.get(waiting.pop())
-            if node is not None and node.name not in found:
-                found.add(node.name)
-                waiting += node.input
-        return found
-
-    others = [each.name for each in graph.output if each.name not in outputs]  # type: ignore[attr-defined]
-    return sorted(needed(list(outputs)) - needed(others))
+    needed = needed_names(graph, outputs)
+    others = needed_names(graph, [each.name for each in graph.output if each.name not in outputs])
+    return sorted(
+        node.name
+        for node in graph.node
+        if needed.intersection(node.output) and others.isdisjoint(node.output)
+    )
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of an int8 network with its float32 original.
-
-    Attributes:
-        values: measured values by name.
-        least: minimum of each value.
-    """
+    """Agreement of an int8 network with its float32 original: measured values by name, and their minima."""
 
     values: dict[str, float]
     least: dict[str, float]
@@ -121,20 +110,13 @@ class Agreement:
         """Return whether to use int8 (`precision` is "auto" or "int8"), and log the decision."""
         agrees = all(self.values[name] >= least for name, least in self.least.items())
         use = agrees or precision == "int8"
-        said = ", ".join(
-            f"{name} {self.values[name]:.4f} (least: {least})" for name, least in self.least.items()
-        )
+        said = ", ".join(f"{name} {self.values[name]:.4f} (least: {at})" for name, at in self.least.items())
         logger.info("%s runs in %s. int8 and float32: %s", what, "int8" if use else "float32", said)
         return use
 
     @staticmethod
     def remembered(cache: Path, inputs: object, measure: Callable[[], "Agreement"]) -> "Agreement":
-        """Return the cached agreement for the same inputs, or measure it.
-
-        Args:
-            cache: folder of the caches.
-            inputs: digests of the model and of the data it is checked on.
-        """
+        """Return the cached agreement for the same inputs (digests of model and data), or measure it."""
 
         def arrays() -> dict[str, np.ndarray]:
             found = measure()

@@ -75,32 +75,24 @@ def _places(name: str) -> tuple[str, ...]:
 def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layout:
     """Return the layout of a SAM whose encoder passes the named features to its decoder."""
     encoded = dict.fromkeys(features, _ANY4)
-    return Layout(
-        "sam",
-        {
-            "vision_encoder": NetworkSpec(
-                {"pixel_values": _IMAGE}, encoded, places=_places("vision_encoder")
-            ),
-            DECODER: NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(DECODER)),
-        },
-        {PREVIEW: NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(PREVIEW))},
+    encoder = NetworkSpec({"pixel_values": _IMAGE}, encoded, (), _places("vision_encoder"))
+    decoder, preview = (
+        NetworkSpec(_POINTS | encoded, _MASKS, optional, _places(name)) for name in (DECODER, PREVIEW)
     )
+    return Layout("sam", {"vision_encoder": encoder, DECODER: decoder}, {PREVIEW: preview})
 
 
 def _image_and_text(image: str, text: str, optional: tuple[str, ...] = ()) -> Layout:
     """Return the layout of a Hugging Face CLIP export whose vectors have the given output names."""
-    synonyms = {"pooler_output": ("image_embeds", "text_embeds")}
-    others = [{image: synonyms[image][0]}, {text: synonyms[text][1]}] if image in synonyms else [{}, {}]
+    vision = NetworkSpec(
+        {"pixel_values": _IMAGE}, {image: _ANY2}, (), _places("vision_model"), {image: "image_embeds"}
+    )
+    texts = NetworkSpec(
+        {"input_ids": _ANY2}, {text: _ANY2}, optional, _places("text_model"), {text: "text_embeds"}
+    )
     return Layout(
         "clip",
-        {
-            "vision_model": NetworkSpec(
-                {"pixel_values": _IMAGE}, {image: _ANY2}, (), _places("vision_model"), others[0]
-            ),
-            "text_model": NetworkSpec(
-                {"input_ids": _ANY2}, {text: _ANY2}, optional, _places("text_model"), others[1]
-            ),
-        },
+        {"vision_model": vision, "text_model": texts},
         tokenizer="tokenizer.json",
         beside=("tokenizer_config.json", "special_tokens_map.json"),
     )

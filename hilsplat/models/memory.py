@@ -26,18 +26,17 @@ FACTORED_MIB = 250
 """Memory of all prompts of a 1024 px image in the factored decoder. Measured: 104 MiB while 1024 prompts are
 previewed, plus the masks of the prompts that are kept."""
 
+CLIP_TOKEN_MIB = 0.03
+"""Memory per patch of a crop in a CLIP, besides two arrays of attention weights. Measured: 521 MiB for 64
+crops in ViT-B/16."""
+
 UNKNOWN_BYTES_PER_PX = 400
 """Memory for encoding an image, per pixel, if the configuration does not describe the network (sam-tiny)."""
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Memory use of a model.
-
-    Attributes:
-        weights_mib: memory of the open networks.
-        view_mib: additional memory of each view processed at the same time.
-    """
+    """Memory use of a model: of the open networks, and of each view processed at the same time."""
 
     weights_mib: float
     view_mib: float
@@ -56,7 +55,6 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
     """Estimate the memory of a model from its configuration and file sizes.
 
     Args:
-        model: the model folder.
         batch: prompts (SAM) or crops (CLIP) per call.
         as_exported: run SAM's networks unchanged (see `segment.sam.SamModel.as_exported`).
     """
@@ -67,7 +65,8 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
     if not isinstance(vision, dict):
         picture, as_exported = side * side * UNKNOWN_BYTES_PER_PX / MIB, True
     elif model.kind == "clip":
-        picture = _crop_mib(vision, side)
+        tokens = (side / _patch_px(vision)) ** 2
+        picture = 2 * _attention_mib(vision, side) + CLIP_TOKEN_MIB * tokens
     elif model.layout == "sam" and not as_exported:
         patches = side / _patch_px(vision)
         features = patches**2 * vision.get("hidden_size", 768) * 4 / MIB
@@ -93,12 +92,6 @@ def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
 
 def _patch_px(vision: dict[str, Any]) -> int:
     return vision.get("patch_size", 16)
-
-
-def _crop_mib(vision: dict[str, Any], side_px: int) -> float:
-    """Return the memory of a crop in a CLIP, MiB. Measured: 521 MiB for 64 crops in ViT-B/16."""
-    tokens = (side_px / _patch_px(vision)) ** 2
-    return 2 * _attention_mib(vision, side_px) + 0.03 * tokens
 
 
 SYSTEM = Path("/")

@@ -32,18 +32,28 @@ def execution_providers() -> list[str]:
     return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
 
 
+def one_thread_session(network: bytes | str, providers: list[str]) -> onnxruntime.InferenceSession:
+    """Open a network (its graph or path) that runs in one thread per call.
+
+    Stages are faster if they process several views at once, and results then do not depend on the number of
+    threads.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(network, options, providers=providers)
+
+
 class Network:
     """An ONNX network with checked names; inputs are cast to its types, and outputs are float32.
 
-    By default, a call runs in one thread: stages are faster if they process several views at once, and
-    results then do not depend on the number of threads. Several threads may call a network.
+    Several threads may call a network (`one_thread_session`).
     """
 
     def __init__(
         self,
         path: Path,
         spec: NetworkSpec,
-        threads: int = 1,
         graph: bytes | None = None,
         provider: str | None = None,
     ) -> None:
@@ -52,7 +62,6 @@ class Network:
         Args:
             path: the `.onnx` file.
             spec: its inputs and outputs.
-            threads: number of threads per call.
             graph: a modified graph to use instead of the file (`onnx_graph`).
             provider: the only execution provider to use, or None for the first that works.
 
@@ -60,11 +69,6 @@ class Network:
             ModelError: it cannot be read, or its inputs or outputs have unexpected names or axes.
         """
         self.path = path
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-        options.log_severity_level = 3
         if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
             raise ModelError(
                 f"network {path} is a Git LFS pointer, not the network",
@@ -72,9 +76,8 @@ class Network:
                 fix="fetch the file itself: git lfs pull, or download it from the model's page",
             )
         try:
-            self.session = onnxruntime.InferenceSession(
-                graph or str(path), options, providers=[provider] if provider else execution_providers()
-            )
+            providers = [provider] if provider else execution_providers()
+            self.session = one_thread_session(graph or str(path), providers)
         except Exception as error:  # onnxruntime's errors share no public base class
             raise ModelError(
                 f"network {path} cannot be opened: {error}",
@@ -83,14 +86,11 @@ class Network:
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
-        names = {
-            name: other
-            for name, other in spec.synonyms.items()
-            if name not in self.outputs and other in self.outputs
-        }
-        self.spec = spec = replace(
-            spec, outputs={names.get(name, name): axes for name, axes in spec.outputs.items()}
-        )
+        outputs = {}
+        for name, axes in spec.outputs.items():
+            other = spec.synonyms.get(name, name)
+            outputs[other if name not in self.outputs and other in self.outputs else name] = axes
+        self.spec = spec = replace(spec, outputs=outputs)
         self._check("inputs", spec.inputs, self.inputs, spec.optional)
         self._check("outputs", spec.outputs, self.outputs, tuple(self.outputs))
         self.providers = self.session.get_providers()
@@ -117,14 +117,9 @@ class Network:
                 fix="export the model in the layout of the Hugging Face ONNX exports",
             )
 
-    def declared_axis(self, name: str, axis: int) -> int | None:
-        """Return the length of an output's axis, or None if the network does not declare it."""
-        shape = self.outputs[name].shape
-        return shape[axis] if shape and isinstance(shape[axis], int) else None
-
     def fixed_axis(self, name: str, axis: int) -> int | None:
-        """Return the length of an input's axis, or None if the network does not fix it."""
-        shape = self.inputs[name].shape
+        """Return the length of an axis of an input or output, or None if the network does not fix it."""
+        shape = {**self.outputs, **self.inputs}[name].shape
         return shape[axis] if shape and isinstance(shape[axis], int) else None
 
     def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
@@ -133,8 +128,11 @@ class Network:
         Raises:
             ModelError: the network rejects the inputs.
         """
-        used = {name: value for name, value in feeds.items() if name in self.inputs}
-        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in used.items()}
+        cast = {
+            name: np.asarray(value, DTYPES[self.inputs[name].type])
+            for name, value in feeds.items()
+            if name in self.inputs
+        }
         try:
             outputs = self.session.run(list(self.spec.outputs), cast)
         except Exception as error:  # onnxruntime's errors share no public base class
@@ -166,11 +164,7 @@ def _fits(shape: Sequence[Any], axes: Axes) -> bool:
 
 
 def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:
-    """Check that a decoder returns three masks per prompt.
-
-    Raises:
-        ModelError: the length of the third axis is not 3.
-    """
+    """Raise a ModelError unless a decoder returned three masks per prompt."""
     if iou_scores.shape[2] != 3 or pred_masks.shape[2] != 3:
         raise ModelError(
             f"decoder {path} does not return three masks per prompt",
@@ -181,11 +175,7 @@ def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarr
 
 
 def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:
-    """Check that the two networks of a CLIP return vectors of the same width; None if a width is unknown.
-
-    Raises:
-        ModelError: the widths differ.
-    """
+    """Raise a ModelError if the two networks of a CLIP return vectors of known, different widths."""
     if None not in (image_numbers, text_numbers) and image_numbers != text_numbers:
         raise ModelError(
             f"the two networks of {folder} do not belong together",

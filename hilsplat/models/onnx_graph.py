@@ -12,13 +12,7 @@ def keep_only(model: Any, outputs: Sequence[str]) -> None:
     import onnx
 
     graph = model.graph
-    makers = {name: node for node in graph.node for name in node.output}
-    needed, waiting = set[str](), list(outputs)
-    while waiting:
-        name = waiting.pop()
-        if name in makers and name not in needed:
-            waiting += _inputs(makers[name])
-        needed.add(name)
+    needed = needed_names(graph, outputs)
     kept = {
         "node": [node for node in graph.node if needed & set(node.output)],
         "initializer": [each for each in graph.initializer if each.name in needed],
@@ -31,6 +25,18 @@ def keep_only(model: Any, outputs: Sequence[str]) -> None:
         target = getattr(graph, field)
         del target[:]
         target.extend(values)
+
+
+def needed_names(graph: Any, outputs: Sequence[str]) -> set[str]:
+    """Return the names of all values that the given values are computed from, and of these."""
+    makers = {name: node for node in graph.node for name in node.output}
+    needed, waiting = set[str](), list(outputs)
+    while waiting:
+        name = waiting.pop()
+        if name in makers and name not in needed:
+            waiting += _inputs(makers[name])
+        needed.add(name)
+    return needed
 
 
 def _inputs(node: Any) -> list[str]:
@@ -49,7 +55,6 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
     Args:
         path: the `.onnx` file of a ViT encoder exported from transformers.
         layers: layers with global attention.
-        heads: attention heads per layer.
         side: patches per side of the image.
 
     Returns:
@@ -73,16 +78,8 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
         if sums is None or len(readers) != 1 or readers[0].op_type != "MatMul":
             return None
         (queries, keys), positions = sums
-        nodes = _row_loop(
-            f"rowwise.{layer}",
-            queries,
-            keys,
-            readers[0].input[1],
-            positions,
-            readers[0].output[0],
-            heads,
-            side,
-        )
+        values, output = readers[0].input[1], readers[0].output[0]
+        nodes = _row_loop(f"rowwise.{layer}", queries, keys, values, positions, output, heads, side)
         place = list(graph.node).index(readers[0])
         graph.node.remove(readers[0])
         for offset, node in enumerate(nodes):

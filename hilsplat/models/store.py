@@ -3,6 +3,8 @@
 This module is fast to import when a run is planned, because it opens no network.
 """
 
+import functools
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +13,7 @@ from typing import Any
 
 import platformdirs
 
-from hilsplat.base.artifacts import parse_json
+from hilsplat.base.artifacts import parse_json, sha256_of_path, write_json
 from hilsplat.base.files import project_path
 from hilsplat.models.layouts import LAYOUTS, layout_of
 
@@ -35,7 +37,6 @@ class Release:
     Attributes:
         name: name of its folder.
         family: "sam" or "clip".
-        repository: repository on the model hub.
         megabytes: approximate size of the download; the exact size is reported before a transfer.
         licence: licence of the weights.
         use: recommended use.
@@ -93,13 +94,7 @@ RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
 
 @dataclass(frozen=True)
 class PresentModel:
-    """An existing model folder; only opening it checks that it is complete.
-
-    Attributes:
-        folder: path of the folder.
-        family: "sam" or "clip".
-        embedded: whether it was trained on the synthetic world only.
-    """
+    """An existing model folder; only opening it checks that it is complete. Fields as in `read_model`."""
 
     folder: Path
     family: str
@@ -112,7 +107,10 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 
 
 def read_model(folder: Path) -> PresentModel | None:
-    """Return the model in a folder, or None if it has no network or its config.json is not supported."""
+    """Return the model in a folder, or None if it has no network or its config.json is not supported.
+
+    Its family is "sam" or "clip"; it is embedded if it was trained on the synthetic world only.
+    """
     place = model_path(folder)
     try:
         config = parse_json((place / "config.json").read_text(encoding="utf-8"))
@@ -169,6 +167,27 @@ def _folders(*stores: Path) -> list[Path]:
         path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*") if path.is_dir()
     ]
     return folders + [project_path(path) for path in EMBEDDED.values() if not stores]
+
+
+@functools.cache
+def model_digest(folder: Path, cache: Path) -> str:
+    """Return the digest of a model folder, or "... is missing"; the stage reports the fix.
+
+    Digests are kept in `cache` by the sizes and modification times of the files: reading ViT-H takes seconds.
+    """
+    if not folder.is_dir():
+        return f"{folder} is missing"
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    stamp = json.dumps([[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files])
+    memo = cache / "digests.json"
+    try:
+        known = parse_json(memo.read_text())
+    except (OSError, ValueError):
+        known = {}
+    if stamp not in known:
+        known[stamp] = sha256_of_path(folder)
+        write_json(memo, known)
+    return known[stamp]
 
 
 def real_model(family: str) -> Path | None:

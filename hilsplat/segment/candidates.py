@@ -158,10 +158,7 @@ def decode_candidates(
 ) -> Candidates:
     """Decode masks at grid points of the image and its crops, skipping repeats (`distinct_prompts`).
 
-    Args:
-        image: the view.
-        model, settings: SAM model and mask settings.
-        points: at least one point (x, y, px) that replaces the grid on the whole image; crops keep the grid.
+    `points` (x, y, px), at least one, replace the grid on the whole image; crops keep the grid.
     """
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)

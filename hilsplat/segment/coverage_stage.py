@@ -12,13 +12,9 @@ from hilsplat.settings import CoverageTreeSettings
 
 
 def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSettings) -> None:
-    """Build the coverage tree of every view.
+    """Write `<view>.npz` of every view with `parent` i32 (M) and `depth` u8 (M), and `index.json`.
 
-    Args:
-        masks_folder: output of `run_masks`.
-        out: folder to write: `<view>.npz` with `parent` i32 (M) and `depth` u8 (M), in the order of the
-            masks, and `index.json`.
-        settings: threshold.
+    Rows are in the order of the masks.
 
     Raises:
         MisalignedArtifactError: if the masks of a view differ from those recorded in their index.

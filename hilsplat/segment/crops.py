@@ -20,12 +20,9 @@ def square_crop(
     """Crop a mask's box with a margin, and make it square (`crop_to_square`).
 
     Args:
-        image: the view.
-        mask: region of the view, not empty.
-        background: see `crop_to_square`.
+        background, size: see `crop_to_square`.
         context: margin on each side of the box, as a share of the box's longer side, clipped at the
             border of the image.
-        size: side of the result, px.
 
     Raises:
         EmptyMaskError: if the mask has no pixel.

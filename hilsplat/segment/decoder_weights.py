@@ -74,9 +74,6 @@ class Attention:
 class DecoderGraph:
     """Graph of a decoder exported from transformers; its nodes are named after the modules.
 
-    Args:
-        path: the `.onnx` file.
-
     Raises:
         ModelError: if the graph lacks expected nodes, or weights are not float32.
     """
@@ -101,7 +98,7 @@ class DecoderGraph:
         return Linear(np.ascontiguousarray(weight.T), bias)
 
     def attention(self, module: str) -> Attention:
-        """Return the projections of an attention block."""
+        """Return an attention block."""
         out = "out" if self._find(f"{module}/out_proj/MatMul") is not None else "o"  # SAM, SAM 2
         return Attention(*(self.linear(f"{module}/{part}_proj") for part in ("q", "k", "v", out)))
 

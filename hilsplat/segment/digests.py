@@ -19,14 +19,10 @@ MASKS_SHA256 = "masks_sha256"
 
 def digest_of(masks: HierarchicalMasks) -> str:
     """Return the SHA-256 of all arrays of a view's masks: sizes, pixels, levels and scores, in row order."""
-    arrays = masks.arrays().items()
-    return sha256_of_bytes(
-        *(
-            part
-            for name, array in arrays
-            for part in (f"{name} {array.dtype.str} {array.shape}".encode(), array.tobytes())
-        )
-    )
+    parts = []
+    for name, array in masks.arrays().items():
+        parts += [f"{name} {array.dtype.str} {array.shape}".encode(), array.tobytes()]
+    return sha256_of_bytes(*parts)
 
 
 def pixel_digests(masks: HierarchicalMasks) -> list[str]:
@@ -64,8 +60,6 @@ def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> Hierarchi
     """Read a view's masks and check their digest, which adds 0.03 s for 48 views of 300 masks at 800 x 600.
 
     Args:
-        folder: masks artifact.
-        view: name of the view.
         digests: the digest that each view's masks must have (`digests_in`).
 
     Raises:

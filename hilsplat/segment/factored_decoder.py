@@ -28,6 +28,7 @@ from jaxtyping import Float, Float32, Float64
 
 from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
+from hilsplat.models.network import one_thread_session
 from hilsplat.segment import decoder_kernels as kernels
 from hilsplat.segment.decoder_weights import IMAGE_SIDE, TOKENS, DecoderGraph, Linear
 
@@ -208,7 +209,10 @@ class FactoredDecoder:
         self._mask_heads = [
             graph.perceptron(f"mask_decoder/output_hypernetworks_mlps.{k}") for k in (1, 2, 3)
         ]
-        self._tokens, self._image_side = _session(graph.until(TOKENS)), _session(graph.until(*IMAGE_SIDE))
+        self._tokens, self._image_side = (
+            one_thread_session(graph.until(*modules), ["CPUExecutionProvider"])
+            for modules in ((TOKENS,), IMAGE_SIDE)
+        )
         self.inner = len(self._reads[0].q.bias)
         # tokens depend only on the shapes of the features
         self._blank = {
@@ -238,15 +242,11 @@ class FactoredDecoder:
         self._bias1 = single(centred(b1 + wide(self._updates[1].out.bias)))
         self._gram0, self._gram1 = single(out0 @ out0.T), single(both @ both.T)
         read1, read2, update1 = self._reads[1], self._reads[2], self._updates[1]
-        self._low_read1, self._values1 = (
-            single(wide(read1.k.weight) @ scaled.T),
-            single(scaled @ read1.v.weight.T),
-        )
+        self._low_read1 = single(wide(read1.k.weight) @ scaled.T)
+        self._values1 = single(scaled @ read1.v.weight.T)
         self._low_update1 = single(wide(update1.q.weight) @ scaled.T)
-        self._low_read2, self._values2 = (
-            single(wide(read2.k.weight) @ finer.T),
-            single(finer @ read2.v.weight.T),
-        )
+        self._low_read2 = single(wide(read2.k.weight) @ finer.T)
+        self._values2 = single(finer @ read2.v.weight.T)
         # rows are (dy, dx, channel) and centred, so that the mean in the upscaling's layer norm is 0
         weight = wide(graph.parameter("mask_decoder/upscale_conv1/weight"))
         bias = np.tile(centred(wide(graph.parameter("mask_decoder/upscale_conv1/bias"))), 4)
@@ -262,10 +262,7 @@ class FactoredDecoder:
         )
 
     def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
-        """Compute the terms that all prompts of an image share.
-
-        Args:
-            features: encoder outputs by name, float32.
+        """Compute the terms that all prompts share from an encoder's outputs by name, float32.
 
         Raises:
             ModelError: if the image side cannot be cut into blocks.
@@ -343,7 +340,6 @@ class FactoredDecoder:
         """Decode prompts.
 
         Args:
-            image: output of `image`.
             points_xy: one foreground point per prompt, px of the network's input.
             fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first of them.
 
@@ -361,7 +357,7 @@ class FactoredDecoder:
 
         q = self._attend_tokens(0, pe, pe)
         rows = self._scores(read0.q(q + pe))
-        sums = PixelSums.empty(sizes, 0)
+        sums = PixelSums(sizes, 0)
         kernels.read_image(sizes, flat(rows), image.keys, image.values, sums.top, sums.sums)
         q = self._think(0, q + read0.out(joined(sums.values())))
 
@@ -382,7 +378,7 @@ class FactoredDecoder:
             low=flat(_low(rows, self._low_read1, change0)),
             offset=flat(_offsets(rows, read1.k, [d0, np.zeros_like(d0)])),
         )
-        sums = PixelSums.empty(sizes, factors)
+        sums = PixelSums(sizes, factors)
         e = np.empty(s1.size * up(factors), np.float32)
         kernels.update_and_read_first(
             sizes, channels, self._eps, image.first, first, sums.top, sums.sums, s1, e
@@ -394,6 +390,7 @@ class FactoredDecoder:
         kc = self._bias1 + last1 @ self._out1
         changes = np.concatenate([change0, change1], axis=1)
         d0g, kg = d0c * self._g2, kc * self._g2
+        squares = [(x * y).sum(axis=1) for x, y in ((d0c, d0c), (d0c, kc), (kc, kc))]
         rows = self._scores(read2.q(q + pe))
         second = SecondPrompts(
             update_keys=flat(keys1),
@@ -403,14 +400,12 @@ class FactoredDecoder:
             linear=flat(2 * np.stack([_along(changes, each @ self._both.T) for each in (d0c, kc)], axis=-1)),
             gram=flat(doubled_below(_between(changes, self._gram1))),
             last=flat(np.stack([last0, last1], axis=1)),
-            square=flat(
-                np.stack([(x * y).sum(axis=1) for x, y in ((d0c, d0c), (d0c, kc), (kc, kc))], axis=1)
-            ),
+            square=flat(np.stack(squares, axis=1)),
             queries=flat(rows),
             low=flat(_low(rows, self._low_read2, changes)),
             offset=flat(_offsets(rows, read2.k, [d0g, kg])),
         )
-        sums = PixelSums.empty(sizes, 2 * factors)
+        sums = PixelSums(sizes, 2 * factors)
         e2 = np.empty(s2.size * up(2 * factors), np.float32)
         kernels.update_and_read_second(
             sizes, channels, self._eps, image.second, second, s1, e, sums.top, sums.sums, s2, e2
@@ -425,6 +420,7 @@ class FactoredDecoder:
         if self._iou_sigmoid:
             iou = 1 / (1 + np.exp(-iou))
         first_mask = self._iou_token + 2  # the first of four masks is for unambiguous prompts
+        combine = [_layers(head, q[:, first_mask + k]) for k, head in enumerate(self._mask_heads)]
         kept = {
             "keys0": keys0,
             "keys1": keys1,
@@ -435,9 +431,7 @@ class FactoredDecoder:
             "changes": changes,
             "both_scales": d0g @ self._upscale.T,
             "second_scale": kg @ self._upscale.T,
-            "combine": np.stack(
-                [_layers(head, q[:, first_mask + k]) for k, head in enumerate(self._mask_heads)], 1
-            ),
+            "combine": np.stack(combine, axis=1),
         }
         return single(iou), self._logits(image, kept, e2, fine=fine), kept
 
@@ -508,21 +502,14 @@ class FactoredDecoder:
         return values[:, :, :-1] - values[:, :, -1:], np.ascontiguousarray(x[:, -1])
 
 
-@dataclass(frozen=True)
 class PixelSums:
-    """Running sums of an attention of tokens to pixels (`decoder_kernels.pixel_weights`)."""
+    """Running sums of an attention of tokens to pixels with factors (`decoder_kernels.pixel_weights`)."""
 
-    sizes: tuple[int, ...]
-    factors: int
-    top: np.ndarray
-    sums: np.ndarray
-
-    @staticmethod
-    def empty(sizes: tuple[int, ...], factors: int) -> "PixelSums":
-        """Allocate the sums of an attention whose pixels have `factors` factors."""
+    def __init__(self, sizes: tuple[int, ...], factors: int) -> None:
         rows = sizes[0] * sizes[2] * sizes[3]
         width = sizes[6] + up(factors) + WIDTH
-        return PixelSums(sizes, factors, np.empty(rows, np.float32), np.empty(rows * width, np.float32))
+        self.sizes, self.factors = sizes, factors
+        self.top, self.sums = np.empty(rows, np.float32), np.empty(rows * width, np.float32)
 
     def values(
         self, factor_values: np.ndarray | None = None, *scale_values: np.ndarray
@@ -542,14 +529,6 @@ class PixelSums:
         for scale, value in zip(scales, scale_values, strict=False):
             found = found + scale * value
         return found / total
-
-
-def _session(network: bytes) -> onnxruntime.InferenceSession:
-    """Open a subgraph of the decoder that uses one thread per call."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    return onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
 
 
 def _run(

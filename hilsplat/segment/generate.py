@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
 from hilsplat.base.levels import Level
-from hilsplat.segment import sam
 from hilsplat.segment.candidates import Candidates, crop_boxes
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
 from hilsplat.segment.masks import HierarchicalMasks, take_runs
-from hilsplat.segment.sam import HEADS, Frame, SamModel
+from hilsplat.segment.sam import HEADS, Frame, SamModel, frame_taps
 from hilsplat.segment.suppression import (
     last_inside,
     suppress_boxes,
@@ -49,7 +48,8 @@ def masks_from_candidates(
         per_crop, ranks = [], []
         for crop, crop_box in enumerate(boxes):
             rows = np.flatnonzero(enough & (candidates.head == head) & (candidates.crop == crop))
-            frame = _frame(crop_box, model)
+            left, top, right, bottom = crop_box.tolist()
+            frame = model.frame((bottom - top, right - left))
             masks = _upscale(candidates, rows, frame, crop_box, size_hw, level, official)
             masks = _suppressed(masks, None, settings)
             per_crop.append(masks)
@@ -63,12 +63,8 @@ def masks_from_candidates(
             masks = _suppressed(masks, (~changed).astype(np.float64), settings)
         streams.append(masks)
     pooled = HierarchicalMasks.concatenate(streams, size_hw)
-    return suppress_masks(
-        pooled,
-        iou_max=settings.nms_iou,
-        score_min=thresholds.nms_score,
-        inner=settings.nms_inner,
-    )
+    limits = {"iou_max": settings.nms_iou, "score_min": thresholds.nms_score, "inner": settings.nms_inner}
+    return suppress_masks(pooled, **limits)
 
 
 def _suppressed(
@@ -77,12 +73,6 @@ def _suppressed(
     """Drop masks whose box repeats that of a better mask, by `first`, then by predicted IoU."""
     suppress = suppress_boxes_officially if settings.generator == "official" else suppress_boxes
     return masks.take(suppress(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou, first))
-
-
-def _frame(crop_box: Int32[np.ndarray, " 4"], model: SamModel) -> Frame:
-    """Return the position of a crop in the network's input."""
-    left, top, right, bottom = (int(number) for number in crop_box)
-    return model.frame((bottom - top, right - left))
 
 
 def _upscale(
@@ -96,14 +86,12 @@ def _upscale(
 ) -> HierarchicalMasks:
     """Upscale candidates to masks of the view, without empty ones and those cut by the crop's edge."""
     low_h, low_w = candidates.low_hw.tolist()
-    along_y, along_x = sam.frame_taps((low_h, low_w), frame)
     runs, offsets = upscaled_runs(
         candidates.logits,
         candidates.offsets,
         candidates.window_xyxy,
         rows,
-        *along_y,
-        *along_x,
+        *frame_taps((low_h, low_w), frame),
         int(crop_box[1]),
         int(crop_box[0]),
         *size_hw,
@@ -112,12 +100,7 @@ def _upscale(
     keep = np.flatnonzero(np.diff(offsets) > 1)
     runs, offsets = take_runs(runs, offsets, keep)
     masks = HierarchicalMasks.from_runs(
-        runs,
-        offsets,
-        np.full(len(keep), int(level), np.uint8),
-        candidates.predicted_iou[rows[keep]],
-        candidates.stability[rows[keep]],
-        size_hw,
+        runs, offsets, level, candidates.predicted_iou[rows[keep]], candidates.stability[rows[keep]], size_hw
     )
     met = last_inside(masks.box_xyxy) if official else masks.box_xyxy
     return masks.take(np.flatnonzero(~cut_by_crop(met, crop_box, size_hw)))
@@ -128,12 +111,8 @@ def clean_masks(
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
     """Fill holes and drop islands below `min_area_px` (8-connected), and drop masks below it.
 
-    The largest island of a mask is always kept.
-
-    Args:
-        masks: masks to change.
-        min_area_px: minimum area of holes, islands and masks.
-        keep_small: keep masks below `min_area_px`, and count them as changed (SAM).
+    The largest island of a mask is always kept. With `keep_small`, masks below `min_area_px` are kept and
+    count as changed (SAM).
 
     Returns:
         the remaining masks, and which of them were changed.

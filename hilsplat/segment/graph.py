@@ -50,7 +50,6 @@ def segment_graph(
     in which every remaining merge costs at least `CONTRAST * s * sqrt(image area)`.
 
     Args:
-        image: the view.
         scales: least size at whole, part, subpart; none exceeds the one before.
         min_area_px: smaller regions are omitted.
 
@@ -65,10 +64,9 @@ def segment_graph(
     lab = to_lab(small)
     base = base_regions(small, min(scales))
     merges = merge_regions(base, lab)
-    size_px = base.size
-    thresholds = [CONTRAST * scale * size_px**0.5 for scale in scales]
     parts = []
-    for level, threshold in zip(LEVELS, thresholds, strict=True):
+    for level, scale in zip(LEVELS, scales, strict=True):
+        threshold = CONTRAST * scale * base.size**0.5
         labels, dies = cut(base, merges, threshold)
         border = border_contrast(labels, lab)
         end = max(merges[-1][0] if merges else threshold, threshold * 1.001)
@@ -79,7 +77,7 @@ def segment_graph(
         parts.append(
             HierarchicalMasks.from_runs(
                 *runs_of_labels(full, large),
-                np.full(len(large), int(level), np.uint8),
+                level,
                 np.clip(border[large] / CLEAR_EDGE, 0, 1).astype(np.float32),
                 life[large].astype(np.float32),
                 (height, width),
@@ -165,12 +163,8 @@ def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 
     """
     flat = labels.reshape(-1)
     area = np.bincount(flat).astype(np.float64).tolist()
-    colour = [
-        np.array(sums)
-        for sums in zip(
-            *(np.bincount(flat, weights=lab[..., axis].reshape(-1)) for axis in range(3)), strict=True
-        )
-    ]
+    sums = [np.bincount(flat, weights=lab[..., axis].reshape(-1)) for axis in range(3)]
+    colour = list(np.stack(sums, axis=1))
     texture = (roughness(labels, lab) * np.array(area)).tolist()
     border: list[dict[int, tuple[float, int]]] = [{} for _ in area]
     for (a, b), edge in neighbours(labels, lab).items():
@@ -224,10 +218,9 @@ def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 
 def cut(
     labels: Int32[np.ndarray, "H W"], merges: list[Merge], threshold: float
 ) -> tuple[Int32[np.ndarray, "H W"], Float[np.ndarray, " n"]]:
-    """Return the regions after all merges cheaper than `threshold`.
+    """Return the regions after all merges cheaper than `threshold`: labels 0..n-1.
 
-    Returns:
-        labels 0..n-1, and the cost at which each region merges next (infinity for the last one).
+    The second result is the cost at which each region merges next (infinity for the last one).
     """
     num_base = int(labels.max()) + 1
     owner = np.arange(num_base + len(merges))

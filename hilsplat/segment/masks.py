@@ -1,7 +1,7 @@
 """Overlapping masks of one view at three levels, run-length encoded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,33 +22,28 @@ LIMITS = {"level": (1, 3), "predicted_iou": (-1, 2), "stability": (0, 1)}
 def encode_runs(
     masks: Bool[np.ndarray, "M H W"],
 ) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M+1"]]:
-    """Encode each mask as run lengths, row by row, starting with a run of False (possibly of length 0).
-
-    Returns:
-        concatenated runs, and the M + 1 offsets of each mask's runs.
-    """
-    runs: list[np.ndarray] = []
-    offsets = np.zeros(len(masks) + 1, dtype=np.int64)
-    for row, mask in enumerate(masks):
+    """Encode each mask as run lengths, row by row, starting with a run of False (possibly of length 0)."""
+    pieces = []
+    for mask in masks:
         flat = mask.reshape(-1)
         edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-        borders = np.concatenate(([0], edges, [flat.size]))
-        lengths = np.diff(borders)
-        if flat.size and flat[0]:
-            lengths = np.concatenate(([0], lengths))
-        runs.append(lengths.astype(np.uint32))
-        offsets[row + 1] = offsets[row] + len(lengths)
-    return (np.concatenate(runs) if runs else np.zeros(0, np.uint32)), offsets
+        lengths = np.diff(edges, prepend=0, append=flat.size)
+        starts_inside = flat.size and flat[0]
+        pieces.append(np.insert(lengths, 0, 0) if starts_inside else lengths)
+    return _joined(pieces)
+
+
+def _joined(pieces: Sequence[np.ndarray]) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M_and_1"]]:
+    """Concatenate the runs of each mask, and return them with their offsets."""
+    offsets = np.cumsum([0, *(len(piece) for piece in pieces)], dtype=np.int64)
+    return np.concatenate([np.zeros(0, np.uint32), *pieces], dtype=np.uint32, casting="unsafe"), offsets
 
 
 def take_runs(
     runs: UInt32[np.ndarray, " R"], offsets: Int64[np.ndarray, " M_and_1"], rows: Int64[np.ndarray, " m"]
 ) -> tuple[UInt32[np.ndarray, " r"], Int64[np.ndarray, " m_and_1"]]:
     """Return the run lengths and offsets of the given rows, in the given order."""
-    pieces = [runs[offsets[row] : offsets[row + 1]] for row in rows]
-    taken = np.zeros(len(rows) + 1, dtype=np.int64)
-    taken[1:] = np.cumsum([len(piece) for piece in pieces])
-    return (np.concatenate(pieces) if pieces else np.zeros(0, np.uint32)), taken
+    return _joined([runs[offsets[row] : offsets[row + 1]] for row in rows])
 
 
 def runs_of_labels(
@@ -69,22 +64,24 @@ def runs_of_labels(
         edges = np.stack([starts[mine], stops[mine]], axis=1).reshape(-1)
         lengths = np.diff(edges, prepend=0)
         pieces.append(lengths if edges[-1] == flat.size else np.append(lengths, flat.size - edges[-1]))
-    offsets = np.cumsum([0, *(len(piece) for piece in pieces)], dtype=np.int64)
-    return np.concatenate([np.zeros(0, np.int64), *pieces]).astype(np.uint32), offsets
+    return _joined(pieces)
 
 
 def join_rows(parts: Sequence[Any], ragged: str, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Concatenate the rows of several tables (at least one), field by field.
 
     Args:
-        parts: tables with `offsets` into the field `ragged`.
-        ragged: field with a variable number of values per row.
+        ragged: field with a variable number of values per row, at `offsets`.
         names: the other fields to join, with one entry per row.
     """
     starts = np.cumsum([0, *(len(getattr(part, ragged)) for part in parts)])
     offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (ragged, *names)}
     return {"offsets": np.concatenate([np.zeros(1, np.int64), *offsets]), **joined}
+
+
+PER_MASK = ("level", "predicted_iou", "stability", "area_px", "box_xyxy")
+"""Fields of `HierarchicalMasks` with one entry per mask."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,6 @@ class HierarchicalMasks:
         level: `Level` of each mask as the segmenter gave it.
         predicted_iou: quality of each mask as estimated by the segmenter; SAM's may slightly exceed 1.
         stability: stability of each mask under a changed threshold, in [0, 1].
-        area_px: pixels of each mask.
         box_xyxy: box of each mask, px, end exclusive.
         size_hw: height and width of the view, px.
     """
@@ -121,49 +117,32 @@ class HierarchicalMasks:
         predicted_iou: Float32[np.ndarray, " M"],
         stability: Float32[np.ndarray, " M"],
     ) -> "HierarchicalMasks":
-        """Pack boolean masks.
-
-        Raises:
-            EmptyMaskError: if a mask has no pixel.
-        """
-        runs, offsets = encode_runs(masks)
+        """Pack boolean masks; errors as in `from_runs`."""
         size_hw = (int(masks.shape[1]), int(masks.shape[2]))
-        return HierarchicalMasks.from_runs(runs, offsets, level, predicted_iou, stability, size_hw)
+        return HierarchicalMasks.from_runs(*encode_runs(masks), level, predicted_iou, stability, size_hw)
 
     @staticmethod
     def from_runs(
         runs: UInt32[np.ndarray, " R"],
         offsets: Int64[np.ndarray, " M_and_1"],
-        level: UInt8[np.ndarray, " M"],
+        level: UInt8[np.ndarray, " M"] | Level,
         predicted_iou: Float32[np.ndarray, " M"],
         stability: Float32[np.ndarray, " M"],
         size_hw: tuple[int, int],
     ) -> "HierarchicalMasks":
-        """Build masks from run lengths; areas and boxes are computed.
-
-        Raises:
-            EmptyMaskError: if a mask has no pixel.
-        """
+        """Build masks of given levels, or of one level; raise an EmptyMaskError if a mask has no pixel."""
         area_px, boxes = areas_and_boxes(runs, offsets, size_hw[1])
         if not area_px.all():
             raise EmptyMaskError(
                 f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} have no pixel",
                 fix="drop empty masks before packing",
             )
-        return HierarchicalMasks(
-            runs,
-            offsets,
-            level.astype(np.uint8),
-            predicted_iou.astype(np.float32),
-            stability.astype(np.float32),
-            area_px,
-            boxes,
-            size_hw,
-        )
+        levels = np.full(len(area_px), level, np.uint8)
+        return HierarchicalMasks(runs, offsets, levels, predicted_iou, stability, area_px, boxes, size_hw)
 
     def dense(self, rows: Int64[np.ndarray, " m"] | None = None) -> Bool[np.ndarray, "m H W"]:
         """Decode all masks, or the given rows, to booleans."""
-        rows = np.arange(len(self)) if rows is None else np.asarray(rows)
+        rows = np.arange(len(self)) if rows is None else rows
         height, width = self.size_hw
         masks = np.empty((len(rows), height * width), dtype=bool)
         for out, row in enumerate(rows):
@@ -182,27 +161,16 @@ class HierarchicalMasks:
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "HierarchicalMasks":
         """Return the given rows, in the given order."""
-        return HierarchicalMasks(
-            *take_runs(self.runs, self.offsets, rows),
-            self.level[rows],
-            self.predicted_iou[rows],
-            self.stability[rows],
-            self.area_px[rows],
-            self.box_xyxy[rows],
-            self.size_hw,
-        )
+        runs, offsets = take_runs(self.runs, self.offsets, rows)
+        others = {name: getattr(self, name)[rows] for name in PER_MASK}
+        return replace(self, runs=runs, offsets=offsets, **others)
 
     @staticmethod
     def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
         """Concatenate the rows of all parts; `size_hw` is the view's size, px."""
-        empty = HierarchicalMasks.from_dense(
-            np.zeros((0, *size_hw), bool),
-            np.zeros(0, np.uint8),
-            np.zeros(0, np.float32),
-            np.zeros(0, np.float32),
-        )
-        names = ("level", "predicted_iou", "stability", "area_px", "box_xyxy")
-        return HierarchicalMasks(size_hw=size_hw, **join_rows([empty, *parts], "runs", names))
+        none = np.zeros(0, np.float32)
+        empty = HierarchicalMasks.from_dense(np.zeros((0, *size_hw), bool), none.astype(np.uint8), none, none)
+        return HierarchicalMasks(size_hw=size_hw, **join_rows([empty, *parts], "runs", PER_MASK))
 
     def content_order(self) -> Int64[np.ndarray, " M"]:
         """Return the rows sorted by content: level, decreasing area, box, predicted IoU, stability, runs.
@@ -228,11 +196,9 @@ class HierarchicalMasks:
         return np.flatnonzero(self.level == int(level))
 
     def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
-        """Paint the masks of a level (None: all), large to small, so that small ones stay visible.
+        """Paint the row numbers of a level's masks (None: all) on -1, large to small.
 
-        Returns:
-            row of the mask at each pixel, or -1 where there is none. Of two equally large masks the
-            lower row is painted last.
+        Small masks thus stay visible; of two equally large masks, the lower row is painted last.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
         rows = np.arange(len(self)) if level is None else self.rows_of(level)
@@ -246,31 +212,18 @@ class HierarchicalMasks:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all fields as plain arrays."""
-        return {
-            "runs": self.runs,
-            "offsets": self.offsets,
-            "level": self.level,
-            "predicted_iou": self.predicted_iou,
-            "stability": self.stability,
-            "area_px": self.area_px,
-            "box_xyxy": self.box_xyxy,
-            "size_hw": np.array(self.size_hw, dtype=np.int32),
-        }
+        return {**vars(self), "size_hw": np.array(self.size_hw, dtype=np.int32)}
 
     @staticmethod
     def from_arrays(arrays: dict[str, np.ndarray]) -> "HierarchicalMasks":
         """Build masks from the result of `arrays`."""
-        fields = dict(arrays)
-        height, width = fields.pop("size_hw")
-        return HierarchicalMasks(**fields, size_hw=(int(height), int(width)))
+        others = dict(arrays)
+        height, width = others.pop("size_hw").tolist()
+        return HierarchicalMasks(**others, size_hw=(height, width))
 
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
-        """Read `<view>.npz` and validate it.
-
-        Raises:
-            ArtifactError: if it is missing or damaged, or its arrays contradict each other.
-        """
+        """Read `<view>.npz`; raise an ArtifactError if it is missing or damaged, or its arrays contradict."""
         arrays = read_npz(path, *(field.name for field in fields(HierarchicalMasks)))
         size = arrays["size_hw"]
         is_size = size.shape == (2,) and size.dtype.kind in "iu"

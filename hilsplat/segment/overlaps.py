@@ -7,14 +7,9 @@ from jaxtyping import Bool, Float32, Int, Int64
 def region_ious(
     labels: Int[np.ndarray, "H W"], masks: Bool[np.ndarray, "M H W"]
 ) -> tuple[Int64[np.ndarray, " R"], Int64[np.ndarray, " R"], Float32[np.ndarray, "R M"]]:
-    """Return the IoU of every region with every mask.
+    """Return the ids of a label image's regions, their areas (px) and their IoUs with every mask.
 
-    Args:
-        labels: id per pixel, negative where there is no region.
-        masks: may overlap.
-
-    Returns:
-        ids of the regions in ascending order, their areas in pixels, and the IoUs.
+    Ids ascend. Labels are negative where there is no region; masks may overlap.
     """
     flat = labels.reshape(-1)
     ids, index = np.unique(flat, return_inverse=True)

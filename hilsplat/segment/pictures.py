@@ -56,12 +56,11 @@ def masks_picture(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw a view and its three levels side by side, with the number of masks of each."""
     factor = max(1, -(-min_side_px // max(image.shape[:2])))
-    panels = [("photo", image)]
-    panels += [
-        (f"{level.label}: {len(masks.rows_of(level))}", paint_level(image, masks, level)) for level in LEVELS
-    ]
+    panels = {"photo": image}
+    for level in LEVELS:
+        panels[f"{level.label}: {len(masks.rows_of(level))}"] = paint_level(image, masks, level)
     drawn = []
-    for title, panel in panels:
+    for title, panel in panels.items():
         large = np.repeat(np.repeat(panel, factor, axis=0), factor, axis=1)
         header = np.full((28, large.shape[1], 3), 255, dtype=np.uint8)
         cv2.putText(header, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
@@ -81,13 +80,8 @@ def tree_picture(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the largest coverage trees of a view: roots at the left, children to the right.
 
-    A mask is shown as its crop, dimmed outside and framed in its colour in `masks_picture`.
-
-    Args:
-        image: the view.
-        masks: its masks.
-        parent: row of each mask's parent, or `NONE`.
-        max_leaves: rows of the picture; trees that don't fit are omitted.
+    A mask is shown as its crop, dimmed outside and framed in its colour in `masks_picture`. Trees that don't
+    fit into `max_leaves` rows are omitted.
     """
     children: dict[int, list[int]] = {}
     for row, above in enumerate(parent.tolist()):
@@ -143,17 +137,12 @@ def masks_overview(
     view: str | None = None,
     tree_folder: Path | None = None,
 ) -> str:
-    """Write a picture of one view with its masks at three levels, and optionally one of its trees.
+    """Draw one view with its masks at three levels, and optionally its trees; return the view's name.
 
     Args:
-        scene_folder: the `Scene` artifact.
-        masks_folder: output of the masks stage.
         out_png: file to write; the trees are written beside it as `<name>_tree.png`.
         view: view name; None selects the middle one of the views that have masks.
         tree_folder: output of the coverage_tree stage; None draws no trees.
-
-    Returns:
-        name of the view.
 
     Raises:
         ArtifactError: if the view has no masks.

@@ -6,7 +6,6 @@ exports are read. The rounding of logits (`read_logits`) is ours.
 
 import logging
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -67,7 +66,6 @@ class Encoded:
 
     Attributes:
         features: inputs of the decoder by name, float32 (1, C, h, w).
-        frame: position of the image in the input.
         terms: per-image arrays of the factored decoder, if the model has one.
     """
 
@@ -122,7 +120,6 @@ class SamModel:
     """A SAM model folder, opened for inference.
 
     Attributes:
-        own: default thresholds of the model.
         stretches: whether images are stretched to a square (SAM 2) or padded (SAM).
         previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
         factored: the equivalent, much faster decoder, if the model's graph can be factored.
@@ -167,14 +164,7 @@ class SamModel:
     def choose_precision(
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
-        """Use int8 if the settings require it, or if its masks of these images agree with those of float32.
-
-        Args:
-            precision: `masks.precision`.
-            images: photographs of the scene.
-            cache: folder of the caches.
-            threads: images processed in parallel.
-        """
+        """Use int8 if `masks.precision` requires it, or if its masks of these images agree with float32's."""
         if precision == "fp32" or not may_be_int8(self.model):
             return
         quantised = self.int8_encoder(cache)
@@ -184,9 +174,9 @@ class SamModel:
         def masks(work: tuple[np.ndarray, Network]) -> np.ndarray:
             image, encoder = work
             encoded, points = self.encode(image, encoder), grid * (image.shape[1], image.shape[0])
-            starts = range(0, len(grid), batch)
-            logits = [self.decode(encoded, points[start : start + batch])[1] for start in starts]
-            return np.concatenate([each.reshape(-1, *each.shape[2:]) > 0 for each in logits])
+            pieces = np.split(points, range(batch, len(points), batch))
+            logits = np.concatenate([self.decode(encoded, piece)[1] for piece in pieces])
+            return logits.reshape(-1, *logits.shape[2:]) > 0
 
         def measure() -> Agreement:
             work = [(image, encoder) for encoder in (self.encoder, quantised) for image in images]
@@ -204,30 +194,11 @@ class SamModel:
         exact = [name for name in self.encoder.outputs if name == "image_positional_embeddings"]
         return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
 
-    def seconds(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network) -> dict[str, float]:
-        """Measure the seconds per image of an encoder, and per prompt of the decoder's masks and preview."""
-        self.encode(image, encoder)  # the first call allocates memory
-        start = time.perf_counter()
-        encoded = self.encode(image, encoder)
-        found = {"image": time.perf_counter() - start}
-        prompts = self.prompts_per_call(1, 1)
-        points = np.tile(np.array(image.shape[1::-1]) / 2, (prompts, 1))
-        for name, decode in (("masks", self.decode), ("preview", self.preview)):
-            if name == "masks" or self.previews:
-                decode(encoded, points)  # compiles, and loads weights into the caches
-                start = time.perf_counter()
-                decode(encoded, points)
-                found[name] = (time.perf_counter() - start) / prompts
-        return found
-
     def _rowwise_encoder(self) -> bytes | None:
         """Rewrite a ViT's global attentions for the CPU; None for other encoders or on a GPU."""
         vision = self.model.config.get("vision_config")
-        if (
-            self.stretches
-            or not isinstance(vision, dict)
-            or execution_providers()[0] != "CPUExecutionProvider"
-        ):
+        on_cpu = execution_providers()[0] == "CPUExecutionProvider"
+        if self.stretches or not isinstance(vision, dict) or not on_cpu:
             return None
         graph = with_rowwise_attention(
             self.model.networks["vision_encoder"],
@@ -241,9 +212,8 @@ class SamModel:
 
     def _factor(self) -> FactoredDecoder | None:
         """Factor the decoder and check it against the network; None if that fails."""
-        heads = self.model.config.get("mask_decoder_config", {}).get(
-            "num_attention_heads", HEADS_PER_ATTENTION
-        )
+        described = self.model.config.get("mask_decoder_config", {})
+        heads = described.get("num_attention_heads", HEADS_PER_ATTENTION)
         try:
             factored = FactoredDecoder(DecoderGraph(self.model.networks[DECODER]), heads)
             apart = largest_difference(factored, self.decoder, self.padded_hw[0])
@@ -261,11 +231,7 @@ class SamModel:
 
     @staticmethod
     def load(folder: Path, variant: str = "") -> "SamModel":
-        """Open a model folder.
-
-        Args:
-            folder: folder in a layout of `models.layouts`.
-            variant: suffix of the networks' names, such as `fp16`.
+        """Open a model folder (`open_model_folder`).
 
         Raises:
             ModelError: if it is missing, incomplete or not a SAM.
@@ -286,15 +252,13 @@ class SamModel:
 
     def prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> tuple[Float32[np.ndarray, "1 3 h w"], Frame]:
         """Resize and normalise an image, and pad it with zeros at the right and bottom."""
-        original = (image.shape[0], image.shape[1])
-        frame = self.frame(original)
-        resized = frame.resized_hw
-        if resized != original:
-            shrunk = Image.fromarray(image).resize((resized[1], resized[0]), self.resample)
-            image = np.asarray(shrunk)
+        frame = self.frame((image.shape[0], image.shape[1]))
+        height, width = frame.resized_hw
+        if frame.resized_hw != frame.original_hw:
+            image = np.asarray(Image.fromarray(image).resize((width, height), self.resample))
         values = (image.astype(np.float32) * self.rescale - self.mean) / self.std
         padded = np.zeros((1, 3, *self.padded_hw), dtype=np.float32)
-        padded[0, :, : resized[0], : resized[1]] = values.transpose(2, 0, 1)
+        padded[0, :, :height, :width] = values.transpose(2, 0, 1)
         return padded, frame
 
     def encode(self, image: UInt8[np.ndarray, "H W 3"], encoder: Network | None = None) -> Encoded:
@@ -318,14 +282,11 @@ class SamModel:
         Returns:
             predicted IoUs and low-resolution logits, in the order of `HEADS`.
         """
+        points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
-            iou, logits, _ = self.factored.decode(
-                encoded.terms, in_input(points_xy, encoded.frame), fine=True
-            )
+            iou, logits, _ = self.factored.decode(encoded.terms, points, fine=True)
             return iou, logits
-        return ask_network(
-            self.decoder, encoded.features, *one_point_each(in_input(points_xy, encoded.frame))
-        )
+        return ask_network(self.decoder, encoded.features, points[:, None])
 
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
@@ -349,7 +310,7 @@ class SamModel:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
             return iou, logits, {"iou": iou, **kept}
         assert self.previewer is not None
-        return *ask_network(self.previewer, encoded.features, *one_point_each(points)), {"points": points_xy}
+        return *ask_network(self.previewer, encoded.features, points[:, None]), {"points": points_xy}
 
     def finish(
         self, encoded: Encoded, prompts: Prompts
@@ -371,15 +332,15 @@ def ask_network(
     decoder: Network,
     features: Mapping[str, np.ndarray],
     points_xy: Float[np.ndarray, "P K 2"],
-    labels: Float[np.ndarray, "P K"],
+    labels: Float[np.ndarray, "P K"] | None = None,
 ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
     """Run a decoder on prompts of K points of its input, and return predicted IoUs and logits.
 
-    Labels are 1 for points inside the object and 0 for points outside.
+    Labels are 1 for points inside the object (the default) and 0 for points outside.
     """
     scores, logits = decoder(
         input_points=points_xy[None],
-        input_labels=labels[None],
+        input_labels=np.ones((1, *points_xy.shape[:2])) if labels is None else labels[None],
         input_boxes=np.zeros((1, 0, 4)),
         **features,
     )
@@ -387,29 +348,19 @@ def ask_network(
     return scores[0], logits[0]
 
 
-def one_point_each(points_xy: Float[np.ndarray, "P 2"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and labels of `ask_network` for prompts of one foreground point each."""
-    return points_xy[:, None], np.ones((len(points_xy), 1))
-
-
 def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndarray, "K H W"]:
     """Upscale low-resolution logits as SamProcessor does, and return the masks at the image's size."""
-    height, width = frame.original_hw
     found = []
     for each in logits:
         if not frame.stretched:
             each = cv2.resize(each, frame.padded_hw[::-1], interpolation=cv2.INTER_LINEAR)
             each = each[: frame.resized_hw[0], : frame.resized_hw[1]]
-        found.append(cv2.resize(each, (width, height), interpolation=cv2.INTER_LINEAR) > 0)
+        found.append(cv2.resize(each, frame.original_hw[::-1], interpolation=cv2.INTER_LINEAR) > 0)
     return np.stack(found)
 
 
 def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
     """Compare the factored decoder with the network on a random image and random prompts.
-
-    Args:
-        factored, decoder: decoders of the same model.
-        side_px: side of the network's input.
 
     Returns:
         the largest difference of predicted IoUs, and of logits relative to the largest logit above 1.
@@ -426,7 +377,7 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
                 raise ModelError(f"{decoder.path.name} declares no shape of {name}")
             features[name] = rng.standard_normal((1, *shape), np.float32)  # type: ignore[arg-type]
     points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
-    iou, logits = ask_network(decoder, features, *one_point_each(points))
+    iou, logits = ask_network(decoder, features, points[:, None])
     own_iou, own_logits, _ = factored.decode(factored.image(features), points, fine=True)
     off = np.abs(own_logits - logits).max() / max(1, np.abs(logits).max())
     return float(max(off, np.abs(own_iou - iou).max()))
@@ -451,14 +402,6 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
         ) from error
 
 
-def valid_low_resolution(low_hw: tuple[int, int], frame: Frame) -> tuple[int, int]:
-    """Return the number of low-resolution rows and columns that overlap the image; the rest is padding."""
-    return (
-        -(-frame.resized_hw[0] * low_hw[0] // frame.padded_hw[0]),
-        -(-frame.resized_hw[1] * low_hw[1] // frame.padded_hw[1]),
-    )
-
-
 def read_logits(
     logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
 ) -> tuple[Int8[np.ndarray, "K h w"], Float32[np.ndarray, " K"], Int32[np.ndarray, "K 4"]]:
@@ -472,7 +415,10 @@ def read_logits(
         logits in steps of `LOGIT_STEP`, clipped to +-127 steps; stability; box (xyxy, low-resolution
         px, end exclusive) of the positive logits, all 0 if there are none.
     """
-    height, width = valid_low_resolution((logits.shape[1], logits.shape[2]), frame)
+    # low-resolution rows and columns that overlap the image; the rest is padding
+    height, width = (
+        -(-frame.resized_hw[axis] * logits.shape[1 + axis] // frame.padded_hw[axis]) for axis in (0, 1)
+    )
     steps = offset / LOGIT_STEP
     rounded, small, large, boxes = quantise_logits(
         np.ascontiguousarray(logits),
@@ -490,7 +436,6 @@ def full_stability(
 ) -> Float32[np.ndarray, " K"]:
     """Return the stability at the image's size, from unrounded logits, as in SAM."""
     number, height, width = logits.shape
-    along_y, along_x = frame_taps((height, width), frame)
     areas = []
     for threshold in (offset, -offset):
         runs, offsets = upscaled_runs(
@@ -498,8 +443,7 @@ def full_stability(
             np.arange(number + 1) * (height * width),
             np.tile(np.array([0, 0, width, height], np.int32), (number, 1)),
             np.arange(number),
-            *along_y,
-            *along_x,
+            *frame_taps((height, width), frame),
             0,
             0,
             *frame.original_hw,
@@ -508,15 +452,11 @@ def full_stability(
     return (areas[0] / np.maximum(areas[1], 1)).astype(np.float32)
 
 
-def frame_taps(
-    low_hw: tuple[int, int], frame: Frame
-) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return the taps from low-resolution rows and columns to those of the image (`taps`)."""
+def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
+    """Return the taps (`taps`) from low-resolution rows, then columns, to those of the image."""
     padded, resized = (low_hw, low_hw) if frame.stretched else (frame.padded_hw, frame.resized_hw)
-    along_y, along_x = (
-        taps(low_hw[axis], padded[axis], resized[axis], frame.original_hw[axis]) for axis in (0, 1)
-    )
-    return along_y, along_x
+    along_y, along_x = map(taps, low_hw, padded, resized, frame.original_hw)
+    return *along_y, *along_x
 
 
 @lru_cache(maxsize=16)

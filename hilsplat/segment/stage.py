@@ -9,13 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hilsplat.base.artifacts import (
-    ViewCache,
-    atomic_folder,
-    sha256_of_file,
-    sha256_of_json,
-    write_index,
-)
+from hilsplat.base.artifacts import ViewCache, atomic_folder, sha256_of_file, sha256_of_json, write_index
 from hilsplat.base.errors import SceneError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS
@@ -37,11 +31,7 @@ logger = logging.getLogger(__name__)
 
 
 def train_views(scene: Scene) -> list[str]:
-    """Return the training views of a scene.
-
-    Raises:
-        SceneError: if there are none.
-    """
+    """Return the training views of a scene, or raise a SceneError if there are none."""
     views = scene.views("train")
     if not views:
         raise SceneError(f"{scene.name} has no training view", fix="hold out fewer views (poses.test_every)")
@@ -62,11 +52,9 @@ def run_masks(
     """Segment training views at three levels.
 
     Args:
-        scene_folder: the `Scene` artifact.
         out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
         cache: folder of the view cache. For SAM it contains the decoder's candidates and the masks, so other
             thresholds don't rerun the networks, and other levels need no computation.
-        settings: segmenter and its settings.
         threads: views processed in parallel if they fit into memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: all free memory.
         key_views: views to segment; None: every training view.
@@ -90,9 +78,8 @@ def run_masks(
                 "precision": model.precision,
             }
 
-            batch = model.prompts_per_call(
-                model.thresholds(settings).points_per_batch, settings.points_per_side**2
-            )
+            limit = model.thresholds(settings).points_per_batch
+            batch = model.prompts_per_call(limit, settings.points_per_side**2)
             needs = needs_of(model.model, batch, as_exported=model.as_exported)
             threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
@@ -168,8 +155,8 @@ def graph_masks(scene: Scene, view: str, cache: ViewCache, settings: MasksSettin
             "code": code_digest(segment_graph, HierarchicalMasks),
         }
     )
-    arrays = cache.get(
-        key,
-        lambda: segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays(),
-    )
-    return HierarchicalMasks.from_arrays(arrays)
+
+    def segment() -> dict[str, np.ndarray]:
+        return segment_graph(scene.image(view), settings.graph_scales, settings.min_area_px).arrays()
+
+    return HierarchicalMasks.from_arrays(cache.get(key, segment))

@@ -40,17 +40,13 @@ def suppress_boxes(
     iou_max: float,
     first: Float[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " k"]:
-    """Suppress boxes greedily, as SAM's automatic generator does.
+    """Return the rows of boxes kept by SAM's greedy suppression, ascending.
 
     The best box is kept and drops every other whose IoU with it exceeds `iou_max`; then the best of
     the rest, and so on. Boxes are ranked by `first`, if given, then by score, larger area, the box's
     coordinates and row.
-
-    Returns:
-        rows kept, ascending.
     """
-    width_height = (boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]).astype(np.int64)
-    area = width_height[:, 0] * width_height[:, 1]
+    area = np.prod(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], axis=1, dtype=np.int64)
     ranks = [] if first is None else [-first]
     order = np.lexsort((*boxes_xyxy.T[::-1], -area, -score, *ranks))
     return np.sort(order[_greedy(boxes_xyxy[order], iou_max)])
@@ -62,12 +58,9 @@ def suppress_boxes_officially(
     iou_max: float,
     first: Float[np.ndarray, " M"] | None = None,
 ) -> Int64[np.ndarray, " k"]:
-    """Suppress boxes as published, with boxes that end at the last pixel inside.
+    """Return the rows kept by SAM's suppression as published, the best first.
 
-    Boxes are ranked by `first` alone, if given, otherwise by score; ties by row.
-
-    Returns:
-        rows kept, the best first.
+    Boxes end at the last pixel inside. They are ranked by `first`, or by score if it is None; ties by row.
     """
     order = np.argsort(-(score if first is None else first), kind="stable")
     return order[_greedy(last_inside(boxes_xyxy)[order], iou_max)]
@@ -80,14 +73,11 @@ def distinct_boxes(
     iou_max: float,
     slack: float,
 ) -> Int64[np.ndarray, " k"]:
-    """Suppress boxes greedily so that the result is valid for any thresholds on score and stability.
+    """Return the rows kept by a suppression that is valid for any thresholds, the best first.
 
     The box with the highest score (on a tie, the lower row) is kept and drops every other whose IoU with it
     exceeds `iou_max` and whose stability is at most `slack` above its own; then the best of the rest, and so
     on. Except for the slack, a box that passes a threshold is dropped only by a box that also passes it.
-
-    Returns:
-        rows kept, the best first.
     """
     order = np.argsort(-score, kind="stable")
     return order[_greedy(boxes_xyxy[order], iou_max, stability[order], slack)]

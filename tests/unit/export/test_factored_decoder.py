@@ -8,7 +8,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.decoder_weights import DecoderGraph
 from hilsplat.segment.factored_decoder import FactoredDecoder
-from hilsplat.segment.sam import SamModel, ask_network, in_input, one_point_each, point_grid
+from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
 from hilsplat.settings import MasksSettings
 
 TOLERANCE = 2e-5
@@ -24,7 +24,7 @@ def model(request) -> SamModel:
 def test_scores_logits_and_previews_agree(model, photograph):
     encoded, points = model.encode(photograph), point_grid(5) * (100, 60)
     in_square = in_input(points, encoded.frame)
-    expected_iou, expected = ask_network(model.decoder, encoded.features, *one_point_each(in_square))
+    expected_iou, expected = ask_network(model.decoder, encoded.features, in_square[:, None])
     iou, logits, _ = model.factored.decode(encoded.terms, in_square, fine=True)
     assert expected.std() > 0.1
     np.testing.assert_allclose(iou, expected_iou, atol=TOLERANCE)
