@@ -4,84 +4,56 @@ import json
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 from tokenizers import Tokenizer, models, pre_tokenizers
 
 from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
-from hilsplat.base.images import write_png
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.model_check import check_model
 from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models.network import Network
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
+from tests.unit.segment.handmade import pack, save_network, save_scene, tensor
 
 WORDS = ["red", "green", "blue"]
 
 
-def save(path: Path, nodes: list, inputs: list, outputs: list, constants: dict[str, np.ndarray]) -> None:
-    initialisers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "hand-made", inputs, outputs, initialisers)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    onnx.checker.check_model(model)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
+def save_vision(folder: Path, nodes: list, constants: dict[str, np.ndarray]) -> None:
+    inputs, outputs = [tensor("pixel_values", ["batch", 3, 4, 4])], [tensor("image_embeds", ["batch", 3])]
+    save_network(folder / "vision_model.onnx", nodes, inputs, outputs, constants)
 
 
 @pytest.fixture
 def colour_clip(tmp_path) -> Path:
     """A CLIP of 4-px crops: an image is its mean colour, a text the sum of its words' colours."""
     folder = tmp_path / "clip"
-    value = helper.make_tensor_value_info
-    save(
-        folder / "vision_model.onnx",
-        [helper.make_node("ReduceMean", ["pixel_values"], ["image_embeds"], axes=[2, 3], keepdims=0)],
-        [value("pixel_values", TensorProto.FLOAT, ["batch", 3, 4, 4])],
-        [value("image_embeds", TensorProto.FLOAT, ["batch", 3])],
-        {},
-    )
-    save(
+    mean = helper.make_node("ReduceMean", ["pixel_values"], ["image_embeds"], axes=[2, 3], keepdims=0)
+    save_vision(folder, [mean], {})
+    save_network(
         folder / "text_model.onnx",
         [
             helper.make_node("Gather", ["table", "input_ids"], ["words"]),
             helper.make_node("ReduceSum", ["words", "one"], ["text_embeds"], keepdims=0),
         ],
-        [value("input_ids", TensorProto.INT64, ["batch", "words_of_text"])],
-        [value("text_embeds", TensorProto.FLOAT, ["batch", 3])],
-        {"table": np.concatenate([np.zeros((1, 3)), np.eye(3)]).astype(np.float32), "one": np.array([1])},
+        [tensor("input_ids", ["batch", "words_of_text"], TensorProto.INT64)],
+        [tensor("text_embeds", ["batch", 3])],
+        {"table": np.eye(4, 3, -1, np.float32), "one": np.array([1])},
     )
-    (folder / "config.json").write_text(
-        json.dumps({"model_type": "clip", "text_config": {"max_position_embeddings": 4}})
-    )
-    (folder / "preprocessor_config.json").write_text(
-        json.dumps(
-            {
-                "size": {"shortest_edge": 4},
-                "crop_size": {"height": 4, "width": 4},
-                "image_mean": [0, 0, 0],
-                "image_std": [1, 1, 1],
-            }
-        )
-    )
+    config = {"model_type": "clip", "text_config": {"max_position_embeddings": 4}}
+    preprocessing = {"crop_size": {"height": 4, "width": 4}, "image_mean": [0] * 3, "image_std": [1] * 3}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
     tokenizer = Tokenizer(
         models.WordLevel({"[UNK]": 0} | {word: 1 + n for n, word in enumerate(WORDS)}, "[UNK]")
     )
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
     tokenizer.save(str(folder / "tokenizer.json"))
     return folder
-
-
-def pack(*masks: np.ndarray) -> HierarchicalMasks:
-    number = len(masks)
-    ones = np.ones(number, np.float32)
-    return HierarchicalMasks.from_dense(np.stack(masks).astype(bool), np.ones(number, np.uint8), ones, ones)
 
 
 def two_colours() -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +67,7 @@ def two_colours() -> tuple[np.ndarray, np.ndarray]:
 
 def test_pixels_outside_the_mask_do_not_reach_the_vector(colour_clip):
     image, mask = two_colours()
-    vectors = ClipModel.load(colour_clip).embed_masks(image, pack(mask, ~mask))
+    vectors = ClipModel.load(colour_clip).embed_masks(image, pack([mask, ~mask]))
     assert vectors.dtype == np.float16
     np.testing.assert_array_equal(vectors, np.array([[1, 0, 0], [0, 1, 0]], np.float16))
 
@@ -103,21 +75,8 @@ def test_pixels_outside_the_mask_do_not_reach_the_vector(colour_clip):
 def test_kept_background_mixes_in_by_hand(colour_clip):
     image, mask = two_colours()
     mask[0, 7] = True  # the box is the whole image, half red and half green
-    vectors = ClipModel.load(colour_clip).embed_masks(image, pack(mask), ClipSettings(background="keep"))
+    vectors = ClipModel.load(colour_clip).embed_masks(image, pack([mask]), ClipSettings(background="keep"))
     np.testing.assert_allclose(vectors, [[0.5**0.5, 0.5**0.5, 0]], atol=1e-3)
-
-
-def test_a_thin_box_is_padded_to_a_centred_square(colour_clip, monkeypatch):
-    image = np.full((8, 8, 3), 255, dtype=np.uint8)
-    mask = np.zeros((8, 8), dtype=bool)
-    mask[3, 2:6] = True  # 4 px wide, 1 high: row 1 of a 4 x 4 square
-    seen = []
-    model = ClipModel.load(colour_clip)
-    monkeypatch.setattr(model, "embed_crops", lambda crops: (seen.append(crops), np.ones((len(crops), 3)))[1])
-    model.embed_masks(image, pack(mask))
-    expected = np.zeros((4, 4), dtype=np.uint8)
-    expected[1] = 255
-    np.testing.assert_array_equal(seen[0][0, ..., 0], expected)
 
 
 def test_langsplats_crop_leaves_out_the_last_row_and_column_of_the_box(colour_clip):
@@ -127,9 +86,9 @@ def test_langsplats_crop_leaves_out_the_last_row_and_column_of_the_box(colour_cl
     mask = np.zeros((8, 8), dtype=bool)
     mask[:5, :5] = True
     model = ClipModel.load(colour_clip)
-    (langsplat,) = model.embed_masks(image, pack(mask), ClipSettings(crop="langsplat"))
+    (langsplat,) = model.embed_masks(image, pack([mask]), ClipSettings(crop="langsplat"))
     assert langsplat.tolist() == [1, 0, 0]
-    (box,) = model.embed_masks(image, pack(mask))
+    (box,) = model.embed_masks(image, pack([mask]))
     np.testing.assert_allclose(box, np.array([16, 9, 0]) / np.hypot(16, 9), atol=1e-2)
 
 
@@ -137,7 +96,7 @@ def test_langsplats_crop_leaves_out_the_last_row_and_column_of_the_box(colour_cl
 def test_vectors_do_not_depend_on_batch_or_threads(colour_clip, batch, threads):
     generator = np.random.default_rng(0)
     image = generator.integers(0, 255, (12, 10, 3), dtype=np.uint8)
-    masks = pack(*(generator.random((5, 12, 10)) > 0.7))
+    masks = pack(generator.random((5, 12, 10)) > 0.7)
     expected = ClipModel.load(colour_clip).embed_masks(image, masks)
     found = ClipModel.load(colour_clip, threads).embed_masks(image, masks, ClipSettings(batch=batch))
     np.testing.assert_array_equal(found, expected)
@@ -219,26 +178,11 @@ def test_check_describes_the_model(colour_clip):
 def red_scene(tmp_path) -> tuple[Path, Path]:
     """A scene of two training views and its masks."""
     image, mask = two_colours()
-    names = ("0.png", "1.png")
+    names, masks = ("0.png", "1.png"), pack([mask, ~mask])
     for name in names:
-        write_png(tmp_path / "scene" / "images" / name, image)
-    eye = np.tile(np.eye(4), (2, 1, 1))
-    cameras = Cameras(names, eye, eye[:, :3, :3], np.full((2, 2), 8, np.int32))
-    empty = np.zeros((0, 3))
-    Scene(
-        tmp_path / "scene",
-        "set/scene",
-        "metre",
-        cameras,
-        dict.fromkeys(names, "train"),
-        empty.astype(np.float32),
-        empty.astype(np.uint8),
-        np.eye(4),
-    ).save()
-    for name in names:
-        pack(mask, ~mask).save(tmp_path / "masks" / f"{name}.npz")
-    write_index(tmp_path / "masks", dict.fromkeys(names, index_entry(pack(mask, ~mask))), scene="set/scene")
-    return tmp_path / "scene", tmp_path / "masks"
+        masks.save(tmp_path / "masks" / f"{name}.npz")
+    write_index(tmp_path / "masks", dict.fromkeys(names, index_entry(masks)), scene="set/scene")
+    return save_scene(tmp_path / "scene", dict.fromkeys(names, image)), tmp_path / "masks"
 
 
 def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour_clip, tmp_path, monkeypatch):
@@ -302,17 +246,11 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     weights = np.random.default_rng(0).uniform(0.1, 1, (48, 3)).astype(np.float32)
     weights[16:] *= -1
     weights[47] = largest
-    value = helper.make_tensor_value_info
-    save(
-        colour_clip / "vision_model.onnx",
-        [
-            helper.make_node("Flatten", ["pixel_values"], ["flat"], name="flatten"),
-            helper.make_node("MatMul", ["flat", "weights"], ["image_embeds"], name="product"),
-        ],
-        [value("pixel_values", TensorProto.FLOAT, ["batch", 3, 4, 4])],
-        [value("image_embeds", TensorProto.FLOAT, ["batch", 3])],
-        {"weights": weights},
-    )
+    nodes = [
+        helper.make_node("Flatten", ["pixel_values"], ["flat"], name="flatten"),
+        helper.make_node("MatMul", ["flat", "weights"], ["image_embeds"], name="product"),
+    ]
+    save_vision(colour_clip, nodes, {"weights": weights})
     settings = ClipSettings(model=str(colour_clip))
     with caplog.at_level("INFO"):
         run_clip(scene, masks, None, tmp_path / "auto", tmp_path / "cache", settings, threads=1)
@@ -325,23 +263,27 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     assert same == (precision == "fp32")
 
 
-def test_masks_of_other_views_are_refused(red_scene, colour_clip, tmp_path):
-    scene, masks = red_scene
+def with_another_view(masks: Path) -> None:
     write_index(masks, {"7.png": read_index(masks)["views"]["0.png"]}, scene="set/scene")
-    with pytest.raises(MisalignedArtifactError, match=r"7\.png"):
-        run_clip(
-            scene, masks, None, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1
-        )
 
 
-def test_masks_that_their_index_does_not_record_are_refused(red_scene, colour_clip, tmp_path):
-    scene, masks = red_scene
+def with_shuffled_rows(masks: Path) -> None:
     found = HierarchicalMasks.load(masks / "0.png.npz")
     found.take(np.array([1, 0])).save(masks / "0.png.npz")
-    with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 0\.png\)"):
-        run_clip(
-            scene, masks, None, tmp_path / "out", tmp_path / "cache", ClipSettings(model=str(colour_clip)), 1
-        )
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [(with_another_view, r"7\.png"), (with_shuffled_rows, r"contains other masks \(view 0\.png\)")],
+)
+def test_masks_that_do_not_belong_to_scene_or_index_are_refused(
+    red_scene, colour_clip, tmp_path, change, words
+):
+    scene, masks = red_scene
+    change(masks)
+    settings = ClipSettings(model=str(colour_clip))
+    with pytest.raises(MisalignedArtifactError, match=words):
+        run_clip(scene, masks, None, tmp_path / "out", tmp_path / "cache", settings, threads=1)
 
 
 def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_clip, tmp_path):

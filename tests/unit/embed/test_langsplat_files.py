@@ -7,24 +7,16 @@ import pytest
 
 from hilsplat.base.artifacts import read_index, read_npy, write_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.images import write_png
+from hilsplat.base.images import read_image
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.langsplat_export import maps_of, write_langsplat
 from hilsplat.embed.langsplat_files import read_clip, read_masks, read_view
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
-from tests.unit.artifact_changes import change_index
+from tests.unit.segment.handmade import pack, save_scene
 
 SIZE = (6, 8)
-
-
-def pack(dense: np.ndarray, level: list[int]) -> HierarchicalMasks:
-    ones = np.ones(len(dense), np.float32)
-    masks = HierarchicalMasks.from_dense(dense, np.array(level, np.uint8), ones, ones)
-    return masks.take(masks.content_order())
 
 
 def nested() -> HierarchicalMasks:
@@ -33,7 +25,8 @@ def nested() -> HierarchicalMasks:
     dense[0, 1:, 1:7] = True
     dense[1, 2:5, 2:6] = True
     dense[2, 2, 2] = dense[3, 4, 3:5] = True
-    return pack(dense, [1, 2, 3, 3])
+    masks = pack(dense, [1, 2, 3, 3])
+    return masks.take(masks.content_order())
 
 
 def unit_rows(number: int) -> np.ndarray:
@@ -57,23 +50,9 @@ def ours(tmp_path) -> tuple[Path, Path]:
 
 @pytest.fixture
 def scene(tmp_path) -> Path:
-    names = ("a.png", "b.png")
-    for name in names:
-        write_png(tmp_path / "scene" / "images" / name, np.zeros((*SIZE, 3), np.uint8))
-    eye = np.tile(np.eye(4), (2, 1, 1))
-    cameras = Cameras(names, eye, eye[:, :3, :3], np.tile(np.array(SIZE, np.int32), (2, 1)))
-    empty = np.zeros((0, 3))
-    Scene(
-        tmp_path / "scene",
-        "set/scene",
-        "metre",
-        cameras,
-        dict.fromkeys(names, "train"),
-        empty.astype(np.float32),
-        empty.astype(np.uint8),
-        np.eye(4),
-    ).save()
-    return tmp_path / "scene"
+    """A posed scene of two noisy training views."""
+    images = np.random.default_rng(0).integers(0, 255, (2, *SIZE, 3), np.uint8)
+    return save_scene(tmp_path / "scene", {"a.png": images[0], "b.png": images[1]})
 
 
 def test_maps_by_hand():
@@ -93,12 +72,8 @@ def test_maps_by_hand():
 def test_what_is_written_is_read_back(ours, scene, tmp_path):
     masks_folder, clip_folder = ours
     write_langsplat(masks_folder, clip_folder, tmp_path / "files")
-    assert sorted(path.name for path in (tmp_path / "files").glob("*.npy")) == [
-        "a_f.npy",
-        "a_s.npy",
-        "b_f.npy",
-        "b_s.npy",
-    ]
+    names = sorted(path.name for path in (tmp_path / "files").glob("*.npy"))
+    assert names == ["a_f.npy", "a_s.npy", "b_f.npy", "b_s.npy"]
     maps, vectors = (np.load(tmp_path / "files" / f"a_{kind}.npy", allow_pickle=False) for kind in "sf")
     assert (maps.shape, maps.dtype, vectors.shape, vectors.dtype) == ((4, *SIZE), "f4", (8, 512), "f4")
     read_masks(scene, tmp_path / "files", tmp_path / "again")
@@ -187,28 +162,15 @@ def test_vectors_of_other_masks_are_refused(ours, tmp_path):
         write_langsplat(masks_folder, clip_folder, tmp_path / "files")
 
 
-def test_vectors_of_another_clip_are_refused(ours, scene, tmp_path, project):
-    write_langsplat(*ours, tmp_path / "files")
-    settings = ClipSettings(model=str(project / "models/clip-tiny"))
-    with pytest.raises(MisalignedArtifactError, match=r"a_f.npy does not belong to the CLIP in"):
-        for stem in "ab":
-            vectors = np.load(tmp_path / "files" / f"{stem}_f.npy")[:, :100]
-            np.save(tmp_path / "files" / f"{stem}_f.npy", vectors)
-        read_clip(scene, tmp_path / "files", tmp_path / "out", settings)
-
-
 @pytest.fixture
 def embedded(ours, scene, tmp_path, project) -> ClipModel:
-    """LangSplat's files of two noisy views, with vectors of clip-tiny."""
+    """LangSplat's files of the scene, with vectors of clip-tiny."""
     model = ClipModel.load(project / "models/clip-tiny")
     masks_folder, clip_folder = ours
-    for seed, name in enumerate(("a.png", "b.png")):
-        image = np.random.default_rng(seed).integers(0, 255, (*SIZE, 3), np.uint8)
-        write_png(scene / "images" / name, image)
-        np.save(
-            clip_folder / f"{name}.npy", model.embed_masks(image, nested(), ClipSettings(crop="langsplat"))
-        )
-    change_index(scene)
+    for name in ("a.png", "b.png"):
+        image = read_image(scene / "images" / name)
+        vectors = model.embed_masks(image, nested(), ClipSettings(crop="langsplat"))
+        np.save(clip_folder / f"{name}.npy", vectors)
     write_langsplat(masks_folder, clip_folder, tmp_path / "files")
     return model
 
@@ -227,11 +189,15 @@ def test_vectors_of_the_same_clip_are_taken(embedded, scene, tmp_path):
     np.testing.assert_allclose(lengths, 1, atol=2e-3)
 
 
-def test_vectors_of_another_clip_of_the_same_width_are_refused(embedded, scene, tmp_path):
+@pytest.mark.parametrize(
+    ("width", "words"),
+    [(100, r"a_f.npy does not belong to the CLIP in"), (None, r"are not of the CLIP in(.|\n)*laion2b")],
+)
+def test_vectors_of_another_clip_are_refused(embedded, scene, tmp_path, width, words):
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(embedded.width, embedded.width)))
     for stem in "ab":
         path = tmp_path / "files" / f"{stem}_f.npy"
-        np.save(path, (np.load(path) @ turn).astype(np.float32))
-    with pytest.raises(MisalignedArtifactError, match=r"are not of the CLIP in(.|\n)*laion2b"):
+        np.save(path, (np.load(path) @ turn).astype(np.float32)[:, :width])
+    with pytest.raises(MisalignedArtifactError, match=words):
         read_clip(scene, tmp_path / "files", tmp_path / "out", ClipSettings(model=str(embedded.model.folder)))
     assert not (tmp_path / "out").exists()

@@ -1,19 +1,19 @@
-"""What counts as a model's files, and what is said about folders that cannot be used."""
+"""What counts as a model's files, variants, and the split of a whole CLIP."""
 
-import json
 import shutil
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
 
 from hilsplat.base.errors import ModelError
 from hilsplat.models.clip_split import split_clip
 from hilsplat.models.folder import external_weights, open_model_folder, variants_of
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
+from tests.unit.segment.handmade import save_network, tensor
 
 TINY = PROJECT / "models/sam-tiny"
 
@@ -25,10 +25,11 @@ def sam(tmp_path):
 
 
 def outside(path, location: str) -> None:
-    """Move a network's weights into a file of their own."""
+    """Move a network's weights and constants into a file of their own."""
     model = onnx.load(path)
     path.unlink()
-    onnx.save(model, path, save_as_external_data=True, location=location, size_threshold=64)
+    options = {"size_threshold": 64, "convert_attribute": True}
+    onnx.save(model, path, save_as_external_data=True, location=location, **options)
 
 
 @pytest.mark.parametrize("location", ["vision_encoder.onnx_data", "weights.bin", "onnx__MatMul_7"])
@@ -45,16 +46,10 @@ def test_the_digest_covers_weights_in_a_file_of_any_name(sam, location):
 
 def test_weights_of_constants_count_too(tmp_path):
     value = numpy_helper.from_array(np.ones(4096, np.float32), "value")
-    nodes = [helper.make_node("Constant", [], ["y"], value=value)]
-    graph = helper.make_graph(nodes, "g", [], [helper.make_tensor_value_info("y", TensorProto.FLOAT, [4096])])
     path = tmp_path / "constant.onnx"
-    onnx.save(
-        helper.make_model(graph),
-        path,
-        save_as_external_data=True,
-        location="elsewhere",
-        convert_attribute=True,
-    )
+    constant = helper.make_node("Constant", [], ["y"], value=value)
+    save_network(path, [constant], [], [tensor("y", [4096])], {})
+    outside(path, "elsewhere")
     assert external_weights(path, tmp_path) == [tmp_path / "elsewhere"]
 
 
@@ -67,14 +62,10 @@ def test_weights_outside_the_folder_are_refused(sam):
         external_weights(path, sam)
 
 
-def rename(folder, ending: str) -> None:
-    for path in (folder / "onnx").glob("*.onnx"):
-        path.rename(path.with_name(f"{path.stem}_{ending}.onnx"))
-
-
 def test_a_variant_is_chosen_by_its_ending(sam):
     plain = open_model_folder(sam).digest
-    rename(sam, "fp16")
+    for path in (sam / "onnx").glob("*.onnx"):
+        path.rename(path.with_name(f"{path.stem}_fp16.onnx"))
     with pytest.raises(ModelError, match=r"come as variants: set masks.variant to one of 'fp16'"):
         SamModel.load(sam)
     model = SamModel.load(sam, "fp16")
@@ -92,43 +83,19 @@ def test_variants_are_those_that_all_networks_have(sam):
         open_model_folder(sam, variant="q4")
 
 
-def test_pytorch_weights_must_be_exported(sam):
-    shutil.rmtree(sam / "onnx")
-    (sam / "model.safetensors").touch()
-    with pytest.raises(ModelError, match=r"PyTorch's weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"):
-        open_model_folder(sam)
-
-
-@pytest.mark.parametrize(
-    ("model_type", "words"),
-    [("siglip2", "variable resolution"), ("sam3", "take SAM 2.1"), ("blip", "docs/models.md")],
-)
-def test_the_error_for_other_models_lists_readable_ones(sam, model_type, words):
-    (sam / "config.json").write_text(json.dumps({"model_type": model_type}))
-    with pytest.raises(ModelError, match=rf"SAM 2 or 2.1 \(sam2\)(.|\n)*{model_type}(.|\n)*{words}"):
-        open_model_folder(sam)
-
-
 def write_whole_clip(folder, external: bool) -> None:
     """A `model.onnx` whose halves scale their inputs by weights of their own."""
-    wide = TensorProto.FLOAT
-    values = {"vision": np.arange(64, dtype=np.float32), "text": -np.arange(64, dtype=np.float32)}
     nodes = [
         helper.make_node("Mul", ["pixel_values", "vision"], ["image_embeds"]),
         helper.make_node("Mul", ["input_ids", "text"], ["words"]),
         helper.make_node("Mul", ["words", "attention_mask"], ["text_embeds"]),
     ]
-    inputs = [
-        helper.make_tensor_value_info(name, wide, [1, 64])
-        for name in ("pixel_values", "input_ids", "attention_mask")
-    ]
-    outputs = [helper.make_tensor_value_info(name, wide, [1, 64]) for name in ("image_embeds", "text_embeds")]
-    initialisers = [numpy_helper.from_array(value, name) for name, value in values.items()]
-    graph = helper.make_graph(nodes, "clip", inputs, outputs, initialisers)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    folder.mkdir()
-    options = {"save_as_external_data": True, "location": "model.onnx_data", "size_threshold": 0}
-    onnx.save(model, folder / "model.onnx", **options if external else {})
+    inputs = [tensor(name, [1, 64]) for name in ("pixel_values", "input_ids", "attention_mask")]
+    outputs = [tensor(name, [1, 64]) for name in ("image_embeds", "text_embeds")]
+    numbers = np.arange(64, dtype=np.float32)
+    save_network(folder / "model.onnx", nodes, inputs, outputs, {"vision": numbers, "text": -numbers})
+    if external:
+        outside(folder / "model.onnx", "model.onnx_data")
 
 
 @pytest.mark.parametrize("external", [False, True])

@@ -56,15 +56,9 @@ def test_a_real_model_is_used_and_the_best_one_of_several(models):
     lay(models / "clip-vit-base-patch16", "clip")
     lay(models / "clip-vit-b-16-laion2b", "clip")
     assert with_models(ClipSettings(model="auto")).model == "models/clip-vit-b-16-laion2b"
-    assert [model.folder.name for model in present_models()] == [
-        "sam-vit-base",
-        "slimsam-77",
-        "clip-vit-b-16-laion2b",
-        "clip-vit-base-patch16",
-        "zebra-sam",
-        "clip-tiny",
-        "sam-tiny",
-    ]
+    released = ["sam-vit-base", "slimsam-77", "clip-vit-b-16-laion2b", "clip-vit-base-patch16"]
+    names = [model.folder.name for model in present_models()]
+    assert names == [*released, "zebra-sam", "clip-tiny", "sam-tiny"]
 
 
 def test_what_is_named_is_used_whatever_else_is_there(models):
@@ -83,12 +77,9 @@ def test_what_is_named_is_used_whatever_else_is_there(models):
 def test_what_is_half_there_or_of_another_kind_is_passed_over(models):
     lay(models / ".sam-vit-base.part", "sam")
     lay(models / "bert", "bert")
-    (models / "weights").mkdir()
-    (models / "weights/config.json").write_text('{"model_type": "sam"}')
-    (models / "list").mkdir()
-    (models / "list/config.json").write_text("[]")
-    (models / "broken").mkdir()
-    (models / "broken/config.json").write_text("{")
+    for name, config in {"weights": '{"model_type": "sam"}', "list": "[]", "broken": "{"}.items():
+        (models / name).mkdir()
+        (models / name / "config.json").write_text(config)
     assert read_model(models / "none") is None
     assert [model.folder.name for model in present_models()] == ["clip-tiny", "sam-tiny"]
     assert real_model("sam") is None
@@ -104,10 +95,8 @@ def test_models_of_the_user_are_found_from_any_folder_and_those_of_the_project_c
     lay(of_user / "sam-vit-huge", "sam")
     lay(models / "sam-vit-base", "sam")
     assert real_model("sam") == of_user / "sam-vit-huge"
-    assert [model.folder for model in present_models()][:2] == [
-        of_user / "sam-vit-huge",
-        Path("models/sam-vit-base"),
-    ]
+    folders = [model.folder for model in present_models()]
+    assert folders[:2] == [of_user / "sam-vit-huge", Path("models/sam-vit-base")]
     assert model_path("models/sam-vit-huge") == of_user / "sam-vit-huge"
     assert model_path("models/sam-vit-base") == Path("models/sam-vit-base")
     assert model_path("models/none") == Path("models/none")

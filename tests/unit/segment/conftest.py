@@ -1,127 +1,10 @@
-"""Hand-made models and scenes for the segmenter's tests."""
+"""Fixtures of the segmenter's tests."""
 
-import json
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
 
-from hilsplat.base.images import write_png
-from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.scene import Scene
-
-FRAME, LOW = 32, 16
-RADII = (3.0, 6.0, 10.0)
-"""Radius in px of the 32-px frame that the disc decoder answers with: subpart, part, whole."""
-SCORES = (0.9, 0.8, 0.7)
-
-
-def save_network(
-    path: Path, nodes: list, inputs: list, outputs: list, constants: dict[str, np.ndarray]
-) -> None:
-    initialisers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "hand-made", inputs, outputs, initialisers)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    onnx.checker.check_model(model)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
-
-
-def tensor(name: str, shape: list, kind: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, kind, shape)
-
-
-def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, cell_px: float) -> None:
-    """The decoder of `write_disc_sam`, with those rows and columns of the masks that `every` takes."""
-    centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
-    low = len(centres)
-    x, y = np.meshgrid(centres, centres)
-    to_middle_of_cell = [
-        helper.make_node("Div", [points_name, "cell"], ["in_cells"]),
-        helper.make_node("Floor", ["in_cells"], ["corner"]),
-        helper.make_node("Add", ["corner", "half"], ["middle"]),
-        helper.make_node("Mul", ["middle", "cell"], ["centre"]),
-    ]
-    save_network(
-        path,
-        [
-            *(to_middle_of_cell if cell_px else [helper.make_node("Identity", [points_name], ["centre"])]),
-            helper.make_node("Sub", ["centre", "grid"], ["offset"]),  # (1, P, 256, 2)
-            helper.make_node("Mul", ["offset", "offset"], ["squared"]),
-            helper.make_node("ReduceSum", ["squared", "last"], ["sum"], keepdims=0),
-            helper.make_node("Sqrt", ["sum"], ["distance"]),
-            helper.make_node("Unsqueeze", ["distance", "two"], ["apart"]),  # (1, P, 1, 256)
-            helper.make_node("Sub", ["radii", "apart"], ["logits"]),  # (1, P, 3, 256)
-            helper.make_node("Reshape", ["logits", "shape"], ["pred_masks"]),
-            helper.make_node("ReduceMax", ["logits"], ["peak"], axes=[3], keepdims=0),
-            helper.make_node("Mul", ["peak", "zero"], ["nothing"]),
-            helper.make_node("Add", ["nothing", "scores"], ["iou_scores"]),
-        ],
-        [
-            tensor(points_name, [1, "P", 1, 2]),
-            tensor("input_labels", [1, "P", 1], TensorProto.INT64),
-            tensor("image_embeddings", [1, 3, LOW, LOW]),
-            tensor("image_positional_embeddings", [1, 3, LOW, LOW]),
-        ],
-        [tensor("iou_scores", [1, "P", heads]), tensor("pred_masks", [1, "P", heads, low, low])],
-        {
-            "cell": np.array([cell_px], np.float32),
-            "half": np.array([0.5], np.float32),
-            "grid": np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
-            "last": np.array([3]),
-            "two": np.array([2]),
-            "radii": np.array((RADII + RADII)[:heads], np.float32)[None, None, :, None],
-            "shape": np.array([1, -1, heads, low, low]),
-            "zero": np.zeros(1, np.float32),
-            "scores": np.array((SCORES + SCORES)[:heads], np.float32),
-        },
-    )
-
-
-def write_disc_sam(
-    folder: Path, points_name: str = "input_points", heads: int = 3, cell_px: float = 0
-) -> Path:
-    """A SAM whose answer to a point is three discs around it: logit = radius - distance, px of the frame.
-
-    With `cell_px`, discs are around the middle of the point's cell of a grid, and the model has a preview.
-    """
-    save_network(
-        folder / "onnx" / "vision_encoder.onnx",
-        [
-            helper.make_node(
-                "AveragePool", ["pixel_values"], ["image_embeddings"], kernel_shape=[2, 2], strides=[2, 2]
-            ),
-            helper.make_node("Identity", ["image_embeddings"], ["image_positional_embeddings"]),
-        ],
-        [tensor("pixel_values", ["batch", 3, FRAME, FRAME])],
-        [
-            tensor("image_embeddings", ["batch", 3, LOW, LOW]),
-            tensor("image_positional_embeddings", ["batch", 3, LOW, LOW]),
-        ],
-        {},
-    )
-    networks = {DECODER: slice(None), PREVIEW: slice(None, None, 2)} if cell_px else {DECODER: slice(None)}
-    for name, every in networks.items():
-        _write_disc_decoder(folder / "onnx" / f"{name}.onnx", every, points_name, heads, cell_px)
-    own = {"predicted_iou_min": 0.35, "stability_min": 0.5, "nms_score": 0.0, "points_per_batch": 64}
-    (folder / "config.json").write_text(json.dumps({"model_type": "sam", "mask_generation": own}))
-    (folder / "preprocessor_config.json").write_text(
-        json.dumps(
-            {
-                "size": {"longest_edge": FRAME},
-                "pad_size": {"height": FRAME, "width": FRAME},
-                "image_mean": [0.5, 0.5, 0.5],
-                "image_std": [0.25, 0.25, 0.25],
-                "rescale_factor": 1 / 255,
-                "resample": 2,
-            }
-        )
-    )
-    return folder
+from tests.unit.segment.handmade import write_disc_sam
 
 
 @pytest.fixture(scope="session")
@@ -130,38 +13,6 @@ def disc_sam(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def make_disc_sam() -> Callable[..., Path]:
-    return write_disc_sam
-
-
-@pytest.fixture
-def make_scene(tmp_path) -> Callable[..., Path]:
-    """A posed scene of noise images; the last view is a test view."""
-
-    def make(views: int = 3, size_hw: tuple[int, int] = (32, 32)) -> Path:
-        names = tuple(f"{number:03d}.png" for number in range(views))
-        folder = tmp_path / "scene"
-        generator = np.random.default_rng(0)
-        for name in names:
-            write_png(folder / "images" / name, generator.integers(0, 255, (*size_hw, 3), dtype=np.uint8))
-        cameras = Cameras(
-            names,
-            np.tile(np.eye(4), (views, 1, 1)),
-            np.tile(np.eye(3), (views, 1, 1)),
-            np.tile(np.array(size_hw, np.int32), (views, 1)),
-        )
-        split = dict.fromkeys(names, "train") | {names[-1]: "test"}
-        empty = np.zeros((0, 3))
-        Scene(
-            folder,
-            "set/scene",
-            "metre",
-            cameras,
-            split,
-            empty.astype(np.float32),
-            empty.astype(np.uint8),
-            np.eye(4),
-        ).save()
-        return folder
-
-    return make
+def own_sam(tmp_path) -> Path:
+    """A disc SAM that a test may change."""
+    return write_disc_sam(tmp_path / "sam")

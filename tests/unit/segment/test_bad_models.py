@@ -1,6 +1,10 @@
-"""Errors for a model folder that is incomplete or of another kind."""
+"""Errors for a model folder that is incomplete, damaged or of another kind."""
 
 import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -11,89 +15,130 @@ from hilsplat.base.errors import ModelError
 from hilsplat.models.folder import open_model_folder
 from hilsplat.models.network import require_one_space, require_three_heads
 from hilsplat.segment.sam import SamModel
+from tests.unit.segment.handmade import save_network, tensor, write_disc_sam
+
+ENCODER = "onnx/vision_encoder.onnx"
+PREPROCESSOR = "preprocessor_config.json"
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
 
 
-def test_a_half_downloaded_network_is_named(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    network = folder / "onnx" / "vision_encoder.onnx"
-    network.write_bytes(network.read_bytes()[: network.stat().st_size // 2])
-    with pytest.raises(ModelError, match=r"vision_encoder.onnx cannot be opened(.|\n)*fetch a whole copy"):
-        SamModel.load(folder)
+def replaced(folder: Path, name: str, content: bytes) -> None:
+    (folder / name).write_bytes(content)
 
 
-def test_an_empty_network_is_named(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    (folder / "onnx" / "vision_encoder.onnx").write_bytes(b"")
-    with pytest.raises(ModelError, match=r"vision_encoder.onnx cannot be opened(.|\n)*a file of 0 bytes"):
-        SamModel.load(folder)
+def halved(folder: Path) -> None:
+    replaced(folder, ENCODER, (folder / ENCODER).read_bytes()[: (folder / ENCODER).stat().st_size // 2])
 
 
-def test_a_network_without_its_weights_file_is_named(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    path = folder / "onnx" / "prompt_encoder_mask_decoder.onnx"
+def changed(folder: Path, name: str, **entries: object) -> None:
+    (folder / name).write_text(json.dumps(json.loads((folder / name).read_text()) | entries))
+
+
+def renamed(folder: Path) -> None:
+    (folder / ENCODER).rename(folder / "onnx" / "vision_encoder_quantized.onnx")
+
+
+def as_torch(folder: Path) -> None:
+    shutil.rmtree(folder / "onnx")
+    (folder / "model.safetensors").touch()
+
+
+def retyped(folder: Path, channels: int, kind: int) -> None:
+    """Redeclare the encoder's input; onnxruntime trusts the declaration."""
+    names = ("image_embeddings", "image_positional_embeddings")
+    nodes = [
+        helper.make_node("Cast", ["pixel_values"], ["as_float"], to=TensorProto.FLOAT),
+        helper.make_node("GlobalAveragePool", ["as_float"], [names[0]]),
+        helper.make_node("Identity", [names[0]], [names[1]]),
+    ]
+    outputs = [tensor(name, [1, channels, 1, 1]) for name in names]
+    save_network(folder / ENCODER, nodes, [tensor("pixel_values", [1, channels, 32, 32], kind)], outputs, {})
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (halved, r"vision_encoder.onnx cannot be opened(.|\n)*fetch a whole copy"),
+        (partial(replaced, name=ENCODER, content=b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
+        (partial(replaced, name=ENCODER, content=LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
+        *(
+            (partial(replaced, name="config.json", content=text), r"no readable config.json(.|\n)*model_type")
+            for text in (b"", b"{")
+        ),
+        *(
+            (partial(replaced, name="config.json", content=text), r"another kind of model(.|\n)*model_type")
+            for text in (b"[]", b'{"model_type": 3}')
+        ),
+        (renamed, r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"),
+        (partial(changed, name=PREPROCESSOR, do_normalize=False), "switches off do_normalize"),
+        *(
+            (partial(changed, name=PREPROCESSOR, image_std=values), "image_std cannot be used")
+            for values in ([0, 1, 1], [-1, 1, 1], "x")
+        ),
+        (partial(changed, name=PREPROCESSOR, image_mean=[1e999, 0, 0]), "image_mean cannot be used"),
+        *(
+            (
+                partial(changed, name="config.json", mask_generation=own),
+                r"config.json: mask_generation cannot be used",
+            )
+            for own in ({"stability_min": 3}, {"segmenter": "graph"}, [1])
+        ),
+        (
+            partial(retyped, channels=3, kind=TensorProto.UINT8),
+            r"other inputs than expected: pixel_values(.|\n)*tensor\(uint8\)",
+        ),
+        (
+            partial(retyped, channels=1, kind=TensorProto.FLOAT),
+            r"pixel_values(.|\n)*\(any, 3, any, any\)(.|\n)*\[1, 1, 32, 32\]",
+        ),
+        (
+            partial(write_disc_sam, points_name="point_coords"),
+            r"other inputs than expected: input_points, point_coords",
+        ),
+        (
+            partial(write_disc_sam, heads=4),
+            r"other outputs(.|\n)*expected .*\(any, any, 3\)(.|\n)*'P', 4\]",
+        ),
+        (as_torch, r"PyTorch's weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
+        *(
+            (
+                partial(replaced, name="config.json", content=b'{"model_type": "%s"}' % model_type),
+                rf"SAM 2 or 2.1 \(sam2\)(.|\n)*{model_type.decode()}(.|\n)*{words}",
+            )
+            for model_type, words in (
+                (b"siglip2", "variable resolution"),
+                (b"sam3", "take SAM 2.1"),
+                (b"blip", "docs/models.md"),
+            )
+        ),
+    ],
+)
+def test_the_error_says_what_is_wrong_with_a_folder(own_sam, damage: Callable[[Path], None], words):
+    damage(own_sam)
+    with pytest.raises(ModelError, match=words):
+        SamModel.load(own_sam)
+
+
+def test_a_network_without_its_weights_file_is_named(own_sam):
+    path = own_sam / "onnx" / "prompt_encoder_mask_decoder.onnx"
     onnx.save(
         onnx.load(path), path, save_as_external_data=True, location="decoder.onnx_data", size_threshold=1024
     )
-    assert SamModel.load(folder).longest_edge == 32
-    (folder / "onnx" / "decoder.onnx_data").unlink()
+    assert SamModel.load(own_sam).longest_edge == 32
+    (own_sam / "onnx" / "decoder.onnx_data").unlink()
     with pytest.raises(ModelError, match=r"cannot be opened(.|\n)*\.onnx_data"):
-        SamModel.load(folder)
+        SamModel.load(own_sam)
 
 
-def test_a_git_lfs_pointer_is_recognised(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    (folder / "onnx" / "vision_encoder.onnx").write_text(
-        "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
-    )
-    with pytest.raises(ModelError, match=r"Git LFS pointer(.|\n)*git lfs pull"):
-        SamModel.load(folder)
+def test_another_kind_of_model_is_refused(disc_sam):
+    with pytest.raises(ModelError, match=r"another kind(.|\n)*model_type clip(.|\n)*'sam'"):
+        open_model_folder(disc_sam, "clip")
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"model_type": 3}'])
-def test_a_broken_description_is_named(make_disc_sam, tmp_path, text):
-    folder = make_disc_sam(tmp_path / "sam")
-    (folder / "config.json").write_text(text)
-    with pytest.raises(ModelError, match=r"(no readable config.json|another kind of model)(.|\n)*model_type"):
-        open_model_folder(folder, "sam")
-
-
-def test_preprocessing_that_is_switched_off_is_refused(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    path = folder / "preprocessor_config.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"do_normalize": False}))
-    with pytest.raises(ModelError, match="switches off do_normalize"):
-        SamModel.load(folder)
-
-
-def retyped(folder, shape: list, kind: int) -> None:
-    """Redeclare the encoder's input; onnxruntime trusts the declaration."""
-    path = folder / "onnx" / "vision_encoder.onnx"
-    cast = helper.make_node("Cast", ["pixel_values"], ["as_float"], to=TensorProto.FLOAT)
-    pool = helper.make_node("GlobalAveragePool", ["as_float"], ["image_embeddings"])
-    same = helper.make_node("Identity", ["image_embeddings"], ["image_positional_embeddings"])
-    outputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, shape[1], 1, 1])
-        for name in ("image_embeddings", "image_positional_embeddings")
-    ]
-    graph = helper.make_graph(
-        [cast, pool, same], "g", [helper.make_tensor_value_info("pixel_values", kind, shape)], outputs
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    path.write_bytes(model.SerializeToString())
-
-
-def test_a_network_that_takes_bytes_is_refused(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    retyped(folder, [1, 3, 32, 32], TensorProto.UINT8)
-    with pytest.raises(ModelError, match=r"other inputs than expected: pixel_values(.|\n)*tensor\(uint8\)"):
-        SamModel.load(folder)
-
-
-def test_a_network_for_grey_images_is_refused(make_disc_sam, tmp_path):
-    folder = make_disc_sam(tmp_path / "sam")
-    retyped(folder, [1, 1, 32, 32], TensorProto.FLOAT)
-    with pytest.raises(ModelError, match=r"pixel_values(.|\n)*\(any, 3, any, any\)(.|\n)*\[1, 1, 32, 32\]"):
-        SamModel.load(folder)
+def test_networks_may_be_beside_the_configuration(own_sam):
+    for path in (own_sam / "onnx").iterdir():
+        path.rename(own_sam / path.name)
+    assert SamModel.load(own_sam).longest_edge == 32
 
 
 def test_a_decoder_that_hides_its_number_of_masks_is_found_out_when_it_runs(tmp_path):

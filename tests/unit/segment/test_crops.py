@@ -35,8 +35,7 @@ def test_backgrounds_differ_outside_the_mask_only(background, outside):
 
 def test_the_margin_ends_at_the_border_of_the_image():
     image = np.full((4, 4, 3), 50, np.uint8)
-    mask = np.ones((4, 4), bool)
-    assert (square_crop(image, mask, "black", 1.0, 4) == 50).all()
+    assert (square_crop(image, np.ones((4, 4), bool), "black", 1.0, 4) == 50).all()
 
 
 def test_an_empty_mask_is_refused():

@@ -1,7 +1,5 @@
 """Digests of masks: what changes them, and what they refuse."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,30 +7,30 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.segment.digests import digest_of, digests_in, index_entry, load_masks, require_same_masks
 from hilsplat.segment.masks import HierarchicalMasks
+from tests.unit.segment.handmade import pack
 
 
-def two_masks(dense: np.ndarray | None = None) -> HierarchicalMasks:
-    """A mask of the left column and one of the top row, or those given."""
-    if dense is None:
-        dense = np.zeros((2, 3, 4), bool)
-        dense[0, :, 0] = dense[1, 0] = True
-    scores = np.array([0.9, 0.8], np.float32)
-    return HierarchicalMasks.from_dense(dense, np.array([1, 2], np.uint8), scores, scores)
+def two_masks() -> HierarchicalMasks:
+    """A mask of the left column and one of the top row."""
+    dense = np.zeros((2, 3, 4), bool)
+    dense[0, :, 0] = dense[1, 0] = True
+    return pack(dense, [1, 2], [0.9, 0.8])
 
 
-def test_a_digest_depends_on_order_size_pixels_and_levels(tmp_path):
+def test_a_digest_depends_on_order_size_pixels_levels_and_scores(tmp_path):
     masks = two_masks()
     pixels = masks.dense()
     pixels[0, 2, 3] = True
     others = (
         masks.take(np.array([1, 0])),
         masks.take(np.array([0])),
-        two_masks(masks.dense().reshape(2, 4, 3)),
-        two_masks(pixels),
-        replace(masks, level=np.array([1, 3], np.uint8)),
+        pack(masks.dense().reshape(2, 4, 3), [1, 2], [0.9, 0.8]),
+        pack(pixels, [1, 2], [0.9, 0.8]),
+        pack(masks.dense(), [1, 3], [0.9, 0.8]),
+        pack(masks.dense(), [1, 2], [0.9, 0.7]),
         HierarchicalMasks.concatenate([], (3, 4)),
     )
-    assert len({digest_of(each) for each in (masks, *others)}) == 7
+    assert len({digest_of(each) for each in (masks, *others)}) == 8
     masks.save(tmp_path / "v.npz")
     assert digest_of(HierarchicalMasks.load(tmp_path / "v.npz")) == digest_of(two_masks()) == digest_of(masks)
 

@@ -7,20 +7,21 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.levels import Level
+from hilsplat.models.folder import open_model_folder
 from hilsplat.segment.candidates import Candidates, candidates_key, crop_boxes, decode_candidates, floors
+from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import clean_masks, masks_from_candidates
-from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.sam import SamModel, Thresholds
+from hilsplat.segment.sam import Encoded, SamModel, Thresholds
 from hilsplat.settings import MasksSettings
+from tests.unit.segment.handmade import assert_equal_masks, generate, pack
 from tests.unit.segment.plain import mend
 
 SETTINGS = MasksSettings(points_per_side=2, points_per_batch=3, stability_min=0.0, min_area_px=1)
 IMAGE = np.zeros((32, 32, 3), dtype=np.uint8)
 
 
-def generate(model: SamModel, settings: MasksSettings = SETTINGS, image: np.ndarray = IMAGE):
-    candidates = decode_candidates(image, model, settings)
-    return masks_from_candidates(candidates, image.shape[:2], model, settings)
+def changed(**settings: object) -> MasksSettings:
+    return SETTINGS.model_copy(update=settings)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def model(disc_sam) -> SamModel:
 
 
 def test_every_prompt_gives_a_disc_at_every_level(model):
-    masks = generate(model)
+    masks = generate(model, SETTINGS, IMAGE)
     assert [len(masks.rows_of(level)) for level in Level] == [4, 4, 4]
     for level, radius, score in ((Level.WHOLE, 10, 0.7), (Level.PART, 6, 0.8), (Level.SUBPART, 3, 0.9)):
         rows = masks.rows_of(level)
@@ -44,11 +45,6 @@ def test_every_prompt_gives_a_disc_at_every_level(model):
             assert centres == {(1, 1), (3, 1), (1, 3), (3, 3)}  # prompts at 8 and 24 px
 
 
-def test_predicted_iou_threshold_empties_a_level(model):
-    masks = generate(model, SETTINGS.model_copy(update={"predicted_iou_min": 0.75}))
-    assert [len(masks.rows_of(level)) for level in Level] == [0, 4, 4]
-
-
 def test_small_discs_are_less_stable(model):
     candidates = decode_candidates(IMAGE, model, SETTINGS)
     stability = [candidates.stability[candidates.head == head].mean() for head in range(3)]
@@ -58,19 +54,17 @@ def test_small_discs_are_less_stable(model):
 
 
 def test_box_suppression_merges_neighbouring_prompts(model):
-    many = generate(
-        model, SETTINGS.model_copy(update={"points_per_side": 16, "box_nms_iou": 1.0, "nms_iou": 1.0})
-    )
-    few = generate(
-        model, SETTINGS.model_copy(update={"points_per_side": 16, "box_nms_iou": 0.3, "nms_iou": 1.0})
+    many, few = (
+        generate(model, changed(points_per_side=16, nms_iou=1.0, box_nms_iou=iou_max), IMAGE)
+        for iou_max in (1.0, 0.3)
     )
     assert 0 < len(few) < len(many) / 2
 
 
 @pytest.mark.parametrize("batch", [1, 3, 64])
 def test_masks_do_not_depend_on_the_batch(model, batch):
-    masks = generate(model, SETTINGS.model_copy(update={"points_per_batch": batch}))
-    np.testing.assert_array_equal(masks.runs, generate(model).runs)
+    masks = generate(model, changed(points_per_batch=batch), IMAGE)
+    np.testing.assert_array_equal(masks.runs, generate(model, SETTINGS, IMAGE).runs)
 
 
 def one_row(candidates: Candidates, row: int) -> Candidates:
@@ -83,22 +77,12 @@ def one_row(candidates: Candidates, row: int) -> Candidates:
 
 
 def test_masks_do_not_depend_on_the_order_of_candidates(model):
-    settings = SETTINGS.model_copy(update={"points_per_side": 6, "box_nms_iou": 0.5})
+    settings = changed(points_per_side=6, box_nms_iou=0.5)
     candidates = decode_candidates(IMAGE, model, settings)
     shuffle = np.random.default_rng(0).permutation(len(candidates.head))
     shuffled = Candidates.concatenate([one_row(candidates, row) for row in shuffle])
     first = masks_from_candidates(candidates, (32, 32), model, settings)
-    second = masks_from_candidates(shuffled, (32, 32), model, settings)
-    for name, array in first.arrays().items():
-        np.testing.assert_array_equal(array, second.arrays()[name], err_msg=name)
-
-
-def test_masks_have_the_size_of_a_wide_image(model):
-    masks = generate(model, image=np.zeros((40, 90, 3), dtype=np.uint8))
-    assert masks.size_hw == (40, 90)
-    # 90 px become 32: discs grow by 90 / 32
-    part = masks.area_px[masks.rows_of(Level.PART)].max()
-    assert part <= np.pi * (6 * 90 / 32) ** 2 * 1.1
+    assert_equal_masks(masks_from_candidates(shuffled, (32, 32), model, settings), first)
 
 
 def test_crops_by_hand():
@@ -116,7 +100,7 @@ def test_crops_by_hand():
 
 def test_crops_find_finer_masks_and_drop_those_they_cut(model):
     image = np.zeros((128, 128, 3), dtype=np.uint8)
-    settings = SETTINGS.model_copy(update={"crop_layers": 1, "nms_inner": 0.0})
+    settings = changed(crop_layers=1, nms_inner=0.0)
     candidates = decode_candidates(image, model, settings)
     assert set(candidates.crop.tolist()) == {0, 1, 2, 3, 4}
     masks = masks_from_candidates(candidates, (128, 128), model, settings)
@@ -130,59 +114,71 @@ def test_crops_find_finer_masks_and_drop_those_they_cut(model):
             assert not (cut & ~(np.abs(box - [0, 0, 128, 128]) <= 20)).any()
 
 
-def cleaned(mask: np.ndarray, min_area_px: int) -> tuple[np.ndarray, np.ndarray]:
-    one = np.ones(1, np.float32)
-    masks, changed = clean_masks(
-        HierarchicalMasks.from_dense(mask[None], np.ones(1, np.uint8), one, one), min_area_px
-    )
-    return masks.dense(), changed
-
-
-def test_small_islands_go_and_small_holes_close():
-    mask = np.zeros((8, 8), dtype=bool)
-    mask[1:6, 1:6] = True
-    mask[3, 3] = False
-    mask[7, 7] = True
-    found, changed = cleaned(mask, min_area_px=4)
-    expected = np.zeros((8, 8), dtype=bool)
-    expected[1:6, 1:6] = True
-    assert changed.tolist() == [True]
-    np.testing.assert_array_equal(found[0], expected)
-
-
-def test_a_mask_that_is_small_as_a_whole_goes():
-    mask = np.zeros((8, 8), dtype=bool)
-    mask[0, 0] = mask[4, 4] = mask[4, 5] = True
-    assert len(cleaned(mask, min_area_px=30)[0]) == 0
-    found, changed = cleaned(mask, min_area_px=2)
-    assert (found[0].sum(), changed.tolist()) == (2, [True])
-
-
 @given(hnp.arrays(bool, st.tuples(st.integers(1, 9), st.integers(1, 9))), st.integers(1, 12))
-def test_runs_are_cleaned_like_images(mask, min_area_px):
+def test_small_islands_go_small_holes_close_and_small_masks_go(mask, min_area_px):
     if not mask.any():
         return
-    found, changed = cleaned(mask, min_area_px)
+    found, changed = clean_masks(pack(mask[None]), min_area_px)
     expected = mend(mask, min_area_px)
     if expected.sum() < min_area_px:
         assert len(found) == 0
     else:
-        np.testing.assert_array_equal(found[0], expected)
+        np.testing.assert_array_equal(found.dense()[0], expected)
         assert changed.tolist() == [(expected != mask).any()]
 
 
 def test_cache_key_covers_what_the_network_sees_and_no_more(model):
     key = candidates_key("image", model, SETTINGS)
     for change in ({"predicted_iou_min": 0.5}, {"nms_iou": 0.5}, {"min_area_px": 50}, {"box_nms_iou": 0.1}):
-        assert candidates_key("image", model, SETTINGS.model_copy(update=change)) == key
-    for change in (
-        {"points_per_side": 3},
-        {"crop_layers": 1},
-        {"stability_offset": 0.5},
-        {"predicted_iou_min": 0.05},
-    ):
-        assert candidates_key("image", model, SETTINGS.model_copy(update=change)) != key
+        assert candidates_key("image", model, changed(**change)) == key
+    for change in ({"points_per_side": 3}, {"crop_layers": 1}, {"stability_offset": 0.5}):
+        assert candidates_key("image", model, changed(**change)) != key
+    assert candidates_key("image", model, changed(predicted_iou_min=0.05)) != key
     assert candidates_key("another", model, SETTINGS) != key
+
+
+@pytest.mark.parametrize("size_hw", [(1, 1), (50, 1), (1, 700), (3, 5)])
+@pytest.mark.parametrize("crop_layers", [0, 1])
+def test_an_image_of_one_pixel_width_has_masks_of_its_size(model, size_hw, crop_layers):
+    image = np.full((*size_hw, 3), 90, np.uint8)
+    masks = generate(model, changed(points_per_side=3, crop_layers=crop_layers), image)
+    assert masks.size_hw == size_hw
+    assert len(masks) > 0
+    parent, _ = coverage_tree(masks, theta=0.9)
+    assert len(parent) == len(masks)
+
+
+def test_a_view_without_masks_goes_through(model):
+    none = generate(model, changed(min_area_px=5000), IMAGE)
+    assert (len(none), none.size_hw) == (0, (32, 32))
+    parent, depth = coverage_tree(none, theta=0.9)
+    assert parent.shape == depth.shape == (0,)
+
+
+def test_a_photograph_of_40_megapixels_needs_no_picture_per_mask(model):
+    masks = generate(model, changed(min_area_px=100), np.zeros((5480, 7300, 3), np.uint8))
+    assert masks.size_hw == (5480, 7300)
+    # a disc of radius 6 in a frame of 32 px whose longer side is 7300 px
+    part = masks.area_px[masks.rows_of(Level.PART)].max()
+    assert part == pytest.approx(np.pi * (6 * 7300 / 32) ** 2, rel=0.2)
+    assert masks.runs.nbytes < 2**22
+    coverage_tree(masks, theta=0.9)
+
+
+def test_of_two_masks_above_one_the_surer_stays(disc_sam):
+    """The network is surer of the smaller disc: 1.06 and 1.02. Cut to 1, the larger would win the tie."""
+
+    class Sure(SamModel):
+        def decode(self, encoded: Encoded, points_xy: np.ndarray):
+            y, x = np.mgrid[:16, :16]
+            is_first = np.arange(len(points_xy)) == 0
+            radii = np.where(is_first, 5.2, 4.8)
+            discs = (radii[:, None, None] - np.hypot(x - 7.5, y - 7.5)[None]).astype(np.float32)
+            scores = np.where(is_first, 1.02, 1.06).astype(np.float32)
+            return np.repeat(scores[:, None], 3, axis=1), np.repeat(discs[:, None], 3, axis=1)
+
+    masks = generate(Sure(open_model_folder(disc_sam)), changed(points_per_batch="auto"), IMAGE)
+    assert masks.predicted_iou.tolist() == [np.float32(1.06)] * 3
 
 
 def test_floors_follow_thresholds_below_the_loose_one():

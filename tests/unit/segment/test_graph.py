@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hilsplat.base.levels import NONE, Level
-from hilsplat.segment.coverage import coverage_tree
+from hilsplat.base.levels import Level
 from hilsplat.segment.graph import cut, merge_regions, segment_graph
+from hilsplat.segment.masks import HierarchicalMasks
 
 SCALES = (0.12, 0.04, 0.015)
 
@@ -18,28 +18,29 @@ def mosaic() -> np.ndarray:
     return image
 
 
-def test_clear_regions_are_found_to_the_pixel_or_two():
-    masks = segment_graph(mosaic(), SCALES, min_area_px=16)
-    wholes = masks.dense(masks.rows_of(Level.WHOLE))
-    assert len(wholes) == 2
+def ious(masks: HierarchicalMasks, first: int, last: int) -> np.ndarray:
+    """IoU of each mask with a square of the mosaic."""
     square = np.zeros((160, 160), dtype=bool)
-    square[30:110, 30:110] = True
-    iou = max((mask & square).sum() / (mask | square).sum() for mask in wholes)
-    assert iou > 0.95
+    square[first:last, first:last] = True
+    dense = masks.dense()
+    return (dense & square).sum(axis=(1, 2)) / (dense | square).sum(axis=(1, 2))
 
 
-def test_fine_detail_appears_at_the_finer_levels_only():
-    masks = segment_graph(mosaic(), SCALES, min_area_px=16)
-    detail = np.zeros((160, 160), dtype=bool)
-    detail[60:72, 60:72] = True
+@pytest.fixture(scope="module")
+def masks() -> HierarchicalMasks:
+    return segment_graph(mosaic(), SCALES, min_area_px=16)
 
-    def best(level: Level) -> float:
-        return max(
-            (mask & detail).sum() / (mask | detail).sum() for mask in masks.dense(masks.rows_of(level))
-        )
 
-    assert best(Level.WHOLE) < 0.1
-    assert best(Level.SUBPART) > 0.7
+def test_clear_regions_are_found_to_the_pixel_or_two(masks):
+    wholes = masks.rows_of(Level.WHOLE)
+    assert len(wholes) == 2
+    assert ious(masks, 30, 110)[wholes].max() > 0.95
+
+
+def test_fine_detail_appears_at_the_finer_levels_only(masks):
+    found = ious(masks, 60, 72)
+    assert found[masks.rows_of(Level.WHOLE)].max() < 0.1
+    assert found[masks.rows_of(Level.SUBPART)].max() > 0.7
 
 
 def test_every_level_covers_the_image_and_levels_nest():
@@ -56,30 +57,26 @@ def test_every_level_covers_the_image_and_levels_nest():
             assert max(covers) == 1.0
 
 
-def test_parents_of_the_detail_is_the_square():
-    masks = segment_graph(mosaic(), SCALES, min_area_px=16)
-    parent, _ = coverage_tree(masks, theta=0.9)
-    smallest = int(masks.area_px.argmin())
-    assert parent[smallest] != NONE
-    assert masks.area_px[parent[smallest]] == pytest.approx(80 * 80, rel=0.05)
-
-
-def test_scores_are_shares_and_a_clear_region_has_the_better_one():
-    masks = segment_graph(mosaic(), SCALES, min_area_px=16)
+def test_scores_are_shares_and_a_clear_region_has_the_better_one(masks):
     for score in (masks.predicted_iou, masks.stability):
         assert ((score >= 0) & (score <= 1)).all()
-    detail = np.zeros((160, 160), dtype=bool)
-    detail[60:72, 60:72] = True
-    faint = int(
-        ((masks.dense() & detail).sum(axis=(1, 2)) / (masks.dense() | detail).sum(axis=(1, 2))).argmax()
-    )
+    faint = ious(masks, 60, 72).argmax()
     assert masks.predicted_iou[masks.rows_of(Level.WHOLE)].min() > masks.predicted_iou[faint] > 0
 
 
-def test_one_colour_is_one_region():
-    masks = segment_graph(np.full((40, 60, 3), 77, dtype=np.uint8), SCALES, min_area_px=16)
+@pytest.mark.parametrize("size_hw", [(1, 1), (50, 1), (1, 700), (3, 5), (40, 60)])
+def test_an_image_of_one_colour_is_one_region(size_hw):
+    masks = segment_graph(np.full((*size_hw, 3), 90, np.uint8), SCALES, min_area_px=1)
     assert [len(masks.rows_of(level)) for level in Level] == [1, 1, 1]
-    assert (masks.area_px == 40 * 60).all()
+    assert (masks.area_px == size_hw[0] * size_hw[1]).all()
+
+
+def test_40_megapixels_are_segmented_at_a_smaller_size():
+    image = np.full((5480, 7300, 3), 120, np.uint8)
+    image[1000:3000, 1000:4000] = (40, 60, 200)
+    masks = segment_graph(image, SCALES, min_area_px=100)
+    wholes = masks.area_px[masks.rows_of(Level.WHOLE)]
+    assert sorted(wholes / 1e6) == pytest.approx([6, 34.004], rel=0.02)
 
 
 def test_the_cheapest_pair_merges_first():

@@ -10,19 +10,10 @@ from pycocotools import mask as coco_mask
 from hilsplat.base.errors import EmptyMaskError
 from hilsplat.base.levels import Level
 from hilsplat.segment.masks import HierarchicalMasks, encode_runs, runs_of_labels
+from tests.unit.segment.handmade import assert_equal_masks, pack
 
 shapes = st.tuples(st.integers(0, 6), st.integers(1, 5), st.integers(1, 5))
 nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1, 2)).all())
-
-
-def pack(dense: np.ndarray, level=None, iou=None) -> HierarchicalMasks:
-    number = len(dense)
-    return HierarchicalMasks.from_dense(
-        dense,
-        np.full(number, 1, np.uint8) if level is None else np.asarray(level, np.uint8),
-        np.full(number, 0.5, np.float32) if iou is None else np.asarray(iou, np.float32),
-        np.ones(number, np.float32),
-    )
 
 
 def test_runs_of_a_small_mask_by_hand():
@@ -99,9 +90,7 @@ def test_content_order_does_not_depend_on_the_order_of_rows(dense, random):
     shuffled = list(range(len(dense)))
     random.shuffle(shuffled)
     again = masks.take(np.array(shuffled, dtype=np.int64))
-    first, second = masks.take(masks.content_order()), again.take(again.content_order())
-    for name, array in first.arrays().items():
-        np.testing.assert_array_equal(array, second.arrays()[name], err_msg=name)
+    assert_equal_masks(again.take(again.content_order()), masks.take(masks.content_order()))
 
 
 def test_taken_and_joined_masks_keep_their_pixels(tmp_path):

@@ -1,24 +1,24 @@
-"""Sizes, points and logits on their way into and out of SAM."""
+"""Sizes, points and logits on their way into and out of SAM, and its thresholds."""
 
 import numpy as np
 import pytest
 import torch
 
-from hilsplat.base.levels import Level
+from hilsplat.embed.model_check import check_model
 from hilsplat.segment.sam import (
-    HEADS,
+    REAL_SAM,
     Frame,
     SamModel,
+    Thresholds,
     point_grid,
     read_logits,
     resized_size,
     taps,
-    valid_low_resolution,
 )
+from hilsplat.settings import MasksSettings
+from models.training.export import OWN_THRESHOLDS
 
-
-def test_heads_run_from_fine_to_coarse():
-    assert HEADS == (Level.SUBPART, Level.PART, Level.WHOLE)
+SQUARE = Frame((4, 4), (4, 4), (4, 4))
 
 
 @pytest.mark.parametrize(
@@ -39,19 +39,18 @@ def test_grid_points_are_the_centres_of_squares():
     assert point_grid(2).tolist() == [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
 
 
-def test_image_is_normalised_then_padded_with_zeros(disc_sam):
-    image = np.full((16, 32, 3), 255, dtype=np.uint8)
-    pixels, frame = SamModel.load(disc_sam).prepare(image)
-    assert frame == Frame((16, 32), (16, 32), (32, 32))
-    np.testing.assert_allclose(pixels[0, :, :16], 2.0, rtol=1e-6)  # (255 / 255 - 0.5) / 0.25
-    assert (pixels[0, :, 16:] == 0).all()  # padding is zero after normalisation
-
-
-def test_larger_images_shrink_to_the_longest_edge(disc_sam):
-    pixels, frame = SamModel.load(disc_sam).prepare(np.zeros((64, 48, 3), dtype=np.uint8))
-    assert frame.resized_hw == (32, 24)
-    assert (pixels[0, :, :, :24] == -2).all()
-    assert (pixels[0, :, :, 24:] == 0).all()
+@pytest.mark.parametrize(
+    ("original_hw", "resized_hw", "value", "expected"),
+    [((16, 32), (16, 32), 255, 2.0), ((64, 48), (32, 24), 0, -2.0)],  # (255 / 255 - 0.5) / 0.25
+)
+def test_images_are_shrunk_and_normalised_then_padded_with_zeros(
+    disc_sam, original_hw, resized_hw, value, expected
+):
+    pixels, frame = SamModel.load(disc_sam).prepare(np.full((*original_hw, 3), value, np.uint8))
+    assert frame == Frame(original_hw, resized_hw, (32, 32))
+    np.testing.assert_allclose(pixels[0, :, : resized_hw[0], : resized_hw[1]], expected, rtol=1e-6)
+    assert (pixels[0, :, resized_hw[0] :] == 0).all()
+    assert (pixels[0, :, :, resized_hw[1] :] == 0).all()
 
 
 def test_points_are_scaled_to_the_resized_image(disc_sam):
@@ -63,9 +62,6 @@ def test_points_are_scaled_to_the_resized_image(disc_sam):
     for cell in ((3, 7), (3, 8), (4, 7), (4, 8)):
         assert logits[0, 2][cell] == pytest.approx(10 - 2**0.5)
     assert logits[0, 2].max() == pytest.approx(10 - 2**0.5)
-
-
-SQUARE = Frame((4, 4), (4, 4), (4, 4))
 
 
 def test_logits_are_rounded_to_eighths_and_clipped():
@@ -82,6 +78,23 @@ def test_the_box_holds_what_is_above_zero():
     assert boxes.tolist() == [[2, 1, 5, 3], [0, 0, 0, 0]]
 
 
+def test_a_released_sam_has_langsplats_thresholds(own_sam):
+    (own_sam / "config.json").write_text('{"model_type": "sam"}')
+    assert SamModel.load(own_sam).thresholds(MasksSettings()) == REAL_SAM == Thresholds(0.7, 0.85, 0.7, 8)
+
+
+def test_the_embedded_sam_brings_its_own_thresholds(project):
+    model = SamModel.load(project / "models/sam-tiny")
+    assert model.thresholds(MasksSettings()) == OWN_THRESHOLDS == Thresholds(0.35, 0.5, 0.0, 16)
+    text = check_model(project / "models/sam-tiny")
+    assert "thresholds predicted IoU 0.35, stability 0.5, score 0.0" in text
+
+
+def test_a_setting_wins_over_the_thresholds_of_the_model(disc_sam):
+    chosen = MasksSettings(stability_min=0.9, points_per_batch=3)
+    assert SamModel.load(disc_sam).thresholds(chosen) == Thresholds(0.35, 0.9, 0.0, 3)
+
+
 @pytest.mark.parametrize("length", [1, 7, 48, 90, 500])
 def test_taps_equal_two_bilinear_steps_of_torch(length):
     resized = min(64, max(1, round(length * 0.6)))
@@ -96,21 +109,16 @@ def test_taps_equal_two_bilinear_steps_of_torch(length):
     np.testing.assert_allclose(whole, padded[0].numpy().T, atol=1e-5)  # torch places pixels in float32
 
 
-def test_stability_counts_between_the_two_thresholds_and_leaves_out_padding():
-    frame = Frame(original_hw=(2, 4), resized_hw=(16, 32), padded_hw=(32, 32))
-    logits = np.zeros((1, 4, 4), dtype=np.float32)
-    logits[0, 0] = [10, 10, 0, -10]
-    logits[0, 1] = [10, 0, 0, -10]
-    logits[0, 2:] = 10  # padding
-    assert valid_low_resolution((4, 4), frame) == (2, 4)
-    assert read_logits(logits, 1.0, frame)[1].tolist() == [pytest.approx(3 / 6)]
-
-
-def test_a_logit_at_a_threshold_is_not_above_it():
-    logits = np.array([1.0, 1.125, -1.0, -0.875], np.float32).reshape(1, 2, 2)
-    # above 1: 1.125; above -1: 1, 1.125 and -0.875
-    assert read_logits(logits, 1.0, Frame((2, 2), (2, 2), (2, 2)))[1].tolist() == [pytest.approx(1 / 3)]
-
-
-def test_stability_of_nothing_is_zero():
-    assert read_logits(np.full((1, 4, 4), -12.5, np.float32), 1.0, SQUARE)[1].tolist() == [0.0]
+@pytest.mark.parametrize(
+    ("rows", "resized_hw", "expected"),
+    [
+        # above 1: 1.125; above -1: 1, 1.125 and -0.875
+        ([[1, 1.125], [-1, -0.875]], (32, 32), 1 / 3),
+        # the lower half is padding
+        ([[10, 10, 0, -10], [10, 0, 0, -10], [10] * 4, [10] * 4], (16, 32), 3 / 6),
+        ([[-12.5] * 4] * 4, (32, 32), 0),
+    ],
+)
+def test_stability_counts_pixels_of_the_image_above_both_thresholds(rows, resized_hw, expected):
+    _, stability, _ = read_logits(np.array([rows], np.float32), 1.0, Frame((2, 4), resized_hw, (32, 32)))
+    assert stability.tolist() == [pytest.approx(expected)]

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.suppression import (
     box_iou,
     distinct_boxes,
@@ -14,6 +13,7 @@ from hilsplat.segment.suppression import (
     suppress_boxes,
     suppress_masks,
 )
+from tests.unit.segment.handmade import assert_equal_masks, pack
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(5))
 nonempty_masks = hnp.arrays(bool, shapes).filter(lambda masks: masks.any(axis=(1, 2)).all())
@@ -51,15 +51,17 @@ def test_box_iou_by_hand():
     assert box_iou(a, b)[0].tolist() == [1.0, pytest.approx(8 / 24), 0.0]
 
 
-def test_best_box_stays_and_its_neighbour_goes():
-    boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 9], [20, 20, 30, 30]])
-    assert suppress_boxes(boxes, np.array([0.5, 0.9, 0.1]), iou_max=0.7).tolist() == [1, 2]
-
-
-def test_a_dropped_box_drops_no_other():
-    # 0-1 and 1-2 overlap by 0.6, 0-2 by a third: 0 drops 1, so 2 stays
-    boxes = np.array([[0, 0, 8, 1], [2, 0, 10, 1], [4, 0, 12, 1]])
-    assert suppress_boxes(boxes, np.array([0.9, 0.8, 0.7]), iou_max=0.5).tolist() == [0, 2]
+@pytest.mark.parametrize(
+    ("boxes", "score", "iou_max", "kept"),
+    [
+        # the best box drops its neighbour
+        ([[0, 0, 10, 10], [0, 0, 10, 9], [20, 20, 30, 30]], [0.5, 0.9, 0.1], 0.7, [1, 2]),
+        # a dropped box drops no other: 0-1 and 1-2 overlap by 0.6, 0-2 by a third
+        ([[0, 0, 8, 1], [2, 0, 10, 1], [4, 0, 12, 1]], [0.9, 0.8, 0.7], 0.5, [0, 2]),
+    ],
+)
+def test_boxes_are_dropped_by_better_ones_that_are_kept(boxes, score, iou_max, kept):
+    assert suppress_boxes(np.array(boxes), np.array(score), iou_max).tolist() == kept
 
 
 def test_a_box_repeats_a_better_one_unless_it_is_steadier():
@@ -118,23 +120,13 @@ def test_result_does_not_depend_on_the_order_of_masks(masks, data):
     score = np.array(data.draw(st.lists(scores_of, min_size=number, max_size=number)), np.float32)
     level = np.array(data.draw(st.lists(st.integers(1, 3), min_size=number, max_size=number)), np.uint8)
     shuffle = np.array(data.draw(st.permutations(range(number))))
-    results = [
-        suppress_masks(
-            HierarchicalMasks.from_dense(
-                masks[order], level[order], score[order], np.ones(number, np.float32)
-            ),
-            iou_max=0.8,
-            score_min=0.2,
-            inner=0.5,
-        )
+    first, second = (
+        suppress_masks(pack(masks[order], level[order], score[order]), iou_max=0.8, score_min=0.2, inner=0.5)
         for order in (np.arange(number), shuffle)
-    ]
-    for name, array in results[0].arrays().items():
-        np.testing.assert_array_equal(array, results[1].arrays()[name], err_msg=name)
+    )
+    assert_equal_masks(second, first)
 
 
 def test_levels_do_not_suppress_each_other():
-    mask = np.ones((3, 2, 2), dtype=bool)
-    ones = np.ones(3, np.float32)
-    masks = HierarchicalMasks.from_dense(mask, np.array([1, 2, 3], np.uint8), ones, ones)
+    masks = pack(np.ones((3, 2, 2)), [1, 2, 3])
     assert len(suppress_masks(masks, iou_max=0.8, score_min=0.0, inner=0.5)) == 3
