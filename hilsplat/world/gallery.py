@@ -67,9 +67,9 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
     scale = min(RADIUS / radius, 2.7 * RADIUS / height)
     assembly = Assembly()
     assembly.add_object(model, scale, -centre * scale, 0.0)
-    ground = assembly.add_surroundings("ground", (), [(box((8, 8, 0.1), (0, 0, -0.05)), _GROUND)])
+    assembly.add_surroundings("ground", (), [(box((8, 8, 0.1), (0, 0, -0.05)), _GROUND)])
     style = Style(light_position=(1.2, -1.0, 3.6), exposure=1.3)
-    scene = assembly.finished(model.name, 0, 1, (), [ground], style)
+    scene = assembly.finished(model.name, 0, 1, (), style)
     middle = np.array([0, 0, 0.48 * height * scale])
     pose = looking_at(middle + on_sphere(AZIMUTH_DEG, ELEVATION_DEG, 1.9), middle)
     reach = max(0.90 * RADIUS, 0.60 * height * scale)
@@ -106,15 +106,8 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
             if index < across:
                 axes.set_title(title or "view", fontsize=10, pad=3)
             if column == 0:
-                axes.text(
-                    0.03,
-                    0.97,
-                    f"{kind} {seed}",
-                    color="white",
-                    fontsize=7.5,
-                    va="top",
-                    transform=axes.transAxes,
-                )
+                name = f"{kind} {seed}"
+                axes.text(0.03, 0.97, name, color="white", fontsize=7.5, va="top", transform=axes.transAxes)
     top = 1 - 0.24 / (PANEL_INCHES * rows + 0.25)
     figure.subplots_adjust(left=0.003, right=0.997, bottom=0.005, top=top, wspace=0.025, hspace=0.03)
     _write(figure, out)

@@ -52,9 +52,6 @@ class LidarScan:
     beam: Int32[np.ndarray, " P"]
     origins: Float[np.ndarray, "S 3"]
 
-    def __len__(self) -> int:
-        return len(self.points)
-
     def save(self, path: Path) -> None:
         """Write all fields as .npz; equal scans give equal bytes."""
         write_npz(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
@@ -65,11 +62,8 @@ def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:
     share = (np.arange(BEAMS) + 0.5) / BEAMS
     up = np.radians(INCLINATION_DEG[0] + share * (INCLINATION_DEG[1] - INCLINATION_DEG[0]))[:, None]
     around = 2 * np.pi * (np.arange(azimuth_steps) + 0.5)[None] / azimuth_steps
-    grid = [
-        np.cos(up) * np.cos(around),
-        np.cos(up) * np.sin(around),
-        np.broadcast_to(np.sin(up), (BEAMS, azimuth_steps)),
-    ]
+    level = np.cos(up)
+    grid = np.broadcast_arrays(level * np.cos(around), level * np.sin(around), np.sin(up))
     return np.stack(grid, axis=-1).reshape(-1, 3)
 
 
@@ -86,10 +80,6 @@ def scan_street(
     Args:
         scene: street to scan; its seed also determines noise and losses. The sky returns nothing.
         camera_centres: positions along the drive, in order; the scanner is above evenly chosen ones.
-        azimuth_steps: directions per turn of each beam.
-        poses: number of turns recorded.
-        range_noise_m: standard deviation of the range.
-        lost_share: share of returns that is dropped.
     """
     rng = np.random.default_rng([scene.seed, 31])
     chosen = np.unique(np.linspace(0, len(camera_centres) - 1, poses).round().astype(int))

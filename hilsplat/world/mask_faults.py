@@ -7,7 +7,7 @@ a lower one and adds more of the same kind, so the steps of a sweep over a setti
 
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -72,13 +72,7 @@ class TrueNodes:
         background: Collection[int],
         labels: Iterable[Int32[np.ndarray, "3 H W"]],
     ) -> "TrueNodes":
-        """Measure the borders in all views.
-
-        Args:
-            nodes: all nodes by id.
-            background: ids of the surroundings.
-            labels: for each view, the node id per level and pixel, -1 for none.
-        """
+        """Measure the borders in all views; `labels` has one image of node ids per view, -1 for none."""
         total: Borders = defaultdict(lambda: defaultdict(int))
         alone = TrueNodes(nodes, frozenset(background), {})
         for view in labels:
@@ -86,9 +80,7 @@ class TrueNodes:
                 for node, around in sibling_borders(view[level.index], alone).items():
                     for other, length in around.items():
                         total[node][other] += length
-        return TrueNodes(
-            nodes, alone.background, {node: longest_border(around) for node, around in sorted(total.items())}
-        )
+        return replace(alone, partner={node: longest_border(total[node]) for node in sorted(total)})
 
 
 def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borders:
@@ -190,7 +182,6 @@ def displaced(
         mask: non-empty mask.
         amplitude_px: standard deviation of the displacement; 0 returns the mask itself.
         smooth_px: standard deviation of the field's Gaussian correlation function.
-        generator: source of the field.
 
     Returns:
         The new mask, never empty: the boundary moves inwards by at most half the distance to the innermost
@@ -255,10 +246,6 @@ def faulty_masks(
 
     Args:
         labels: node id per level and pixel, -1 for none.
-        truth: nodes of the scene.
-        view: view name.
-        draws: random numbers of the scene.
-        settings: the faults.
         min_area_px: smaller true regions give no mask.
 
     Returns:

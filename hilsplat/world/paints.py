@@ -3,27 +3,46 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 Colour = tuple[float, float, float]
 
-KINDS = (
-    "mottled",
-    "stripes",
-    "checks",
-    "spots",
-    "wood",
-    "stone",
-    "collage",
-    "weave",
-    "brushed",
-    "brick",
-    "fur",
-    "tiles",
-)
-"""Solid textures, in the order of the shader's kind numbers."""
+
+class Texture(NamedTuple):
+    """A kind of solid texture.
+
+    Attributes:
+        adjective: adjective for an object with the texture, or None.
+        second_share: average share of the texture in its second colour (measured by a test).
+        cells: typical number of pattern cells per scene unit.
+    """
+
+    adjective: str | None
+    second_share: float
+    cells: float
+
+
+TEXTURES: dict[str, Texture] = {
+    "mottled": Texture(None, 0.47, 9.0),
+    "stripes": Texture("striped", 0.40, 11.0),
+    "checks": Texture("checkered", 0.50, 12.0),
+    "spots": Texture("spotted", 0.13, 11.0),
+    "wood": Texture("wooden", 0.45, 13.0),
+    "stone": Texture("stone", 0.50, 8.0),
+    "collage": Texture(None, 0.50, 7.0),
+    "weave": Texture("woven", 0.50, 26.0),
+    "brushed": Texture("metal", 0.43, 8.0),
+    "brick": Texture("brick", 0.18, 13.0),
+    "fur": Texture("furry", 0.50, 16.0),
+    "tiles": Texture("tiled", 0.17, 9.0),
+}
+"""Solid textures by kind."""
+
+KINDS = tuple(TEXTURES)
+"""Kinds of texture, in the order of the shader's kind numbers."""
 
 COLOURS: dict[str, Colour] = {
     "red": (0.78, 0.14, 0.12),
@@ -41,36 +60,6 @@ COLOURS: dict[str, Colour] = {
     "black": (0.13, 0.13, 0.15),
 }
 """sRGB values in [0, 1] by colour word."""
-
-ADJECTIVES: dict[str, str] = {
-    "stripes": "striped",
-    "checks": "checkered",
-    "spots": "spotted",
-    "wood": "wooden",
-    "stone": "stone",
-    "weave": "woven",
-    "brushed": "metal",
-    "brick": "brick",
-    "fur": "furry",
-    "tiles": "tiled",
-}
-"""Adjective for an object with the texture; other kinds have none."""
-
-SECOND_SHARE: dict[str, float] = {
-    "mottled": 0.47,
-    "stripes": 0.40,
-    "checks": 0.50,
-    "spots": 0.13,
-    "wood": 0.45,
-    "stone": 0.50,
-    "collage": 0.50,
-    "weave": 0.50,
-    "brushed": 0.43,
-    "brick": 0.18,
-    "fur": 0.50,
-    "tiles": 0.17,
-}
-"""Average share of a texture in its second colour (measured by a test)."""
 
 # (kinds to draw from, specular strength, shininess) per group of materials.
 GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
@@ -128,30 +117,24 @@ class Paint:
     @property
     def adjective(self) -> str | None:
         """Adjective for the texture, or None."""
-        return ADJECTIVES.get(self.kind)
+        return TEXTURES[self.kind].adjective
 
     @property
     def seen(self) -> Float[np.ndarray, " 3"]:
         """Average colour of the paint, sRGB: both colours mixed in linear light as in the texture."""
-        share = SECOND_SHARE[self.kind]
+        share = TEXTURES[self.kind].second_share
         first, second = (linear_from_srgb(np.array(colour)) for colour in (self.first, self.second))
         return srgb_from_linear((1 - share) * first + share * second)
 
     def paled(self, share: float) -> "Paint":
         """Return the paint with a share of light grey in both colours, and the matching colour word."""
-
-        def mixed(value: float) -> float:
-            return (1 - share) * value + share * 0.68
-
-        return self._changed(mixed)
+        return self._changed(lambda value: (1 - share) * value + share * 0.68)
 
     def shaded(self, factor: float) -> "Paint":
         """Return the paint darker (factor below 1) or nearer to white, with the matching colour word."""
-
-        def moved(value: float) -> float:
-            return max(0.03, factor * value) if factor <= 1 else value + (factor - 1) * (0.95 - value)
-
-        return self._changed(moved)
+        if factor <= 1:
+            return self._changed(lambda value: max(0.03, factor * value))
+        return self._changed(lambda value: value + (factor - 1) * (0.95 - value))
 
     def recoloured(self, word: str) -> "Paint":
         """Return the same texture in another colour, whose shade becomes the second colour."""
@@ -266,11 +249,9 @@ class PaintBox:
         kinds, specular, shininess = GROUPS[group]
         kind = str(rng.choice(kinds))
         choice = colours or (WOOD_COLOURS if kind == "wood" else ())
-        if choice:
-            fresh = [colour for colour in choice if colour in self._unused()] or list(choice)
-            colour = str(rng.choice(fresh))
-        else:
-            colour = str(rng.choice(self._unused()))
+        self._left = self._left or list(COLOURS)
+        fresh = [colour for colour in choice or COLOURS if colour in self._left] or list(choice)
+        colour = str(rng.choice(fresh))
         if colour in self._left:
             self._left.remove(colour)
         first = np.clip(
@@ -281,7 +262,7 @@ class PaintBox:
             kind,
             tuple(first.tolist()),
             tuple(_relative(first).tolist()),
-            scale * float(_CELLS[kind] * rng.uniform(0.8, 1.25)),
+            scale * float(TEXTURES[kind].cells * rng.uniform(0.8, 1.25)),
             specular * float(rng.uniform(0.7, 1.2)),
             shininess * float(rng.uniform(0.7, 1.4)),
             float(rng.uniform(0.22, 0.36)),
@@ -291,11 +272,6 @@ class PaintBox:
         if kind in PATTERNS:
             paint = self._patterned(paint)
         return paint if colour_word(paint.seen) == colour else paint.recoloured(colour)
-
-    def _unused(self) -> list[str]:
-        if not self._left:
-            self._left = list(COLOURS)
-        return self._left
 
     def _patterned(self, paint: Paint) -> Paint:
         """Return the paint with a visible second colour that does not change its colour word.
@@ -310,19 +286,3 @@ class PaintBox:
             if apart > PATTERN_CONTRAST and colour_word(patterned.seen) == paint.colour:
                 return patterned
         return paint
-
-
-_CELLS = {
-    "mottled": 9.0,
-    "stripes": 11.0,
-    "checks": 12.0,
-    "spots": 11.0,
-    "wood": 13.0,
-    "stone": 8.0,
-    "collage": 7.0,
-    "weave": 26.0,
-    "brushed": 8.0,
-    "brick": 13.0,
-    "fur": 16.0,
-    "tiles": 9.0,
-}

@@ -9,7 +9,6 @@ import ctypes
 import weakref
 from dataclasses import dataclass
 from functools import cache
-from typing import no_type_check
 
 import llvmlite.binding
 import numpy as np
@@ -138,7 +137,6 @@ def _embree() -> tuple[ctypes.CDLL, int]:
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _aligned(rows):
     """Return an uninitialised packet aligned to 64 bytes, as Embree requires."""
     space = np.empty((rows + 1) * LANES, np.float32)
@@ -147,7 +145,6 @@ def _aligned(rows):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _new_packet(rows):
     """Return a packet of rays that start at distance 0, its lane mask, and arguments for coherent rays."""
     packet, valid, arguments = _aligned(rows), _aligned(1), np.zeros(8, np.int64)
@@ -160,7 +157,6 @@ def _new_packet(rows):
 
 
 @compiled(forceinline=True)
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _load(packet, valid, origins, directions, first):
     """Load the next rays into a packet and return their number."""
     step = 1 if len(origins) > 1 else 0
@@ -176,7 +172,6 @@ def _load(packet, valid, origins, directions, first):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _nearest(scene, origins, directions, triangle, u, v, distance):
     packet, valid, arguments = _new_packet(_ROWS)
     ids = packet.view(np.int32)
@@ -193,7 +188,6 @@ def _nearest(scene, origins, directions, triangle, u, v, distance):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _blocked(scene, origins, directions, reach, found):
     packet, valid, arguments = _new_packet(_RAY_ROWS)
     for first in range(0, len(directions), LANES):

@@ -7,7 +7,6 @@ every view. Random rays would add noise that differs between views and is averag
 
 import math
 from collections.abc import Callable
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
@@ -167,7 +166,6 @@ def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.n
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _directions(x_cam, y_cam, rotation, samples, directions):
     """Compute the unit directions of the rays through a grid of points at depth 1, pixel by pixel."""
     i = 0
@@ -188,7 +186,6 @@ def _directions(x_cam, y_cam, rotation, samples, directions):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _surfaces(
     prim,
     u,
@@ -252,7 +249,6 @@ def _surfaces(
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _to_light(points, facets, shading, i, light):
     """Return direction and distance of the light, and its cosine at point i, 0 from behind."""
     lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
@@ -265,7 +261,6 @@ def _to_light(points, facets, shading, i, light):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _receivers(prim, points, facets, shading, gloss, light, samples):
     """Return the rows that the sky lights (hits on non-luminous surfaces), and those that face the light.
 
@@ -287,7 +282,6 @@ def _receivers(prim, points, facets, shading, gloss, light, samples):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _cell(points, i, cells, salt):
     """Return a hash in [0, 1) of the small cell of space that contains point i."""
     return hash01(
@@ -299,7 +293,6 @@ def _cell(points, i, cells, salt):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _light_rays(
     rows, points, facets, lift, samples, ray, rays_each, cells, light, shadow_reach, starts, toward, reach
 ):
@@ -322,7 +315,6 @@ def _light_rays(
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_reach, starts, toward, reach):
     """Compute a cosine-weighted direction above each row's point, from its stratum of the hemisphere."""
     per_pixel = samples * samples
@@ -347,7 +339,6 @@ def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_re
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _shade(
     prim,
     directions,

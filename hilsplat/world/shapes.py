@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
+from itertools import compress, pairwise, product
 
 import numpy as np
 from jaxtyping import Float
@@ -58,9 +58,8 @@ def rotation_about(axis: str, degrees: Number) -> Float[np.ndarray, "3 3"]:
 
 def joined(*meshes: Mesh) -> Mesh:
     """Join several meshes into one."""
-    return Mesh(
-        np.concatenate([mesh.triangles for mesh in meshes]), np.concatenate([mesh.normals for mesh in meshes])
-    )
+    triangles, normals = zip(*((mesh.triangles, mesh.normals) for mesh in meshes), strict=True)
+    return Mesh(np.concatenate(triangles), np.concatenate(normals))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -77,6 +76,11 @@ def _flat(triangles: np.ndarray) -> Mesh:
 
 def _fan(polygon: np.ndarray) -> list[np.ndarray]:
     return [np.stack([polygon[0], polygon[i], polygon[i + 1]]) for i in range(1, len(polygon) - 1)]
+
+
+def _strip(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles between two rows of points: those with an edge on `low`, and those on `high`."""
+    return np.stack([low[:-1], low[1:], high[1:]], axis=1), np.stack([low[:-1], high[1:], high[:-1]], axis=1)
 
 
 def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Mesh:
@@ -99,10 +103,8 @@ def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.n
     it, which is along the two axes other than the normal of its face."""
     triangles: list[np.ndarray] = []
 
-    def corner(signs: Sequence[Number] | np.ndarray, full_axis: int) -> np.ndarray:
-        inset = np.ones(3)
-        inset[full_axis] = 0.0
-        return np.stack([np.asarray(signs, dtype=np.float64), inset])
+    def corner(signs: Sequence[float] | np.ndarray, full_axis: int) -> np.ndarray:
+        return np.stack([np.asarray(signs, dtype=np.float64), 1.0 - np.eye(3)[full_axis]])
 
     def add(polygon: list[np.ndarray]) -> None:
         corners = np.stack(polygon)  # (corners, 2, 3)
@@ -113,30 +115,17 @@ def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.n
         triangles.extend(_fan(corners))
 
     for axis in range(3):
-        b, c = (axis + 1) % 3, (axis + 2) % 3
         for sign in (-1.0, 1.0):
-            quad = []
-            for sb, sc in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
-                signs = np.empty(3)
-                signs[axis], signs[b], signs[c] = sign, sb, sc
-                quad.append(corner(signs, axis))
-            add(quad)
+            around = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+            add([corner(np.roll((sign, *sides), axis), axis) for sides in around])
     if bevelled:
         for axis in range(3):
             b, c = (axis + 1) % 3, (axis + 2) % 3
-            for sb in (-1.0, 1.0):
-                for sc in (-1.0, 1.0):
-                    ends = []
-                    for sa in (-1.0, 1.0):
-                        signs = np.empty(3)
-                        signs[axis], signs[b], signs[c] = sa, sb, sc
-                        ends.append(signs)
-                    add([corner(ends[0], b), corner(ends[1], b), corner(ends[1], c), corner(ends[0], c)])
-        for sx in (-1.0, 1.0):
-            for sy in (-1.0, 1.0):
-                for sz in (-1.0, 1.0):
-                    signs = np.array([sx, sy, sz])
-                    add([corner(signs, 0), corner(signs, 1), corner(signs, 2)])
+            for sides in product((-1.0, 1.0), repeat=2):
+                low, high = (np.roll((end, *sides), axis) for end in (-1.0, 1.0))
+                add([corner(low, b), corner(high, b), corner(high, c), corner(low, c)])
+        for signs in product((-1.0, 1.0), repeat=3):
+            add([corner(signs, axis) for axis in range(3)])
     stacked = np.stack(triangles)  # (triangles, 3 corners, 2, 3)
     return stacked[:, :, 0], stacked[:, :, 1]
 
@@ -158,7 +147,8 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     ring[-1] = ring[0]
-    triangles, shading = [], []
+    triangles: list[np.ndarray] = []
+    shading: list[np.ndarray] = []
     for i, (low, high) in enumerate(pairwise(points)):
         own = normals[i]
         below = normals[i - 1] if i > 0 and normals[i - 1] @ own > smooth else own
@@ -166,17 +156,12 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
         normal_low, normal_high = _unit(own + below), _unit(own + above)
 
         def around(value: np.ndarray) -> np.ndarray:
-            return np.concatenate(
-                [ring * value[0], np.full((len(ring), 1), value[1])], axis=1
-            )  # (segments + 1, 3)
+            return np.column_stack([ring * value[0], np.full(len(ring), value[1])])  # (segments + 1, 3)
 
         p0, p1, n0, n1 = around(low), around(high), around(normal_low), around(normal_high)
-        if low[0] > 1e-9:
-            triangles.append(np.stack([p0[:-1], p0[1:], p1[1:]], axis=1))
-            shading.append(np.stack([n0[:-1], n0[1:], n1[1:]], axis=1))
-        if high[0] > 1e-9:
-            triangles.append(np.stack([p0[:-1], p1[1:], p1[:-1]], axis=1))
-            shading.append(np.stack([n0[:-1], n1[1:], n1[:-1]], axis=1))
+        extended = (low[0] > 1e-9, high[0] > 1e-9)  # a ring of radius 0 is a point
+        triangles += compress(_strip(p0, p1), extended)
+        shading += compress(_strip(n0, n1), extended)
     return Mesh(np.concatenate(triangles), _unit(np.concatenate(shading)))
 
 
@@ -184,25 +169,12 @@ def cylinder(radius: Number, bottom: Number, top: Number, segments: int = 28, be
     """Return a closed upright cylinder about z."""
     if bevel <= 0:
         return lathe([(0, bottom), (radius, bottom), (radius, top), (0, top)], segments)
-    return lathe(
-        [
-            (0, bottom),
-            (radius - bevel, bottom),
-            (radius, bottom + bevel),
-            (radius, top - bevel),
-            (radius - bevel, top),
-            (0, top),
-        ],
-        segments,
-    )
+    lower = [(0, bottom), (radius - bevel, bottom), (radius, bottom + bevel)]
+    upper = [(radius, top - bevel), (radius - bevel, top), (0, top)]
+    return lathe(lower + upper, segments)
 
 
-def ellipsoid(
-    radii: Point,
-    centre: Point = (0.0, 0.0, 0.0),
-    segments: int = 24,
-    rings: int = 12,
-) -> Mesh:
+def ellipsoid(radii: Point, centre: Point = (0.0, 0.0, 0.0), segments: int = 24, rings: int = 12) -> Mesh:
     """Return an ellipsoid with the given semi-axes."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
     profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
@@ -239,24 +211,18 @@ def sweep(
         direction[-1] = direction[0]
         rings.append(point + r * direction)
         normals.append(direction)
-    triangles, shading = [], []
+    triangles: list[np.ndarray] = []
+    shading: list[np.ndarray] = []
     for (p0, p1), (n0, n1) in zip(pairwise(rings), pairwise(normals), strict=True):
-        triangles += [
-            np.stack([p0[:-1], p0[1:], p1[1:]], axis=1),
-            np.stack([p0[:-1], p1[1:], p1[:-1]], axis=1),
-        ]
-        shading += [np.stack([n0[:-1], n0[1:], n1[1:]], axis=1), np.stack([n0[:-1], n1[1:], n1[:-1]], axis=1)]
-    first = np.broadcast_to(points[0], (segments, 3))
-    last = np.broadcast_to(points[-1], (segments, 3))
-    caps = _flat(
-        np.concatenate(
-            [
-                np.stack([first, rings[0][1:], rings[0][:-1]], axis=1),
-                np.stack([last, rings[-1][:-1], rings[-1][1:]], axis=1),
-            ]
-        )
+        triangles += _strip(p0, p1)
+        shading += _strip(n0, n1)
+    first, last = (np.broadcast_to(end, (segments, 3)) for end in points[[0, -1]])
+    caps = (
+        np.stack([first, rings[0][1:], rings[0][:-1]], axis=1),
+        np.stack([last, rings[-1][:-1], rings[-1][1:]], axis=1),
     )
-    return joined(Mesh(np.concatenate(triangles), _unit(np.concatenate(shading))), caps)
+    tube = Mesh(np.concatenate(triangles), _unit(np.concatenate(shading)))
+    return joined(tube, _flat(np.concatenate(caps)))
 
 
 def arc(

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Int32, UInt8
 
 from hilsplat.base.artifacts import atomic_path, read_index, read_json
-from hilsplat.base.images import list_images, read_image
+from hilsplat.base.files import list_images
+from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.provenance import SOFTWARE, require_own_picture
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
@@ -17,27 +18,19 @@ LINES_SHOWN = 52
 
 
 def show_world(world_folder: Path, out: Path) -> None:
-    """Draw the contact sheet of a finished world stage (`images` and `truth` in the folder).
-
-    Raises:
-        ArtifactError: if the folder is missing or incomplete.
-    """
-    contact_sheet(Path(world_folder) / "truth", Path(world_folder) / "images", out)
-
-
-def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
-    """Draw some views with their labels by level, and the tree of texts, as PNG.
+    """Draw some views of a finished world stage with their labels by level, and the tree of texts, as PNG.
 
     Each text is marked in the colour of its region; texts that no view annotates are in brackets.
 
     Raises:
-        ArtifactError: if a folder is missing or incomplete.
+        ArtifactError: if the folder is missing or incomplete.
     """
     from matplotlib.figure import Figure
 
+    truth_folder, images_folder = Path(world_folder) / "truth", Path(world_folder) / "images"
     for folder in (truth_folder, images_folder):
         read_index(folder)
-    record = read_json(Path(truth_folder) / "scene.json")
+    record = read_json(truth_folder / "scene.json")
     truth = HierarchyAnnotations.load(truth_folder)
     images = list_images(images_folder)
     picked = [images[i] for i in np.linspace(0, len(images) - 1, min(VIEWS_SHOWN, len(images))).astype(int)]
@@ -46,21 +39,13 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
     lines = tree_lines(truth.nodes)
     columns = -(-len(lines) // LINES_SHOWN)
     figure = Figure(figsize=(10.5 + 2.6 * columns, 2.7 * len(picked) + 0.6), dpi=110)
-    grid = figure.add_gridspec(
-        len(picked),
-        4 + columns,
-        width_ratios=[1] * 4 + [0.95] * columns,
-        left=0.01,
-        right=0.99,
-        bottom=0.01,
-        top=1 - 0.55 / (2.7 * len(picked) + 0.6),
-        wspace=0.03,
-        hspace=0.04,
-    )
+    widths = [1] * 4 + [0.95] * columns
+    top = 1 - 0.55 / (2.7 * len(picked) + 0.6)
+    margins = {"left": 0.01, "right": 0.99, "bottom": 0.01, "top": top, "wspace": 0.03, "hspace": 0.04}
+    grid = figure.add_gridspec(len(picked), 4 + columns, width_ratios=widths, **margins)
     for row, image in enumerate(picked):
         panels = [("view", read_image(image))]
-        for level in LEVELS:
-            panels.append((level.label, _panel(truth, image.name, level, colours)))
+        panels += [(level.label, _panel(truth, image.name, level, colours)) for level in LEVELS]
         for column, (title, pixels) in enumerate(panels):
             axes = figure.add_subplot(grid[row, column])
             axes.imshow(pixels, interpolation="nearest")
@@ -86,8 +71,8 @@ def contact_sheet(truth_folder: Path, images_folder: Path, path: Path) -> None:
         f"{record['objects_placed']} of {record['objects_asked']} objects placed, {len(images)} views",
         fontsize=11,
     )
-    require_own_picture(path)
-    with atomic_path(path) as temporary:
+    require_own_picture(out)
+    with atomic_path(out) as temporary:
         figure.savefig(temporary, format="png", metadata=SOFTWARE)
 
 
@@ -127,11 +112,10 @@ def tree_lines(nodes: tuple[AnnotatedNode, ...]) -> list[tuple[int, AnnotatedNod
     lines: list[tuple[int, AnnotatedNode]] = []
 
     def walk(parent: int, depth: int) -> None:
-        seen: set[str] = set()
+        first: dict[str, AnnotatedNode] = {}
         for node in children.get(parent, []):
-            if node.text in seen:
-                continue
-            seen.add(node.text)
+            first.setdefault(node.text, node)
+        for node in first.values():
             lines.append((depth, node))
             walk(node.id, depth + 1)
 

@@ -1,7 +1,6 @@
 """The world stage: render a synthetic scene and write its ground truth for evaluation."""
 
 import logging
-from collections.abc import Iterator
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -80,7 +79,8 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
         labels, annotated = {}, {}
         size = {"height": settings.image_px, "width": settings.image_px}
         with atomic_folder(out / "images") as folder:
-            results = _rendered(kind, seed, settings, threads)
+            jobs = [(kind, seed, settings, row) for row in range(settings.views)]
+            results = in_processes(_render, jobs, threads)
             for name, (image, label) in track(
                 zip(cameras.names, results, strict=True), "rendered views", total=len(cameras)
             ):
@@ -132,10 +132,3 @@ def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np
     scene = _scene(kind, seed, settings.objects)
     cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
     return render_and_label(scene, cameras[cameras.names[row]], settings.samples)
-
-
-def _rendered(
-    kind: str, seed: int, settings: WorldSettings, threads: int
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield image and labels of all views in order."""
-    return in_processes(_render, [(kind, seed, settings, row) for row in range(settings.views)], threads)

@@ -5,7 +5,6 @@ point has the same colour in all views, as structure from motion and 3D Gaussian
 """
 
 import math
-from typing import no_type_check
 
 import numpy as np
 
@@ -17,7 +16,6 @@ _Z, _SALT = np.uint32(0x1B873593), np.uint32(0x2545F491)
 
 
 @compiled(forceinline=True)
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _mixed(h):
     """Map a key to a number in [0, 1) by a chain of 32-bit integer mixing steps."""
     h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
@@ -26,21 +24,18 @@ def _mixed(h):
 
 
 @compiled(forceinline=True)
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _key(i, j, k, salt):
     """Return the hash key of a lattice cell."""
     return np.uint32(np.uint32(i) * _X + np.uint32(j) * _Y + np.uint32(k) * _Z + np.uint32(salt) * _SALT)
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def hash01(x: int, y: int, z: int, salt: int) -> float:
     """Return the hash of a lattice cell in [0, 1)."""
     return _mixed(_key(x, y, z, salt))
 
 
 @compiled(forceinline=True)
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def _value_noise(x, y, z, salt):
     """Compute `value_noise` inline, because a loop that calls a function is not vectorised."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
@@ -55,14 +50,12 @@ def _value_noise(x, y, z, salt):
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def value_noise(x: float, y: float, z: float, salt: int) -> float:
     """Return smoothly interpolated lattice noise in [0, 1)."""
     return _value_noise(x, y, z, salt)
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> float:
     """Return the sum of octaves of `value_noise`, each at half the size and amplitude, in [0, 1)."""
     total, amplitude, reach = 0.0, 0.5, 0.0
@@ -75,7 +68,6 @@ def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> floa
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, float]:
     """Find the nearest and second nearest of one random point per cell (Worley noise).
 
@@ -100,7 +92,6 @@ def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, f
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def step_between(value: float, low: float, high: float) -> float:
     """Return 0 below `low`, 1 above `high` and a smooth transition between."""
     t = min(1.0, max(0.0, (value - low) / (high - low)))
@@ -108,7 +99,6 @@ def step_between(value: float, low: float, high: float) -> float:
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
     """Evaluate a texture at a point given in pattern cells.
 
@@ -181,7 +171,6 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
 
 
 @compiled(error_model="numpy")  # a loop that may raise is not vectorised
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return `fractal_noise(16 x, 16 y, 16 z, 4, 201)` of many points, vectorised and bit-identical.
 
@@ -200,7 +189,6 @@ def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 @compiled
-@no_type_check  # the shape checks of the test-suite cannot be compiled
 def albedo(material: np.ndarray, x: float, y: float, z: float, grain: float) -> tuple[float, float, float]:
     """Return the linear-light colour of a surface point.
 

@@ -21,17 +21,9 @@ HIDDEN_BY = 2e-3
 
 
 def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
-    """Return the minimum area of an annotated text in a view, per level, px.
-
-    Args:
-        image_px: height and width of the view.
-        min_area_px: minimum for wholes and parts, regardless of the view's size.
-    """
-    return {
-        Level.WHOLE: min_area_px,
-        Level.PART: min_area_px,
-        Level.SUBPART: MIN_SUBPART_AREA * image_px**2,
-    }
+    """Return the minimum area of an annotated text in a view, per level, px."""
+    smallest_subpart = MIN_SUBPART_AREA * image_px**2
+    return {Level.WHOLE: min_area_px, Level.PART: min_area_px, Level.SUBPART: smallest_subpart}
 
 
 def annotated_nodes(
@@ -40,7 +32,7 @@ def annotated_nodes(
     background: Collection[int],
     smallest: dict[Level, float | int],
 ) -> tuple[int, ...]:
-    """Return the nodes that are scored in a view.
+    """Return the ids of the nodes that are scored in a view, in ascending order.
 
     Nodes with the same text (four legs) match one query, so the size limit applies to their union: either
     all visible ones are annotated or none. The true region would be wrong if one large leg were annotated
@@ -51,9 +43,6 @@ def annotated_nodes(
         nodes: all nodes of the scene.
         background: ids that are never scored (table, floor, walls).
         smallest: minimum area of a scored text per level, px.
-
-    Returns:
-        Ids in ascending order.
     """
     kept: list[int] = []
     for level in LEVELS:

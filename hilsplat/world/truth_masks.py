@@ -46,22 +46,15 @@ FAULTS = (
 
 
 def run_truth_masks(
-    scene_folder: Path,
-    truth: Path,
-    out: Path,
-    settings: PerturbSettings,
-    min_area_px: int,
-    threads: int,
+    scene_folder: Path, truth: Path, out: Path, settings: PerturbSettings, min_area_px: int, threads: int
 ) -> None:
     """Write masks of every training view from the true labels, with faults (see `mask_faults.faulty_masks`).
 
     Args:
-        scene_folder: the `Scene` artifact.
         truth: the truth folder of a synthetic scene, with annotations and `scene.json`, which lists the
             surroundings.
         out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as in the masks stage;
             the index also holds the requested faults and, per view, the number of faults.
-        settings: the faults.
         min_area_px: smaller true regions give no mask (`masks.min_area_px`).
         threads: number of views processed at once; the result does not depend on it.
 

@@ -34,6 +34,12 @@ def on_sphere(azimuth_deg: float, elevation_deg: float, distance: float) -> Floa
     )
 
 
+def arc_azimuths(views: int, arc_deg: float | int) -> Float[np.ndarray, " V"]:
+    """Return evenly spaced azimuths centred on 0, degrees; a full ring does not repeat its first azimuth."""
+    share = np.arange(views) / (views if arc_deg >= 360 else max(1, views - 1))
+    return arc_deg * (share - 0.5)
+
+
 def numbered_cameras(
     cam_from_world: Sequence[Float[np.ndarray, "4 4"]], K: Float[np.ndarray, "3 3"], image_px: int
 ) -> Cameras:

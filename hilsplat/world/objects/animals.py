@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.shapes import box, cylinder, ellipsoid, joined, lathe, ring, sphere, sweep
 
 
@@ -117,13 +117,12 @@ def _turtle(b: Builder) -> None:
         b.paint("cloth"), ring(0.105, 0.065, axis="x").turned("y", -30).moved(r * 1.17, 0, 0.26)
     )
     claw = b.paint("plastic")
-    for x in (-1, 1):
-        for side in (-1, 1):
-            a = side * (42 if x > 0 else 135)
-            limb = sweep([(r * 0.7, 0, 0.17), (r * 1.05, 0, 0.12), (r * 1.22, 0, 0.10)], [0.10, 0.105, 0.10])
-            leg = b.part("leg").put(skin, limb.turned("z", a))
-            foot = ellipsoid((0.13, 0.15, 0.09), (r * 1.34, 0, 0.09))
-            leg.subpart("foot", "flipper", at="of").put(claw, foot.turned("z", a))
+    for x, y in CORNERS:
+        a = y * (42 if x > 0 else 135)
+        limb = sweep([(r * 0.7, 0, 0.17), (r * 1.05, 0, 0.12), (r * 1.22, 0, 0.10)], [0.10, 0.105, 0.10])
+        leg = b.part("leg").put(skin, limb.turned("z", a))
+        foot = ellipsoid((0.13, 0.15, 0.09), (r * 1.34, 0, 0.09))
+        leg.subpart("foot", "flipper", at="of").put(claw, foot.turned("z", a))
     b.part("tail").put(
         skin, sweep([(-r * 0.9, 0, 0.17), (-r * 1.2, 0, 0.13), (-r * 1.48, 0, 0.10)], [0.12, 0.10, 0.06])
     )
@@ -176,4 +175,3 @@ MAKERS: dict[str, Maker] = {
     "turtle": Maker(_turtle, ("tortoise",)),
     "rabbit": Maker(_rabbit, ("bunny", "hare")),
 }
-"""Classes drawn by this module."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.shapes import arc, box, cylinder, disc, ellipsoid, extrude, lathe, loft, ring, sweep
 
 
@@ -193,12 +193,10 @@ def _chest(b: Builder) -> None:
         *[box((d, 0.05, h), (0, s * (w / 2 - 0.025), h / 2 + 0.02)) for s in (-1, 1)],
     )
     bands = chest.subpart("bands", "straps", "iron bands")
-    for side in (-1, 1):
-        for x in (-1.0, 1.0):
-            bands.put(
-                metal,
-                box((0.05, 0.105, h + 0.02), (x * (d / 2 + 0.005), side * w * 0.33, h / 2 + 0.02), 0.01),
-            )
+    for side, x in CORNERS:
+        bands.put(
+            metal, box((0.05, 0.105, h + 0.02), (x * (d / 2 + 0.005), side * w * 0.33, h / 2 + 0.02), 0.01)
+        )
     chest.subpart("lock", "padlock").put(
         b.paint("metal"), box((0.08, 0.19, 0.20), (d / 2 + 0.02, 0, h - 0.08), 0.03)
     )
@@ -236,4 +234,3 @@ MAKERS: dict[str, Maker] = {
     "lantern": Maker(_lantern, ("oil lantern", "storm lantern")),
     "treasure chest": Maker(_chest, ("pirate chest", "money chest")),
 }
-"""Classes drawn by this module."""

@@ -20,6 +20,9 @@ PARENT_CONTRAST = 24.0
 NEIGHBOUR_CONTRAST = 11.0
 """Minimum distance in L*a*b* between other adjacent parts and subparts of an object."""
 
+CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
+"""Signs of x and y, for legs and wheels."""
+
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
 _TOUCH = 0.03  # maximum gap between touching boxes, as a share of the object's size
 _PREVAILS = {1: 0.5, 2: 0.6, 3: 0.6}  # minimum share of a surface whose colour or material is named, by level

@@ -65,7 +65,7 @@ def build_object(name: str, rng: np.random.Generator) -> ObjectModel:
     Raises:
         SceneError: if there is no such class.
     """
-    return _drawn(name, maker_of(name), rng)
+    return _drawn(name, _MAKERS, "object class", rng)
 
 
 def build_furniture(name: str, rng: np.random.Generator) -> ObjectModel:
@@ -74,7 +74,7 @@ def build_furniture(name: str, rng: np.random.Generator) -> ObjectModel:
     Raises:
         SceneError: if there is no such class.
     """
-    return _drawn(name, _known(name, FURNITURE, "class of furniture"), rng)
+    return _drawn(name, FURNITURE, "class of furniture", rng)
 
 
 def build_street_object(name: str, rng: np.random.Generator) -> ObjectModel:
@@ -83,25 +83,12 @@ def build_street_object(name: str, rng: np.random.Generator) -> ObjectModel:
     Raises:
         SceneError: if there is no such class.
     """
-    return _drawn(name, _known(name, STREET, "class of a street"), rng)
+    return _drawn(name, STREET, "class of a street", rng)
 
 
-def maker_of(name: str) -> Maker:
-    """Return the maker of a tabletop class.
-
-    Raises:
-        SceneError: if there is no such class.
-    """
-    return _known(name, _MAKERS, "object class")
-
-
-def _known(name: str, makers: dict[str, Maker], what: str) -> Maker:
+def _drawn(name: str, makers: dict[str, Maker], what: str, rng: np.random.Generator) -> ObjectModel:
     if name not in makers:
         raise SceneError(f"unknown {what} {name!r}", expected=f"one of {', '.join(makers)}")
-    return makers[name]
-
-
-def _drawn(name: str, maker: Maker, rng: np.random.Generator) -> ObjectModel:
-    builder = Builder(name, maker.aliases, rng)
-    maker.draw(builder)
+    builder = Builder(name, makers[name].aliases, rng)
+    makers[name].draw(builder)
     return builder.build()

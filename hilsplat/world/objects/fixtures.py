@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.shapes import Mesh, box, cylinder, extrude, lathe, sphere, sweep
 
 
@@ -108,10 +108,9 @@ def _picture(b: Builder) -> None:
             wood, box((0.04, width, border), (0.02, 0, height / 2 + side * (height - border) / 2), 0.012)
         )
     corner = frame.subpart("corners", "ornaments")
-    for y in (-1, 1):
-        for z in (-1, 1):
-            place = (0.024, y * (width - border) / 2, height / 2 + z * (height - border) / 2)
-            corner.put(accent, box((0.05, border * 1.35, border * 1.35), place, 0.012))
+    for y, z in CORNERS:
+        place = (0.024, y * (width - border) / 2, height / 2 + z * (height - border) / 2)
+        corner.put(accent, box((0.05, border * 1.35, border * 1.35), place, 0.012))
     canvas = b.part("canvas", "painting").put(
         b.paint("plain", "blue", "pink", "yellow", "beige", "teal", "white"),
         box((0.02, width - border, height - border), (0.01, 0, height / 2)),
@@ -168,4 +167,3 @@ MAKERS: dict[str, Maker] = {
     "picture": Maker(_picture, ("framed picture", "wall painting")),
     "mirror": Maker(_mirror, ("wall mirror", "round mirror")),
 }
-"""Classes drawn by this module."""

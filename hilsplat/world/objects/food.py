@@ -244,4 +244,3 @@ MAKERS: dict[str, Maker] = {
     "fruit basket": Maker(_fruit_basket, ("fruit bowl", "basket of fruit")),
     "ice cream": Maker(_ice_cream, ("ice cream sundae", "gelato")),
 }
-"""Classes drawn by this module."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.paints import Paint
 from hilsplat.world.shapes import Mesh, box, cylinder, ellipsoid, joined, lathe, sweep
 
@@ -31,9 +31,8 @@ def _bed(b: Builder) -> None:
     length, width = b.between(1.85, 2.0), b.between(1.1, 1.45)
     frame_z, mattress = 0.32, b.between(0.17, 0.22)
     frame = b.part("frame", "bedstead").put(wood, box((length, width, 0.2), (0, 0, 0.22), 0.02))
-    for x in (-1, 1):
-        for y in (-1, 1):
-            frame.put(wood, box((0.09, 0.09, 0.14), (x * (length / 2 - 0.06), y * (width / 2 - 0.06), 0.07)))
+    for x, y in CORNERS:
+        frame.put(wood, box((0.09, 0.09, 0.14), (x * (length / 2 - 0.06), y * (width / 2 - 0.06), 0.07)))
     top = b.between(0.85, 1.0)
     frame.subpart("headboard", "head end").put(
         b.paint("cloth"), box((0.07, width + 0.06, top - 0.1), (-length / 2 - 0.03, 0, (top + 0.1) / 2), 0.03)
@@ -75,14 +74,13 @@ def _sofa(b: Builder) -> None:
     depth, seats = b.between(0.82, 0.92), 2 if b.chance(0.5) else 3
     inner, arm_w = seats * b.between(0.54, 0.62), b.between(0.14, 0.2)
     width, seat_z, top = inner + 2 * arm_w, b.between(0.28, 0.32), b.between(0.78, 0.88)
-    for x in (-1, 1):
-        for y in (-1.0, 1.0):
-            b.part("leg", "foot").put(
-                wood,
-                lathe([(0, 0), (0.03, 0), (0.045, 0.1), (0, 0.1)], 16).moved(
-                    x * (depth / 2 - 0.08), y * (width / 2 - 0.08), 0
-                ),
-            )
+    for x, y in CORNERS:
+        b.part("leg", "foot").put(
+            wood,
+            lathe([(0, 0), (0.03, 0), (0.045, 0.1), (0, 0.1)], 16).moved(
+                x * (depth / 2 - 0.08), y * (width / 2 - 0.08), 0
+            ),
+        )
     seat = b.part("seat", "base").put(
         cloth, box((depth - 0.02, inner + 0.02, seat_z - 0.09), (0, 0, (seat_z + 0.09) / 2), 0.02)
     )
@@ -264,15 +262,13 @@ def _stool(b: Builder) -> None:
     hoop = np.stack([0.84 * r * np.cos(angle), 0.84 * r * np.sin(angle), np.full(25, height * 0.36)], axis=1)
     b.part("ring", "footrest").put(b.paint("metal"), sweep(list(hoop), 0.016, 10))
     leg_paint = b.paint("plain")
-    for x in (-1, 1):
-        for y in (-1, 1):
-            corner = np.array([x, y]) / np.sqrt(2)
-            top, knee, floor = (
-                np.array([*(corner * r * out), z])
-                for out, z in ((0.7, height - 0.08), (0.9, 0.1), (0.96, 0.0))
-            )
-            leg = b.part("leg").put(leg_paint, sweep([knee, (knee + top) / 2, top], 0.024))
-            leg.subpart("foot", "leg tip").put(foot_paint, sweep([floor, (knee + floor) / 2, knee], 0.032))
+    for x, y in CORNERS:
+        corner = np.array([x, y]) / np.sqrt(2)
+        top, knee, floor = (
+            np.array([*(corner * r * out), z]) for out, z in ((0.7, height - 0.08), (0.9, 0.1), (0.96, 0.0))
+        )
+        leg = b.part("leg").put(leg_paint, sweep([knee, (knee + top) / 2, top], 0.024))
+        leg.subpart("foot", "leg tip").put(foot_paint, sweep([floor, (knee + floor) / 2, knee], 0.032))
 
 
 MAKERS: dict[str, Maker] = {
@@ -285,4 +281,3 @@ MAKERS: dict[str, Maker] = {
     "rug": Maker(_rug, ("carpet", "mat")),
     "stool": Maker(_stool, ("footstool", "bar stool")),
 }
-"""Classes drawn by this module."""

@@ -275,4 +275,3 @@ MAKERS: dict[str, Maker] = {
     "toaster": Maker(_toaster, ("bread toaster",)),
     "headphones": Maker(_headphones, ("headset", "earphones")),
 }
-"""Classes drawn by this module."""

@@ -213,4 +213,3 @@ MAKERS: dict[str, Maker] = {
     "birdhouse": Maker(_birdhouse, ("nesting box", "bird house")),
     "watering can": Maker(_watering_can, ("garden can", "sprinkling can")),
 }
-"""Classes drawn by this module."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.shapes import box, cylinder, ellipsoid, lathe, sphere, sweep
 
 
@@ -34,13 +34,10 @@ def _chair(b: Builder) -> None:
             slat_paint,
             box((0.05, 0.10, high - low), (-w / 2 + 0.04, (i - 1) * w * 0.26, (low + high) / 2), 0.01),
         )
-    for x in (-1, 1):
-        for y in (-1, 1):
-            px, py = x * (w / 2 - 0.05), y * (w / 2 - 0.05)
-            leg = b.part("leg").put(
-                wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012)
-            )
-            leg.subpart("foot", "leg tip").put(accent, box((0.13, 0.13, 0.16), (px, py, 0.08), 0.02))
+    for x, y in CORNERS:
+        px, py = x * (w / 2 - 0.05), y * (w / 2 - 0.05)
+        leg = b.part("leg").put(wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012))
+        leg.subpart("foot", "leg tip").put(accent, box((0.13, 0.13, 0.16), (px, py, 0.08), 0.02))
 
 
 def _cabinet(b: Builder) -> None:
@@ -266,4 +263,3 @@ MAKERS: dict[str, Maker] = {
     "plant": Maker(_plant, ("potted plant", "flower plant")),
     "clock": Maker(_clock, ("alarm clock", "timepiece")),
 }
-"""Classes drawn by this module."""

@@ -157,4 +157,3 @@ MAKERS: dict[str, Maker] = {
     "bottle": Maker(_bottle, ("flask", "glass bottle")),
     "cake": Maker(_cake, ("birthday cake", "torte")),
 }
-"""Classes drawn by this module."""

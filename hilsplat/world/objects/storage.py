@@ -1,6 +1,6 @@
 """Full-size shelves, kitchen furniture and screens, in metres. Backs face -x, fronts +x."""
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.shapes import box, cylinder, lathe, sphere, sweep
 
 
@@ -199,11 +199,8 @@ def _tv_stand(b: Builder) -> None:
     )
     feet = body.subpart("feet", "legs")
     foot_paint = b.paint("metal")
-    for x in (-1, 1):
-        for y in (-1.0, 1.0):
-            feet.put(
-                foot_paint, box((0.06, 0.06, 0.08), (x * (depth / 2 - 0.06), y * (width / 2 - 0.07), 0.04))
-            )
+    for x, y in CORNERS:
+        feet.put(foot_paint, box((0.06, 0.06, 0.08), (x * (depth / 2 - 0.06), y * (width / 2 - 0.07), 0.04)))
     tall = height - 0.16
     for side in (-1, 1):
         y, w = side * width * 0.33, width * 0.3
@@ -279,4 +276,3 @@ MAKERS: dict[str, Maker] = {
     "television": Maker(_television, ("tv", "tv screen")),
     "monitor": Maker(_monitor, ("computer monitor", "computer screen")),
 }
-"""Classes drawn by this module."""

@@ -159,4 +159,3 @@ def _roof(b: Builder, w: float, eaves: float) -> None:
 
 
 MAKERS: dict[str, Maker] = {"building": Maker(_building, ("town house", "apartment building"))}
-"""Classes drawn by this module."""

@@ -158,4 +158,3 @@ MAKERS: dict[str, Maker] = {
     "pedestrian": Maker(_pedestrian, ("person", "walker")),
     "cyclist": Maker(_cyclist, ("bicyclist", "bike rider")),
 }
-"""Classes drawn by this module."""

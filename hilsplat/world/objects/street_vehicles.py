@@ -156,4 +156,3 @@ MAKERS: dict[str, Maker] = {
     "truck": Maker(_truck, ("vehicle", "lorry")),
     "bus": Maker(_bus, ("vehicle", "coach")),
 }
-"""Classes drawn by this module."""

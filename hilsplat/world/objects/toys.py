@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder, Maker
 from hilsplat.world.shapes import box, cylinder, ellipsoid, extrude, lathe, sphere, sweep
 
 
@@ -219,16 +219,11 @@ def _car(b: Builder) -> None:
     pane = box((0.03, w * 0.72, (roof - belt) * 0.86), (0, 0, 0)).turned("y", -tilt)
     cabin.subpart("windshield", "front window").put(glass, pane.moved(front - 0.07, 0, (roof + belt) / 2))
     radius = b.between(0.165, 0.185)
-    for x in (-1, 1):
-        for side in (-1, 1):
-            rubber = cylinder(radius, -0.07, 0.07, 24, 0.025).turned("x", 90)
-            wheel = b.part("wheel", "tire").put(
-                tyre, rubber.moved(x * length * 0.30, side * (w / 2 - 0.01), radius)
-            )
-            cap = cylinder(radius * 0.68, -0.025, 0.025, 20, 0.008).turned("x", 90)
-            wheel.subpart("rim", "hubcap").put(
-                metal, cap.moved(x * length * 0.30, side * (w / 2 + 0.065), radius)
-            )
+    for x, y in CORNERS:
+        rubber = cylinder(radius, -0.07, 0.07, 24, 0.025).turned("x", 90)
+        wheel = b.part("wheel", "tire").put(tyre, rubber.moved(x * length * 0.30, y * (w / 2 - 0.01), radius))
+        cap = cylinder(radius * 0.68, -0.025, 0.025, 20, 0.008).turned("x", 90)
+        wheel.subpart("rim", "hubcap").put(metal, cap.moved(x * length * 0.30, y * (w / 2 + 0.065), radius))
 
 
 def _house(b: Builder) -> None:
@@ -277,4 +272,3 @@ MAKERS: dict[str, Maker] = {
     "car": Maker(_car, ("toy car", "automobile")),
     "house": Maker(_house, ("toy house", "cottage")),
 }
-"""Classes drawn by this module."""

@@ -291,4 +291,3 @@ MAKERS: dict[str, Maker] = {
     "airplane": Maker(_airplane, ("plane", "aircraft")),
     "tractor": Maker(_tractor, ("toy tractor", "farm tractor")),
 }
-"""Classes drawn by this module."""

@@ -16,8 +16,8 @@ class SceneKind(NamedTuple):
 
     Attributes:
         build: builds a scene, (seed, objects).
-        cameras: returns views of a scene, (scene, views, image_px, arc_deg); neighbours are close enough
-            for structure from motion.
+        cameras: returns the views of a scene, (scene, views, image_px, arc_deg): square images 000.png,
+            001.png, ..., jittered by the scene's seed, and close enough for structure from motion.
         training_camera: returns a random camera for training, (scene, rng, image_px).
     """
 
@@ -40,7 +40,7 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
     Args:
         kind: one of `KINDS`.
         seed: not negative; the same seed and number of objects give the same scene.
-        objects: number of objects to place.
+        objects: number of objects to place; on a street, of vehicles and people.
 
     Raises:
         SceneError: if the kind is unknown or a number is out of range.

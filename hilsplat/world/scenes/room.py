@@ -10,11 +10,11 @@ from jaxtyping import Float
 from hilsplat.base.levels import NONE
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import ROOM_THINGS, build_furniture, build_object
+from hilsplat.world.paints import PaintBox
 from hilsplat.world.scenes.floorplan import WALL_GAP, FloorPlan, Room, Space, turned_space, yaw_of_wall
 from hilsplat.world.scenes.room_cameras import path_points
-from hilsplat.world.scenes.room_shell import add_shell, room_style
-from hilsplat.world.scenes.scene import Assembly, PlacedObject, WorldScene, footprint_of
-from hilsplat.world.shapes import rotation_about
+from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
+from hilsplat.world.shapes import Mesh, box, rotation_about
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +75,9 @@ EDGE = 0.03
 """Minimum distance of things from the edge of their support, and from the wall behind a counter, m."""
 MAX_FLAT = 0.05
 """Maximum height above a board of a flat item that can itself carry things, m."""
+
+WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
+"""Shares of grey in the colours of walls, floor and ceiling, so that the objects stand out."""
 
 
 class _Furnishing:
@@ -171,10 +174,6 @@ def build_room(seed: int, objects: int) -> WorldScene:
     Every room has a door, a window with a curtain, and two pictures (or a picture and a mirror). About two
     thirds of `objects` are furniture; the others are things on it, or on the floor if no support is free.
     Objects that do not fit are omitted, and the camera loop stays free.
-
-    Args:
-        seed: not negative; the same seed and number of objects give the same scene.
-        objects: number of pieces of furniture and things to place.
     """
     rng = np.random.default_rng([seed, 21])
     room = Room(float(rng.uniform(4.4, 5.0)), float(rng.uniform(3.8, 4.3)), 2.55)
@@ -187,10 +186,10 @@ def build_room(seed: int, objects: int) -> WorldScene:
         "scene room:%d: %d pieces of furniture, %d things of %d objects asked, %d fixtures: %s",
         seed, furniture, things, objects, fixtures + pictures, ", ".join(thing.name for thing in work.placed),
     )  # fmt: skip
-    background = add_shell(work.assembly, room, np.random.default_rng([seed, 23]))
-    style = room_style(room, np.random.default_rng([seed, 24]))
+    _add_shell(work.assembly, room, np.random.default_rng([seed, 23]))
+    style = _style(room, np.random.default_rng([seed, 24]))
     asked = objects + fixtures + 2
-    return work.assembly.finished("room", seed, asked, work.placed, background, style)
+    return work.assembly.finished("room", seed, asked, work.placed, style)
 
 
 def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
@@ -380,3 +379,54 @@ def _stand(
     yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + rng.uniform(-50, 50))
     # The footprint is a circle that rotates about its centre, so any yaw keeps it in place.
     work.put(name, model, spot, yaw, base_z, scale)
+
+
+def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None:
+    """Add floor, walls with skirting and ceiling, textured for structure from motion."""
+    paints = PaintBox(rng)
+    w, d, h = room.width, room.depth, room.height
+    floor = paints.draw(str(rng.choice(["wood", "wood", "stone", "collage", "cloth"])), scale=0.45).paled(
+        FLOOR_PALE
+    )
+    ceiling = paints.draw("plain", "white", "beige", scale=0.4).paled(CEILING_PALE)
+    skirting = paints.draw("wood")
+    plane = _plane(w, d)
+    assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(plane, floor)])
+    pieces = []
+    for wall in range(4):
+        group = str(rng.choice(["brick", "collage", "stone", "plain", "cloth"]))
+        paint = paints.draw(group, scale=0.4).paled(WALL_PALE)
+        half, length = (w / 2, d) if wall % 2 == 0 else (d / 2, w)
+        upright = _plane(h, length).turned("y", 90).moved(-half, 0, h / 2).turned("z", yaw_of_wall(wall))
+        pieces.append((upright, paint))
+        board = box((0.018, length - 0.04, 0.09), (0.009 - half, 0, 0.045), 0.004)
+        pieces.append((board.turned("z", yaw_of_wall(wall)), skirting))
+    assembly.add_surroundings("wall", ("walls", "room wall"), pieces)
+    above = _plane(w, d).turned("x", 180).moved(0, 0, h)
+    assembly.add_surroundings("ceiling", ("room ceiling",), [(above, ceiling)])
+
+
+def _plane(x: float, y: float) -> Mesh:
+    """Return a rectangle about the origin that faces up."""
+    corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]) / 2
+    triangles = corners[[[0, 1, 2], [0, 2, 3]]]
+    return Mesh(triangles, np.broadcast_to([0.0, 0.0, 1.0], triangles.shape).copy())
+
+
+def _style(room: Room, rng: np.random.Generator) -> Style:
+    """Draw the light of a closed room: a wide ceiling lamp and strong ambient light.
+
+    The lamp does not light the ceiling, which would be overexposed around it.
+    """
+    warm = rng.uniform(-1, 1)
+    place = rng.uniform(-0.4, 0.4, 2)
+    light = np.array([1.0 + 0.05 * warm, 0.97, 0.92 - 0.08 * warm]) * rng.uniform(0.27, 0.33)
+    sky = np.array([0.50 - 0.04 * warm, 0.51, 0.53 + 0.04 * warm]) * rng.uniform(0.92, 1.05)
+    return Style(
+        (float(place[0]), float(place[1]), room.height - 0.02),
+        float(rng.uniform(0.5, 0.7)),
+        tuple(light.tolist()),
+        tuple(sky.tolist()),
+        tuple((sky * np.array([1.12, 1.06, 0.98])).tolist()),
+        float(rng.uniform(1.05, 1.2)),
+    )

@@ -1,14 +1,12 @@
 """Cameras of room scenes: a loop for structure from motion, and random ones for training."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.scenes.floorplan import Room
 from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.views import looking_at, numbered_cameras, pinhole
+from hilsplat.world.views import arc_azimuths, looking_at, numbered_cameras, pinhole
 
 FOV_DEG = 62.0
 EYE_HEIGHTS = (1.34, 1.7)
@@ -36,18 +34,9 @@ def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
 
     The views show the far wall with everything in front of it, and the middle from all sides. A camera that
     rotates in place and looks outwards would give no parallax.
-
-    Args:
-        scene: room to view; its seed also determines the jitter.
-        views: number of cameras, named 000.png, 001.png, ...
-        image_px: height and width.
-        arc_deg: azimuth covered, centred on +x; a full ring does not repeat its first azimuth.
     """
     rng = np.random.default_rng([scene.seed, 25])
-    room = room_of(scene)
-    share = np.arange(views) / (views if arc_deg >= 360 else max(1, views - 1))
-    azimuths = arc_deg * (share - 0.5) + rng.uniform(-1, 1, views)
-    spots = path_points(room, azimuths)
+    spots = path_points(room_of(scene), arc_azimuths(views, arc_deg) + rng.uniform(-1, 1, views))
     transforms = []
     for i in range(views):
         centre = np.array([*spots[i], EYE_HEIGHTS[i % 2] + rng.uniform(-0.03, 0.03)])
@@ -62,7 +51,6 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
     The position is inside the room and outside all objects.
     """
     room = room_of(scene)
-    boxes = _boxes(scene)
     if rng.random() < 1 / 3:
         spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
         centre = np.array([*spot, rng.uniform(1.3, 1.78)])
@@ -71,28 +59,17 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
         thing = scene.placed[int(rng.integers(len(scene.placed)))]
         target = np.array([*thing.centre_xy, thing.base_z + 0.5 * thing.height]) + rng.uniform(-0.1, 0.1, 3)
         size = max(thing.footprint, thing.height / 2)
-        centre = _free_centre(room, boxes, target, size, rng)
+        centre = _free_centre(scene, room, target, size, rng)
     K = pinhole(image_px, rng.uniform(54, 66))
     return Camera("random.png", looking_at(centre, target), K, (image_px, image_px))
 
 
-def _boxes(scene: WorldScene) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the lowest and highest corners of all placed objects."""
-    found = []
-    for thing in scene.placed:
-        points = scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
-        found.append((points.min(axis=0), points.max(axis=0)))
-    return found
-
-
 def _free_centre(
-    room: Room,
-    boxes: Sequence[tuple[np.ndarray, np.ndarray]],
-    target: np.ndarray,
-    size: float,
-    rng: np.random.Generator,
+    scene: WorldScene, room: Room, target: np.ndarray, size: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Return a position outside all objects from which an object of this size fills much of a view."""
+    things = [scene.triangles[scene.node_ids[:, 0] == thing.node] for thing in scene.placed]
+    boxes = [(corners.min(axis=(0, 1)), corners.max(axis=(0, 1))) for corners in things]
     half = np.array([room.width, room.depth]) / 2 - 0.2
     for _ in range(200):
         azimuth, distance = rng.uniform(0, 2 * np.pi), size * rng.uniform(1.7, 3.2) + 0.35

@@ -1,6 +1,6 @@
 """A scene of the synthetic world: triangles with their nodes."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -137,6 +137,7 @@ class Assembly:
         self.material_ids: list[np.ndarray] = []
         self.materials: list[np.ndarray] = []
         self.nodes: list[AnnotatedNode] = []
+        self.background: list[int] = []
 
     def add_object(
         self, model: ObjectModel, scale: float, xy: np.ndarray, yaw_deg: float, base_z: float = 0.0
@@ -156,9 +157,12 @@ class Assembly:
         self.materials.append(model.materials)
         return first
 
-    def add_surroundings(self, text: str, synonyms: tuple[str, ...], pieces: list[tuple[Mesh, Paint]]) -> int:
-        """Add a whole without parts, such as the floor, and return its node id."""
+    def add_surroundings(
+        self, text: str, synonyms: tuple[str, ...], pieces: list[tuple[Mesh, Paint]]
+    ) -> None:
+        """Add a whole without parts, such as the floor, to the background."""
         node = len(self.nodes)
+        self.background.append(node)
         self.nodes.append(AnnotatedNode(node, 1, NONE, text, synonyms))
         for mesh, paint in pieces:
             self.coords.append(mesh.triangles / self.scale)
@@ -167,16 +171,9 @@ class Assembly:
             self.node_ids.append(np.tile(np.array([node, NONE, NONE], np.int32), (len(mesh), 1)))
             self.material_ids.append(np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32))
             self.materials.append(paint.row()[None])
-        return node
 
     def finished(
-        self,
-        kind: str,
-        seed: int,
-        asked: int,
-        placed: Sequence[PlacedObject],
-        background: Collection[int],
-        style: Style,
+        self, kind: str, seed: int, asked: int, placed: Sequence[PlacedObject], style: Style
     ) -> WorldScene:
         """Return the scene with everything added so far."""
         return WorldScene(
@@ -191,7 +188,7 @@ class Assembly:
             np.concatenate(self.material_ids).astype(np.int32),
             np.concatenate(self.materials).astype(np.float32),
             tuple(self.nodes),
-            frozenset(background),
+            frozenset(self.background),
             style,
         )
 

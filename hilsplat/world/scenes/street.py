@@ -5,6 +5,7 @@ x points along the street, y to the left of a driver who heads for +x, and z up;
 
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -154,23 +155,19 @@ class _Street:
         y = side * float(rng.uniform(KERB + 1.0, FRONT - 0.9))
         return _Spot(float(rng.uniform(-6, 20)), y, 0.14, yaw)
 
-    def furniture_spot(self, name: str, side: int) -> Callable[[ObjectModel], _Spot]:
-        """Return a function that draws a spot beside the kerb, on the sidewalk."""
+    def furniture_spot(self, side: int, model: ObjectModel) -> _Spot:
+        """Draw a spot beside the kerb, on the sidewalk."""
         rng = self.rng
-
-        def spot(model: ObjectModel) -> _Spot:
-            x = float(rng.uniform(*THINGS_X))
-            y = side * (KERB + 0.62)
-            toward_road = -90.0 * side
-            if name == "traffic sign":
-                return _Spot(x, y, 0.14, 180 + float(rng.uniform(-18, 18)))
-            if name == "traffic light":
-                return _Spot(float(rng.uniform(9.5, 13.0)), y, 0.14, 180 + float(rng.uniform(-8, 8)))
-            if name == "fence":
-                return _Spot(x, side * (KERB + 0.4), 0.14, toward_road)
-            return _Spot(x, y, 0.14, toward_road)
-
-        return spot
+        x = float(rng.uniform(*THINGS_X))
+        y = side * (KERB + 0.62)
+        toward_road = -90.0 * side
+        if model.name == "traffic sign":
+            return _Spot(x, y, 0.14, 180 + float(rng.uniform(-18, 18)))
+        if model.name == "traffic light":
+            return _Spot(float(rng.uniform(9.5, 13.0)), y, 0.14, 180 + float(rng.uniform(-8, 8)))
+        if model.name == "fence":
+            return _Spot(x, side * (KERB + 0.4), 0.14, toward_road)
+        return _Spot(x, y, 0.14, toward_road)
 
 
 def build_street(seed: int, objects: int) -> WorldScene:
@@ -178,11 +175,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
 
     Vehicles are in the lanes or parked at the kerbs, people on the sidewalks, and trees, lamps, signs and
     fences beside the kerb. The boxes around the parts of one object intersect no box of another; objects that
-    do not fit are omitted. `placed` lists only vehicles and people.
-
-    Args:
-        seed: not negative; the same seed and number of objects give the same scene.
-        objects: number of vehicles and people to place; about 16 fit.
+    do not fit are omitted; about 16 vehicles and people fit. `placed` lists only these.
     """
     street = _Street(seed)
     rng = street.rng
@@ -202,18 +195,18 @@ def build_street(seed: int, objects: int) -> WorldScene:
     furniture = 0
     for i, name in enumerate(FURNITURE):
         side = -1 if i == 0 or (i > 1 and rng.random() < 0.5) or i == 1 else 1
-        thing = street.try_spots(name, street.furniture_spot(name, side))
+        thing = street.try_spots(name, partial(street.furniture_spot, side))
         if thing is None:
             logger.info("scene street:%d: no place left for the %s", seed, name)
         else:
             furniture += 1
-    background = add_ground(street.assembly, np.random.default_rng([seed, 23]))
+    add_ground(street.assembly, np.random.default_rng([seed, 23]))
     logger.info(
         "scene street:%d: %d of %d vehicles and people placed (%s), %d pieces of furniture, %d buildings",
         seed, len(placed), objects, ", ".join(thing.name for thing in placed), furniture, houses,
     )  # fmt: skip
     style = _daylight(np.random.default_rng([seed, 24]))
-    return street.assembly.finished("street", seed, objects, placed, background, style)
+    return street.assembly.finished("street", seed, objects, placed, style)
 
 
 def _add_buildings(street: _Street) -> int:
@@ -283,11 +276,7 @@ def drive_poses(scene: WorldScene, views: int) -> list[tuple[Float[np.ndarray, "
 def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
     """Return the cameras of a drive along the street, for the global mapper (see `docs/world.md`).
 
-    Args:
-        scene: scene to view; its seed also determines the jitter.
-        views: number of cameras, named 000.png, 001.png, ...
-        image_px: height and width.
-        arc_deg: unused, because a drive is not a ring.
+    `arc_deg` is unused, because a drive is not a ring.
     """
     rng = np.random.default_rng([scene.seed, 26])
     transforms = []

@@ -20,8 +20,8 @@ DOME_HEIGHT = 62.0
 CROSSING_X = (14.2, 16.8)
 
 
-def add_ground(assembly: Assembly, rng: np.random.Generator) -> list[int]:
-    """Add the surroundings as wholes without parts and return their ids.
+def add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add the surroundings as wholes without parts.
 
     Their texts are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
     """
@@ -36,10 +36,8 @@ def add_ground(assembly: Assembly, rng: np.random.Generator) -> list[int]:
     grass = _paint("green", "mottled", (0.34, 0.50, 0.22), (0.46, 0.56, 0.30), 6.0, rng)
     road = [(box((length, 2 * KERB, 0.2), (middle, 0, -0.1)), asphalt)]
     road.append((_patches(rng), _paint("black", "mottled", (0.22, 0.22, 0.24), (0.30, 0.30, 0.32), 9.0, rng)))
-    nodes = [assembly.add_surroundings("road", ("street", "asphalt", "roadway"), road)]
-    nodes.append(
-        assembly.add_surroundings("lane marker", ("lane marking", "road marking"), [(_markings(), lines)])
-    )
+    assembly.add_surroundings("road", ("street", "asphalt", "roadway"), road)
+    assembly.add_surroundings("lane marker", ("lane marking", "road marking"), [(_markings(), lines)])
     kerbs, walks = [], []
     for side in (-1, 1):
         kerbs.append(
@@ -49,33 +47,18 @@ def add_ground(assembly: Assembly, rng: np.random.Generator) -> list[int]:
         walks.append(
             (box((length, wide + 0.6, 0.2), (middle, side * (KERB + 0.5 + wide / 2), WALK_Z - 0.1)), flags)
         )
-    nodes.append(assembly.add_surroundings("curb", ("kerb", "curbstone"), kerbs))
-    nodes.append(assembly.add_surroundings("sidewalk", ("pavement", "footpath"), walks))
+    assembly.add_surroundings("curb", ("kerb", "curbstone"), kerbs)
+    assembly.add_surroundings("sidewalk", ("pavement", "footpath"), walks)
     lawn = box((2 * DOME_RADIUS, 2 * DOME_RADIUS, 0.2), (middle, 0, -0.13))
-    nodes.append(assembly.add_surroundings("ground", ("other ground", "lawn"), [(lawn, grass)]))
+    assembly.add_surroundings("ground", ("other ground", "lawn"), [(lawn, grass)])
     blue = (0.36 + 0.08 * float(rng.random()), 0.60, 0.90)
-    sky = Paint(
-        "blue",
-        "mottled",
-        blue,
-        (0.93, 0.94, 0.96),
-        0.42,
-        0.0,
-        0.0,
-        0.0,
-        tuple(rng.uniform(3, 90, 3).tolist()),
-    )
-    nodes.append(assembly.add_surroundings("sky", ("clouds", "blue sky"), [(_dome(middle), sky)]))
-    return nodes
+    offset = tuple(rng.uniform(3, 90, 3).tolist())
+    sky = Paint("blue", "mottled", blue, (0.93, 0.94, 0.96), 0.42, 0.0, 0.0, 0.0, offset)
+    assembly.add_surroundings("sky", ("clouds", "blue sky"), [(_dome(middle), sky)])
 
 
 def _paint(
-    colour: str,
-    kind: str,
-    first: Colour,
-    second: Colour,
-    scale: float,
-    rng: np.random.Generator,
+    colour: str, kind: str, first: Colour, second: Colour, scale: float, rng: np.random.Generator
 ) -> Paint:
     """Return a dull paint with strong grain, because structure from motion needs detail on large surfaces."""
     offset = tuple(rng.uniform(3.0, 17.0, 3).tolist())

@@ -11,7 +11,7 @@ from hilsplat.world.objects.catalogue import TABLETOP, build_object
 from hilsplat.world.paints import Paint, PaintBox
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import Mesh, box, cylinder, loft, rotation_about
-from hilsplat.world.views import looking_at, numbered_cameras, on_sphere, pinhole
+from hilsplat.world.views import arc_azimuths, looking_at, numbered_cameras, on_sphere, pinhole
 
 logger = logging.getLogger(__name__)
 
@@ -41,10 +41,6 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
 
     The more objects are requested, the smaller each is. No class repeats before all have been used. Each
     object is placed at random without overlap of footprints; objects that do not fit are omitted.
-
-    Args:
-        seed: not negative; the same seed and number of objects give the same scene.
-        objects: number of objects to place.
     """
     rng = np.random.default_rng([seed, 1])
     assembly = Assembly()
@@ -71,9 +67,9 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
         node = assembly.add_object(model, scale, xy, yaw)
         placed.append(PlacedObject(name, node, (float(spot[0]), float(spot[1])), radius, height, yaw))
     logger.info("scene tabletop:%d: %d of %d objects placed", seed, len(placed), objects)
-    background = _add_room(assembly, np.random.default_rng([seed, 3]))
+    _add_room(assembly, np.random.default_rng([seed, 3]))
     style = Style.draw(np.random.default_rng([seed, 4]))
-    return assembly.finished("tabletop", seed, objects, placed, background, style)
+    return assembly.finished("tabletop", seed, objects, placed, style)
 
 
 def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:
@@ -103,14 +99,14 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
     return best
 
 
-def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
-    """Add richly textured table, floor and walls, sometimes a cloth, a rug or pictures; return their ids."""
+def _add_room(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add richly textured table, floor and walls, sometimes a cloth, a rug or pictures."""
     paints = PaintBox(rng)
-    nodes = _add_table(assembly, rng, paints)
+    _add_table(assembly, rng, paints)
     half = ROOM_HALF
     floor = paints.draw(str(rng.choice(["wood", "collage", "stone", "tiles"])), scale=0.35).paled(ROOM_PALE)
     ground = box((2 * half, 2 * half, 0.1), (0, 0, FLOOR_Z - 0.05))
-    nodes.append(assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(ground, floor)]))
+    assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(ground, floor)])
     if rng.random() < 0.5:
         woven = _fabric(paints, 0.35).paled(0.35)
         mesh = cylinder(1.0, FLOOR_Z, FLOOR_Z + 0.02, 48).scaled(
@@ -119,7 +115,7 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
         if rng.random() < 0.5:
             mesh = box((2.9, rng.uniform(2.2, 2.9), 0.03), (0, 0, FLOOR_Z + 0.01))
         mesh = mesh.turned("z", float(rng.uniform(0, 180)))
-        nodes.append(assembly.add_surroundings("rug", ("carpet", f"{woven.colour} rug"), [(mesh, woven)]))
+        assembly.add_surroundings("rug", ("carpet", f"{woven.colour} rug"), [(mesh, woven)])
     walls, pictures = [], []
     one_paint = rng.random() < 0.4
     for turn in range(4):
@@ -138,13 +134,12 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> list[int]:
                 pictures.append((frame.turned("z", 90 * turn), paints.draw("wood").paled(0.3)))
                 group = str(rng.choice(["collage", "plain", "stone", "plastic"]))
                 pictures.append((canvas.turned("z", 90 * turn), paints.draw(group, scale=0.5).paled(0.35)))
-    nodes.append(assembly.add_surroundings("wall", ("walls", "room wall"), walls))
+    assembly.add_surroundings("wall", ("walls", "room wall"), walls)
     if pictures:
-        nodes.append(assembly.add_surroundings("picture", ("painting", "framed picture"), pictures))
-    return nodes
+        assembly.add_surroundings("picture", ("painting", "framed picture"), pictures)
 
 
-def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -> list[int]:
+def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -> None:
     """Add a round, square or octagonal table of about `TABLE_RADIUS`, sometimes with a cloth."""
     top = paints.draw(
         str(rng.choice(["wood", "wood", "stone", "collage", "plain", "tiles"])), scale=0.6
@@ -174,16 +169,13 @@ def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -
             for y in (-away, away):
                 table.append((box((0.12, 0.12, -FLOOR_Z), (x, y, FLOOR_Z / 2 - 0.03), 0.01), leg))
     texts = (f"{shape} table", f"{top.colour} table", "table top")
-    nodes = [assembly.add_surroundings("table", texts, table)]
+    assembly.add_surroundings("table", texts, table)
     if cloth:
         fabric = _fabric(paints, 0.5).paled(0.35)
         draped = [(slab(1.012, -0.30, 0.0), fabric)]
         if rng.random() < 0.5:  # a flat cloth, smaller than the table
             draped = [(slab(0.86, -0.015, 0.0), fabric)]
-        nodes.append(
-            assembly.add_surroundings("tablecloth", (f"{fabric.colour} tablecloth", "cloth"), draped)
-        )
-    return nodes
+        assembly.add_surroundings("tablecloth", (f"{fabric.colour} tablecloth", "cloth"), draped)
 
 
 def _fabric(paints: PaintBox, scale: float) -> Paint:
@@ -195,21 +187,14 @@ def _fabric(paints: PaintBox, scale: float) -> Paint:
 def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
     """Return slightly jittered cameras around the table at two alternating elevations.
 
-    Neighbours should be at most 9 degrees apart: structure from motion failed with larger steps.
-
-    Args:
-        scene: scene to view; its seed also determines the jitter.
-        views: number of cameras, named 000.png, 001.png, ...
-        image_px: height and width.
-        arc_deg: azimuth covered, centred on +x, where the objects' fronts tend to face; a full ring
-            does not repeat its first azimuth.
+    Neighbours should be at most 9 degrees apart: structure from motion failed with larger steps. The arc is
+    centred on +x, where the objects' fronts tend to face.
     """
     rng = np.random.default_rng([scene.seed, 5])
-    share = np.arange(views) / (views if arc_deg >= 360 else max(1, views - 1))
     target = np.array([0.0, 0.0, LOOK_AT_Z])
     transforms = []
-    for i in range(views):
-        azimuth = arc_deg * (share[i] - 0.5) + rng.uniform(-1, 1)
+    for i, middle in enumerate(arc_azimuths(views, arc_deg)):
+        azimuth = middle + rng.uniform(-1, 1)
         elevation = ELEVATIONS_DEG[i % 2] + rng.uniform(-1.5, 1.5)
         centre = target + on_sphere(azimuth, elevation, DISTANCE * rng.uniform(0.97, 1.03))
         transforms.append(looking_at(centre, target + rng.uniform(-0.03, 0.03, 3)))

@@ -13,7 +13,7 @@ from hilsplat.world.objects.catalogue import (
     build_furniture,
     build_object,
 )
-from hilsplat.world.paints import COLOURS, KINDS, SECOND_SHARE, Paint, PaintBox, colour_word, lab_from_srgb
+from hilsplat.world.paints import COLOURS, KINDS, TEXTURES, Paint, PaintBox, colour_word, lab_from_srgb
 from hilsplat.world.shapes import Mesh, box, cylinder, disc, extrude, loft, ring, sphere, sweep
 from hilsplat.world.textures import pattern
 
@@ -125,7 +125,7 @@ def seen_lab(materials, rows):
     """L*a*b* from afar of materials, from the numbers that the shader gets."""
     linear = []
     for row in materials[rows]:
-        share = SECOND_SHARE[KINDS[int(row[0])]]
+        share = TEXTURES[KINDS[int(row[0])]].second_share
         linear.append((1 - share) * row[1:4] + share * row[4:7])
     values = np.array(linear)
     return lab_from_srgb(np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055))
@@ -176,7 +176,7 @@ def test_two_parts_of_one_paint_become_two_shades_where_they_touch():
 def test_the_share_of_a_texture_that_shows_its_second_colour_is_as_stated(kind):
     points = np.random.default_rng(0).uniform(50, 450, (4000, 3))
     share = np.mean([pattern(KINDS.index(kind), *point)[0] for point in points])
-    assert share == pytest.approx(SECOND_SHARE[kind], abs=0.03)
+    assert share == pytest.approx(TEXTURES[kind].second_share, abs=0.03)
 
 
 def test_a_colour_word_is_that_of_the_nearest_colour_and_paints_keep_theirs():
