@@ -38,7 +38,6 @@ from hilsplat.settings import (
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
 
-
 LONGEST_SHOWN = 120
 """Maximum number of characters of a value in a message."""
 
@@ -173,7 +172,6 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 }
 """Stage -> sections on which it depends, directly or through its inputs; see `upstream`."""
 
-
 RESERVED = frozenset(
     ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
 )
@@ -268,7 +266,6 @@ class RunSettings(StageSettings):
         """Return the settings of a variant for a scene.
 
         Args:
-            variant: name of a variant.
             scopes: keys of `overrides` to apply, general ones first (group, then dataset/scene).
 
         Raises:
@@ -399,12 +396,7 @@ def read_config(path: Path) -> dict[str, Any]:
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct its path, which begins here") from error
-    except (
-        yaml.YAMLError,
-        ValueError,
-        RecursionError,
-        OSError,
-    ) as error:  # ValueError: invalid date, or not UTF-8
+    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: a date, not UTF-8
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
     if not isinstance(found, dict):
         kind = "nothing" if found is None else type(found).__name__
@@ -448,26 +440,7 @@ def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 def config_schema() -> dict[str, Any]:
     """Return the configuration's JSON schema, for editors that check YAML (`hilsplat settings --schema`)."""
-    schema = RunSettings.model_json_schema()
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
-
-
-def _choices(annotation: Any) -> list[str]:
-    """Return the words that a setting accepts, possibly in addition to numbers."""
-    if get_origin(annotation) is Literal:
-        return list(get_args(annotation))
-    if get_origin(annotation) is UnionType or get_origin(annotation) is Union:
-        return [word for part in get_args(annotation) for word in _choices(part)]
-    return []
-
-
-def _limits_inside(annotation: Any) -> list[Any]:
-    """Return the limits of a number that a setting accepts in addition to words."""
-    if get_origin(annotation) is UnionType or get_origin(annotation) is Union:
-        return [limit for part in get_args(annotation) for limit in _limits_inside(part)]
-    if get_origin(annotation) is Annotated:
-        return [limit for info in get_args(annotation)[1:] for limit in getattr(info, "metadata", [])]
-    return []
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **RunSettings.model_json_schema()}
 
 
 def knob_table() -> str:
@@ -480,14 +453,21 @@ def knob_table() -> str:
                 continue
             extra = field.json_schema_extra
             assert isinstance(extra, dict), name  # every field is defined with `knob`
-            limits = ", ".join(
+            choices: list[str] = []
+            limits = [*field.metadata]
+            is_union = get_origin(field.annotation) in (Union, UnionType)
+            for part in get_args(field.annotation) if is_union else [field.annotation]:
+                if get_origin(part) is Literal:
+                    choices += get_args(part)
+                elif get_origin(part) is Annotated:
+                    limits += get_args(part)[1].metadata
+            bounds = ", ".join(
                 f"{symbol} {getattr(limit, attribute)}"
-                for limit in [*field.metadata, *_limits_inside(field.annotation)]
+                for limit in limits
                 for attribute, symbol in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
                 if hasattr(limit, attribute) and getattr(limit, attribute) != LARGEST
             )
-            choices = "|".join(_choices(field.annotation))
-            facts = [choices, limits, extra["unit"], f"origin: {extra['origin']}"]
+            facts = ["|".join(choices), bounds, extra["unit"], f"origin: {extra['origin']}"]
             place = f"{section}.{name}" if section else name
             lines.append(f"{place} = {field.default!r}  ({'; '.join(str(fact) for fact in facts if fact)})")
             lines.append(f"    {field.description}")

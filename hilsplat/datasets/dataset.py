@@ -32,7 +32,6 @@ class Dataset:
         labels: "images" if their pixels are labelled, "points" if the points of a mesh or a scan are.
         folder: the data set's folder below `data_root`.
         scenes: scenes in the paper's tables.
-        licence: licence in one line.
         terms: obligations of the user under the licence, in one sentence.
         citation: authors, title, venue, year.
         layout: the expected file tree below `folder`, as user-facing text.
@@ -107,7 +106,7 @@ class Dataset:
         raise SceneError(
             f"{self.title} is not below {data_root}",
             expected=f"{root} with one of: {', '.join(self.scenes[:8])}",
-            found=_listing(root if root.is_dir() else data_root),
+            found=listing(root if root.is_dir() else data_root),
             fix="unpack it there; its layout is printed by: hilsplat datasets list",
         )
 
@@ -123,12 +122,14 @@ class Dataset:
             raise SceneError(
                 f"scene {scene} of {self.title} is incomplete in {root}",
                 expected=f"also {', '.join(missing)}",
-                found=", ".join(here) or _listing(Path(root)),
+                found=", ".join(here) or listing(root),
                 fix="unpack the whole archive again, or correct the name of the scene",
             )
 
     def _has_begun(self, root: Path) -> bool:
-        """Return whether a folder contains a required path of any known scene."""
+        """Return whether a folder contains a required path of a known scene; any scene if none is known."""
+        if not self.scenes:
+            return bool(self.found(root))
         return any(
             _at(root, place).exists()
             for scene in self.scenes
@@ -147,10 +148,10 @@ def _folders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
 
-def _listing(folder: Path) -> str:
+def listing(folder: Path) -> str:
     """Return the first names in a folder, for messages."""
     if not folder.is_dir():
         return f"no folder {folder}"
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-    return ", ".join(names[:8]) + more if names else "nothing"
+    return (", ".join(names[:8]) + more) or f"an empty folder {folder}"

@@ -7,11 +7,12 @@ Labels, images and poses of a view are keyed by its name in the scene ("frame_00
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int
-from PIL import UnidentifiedImageError
+from PIL import Image
 
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import list_images
@@ -19,8 +20,10 @@ from hilsplat.base.images import open_image
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.importers.known_poses import KnownView, find_known_poses
-from hilsplat.scene.importers.known_views import known_views
+from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.view_names import view_name
+
+Found = TypeVar("Found")
 
 ROUNDING_PX = 1.0
 """A label counts as a scaled copy of its image if their sides differ by rounding only."""
@@ -32,7 +35,7 @@ class LabelledRegion:
 
     Attributes:
         text: the query, spelt as in the labels.
-        size_hw: height and width of the label, px.
+        size_hw: size of the label, px.
         pixels: reads the region at the label's size; called whenever the mask is needed.
         boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
         level: None if the data set has no levels.
@@ -81,12 +84,9 @@ class LabelledScene:
     """One scene of an image-labelled data set.
 
     Attributes:
-        dataset: name of the data set.
-        scene: name of the scene.
         images: image file of each view, for all images of the scene.
         poses: folder in which `scene.known_poses` finds poses; None if the scene has none.
         views: labelled regions by view, in label order.
-        prompts: all texts of the scene, sorted.
         warnings: one sentence for each item that was reinterpreted.
     """
 
@@ -95,8 +95,12 @@ class LabelledScene:
     images: Mapping[str, Path]
     poses: Path | None
     views: Mapping[str, tuple[LabelledRegion, ...]]
-    prompts: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+
+    @property
+    def prompts(self) -> tuple[str, ...]:
+        """All texts of the scene, sorted (capitals first)."""
+        return tuple(sorted({region.text for regions in self.views.values() for region in regions}))
 
     @property
     def num_pairs(self) -> int:
@@ -111,10 +115,11 @@ class LabelledScene:
         """
         missing = [view for view in self.views if view not in names]
         if missing:
+            shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
             raise SceneError(
                 f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
                 expected=f"all {len(self.views)} labelled views among the posed ones",
-                found=f"{len(names)} posed views, {_some(sorted(names))}",
+                found=f"{len(names)} posed views, {', '.join(shown)}",
                 fix="use the poses that come with the data set, or register those images",
             )
 
@@ -158,7 +163,6 @@ def images_by_view(folder: Path) -> dict[str, Path]:
     Raises:
         SceneError: the folder is missing or empty, or two images share a stem.
     """
-    folder = Path(folder)
     files = list_images(folder) if folder.is_dir() else []
     if not files:
         raise SceneError(
@@ -185,15 +189,7 @@ def image_size_hw(path: Path) -> tuple[int, int]:
     Raises:
         ImageError: it is missing or not an image.
     """
-    try:
-        with open_image(path) as image:
-            return image.height, image.width
-    except FileNotFoundError as error:
-        raise ImageError(f"image {path} is missing") from error
-    except (UnidentifiedImageError, OSError) as error:
-        raise ImageError(
-            f"image {path} cannot be read: {error}", fix="replace it with an intact copy"
-        ) from error
+    return _read("image", path, lambda image: (image.height, image.width))
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
@@ -202,20 +198,24 @@ def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
     Raises:
         ImageError: it is missing, truncated or not an image.
     """
+    return _read("mask", path, lambda image: np.asarray(image.convert("L")) >= least)
+
+
+def _read(kind: str, path: Path, read: Callable[[Image.Image], Found]) -> Found:
     try:
         with open_image(path) as image:
-            return np.asarray(image.convert("L")) >= least
+            return read(image)
     except FileNotFoundError as error:
-        raise ImageError(f"mask {path} is missing") from error
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise ImageError(f"{kind} {path} is missing") from error
+    except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for a damaged PNG
         raise ImageError(
-            f"mask {path} cannot be read: {error}", fix="replace it with an intact copy"
+            f"{kind} {path} cannot be read: {error}", fix="replace it with an intact copy"
         ) from error
 
 
 def check_label_size(
     where: str, label_hw: tuple[int, int], image_hw: tuple[int, int], share: float = 0.0
-) -> str | None:
+) -> list[str]:
     """Compare the size of a label with that of its image.
 
     Args:
@@ -225,13 +225,13 @@ def check_label_size(
         share: tolerated height difference at equal widths, beyond rounding, as a share of the image's height.
 
     Returns:
-        None if they are equal, otherwise a sentence stating that the label is resized.
+        A sentence stating that the label is resized; empty if the sizes are equal.
 
     Raises:
         SceneError: one is not a scaled copy of the other.
     """
     if label_hw == image_hw:
-        return None
+        return []
     scale = image_hw[1] / label_hw[1]
     if abs(image_hw[0] - label_hw[0] * scale) > max(ROUNDING_PX, ROUNDING_PX * scale, share * image_hw[0]):
         raise SceneError(
@@ -240,25 +240,22 @@ def check_label_size(
             found=f"{label_hw[1]} x {label_hw[0]} px",
             fix="use the images that the labels were drawn on (undistorted, of the same release)",
         )
-    return (
+    return [
         f"{where} is {label_hw[1]} x {label_hw[0]} px, its image {image_hw[1]} x {image_hw[0]} px: "
         "resized by nearest neighbour"
-    )
+    ]
 
 
-def unlisted_texts(found: Iterable[str], published: Iterable[str]) -> str | None:
-    """Return a sentence naming texts that a non-empty published list lacks, or None."""
-    published = set(published)
-    new = sorted(set(found) - published)
-    if not published or not new:
-        return None
-    return f"texts that the published list lacks: {', '.join(new)}"
+def unlisted_texts(found: Iterable[str], published: Collection[str]) -> list[str]:
+    """Return a sentence naming texts that a non-empty published list lacks, if any."""
+    new = sorted(set(found) - set(published))
+    return [f"texts that the published list lacks: {', '.join(new)}"] if published and new else []
 
 
-def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> str | None:
-    """Return a sentence naming published frames without `what`, or None."""
+def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> list[str]:
+    """Return a sentence naming published frames without `what`, if any."""
     gone = sorted(set(listed) - set(present))
-    return f"published frames without {what}: {', '.join(gone)}" if gone else None
+    return [f"published frames without {what}: {', '.join(gone)}"] if gone else []
 
 
 def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
@@ -275,7 +272,7 @@ def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
             expected="a COLMAP model in sparse/0/",
             fix=f"unpack the whole archive of {dataset} again",
         )
-    views = known_views(known)
+    views = read_source(known)[0]
     bent = sorted({view.camera.model.name for view in views if not view.camera.is_undistorted()})
     if bent:
         raise SceneError(
@@ -286,7 +283,3 @@ def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
         )
     by_stem = {Path(view.name).stem: view for view in views}
     return {view_name(stem): by_stem[stem] for stem in sorted(by_stem)}
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")

@@ -44,12 +44,7 @@ def _presence(dataset: Dataset, data_root: Path) -> list[str]:
 
 
 def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
-    """Read whole scenes of a data set and report what was found.
-
-    Args:
-        dataset: the data set.
-        data_root: folder that contains the data set's folder.
-        scenes: scenes to read; by default those that are at least partly present.
+    """Read whole scenes of a data set, by default those at least partly present, and report what was found.
 
     Returns:
         The report, and the number of scenes that cannot be read.
@@ -59,11 +54,11 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
     """
     root = dataset.locate(data_root)
     known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
-    absent = [
-        scene
-        for scene in known
-        if not scenes and set(dataset.missing(root, scene)) >= set(_own(dataset, scene))
-    ]
+    absent = []
+    for scene in [] if scenes else known:
+        inside = {place for place in dataset.required(scene) if not place.startswith("..")}
+        if inside <= set(dataset.missing(root, scene)):
+            absent.append(scene)
     lines, num_failed = [], 0
     for scene in scenes or [scene for scene in known if scene not in absent]:
         try:
@@ -79,8 +74,3 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
     if absent:
         lines.append(f"{dataset.name}: missing: {', '.join(absent)}")
     return "\n".join(lines), num_failed
-
-
-def _own(dataset: Dataset, scene: str) -> tuple[str, ...]:
-    """Return a scene's required paths inside the data set's own folder."""
-    return tuple(place for place in dataset.required(scene) if not place.startswith(".."))

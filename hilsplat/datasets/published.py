@@ -20,6 +20,10 @@ def _ovs(*numbers: int) -> tuple[str, ...]:
     return tuple(view_name(f"{number:02d}") for number in numbers)
 
 
+def _texts(listed: str) -> tuple[str, ...]:
+    return tuple(listed.split(", "))
+
+
 FRAMES: dict[str, dict[str, tuple[str, ...]]] = {
     "lerf_ovs": {
         "figurines": _lerf(41, 105, 152, 195),
@@ -62,178 +66,60 @@ FRAMES: dict[str, dict[str, tuple[str, ...]]] = {
 
 PROMPTS: dict[str, dict[str, tuple[str, ...]]] = {
     "lerf_ovs": {
-        "figurines": (
-            "bag",
-            "green apple",
-            "green toy chair",
-            "jake",
-            "miffy",
-            "old camera",
-            "pikachu",
-            "pink ice cream",
-            "pirate hat",
-            "porcelain hand",
-            "pumpkin",
-            "red apple",
-            "red toy chair",
-            "rubber duck with buoy",
-            "rubber duck with hat",
-            "rubics cube",
-            "spatula",
-            "tesla door handle",
-            "toy cat statue",
-            "toy elephant",
-            "waldo",
+        "figurines": _texts(
+            "bag, green apple, green toy chair, jake, miffy, old camera, pikachu, pink ice cream, "
+            "pirate hat, porcelain hand, pumpkin, red apple, red toy chair, rubber duck with buoy, "
+            "rubber duck with hat, rubics cube, spatula, tesla door handle, toy cat statue, toy elephant, "
+            "waldo"
         ),
-        "ramen": (
-            "bowl",
-            "chopsticks",
-            "corn",
-            "egg",
-            "glass of water",
-            "hand",
-            "kamaboko",
-            "napkin",
-            "nori",
-            "onion segments",
-            "plate",
-            "sake cup",
-            "spoon",
-            "wavy noodles",
+        "ramen": _texts(
+            "bowl, chopsticks, corn, egg, glass of water, hand, kamaboko, napkin, nori, onion segments, "
+            "plate, sake cup, spoon, wavy noodles"
         ),
-        "teatime": (
-            "apple",
-            "bag of cookies",
-            "bear nose",
-            "coffee",
-            "coffee mug",
-            "dall-e brand",
-            "hooves",
-            "paper napkin",
-            "plate",
-            "sheep",
-            "stuffed bear",
-            "tea in a glass",
-            "three cookies",
-            "yellow pouf",
+        "teatime": _texts(
+            "apple, bag of cookies, bear nose, coffee, coffee mug, dall-e brand, hooves, paper napkin, "
+            "plate, sheep, stuffed bear, tea in a glass, three cookies, yellow pouf"
         ),
-        "waldo_kitchen": (
-            "Stainless steel pots",
-            "cabinet",
-            "dark cup",
-            "frog cup",
-            "ketchup",
-            "knife",
-            "ottolenghi",
-            "plastic ladle",
-            "plate",
-            "pot",
-            "pour-over vessel",
-            "red cup",
-            "refrigerator",
-            "sink",
-            "spatula",
-            "spoon",
-            "toaster",
-            "yellow desk",
+        "waldo_kitchen": _texts(
+            "Stainless steel pots, cabinet, dark cup, frog cup, ketchup, knife, ottolenghi, "
+            "plastic ladle, plate, pot, pour-over vessel, red cup, refrigerator, sink, spatula, spoon, "
+            "toaster, yellow desk"
         ),
     },
     "lerf_mask": {
-        "figurines": (
-            "green apple",
-            "green toy chair",
-            "old camera",
-            "porcelain hand",
-            "red apple",
-            "red toy chair",
-            "rubber duck with red hat",
+        "figurines": _texts(
+            "green apple, green toy chair, old camera, porcelain hand, red apple, red toy chair, "
+            "rubber duck with red hat"
         ),
-        "ramen": (
-            "chopsticks",
-            "egg",
-            "glass of water",
-            "pork belly",
-            "wavy noodles in bowl",
-            "yellow bowl",
-        ),
-        "teatime": (
-            "apple",
-            "bag of cookies",
-            "coffee mug",
-            "cookies on a plate",
-            "paper napkin",
-            "plate",
-            "sheep",
-            "spoon handle",
-            "stuffed bear",
-            "tea in a glass",
+        "ramen": _texts("chopsticks, egg, glass of water, pork belly, wavy noodles in bowl, yellow bowl"),
+        "teatime": _texts(
+            "apple, bag of cookies, coffee mug, cookies on a plate, paper napkin, plate, sheep, "
+            "spoon handle, stuffed bear, tea in a glass"
         ),
     },
     "3d_ovs": {
-        "bed": (
-            "banana",
-            "black leather shoe",
-            "camera",
-            "hand",
-            "red bag",
-            "white sheet",
+        "bed": _texts("banana, black leather shoe, camera, hand, red bag, white sheet"),
+        "bench": _texts(
+            "Portuguese egg tart, dressing doll, green grape, mini offroad car, orange cat, "
+            "pebbled concrete wall, wood"
         ),
-        "bench": (
-            "Portuguese egg tart",
-            "dressing doll",
-            "green grape",
-            "mini offroad car",
-            "orange cat",
-            "pebbled concrete wall",
-            "wood",
+        "blue_sofa": _texts(
+            "a JBL Bluetooth speaker, a bottle of perfume, a squirrel pig doll, an aircon controller, "
+            "blue-grey sofa, sunglasses"
         ),
-        "blue_sofa": (
-            "a JBL Bluetooth speaker",
-            "a bottle of perfume",
-            "a squirrel pig doll",
-            "an aircon controller",
-            "blue-grey sofa",
-            "sunglasses",
+        "lawn": _texts("New York Yankees cap, black headphone, green lawn, hand soap, red apple, stapler"),
+        "office_desk": _texts(
+            "a can of red bull drink, a pack of pocket tissues, a white keyboard, blue partition, "
+            "desktop, the book of The Unbearable Lightness of Being"
         ),
-        "lawn": (
-            "New York Yankees cap",
-            "black headphone",
-            "green lawn",
-            "hand soap",
-            "red apple",
-            "stapler",
+        "room": _texts("baseball, dinosaur, rabbit, shrilling chicken, weaving basket, wood wall"),
+        "snacks": _texts(
+            "Coke Cola, Glico Pocky chocolate biscuits sticks box, calculator, desktop, "
+            "orange juice drink, pitaya"
         ),
-        "office_desk": (
-            "a can of red bull drink",
-            "a pack of pocket tissues",
-            "a white keyboard",
-            "blue partition",
-            "desktop",
-            "the book of The Unbearable Lightness of Being",
-        ),
-        "room": (
-            "baseball",
-            "dinosaur",
-            "rabbit",
-            "shrilling chicken",
-            "weaving basket",
-            "wood wall",
-        ),
-        "snacks": (
-            "Coke Cola",
-            "Glico Pocky chocolate biscuits sticks box",
-            "calculator",
-            "desktop",
-            "orange juice drink",
-            "pitaya",
-        ),
-        "sofa": (
-            "Gundam",
-            "Pikachu",
-            "Xbox wireless controller",
-            "a red Nintendo Switch joy-con controller",
-            "a stack of UNO cards",
-            "grey sofa",
+        "sofa": _texts(
+            "Gundam, Pikachu, Xbox wireless controller, a red Nintendo Switch joy-con controller, "
+            "a stack of UNO cards, grey sofa"
         ),
     },
 }

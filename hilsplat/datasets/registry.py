@@ -61,8 +61,6 @@ def open_labels(name: str, data_root: Path) -> LabelledScene | PointScene:
     """
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
-    if dataset.labels == "images":
-        return open_labelled(name, data_root)
     if not scene:
         raise SceneError(
             f"{name!r} names no scene",

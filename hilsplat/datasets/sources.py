@@ -1,35 +1,35 @@
 """Published data sets named in rows of the scene sheet: which parts are present, and which files are labels.
 
-The workflow uses this module at start-up, so it reads no data and imports nothing heavy at module level.
+The workflow uses this module at start-up, so it reads no data.
 """
 
 from collections.abc import Collection
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
+from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.points.labelled_points import PointScene
+from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
+from hilsplat.scene.posed_images import write_posed_images
 
 DATA_PREFIX = "data:"
 
-LABELS_ON: dict[str, tuple[str, ...]] = {"lerf_ovs": ("hi_lerf",), "3d_ovs": ("hi_3dovs",)}
-"""Data sets that label the images of another one, in addition to its own labels."""
+LABELS_ON = {"lerf_ovs": "hi_lerf", "3d_ovs": "hi_3dovs"}
+"""Data set -> another one that also labels its images, with levels."""
 
-LEVELLED = tuple(name for names in LABELS_ON.values() for name in names)
-"""The data sets with levels, from `LABELS_ON`."""
+LEVELLED = tuple(LABELS_ON.values())
 
 
 def published(source: str) -> tuple[str, str] | None:
     """Return data set and scene of a source such as `data:lerf_ovs/figurines`; None for anything else."""
-    from hilsplat.datasets.registry import DATASETS
-
     name, _, scene = source.removeprefix(DATA_PREFIX).partition("/")
     return (name, scene) if source.startswith(DATA_PREFIX) and scene and name in DATASETS else None
 
 
 def absence(source: str, data_root: str) -> str | None:
-    """Return a sentence on why a `data:` source cannot be used; None if it can.
+    """Return a sentence on why a `data:` source of the scene sheet cannot be used; None if it can.
 
     Args:
-        source: source in a row of the scene sheet.
         data_root: folder of the data sets; empty if not set.
     """
     if not source.startswith(DATA_PREFIX):
@@ -41,13 +41,11 @@ def absence(source: str, data_root: str) -> str | None:
     if place is None:
         folder = root / source.removeprefix(DATA_PREFIX)
         return None if folder.is_dir() else f"{folder} is missing"
-    from hilsplat.datasets.registry import dataset_of
-
     dataset = dataset_of(place[0])
     try:
         dataset.require(dataset.locate(root), place[1])
     except SceneError as error:
-        return _one_line(error)
+        return "; ".join(" ".join(line.split()) for line in str(error).splitlines())
     return None
 
 
@@ -57,16 +55,14 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
     Args:
         sources: sources of all rows of the scene sheet.
         groups: groups that are run; such a data set has the name of its group.
-        data_root: folder of the data sets; empty if not set.
+        data_root: empty if not set.
     """
-    from hilsplat.datasets.registry import DATASETS, dataset_of
-
     open_ended = [dataset_of(name) for name in groups if data_root and name in DATASETS]
     found = [
         f"{dataset.name}/{scene}"
         for dataset in open_ended
         if not dataset.scenes
-        for scene in dataset.found(Path(data_root).expanduser() / dataset.folder)
+        for scene in dataset.found(_folder(dataset, data_root))
     ]
     return [name for name in found if DATA_PREFIX + name not in sources]
 
@@ -79,64 +75,51 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
         data_root: folder of the data sets; empty for the working folder, which may contain own annotations.
         row: name of the row, `dataset/scene`.
     """
-    own = (f"annotated/{row}",) if any((_root(data_root) / "annotated" / row).glob("*.json")) else ()
+    drawn = (Path(data_root).expanduser() / "annotated" / row).glob("*.json")
+    own = (f"annotated/{row}",) if any(drawn) else ()
     place = published(source)
     if place is None or absence(source, data_root) is not None:
         return own
-    from hilsplat.datasets.registry import dataset_of
-
     name, scene = place
     found = [f"{name}/{scene}", *own]
-    for other in LABELS_ON.get(name, ()):
-        dataset = dataset_of(other)
-        folder = Path(data_root).expanduser() / dataset.folder
-        if not dataset.missing(folder, scene):
-            found.append(f"{other}/{scene}")
+    if name in LABELS_ON:
+        other = dataset_of(LABELS_ON[name])
+        if not other.missing(_folder(other, data_root), scene):
+            found.append(f"{other.name}/{scene}")
     return tuple(found)
 
 
-def _root(data_root: str) -> Path:
-    return Path(data_root).expanduser()
+def _folder(dataset: Dataset, data_root: str) -> Path:
+    return Path(data_root).expanduser() / dataset.folder
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
     """Return the files of `data set/scene` that only evaluation reads, sorted; edits rerun nothing else."""
-    from hilsplat.datasets.registry import dataset_of
-
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
-    root = _root(data_root) / dataset.folder
-    files: list[Path] = []
-    for pattern in dataset.label_places(scene):
-        files += [path for path in root.glob(pattern) if path.is_file()]
-    return tuple(sorted(set(files)))
+    root = _folder(dataset, data_root)
+    files = {path for pattern in dataset.label_places(scene) for path in root.glob(pattern) if path.is_file()}
+    return tuple(sorted(files))
 
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
     """Return the files listed by the data set that contain images and poses of an exported scene."""
-    from hilsplat.datasets.registry import dataset_of
-
     place = published(source)
     assert place is not None, source
     name, scene = place
     dataset = dataset_of(name)
-    root = Path(data_root).expanduser() / dataset.folder
-    labels = set(label_files(f"{name}/{scene}", data_root))
     files: set[Path] = set()
     for required in dataset.required(scene):
-        path = root / required
-        files |= {file for file in path.rglob("*") if file.is_file()} if path.is_dir() else {path}
-    return tuple(sorted(file for file in files - labels if file.is_file()))
+        path = _folder(dataset, data_root) / required
+        files |= set(path.rglob("*")) if path.is_dir() else {path}
+    labels = label_files(f"{name}/{scene}", data_root)
+    return tuple(sorted(file for file in files.difference(labels) if file.is_file()))
 
 
 def is_exported(source: str) -> bool:
     """Return whether images and poses must first be exported, as for data sets with labels on points."""
     place = published(source)
-    if place is None:
-        return False
-    from hilsplat.datasets.registry import dataset_of
-
-    return dataset_of(place[0]).labels == "points"
+    return place is not None and dataset_of(place[0]).labels == "points"
 
 
 def export_images(name: str, data_root: Path, out: Path) -> int:
@@ -147,7 +130,6 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
 
     Args:
         name: `data set/scene`.
-        data_root: folder of the data sets.
         out: folder for `images/`, `transforms.json` and, for a mesh, `points.ply`.
 
     Returns:
@@ -156,10 +138,6 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     Raises:
         SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.
     """
-    from hilsplat.datasets.points.labelled_points import PointScene
-    from hilsplat.datasets.registry import open_labels
-    from hilsplat.scene.posed_images import write_posed_images
-
     scene = open_labels(name, data_root)
     if not isinstance(scene, PointScene):
         raise SceneError(
@@ -169,8 +147,3 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     meshes = [points for points in scene.truth.values() if points.faces is not None]
     write_posed_images(out, scene.images, meshes[0].xyz if meshes else None)
     return len(scene.images)
-
-
-def _one_line(error: SceneError) -> str:
-    """Return a message as one line, for a log or a footnote."""
-    return "; ".join(" ".join(line.split()) for line in str(error).splitlines())

@@ -1,5 +1,6 @@
 """Sets of classes for labelled points."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,14 @@ class ClassSet:
     ids: tuple[int, ...]
     texts: tuple[str, ...]
 
+    @staticmethod
+    def of(
+        name: str, source: str, query_of: Mapping[int, str], ids: Iterable[int] | None = None
+    ) -> "ClassSet":
+        """Return the classes with the given ids, or all, from the data set's table of queries by id."""
+        chosen = tuple(query_of if ids is None else ids)
+        return ClassSet(name, source, chosen, tuple(query_of[label] for label in chosen))
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -31,3 +40,8 @@ class ClassSet:
         known = np.asarray(self.ids)[order]
         place = np.minimum(np.searchsorted(known, file_labels), len(known) - 1)
         return np.where(known[place] == file_labels, order[place] + 1, 0).astype(np.int32)
+
+
+def words_of(listed: str) -> list[str]:
+    """Split a comma-separated list, which may have line breaks."""
+    return [" ".join(word.split()) for word in listed.split(",")]

@@ -7,109 +7,21 @@ which matches the paper's number.
 
 from hilsplat.datasets.classes.class_set import ClassSet
 
-NAMES: dict[int, str] = {
-    1: "backpack",
-    2: "base-cabinet",
-    3: "basket",
-    4: "bathtub",
-    5: "beam",
-    6: "beanbag",
-    7: "bed",
-    8: "bench",
-    9: "bike",
-    10: "bin",
-    11: "blanket",
-    12: "blinds",
-    13: "book",
-    14: "bottle",
-    15: "box",
-    16: "bowl",
-    17: "camera",
-    18: "cabinet",
-    19: "candle",
-    20: "chair",
-    21: "chopping-board",
-    22: "clock",
-    23: "cloth",
-    24: "clothing",
-    25: "coaster",
-    26: "comforter",
-    27: "computer-keyboard",
-    28: "cup",
-    29: "cushion",
-    30: "curtain",
-    31: "ceiling",
-    32: "cooktop",
-    33: "countertop",
-    34: "desk",
-    35: "desk-organizer",
-    36: "desktop-computer",
-    37: "door",
-    38: "exercise-ball",
-    39: "faucet",
-    40: "floor",
-    41: "handbag",
-    42: "hair-dryer",
-    43: "handrail",
-    44: "indoor-plant",
-    45: "knife-block",
-    46: "kitchen-utensil",
-    47: "lamp",
-    48: "laptop",
-    49: "major-appliance",
-    50: "mat",
-    51: "microwave",
-    52: "monitor",
-    53: "mouse",
-    54: "nightstand",
-    55: "pan",
-    56: "panel",
-    57: "paper-towel",
-    58: "phone",
-    59: "picture",
-    60: "pillar",
-    61: "pillow",
-    62: "pipe",
-    63: "plant-stand",
-    64: "plate",
-    65: "pot",
-    66: "rack",
-    67: "refrigerator",
-    68: "remote-control",
-    69: "scarf",
-    70: "sculpture",
-    71: "shelf",
-    72: "shoe",
-    73: "shower-stall",
-    74: "sink",
-    75: "small-appliance",
-    76: "sofa",
-    77: "stair",
-    78: "stool",
-    79: "switch",
-    80: "table",
-    81: "table-runner",
-    82: "tablet",
-    83: "tissue-paper",
-    84: "toilet",
-    85: "toothbrush",
-    86: "towel",
-    87: "tv-screen",
-    88: "tv-stand",
-    89: "umbrella",
-    90: "utensil-holder",
-    91: "vase",
-    92: "vent",
-    93: "wall",
-    94: "wall-cabinet",
-    95: "wall-plug",
-    96: "wardrobe",
-    97: "window",
-    98: "rug",
-    99: "logo",
-    100: "bag",
-    101: "set-of-clothing",
-}
+_TEN_PER_LINE = """
+    backpack base-cabinet basket bathtub beam beanbag bed bench bike bin
+    blanket blinds book bottle box bowl camera cabinet candle chair
+    chopping-board clock cloth clothing coaster comforter computer-keyboard cup cushion curtain
+    ceiling cooktop countertop desk desk-organizer desktop-computer door exercise-ball faucet floor
+    handbag hair-dryer handrail indoor-plant knife-block kitchen-utensil lamp laptop major-appliance mat
+    microwave monitor mouse nightstand pan panel paper-towel phone picture pillar
+    pillow pipe plant-stand plate pot rack refrigerator remote-control scarf sculpture
+    shelf shoe shower-stall sink small-appliance sofa stair stool switch table
+    table-runner tablet tissue-paper toilet toothbrush towel tv-screen tv-stand umbrella utensil-holder
+    vase vent wall wall-cabinet wall-plug wardrobe window rug logo bag
+    set-of-clothing
+"""
+
+NAMES: dict[int, str] = dict(enumerate(_TEN_PER_LINE.split(), start=1))
 """Class id -> name as spelt in the release. Negative ids and 0 are undefined."""
 
 # fmt: off
@@ -128,19 +40,13 @@ SCENES: tuple[str, ...] = (
 )
 """The eight evaluated scenes."""
 
+_QUERIES = {label: name.replace("-", " ") for label, name in NAMES.items()}
+"""Class id -> query: hyphens become spaces. OpenYOLO3D keeps them."""
 
-def query_of(name: str) -> str:
-    """Return a class name as a query: hyphens become spaces. OpenYOLO3D keeps them."""
-    return name.replace("-", " ")
-
-
-def _classes(name: str, source: str, ids: tuple[int, ...]) -> ClassSet:
-    return ClassSet(name, source, ids, tuple(query_of(NAMES[label]) for label in ids))
-
-
-REPLICA_51 = _classes("replica-51", "OpenNeRF", EVALUATED_51)
-REPLICA_48 = _classes(
+REPLICA_51 = ClassSet.of("replica-51", "OpenNeRF", _QUERIES, EVALUATED_51)
+REPLICA_48 = ClassSet.of(
     "replica-48",
     "OpenYOLO3D, paper: without wall, floor, ceiling",
-    tuple(sorted(label for label in EVALUATED_51 if label not in STRUCTURE)),
+    _QUERIES,
+    sorted(set(EVALUATED_51) - set(STRUCTURE)),
 )

@@ -12,20 +12,11 @@ from hilsplat.datasets.images.isat import read_isat
 from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 
-LAYOUT = """\
-annotated/
-  <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), a file per annotated photograph
-"""
-
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the annotations of a scene: one region per object that was drawn or accepted.
+    """Read the annotations of a scene, such as "photos/desk": one region per drawn or accepted object.
 
     Files whose objects have no level are read like LERF-OVS: one region per text.
-
-    Args:
-        root: the folder `annotated`.
-        scene: such as "photos/desk".
 
     Raises:
         SceneError: there are none, or a label file cannot be used.
@@ -33,13 +24,12 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     DATASET.require(root, scene)
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
-    for view, path in label_files(Path(root) / scene).items():
+    for view, path in label_files(root / scene).items():
         labels = read_isat(path)
-        warnings.extend(labels.warnings)
+        warnings += labels.warnings
         has_levels = any("level" in thing.keys for thing in labels.objects)
         views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
-    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
-    return LabelledScene("annotated", scene, {}, None, views, prompts, tuple(warnings))
+    return LabelledScene("annotated", scene, {}, None, views, tuple(warnings))
 
 
 class Annotated(Dataset):
@@ -47,11 +37,8 @@ class Annotated(Dataset):
 
     def found(self, root: Path) -> tuple[str, ...]:
         """Return the scenes that have a label file below the folder."""
-        files = Path(root).glob("*/*/*.json")
+        files = root.glob("*/*/*.json")
         return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
-
-    def _has_begun(self, root: Path) -> bool:
-        return bool(self.found(root))
 
 
 DATASET = Annotated(
@@ -63,7 +50,8 @@ DATASET = Annotated(
     licence="yours; the photographs keep theirs",
     terms="Draw them with: hilsplat annotate SCENE",
     citation="none",
-    layout=LAYOUT,
+    layout="""annotated/
+  <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), a file per annotated photograph""",
     required=lambda scene: (scene,),
     open=open_scene,
     label_places=lambda scene: (f"{scene}/*.json",),

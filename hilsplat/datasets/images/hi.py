@@ -48,12 +48,10 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
     Args:
         dataset: "hi_lerf" or "hi_3dovs".
         root: the folder of that name; the folder with the images is next to it.
-        scene: such as "figurines".
 
     Raises:
         SceneError: images or labels are missing, or a label file cannot be used.
     """
-    root = Path(root)
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
     images = images_by_view(source / "images")
@@ -65,25 +63,19 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
             warnings.append(f"label file {path} has no image in {source / 'images'}: left out")
             continue
         labels = read_isat(path)
-        warnings.extend(labels.warnings)
-        size = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
-        if size:
-            warnings.append(size)
+        warnings += labels.warnings
+        warnings += check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
         views[view] = regions_of(labels, warnings)
     listed = FRAMES[dataset].get(scene, ())
-    for what, present in (("image", images), ("label", files)):
-        sentence = missing_frames(what, listed, present)
-        if sentence:
-            warnings.append(sentence)
-    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
-    return LabelledScene(dataset, scene, images, source, views, prompts, tuple(warnings))
+    warnings += missing_frames("image", listed, images)
+    warnings += missing_frames("label", listed, files)
+    return LabelledScene(dataset, scene, images, source, views, tuple(warnings))
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
     """Return one region per object of a file, except for unaccepted proposals.
 
     Args:
-        labels: a file in our format.
         warnings: extended by a sentence for each item that was reinterpreted.
 
     Raises:
@@ -96,7 +88,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
         labels = replace(labels, objects=accepted)
     objects = by_id(labels)
     parents = parents_of(labels, objects, warnings)
-    warnings.extend(nesting_violations(labels, objects, parents))
+    warnings += nesting_violations(labels, objects, parents)
     return tuple(
         LabelledRegion(
             thing.category,
@@ -202,21 +194,8 @@ def path_of(
     return tuple(reversed(texts))
 
 
-def _layout(folder: str, images: str, frame: str) -> str:
-    return f"""\
-{folder}/
-  label/<scene>/{frame}.json ...      our format (docs/datasets.md)
-{images}/
-  <scene>/images, sparse              as of that data set
-"""
-
-
 def _dataset(name: str, title: str, frame: str) -> Dataset:
     """Return one of the two data sets, which differ in names only."""
-
-    def open_scene(root: Path, scene: str) -> LabelledScene:
-        return open_hi(name, root, scene)
-
     images = IMAGES_OF[name]
     return Dataset(
         name=name,
@@ -227,9 +206,12 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         licence="labels unpublished; images under the licence of their data set",
         terms="Write your own labels in our format; the terms of the images apply.",
         citation="Hi-LSplat (frames and levels)",
-        layout=_layout(name, images, frame),
+        layout=f"""{name}/
+  label/<scene>/{frame}.json ...      our format (docs/datasets.md)
+{images}/
+  <scene>/images, sparse              as of that data set""",
         required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),
-        open=open_scene,
+        open=partial(open_hi, name),
         label_places=lambda scene: (f"label/{scene}/*.json",),
     )
 

@@ -6,7 +6,7 @@ numbers restart and repeat. Unknown keys are ignored.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.polygons import fill_polygons, outside_px
+from hilsplat.datasets.images.polygons import fill_polygons
 
 LARGEST_SIDE_PX = 20_000
 """Limit on the size stated in a label file; regions are drawn at it, so a wrong one could exhaust memory."""
@@ -30,7 +30,7 @@ class IsatObject:
     """One annotated object.
 
     Attributes:
-        category: its text, verbatim.
+        category: the text, verbatim.
         polygons: vertices, px; the region is the union of the filled polygons.
         box_xyxy: whole pixels inside the annotated box, borders included.
         keys: all keys of the object in the file.
@@ -42,7 +42,7 @@ class IsatObject:
     keys: Mapping[str, Any]
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """Rasterise the object (see `polygons.fill_polygon`)."""
+        """Rasterise the object (see `polygons.fill_polygons`)."""
         return fill_polygons(self.polygons, size_hw)
 
 
@@ -51,7 +51,6 @@ class IsatFile:
     """The objects of one image.
 
     Attributes:
-        path: the file.
         size_hw: size of the annotated image, px.
         objects: in the order of the file.
         warnings: one sentence for each irregularity, naming file and object.
@@ -60,7 +59,7 @@ class IsatFile:
     path: Path
     size_hw: tuple[int, int]
     objects: tuple[IsatObject, ...]
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
 
 
 def read_isat(path: Path) -> IsatFile:
@@ -70,7 +69,6 @@ def read_isat(path: Path) -> IsatFile:
         SceneError: the file is not JSON, a key is missing or has the wrong type, a polygon is entirely
             outside the image, or a box is [x, y, width, height].
     """
-    path = Path(path)
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:
@@ -98,16 +96,14 @@ def parse_isat(path: Path, content: Any) -> IsatFile:
     info = content.get("info")
     if not isinstance(info, dict):
         info = {}
-    height, width = info.get("height"), info.get("width")
-    sides = [side for side in (height, width) if isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX]
-    if len(sides) != 2:
+    size_hw = height, width = info.get("height"), info.get("width")
+    if not all(isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX for side in size_hw):
         raise SceneError(
             f"label file {path} does not give the size of its image",
             expected=f"info.width and info.height, px, at most {LARGEST_SIDE_PX}",
             found=f"height {height!r}, width {width!r}",
             fix="export the labels again",
         )
-    size_hw = (sides[0], sides[1])
     warnings: list[str] = []
     name = info.get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:
@@ -145,9 +141,11 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
             )
         if len(polygon) < 3:
             warnings.append(f"{where}: a polygon has {len(polygon)} vertices; taken as a line")
-    if (reach := outside_px(polygons, size_hw)) > SLACK_PX:
+    points = np.concatenate(polygons)
+    reach = float(max((-points).max(), (points - [width, height]).max()))
+    if reach > SLACK_PX:
         warnings.append(f"{where}: a polygon reaches {reach:g} px outside the image; clipped")
-    return IsatObject(category, polygons, _box(where, entry.get("bbox"), polygons, warnings), entry)
+    return IsatObject(category, polygons, _box(where, entry.get("bbox"), points, warnings), entry)
 
 
 def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
@@ -175,10 +173,9 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
 
 
 def _box(
-    where: str, value: Any, polygons: tuple[Float[np.ndarray, "_ 2"], ...], warnings: list[str]
+    where: str, value: Any, points: Float[np.ndarray, "P 2"], warnings: list[str]
 ) -> Int64[np.ndarray, " 4"]:
     """Return the whole pixels of the box [x1, y1, x2, y2]; of the polygon's extent if there is none."""
-    points = np.concatenate(polygons)
     extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
     try:
         box = extent if value is None else np.array(value, dtype=np.float64)

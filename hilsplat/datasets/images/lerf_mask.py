@@ -4,6 +4,7 @@ Test views are the posed images missing from `images_train`, sorted by name; the
 the masks of the first, `test_mask/1` those of the second. Every mask file is named after its prompt.
 """
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,8 +25,7 @@ from hilsplat.datasets.published import PROMPTS
 FOREGROUND = 129
 """Lowest grey value of the foreground: the published evaluation thresholds above 128."""
 
-LAYOUT = """\
-lerf_mask/
+LAYOUT = """lerf_mask/
   figurines/  ramen/  teatime/
     images/             all images
     images_train/       training images; a posed image that is not here is a test view
@@ -36,22 +36,16 @@ lerf_mask/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the test masks of a scene; pixels are read when needed.
-
-    Args:
-        root: the folder `lerf_mask`.
-        scene: such as "figurines".
+    """Read the test masks of a scene, such as "figurines"; pixels are read when needed.
 
     Raises:
         SceneError: a part of the scene is missing, the mask folders do not match the test views, or a
             prompt has a dot.
     """
-    root = Path(root)
     DATASET.require(root, scene)
     folder = root / scene
     images = images_by_view(folder / "images")
-    test = held_out_views(folder)
-    masks = _mask_folders(folder / "test_mask", test)
+    masks = _mask_folders(folder / "test_mask", held_out_views(folder))
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, place in masks.items():
@@ -64,21 +58,24 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
         image_hw = image_size_hw(images[view])
         regions = []
         for path in sorted(place.glob("*.png")):
-            text = prompt_of(path)
+            text = path.stem
+            if "." in text:  # at which the published evaluation would cut it
+                raise SceneError(
+                    f"mask {path} cannot be named after its prompt",
+                    expected="a prompt without a dot",
+                    found=text,
+                    fix="rename the file",
+                )
             size_hw = image_size_hw(path)
-            sentence = check_label_size(f"mask {path}", size_hw, image_hw)
-            if sentence:
-                warnings.append(sentence)
+            warnings += check_label_size(f"mask {path}", size_hw, image_hw)
             read = partial(read_mask_file, path, FOREGROUND)
             regions.append(LabelledRegion(text, size_hw, read, path=(text,)))
         if not regions:
             raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
         views[view] = tuple(regions)
-    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
-    new = unlisted_texts(prompts, PROMPTS["lerf_mask"].get(scene, ()))
-    if new:
-        warnings.append(new)
-    return LabelledScene("lerf_mask", scene, images, folder, views, prompts, tuple(warnings))
+    read = LabelledScene("lerf_mask", scene, images, folder, views)
+    warnings += unlisted_texts(read.prompts, PROMPTS["lerf_mask"].get(scene, ()))
+    return replace(read, warnings=tuple(warnings))
 
 
 def held_out_views(folder: Path) -> tuple[str, ...]:
@@ -98,22 +95,6 @@ def held_out_views(folder: Path) -> tuple[str, ...]:
             fix="unpack images_train again; it is not a copy of images",
         )
     return test
-
-
-def prompt_of(path: Path) -> str:
-    """Return the prompt of a mask file: its name without `.png`.
-
-    Raises:
-        SceneError: the prompt has a dot, at which the published evaluation would cut it.
-    """
-    if "." in path.stem:
-        raise SceneError(
-            f"mask {path} cannot be named after its prompt",
-            expected="a prompt without a dot",
-            found=path.stem,
-            fix="rename the file",
-        )
-    return path.stem
 
 
 def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:

@@ -6,7 +6,7 @@ matched by name, never by position: LangSplat's own evaluation uses the index of
 if an earlier image was not registered.
 """
 
-from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
+from hilsplat.datasets.images.polygons import fill_polygons
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
@@ -38,17 +39,12 @@ lerf_ovs/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene; masks are rasterised when needed.
-
-    Args:
-        root: the folder `lerf_ovs`.
-        scene: such as "figurines".
+    """Read the labels of a scene, such as "figurines"; masks are rasterised when needed.
 
     Raises:
         SceneError: a part of the scene is missing, a label file cannot be used, or a labelled frame has
             no image.
     """
-    root = Path(root)
     DATASET.require(root, scene)
     images = images_by_view(root / scene / "images")
     files = label_files(root / "label" / scene)
@@ -64,24 +60,18 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, path in files.items():
         labels = read_isat(path)
-        warnings.extend(labels.warnings)
-        size = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
-        if size:
-            warnings.append(size)
+        warnings += labels.warnings
+        warnings += check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
         views[view] = merged_regions(labels)
-    prompts = tuple(sorted({region.text for regions in views.values() for region in regions}))
+    read = LabelledScene("lerf_ovs", scene, images, root / scene, views)
     listed = FRAMES["lerf_ovs"].get(scene, ())
-    for sentence in (
-        missing_frames("label", listed, views),
-        unlisted_texts(prompts, PROMPTS["lerf_ovs"].get(scene, ())),
-    ):
-        if sentence:
-            warnings.append(sentence)
-    read = LabelledScene("lerf_ovs", scene, images, root / scene, views, prompts, tuple(warnings))
+    warnings += missing_frames("label", listed, views)
+    warnings += unlisted_texts(read.prompts, PROMPTS["lerf_ovs"].get(scene, ()))
     if set(views) == set(listed) and read.num_pairs != PAIRS[scene]:
-        counted = f"{read.num_pairs} pairs of frame and category, published figures imply {PAIRS[scene]}"
-        read = LabelledScene("lerf_ovs", scene, images, root / scene, views, prompts, (*warnings, counted))
-    return read
+        warnings.append(
+            f"{read.num_pairs} pairs of frame and category, published figures imply {PAIRS[scene]}"
+        )
+    return replace(read, warnings=tuple(warnings))
 
 
 def label_files(folder: Path) -> dict[str, Path]:
@@ -90,13 +80,13 @@ def label_files(folder: Path) -> dict[str, Path]:
     Raises:
         SceneError: there are none.
     """
-    paths = sorted(path for path in Path(folder).glob("*.json") if path.name[0] != ".")
+    paths = sorted(path for path in folder.glob("*.json") if path.name[0] != ".")
     files = {view_name(path.stem): path for path in paths}
     if not files:
         raise SceneError(
             f"{folder} has no label file",
             expected="one .json per labelled frame",
-            found=", ".join(sorted(path.name for path in Path(folder).glob("*"))[:5]) or "nothing",
+            found=", ".join(sorted(path.name for path in folder.glob("*"))[:5]) or "nothing",
             fix="unpack the labels again, or move them up if they are in a subfolder",
         )
     return files
@@ -111,18 +101,12 @@ def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
         LabelledRegion(
             category,
             labels.size_hw,
-            partial(union_mask, same, labels.size_hw),
+            partial(fill_polygons, [each for thing in same for each in thing.polygons], labels.size_hw),
             np.stack([thing.box_xyxy for thing in same]),
-            None,
-            (category,),
+            path=(category,),
         )
         for category, same in objects.items()
     )
-
-
-def union_mask(objects: Sequence[IsatObject], size_hw: tuple[int, int]) -> np.ndarray:
-    """Return the rasterised union of objects."""
-    return np.any([thing.mask(size_hw) for thing in objects], axis=0)
 
 
 DATASET = Dataset(

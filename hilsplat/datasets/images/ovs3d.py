@@ -21,7 +21,7 @@ from hilsplat.datasets.labelled import (
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
-from hilsplat.scene.importers.llff import POSES_BOUNDS
+from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.view_names import view_name
 
 FOREGROUND = 255
@@ -41,25 +41,31 @@ LAYOUT = """\
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the segmentations of a scene; pixels are read when needed.
+    """Read the segmentations of a scene, such as "bed"; pixels are read when needed.
 
     The regions of a view are ordered like the sorted prompts; some may have no pixels.
-
-    Args:
-        root: the folder `3d_ovs`.
-        scene: such as "bed".
 
     Raises:
         SceneError: a part of the scene or a mask is missing, or a view has no image.
     """
-    root = Path(root)
     DATASET.require(root, scene)
     folder = root / scene
     images = images_by_view(folder / "images")
     prompts = read_classes(folder / "segmentations" / "classes.txt")
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
-    for place in _view_folders(folder / "segmentations"):
+    places = sorted(
+        place
+        for place in (folder / "segmentations").iterdir()
+        if place.is_dir() and not place.name.startswith((".", "__"))
+    )
+    if not places:
+        raise SceneError(
+            f"{folder / 'segmentations'} has no segmented view",
+            expected="00/, 04/, ...",
+            fix="unpack segmentations again",
+        )
+    for place in places:
         view = view_name(place.name)
         if view not in images:
             raise SceneError(
@@ -70,13 +76,9 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             )
         views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
     posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
-    for sentence in (
-        missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views),
-        unlisted_texts(prompts, PROMPTS["3d_ovs"].get(scene, ())),
-    ):
-        if sentence:
-            warnings.append(sentence)
-    return LabelledScene("3d_ovs", scene, images, folder if posed else None, views, prompts, tuple(warnings))
+    warnings += missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views)
+    warnings += unlisted_texts(prompts, PROMPTS["3d_ovs"].get(scene, ()))
+    return LabelledScene("3d_ovs", scene, images, folder if posed else None, views, tuple(warnings))
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
@@ -101,17 +103,6 @@ def read_classes(path: Path) -> tuple[str, ...]:
     return tuple(prompts)
 
 
-def _view_folders(folder: Path) -> list[Path]:
-    places = sorted(
-        place for place in folder.iterdir() if place.is_dir() and not place.name.startswith((".", "__"))
-    )
-    if not places:
-        raise SceneError(
-            f"{folder} has no segmented view", expected="00/, 04/, ...", fix="unpack segmentations again"
-        )
-    return places
-
-
 def _regions(
     place: Path, prompts: tuple[str, ...], image_hw: tuple[int, int], warnings: list[str]
 ) -> tuple[LabelledRegion, ...]:
@@ -131,9 +122,7 @@ def _regions(
     for prompt in prompts:
         path = files[prompt]
         size_hw = image_size_hw(path)
-        sentence = check_label_size(f"mask {path}", size_hw, image_hw, SHAPE_TOLERANCE)
-        if sentence:
-            warnings.append(sentence)
+        warnings += check_label_size(f"mask {path}", size_hw, image_hw, SHAPE_TOLERANCE)
         read = partial(read_mask_file, path, FOREGROUND)
         any_grey = partial(read_mask_file, path, 1)
         regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,), any_grey=any_grey))

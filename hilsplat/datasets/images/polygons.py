@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 
-def fill_polygon(
-    points_xy: Float[np.ndarray, "P 2"] | Int[np.ndarray, "P 2"], size_hw: tuple[int, int]
+def fill_polygons(
+    polygons: Sequence[Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"]], size_hw: tuple[int, int]
 ) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels of a polygon: vertices truncated to integers, even-odd fill, border included.
+    """Return the union of polygons (vertices x, y): truncated to integers, even-odd fill, border included.
 
     This is OpenCV's `fillPoly` on int32 vertices, used by LangSplat's evaluation. Pixel (x, y) is the vertex
     (x, y) itself: the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. Anything outside the image is clipped.
@@ -18,22 +18,13 @@ def fill_polygon(
     import cv2
 
     canvas = np.zeros(size_hw, dtype=np.uint8)
-    cv2.fillPoly(canvas, [np.asarray(points_xy).astype(np.int32)], 1)
+    for polygon in polygons:  # one call for all would leave out pixels that two polygons share
+        cv2.fillPoly(canvas, [np.asarray(polygon).astype(np.int32)], 1)
     return canvas.astype(bool)
 
 
-def fill_polygons(
-    polygons: Sequence[Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"]], size_hw: tuple[int, int]
-) -> Bool[np.ndarray, "H W"]:
-    """Return the union of polygons; empty without polygons."""
-    union = np.zeros(size_hw, bool)
-    for polygon in polygons:
-        union |= fill_polygon(polygon, size_hw)
-    return union
-
-
 def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]]:
-    """Return disjoint polygons whose union, filled by `fill_polygon`, equals the mask exactly.
+    """Return disjoint polygons whose union, filled by `fill_polygons`, equals the mask exactly.
 
     A polygon cannot have a hole, so the mask is cut vertically through the middle of each hole.
     """
@@ -41,11 +32,9 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
 
     mode, every = cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
     contours, ranks = cv2.findContours(mask.astype(np.uint8), mode, every)
-    holes = (
-        [contour for contour, rank in zip(contours, ranks[0], strict=True) if rank[3] >= 0]
-        if contours
-        else []
-    )
+    if not contours:
+        return []
+    holes = [contour for contour, rank in zip(contours, ranks[0], strict=True) if rank[3] >= 0]
     middles = {int(contour[..., 0].min() + contour[..., 0].max() + 1) // 2 for contour in holes}
     edges = [0, *sorted(middles), mask.shape[1]]
     polygons: list[np.ndarray] = []
@@ -55,10 +44,3 @@ def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]
             points = contour.reshape(-1, 2).astype(np.int64) + np.array([left, 0])
             polygons.append(np.concatenate([points, points[-1:].repeat(max(0, 3 - len(points)), axis=0)]))
     return polygons
-
-
-def outside_px(polygons: Sequence[Float[np.ndarray, "_ 2"]], size_hw: tuple[int, int]) -> float:
-    """Return how far the vertices of polygons extend beyond the outermost pixels, px; 0 if none does."""
-    points = np.concatenate(polygons)
-    last = np.array([size_hw[1], size_hw[0]], dtype=np.float64)
-    return float(max((-points).max(), (points - last).max(), 0.0))

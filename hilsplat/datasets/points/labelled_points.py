@@ -69,7 +69,6 @@ class PointScene:
     """A scene of a data set with labelled points.
 
     Attributes:
-        name: name as spelt in the data set.
         images: posed images, without unusable frames (those without a pose).
         truth: labelled points by labelling. Only `evaluate` may read them.
         warnings: one sentence for each item that was skipped or reinterpreted.

@@ -1,5 +1,6 @@
 """Readers for file formats of labelled points."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ from plyfile import PlyData, PlyParseError
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
+from hilsplat.datasets.dataset import listing
 
 UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
 
@@ -20,15 +22,6 @@ def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
     if not path.is_file():
         raise SceneError(f"{path} is missing", found=listing(path.parent), fix=fix)
     return path
-
-
-def listing(folder: Path) -> str:
-    """Return the first names in a folder, for messages."""
-    if not folder.is_dir():
-        return f"no folder {folder}"
-    names = sorted(path.name for path in folder.iterdir())
-    more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-    return (", ".join(names[:8]) + more) or f"an empty folder {folder}"
 
 
 def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
@@ -155,3 +148,22 @@ def ply_faces(path: Path, content: PlyData) -> np.ndarray:
             fix=UNPACK_AGAIN,
         )
     return faces
+
+
+def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:
+    """Sort files by the number in their stem, after a prefix: 2 comes before 10.
+
+    Raises:
+        SceneError: a stem is not a number.
+    """
+    numbered = []
+    for path in paths:
+        stem = path.stem.removeprefix(prefix)
+        if not (stem.isascii() and stem.isdecimal()):
+            raise SceneError(
+                f"{path} is not named like a frame",
+                expected=f"{prefix}<number>{path.suffix}",
+                fix="keep other images out of this folder",
+            )
+        numbered.append((int(stem), path))
+    return sorted(numbered)

@@ -20,10 +20,10 @@ from jaxtyping import Float
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.datasets.classes.replica import SCENES
-from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.dataset import Dataset, listing
+from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import PointScene
-from hilsplat.datasets.points.numbered import by_number, size_of_image
-from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing, read_json_object, read_numbers
+from hilsplat.datasets.points.point_files import UNPACK_AGAIN, by_number, read_json_object, read_numbers
 from hilsplat.datasets.points.replica_mesh import read_labelled_mesh, read_semantic_mesh
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
 
@@ -35,16 +35,18 @@ class Layout:
     """Storage layout of a sequence's frames.
 
     Attributes:
-        colour: image folder and prefix of image names.
+        folder: image folder.
+        prefix: what precedes the number in names of images.
         poses: name of the pose file.
     """
 
-    colour: tuple[str, str]
+    folder: str
+    prefix: str
     poses: str
 
 
-NICE_SLAM = Layout(("results", "frame"), "traj.txt")
-SEMANTIC_NERF = Layout(("rgb", "rgb_"), "traj_w_c.txt")
+NICE_SLAM = Layout("results", "frame", "traj.txt")
+SEMANTIC_NERF = Layout("rgb", "rgb_", "traj_w_c.txt")
 
 
 def layout_of(folder: Path) -> Layout:
@@ -54,7 +56,7 @@ def layout_of(folder: Path) -> Layout:
         SceneError: it has neither layout.
     """
     for layout in (NICE_SLAM, SEMANTIC_NERF):
-        if (folder / layout.poses).is_file() and (folder / layout.colour[0]).is_dir():
+        if (folder / layout.poses).is_file() and (folder / layout.folder).is_dir():
             return layout
     inner = sorted(path.parent for name in ("traj.txt", "traj_w_c.txt") for path in folder.glob(f"*/{name}"))
     raise SceneError(
@@ -65,25 +67,12 @@ def layout_of(folder: Path) -> Layout:
     )
 
 
-def intrinsics(size_hw: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
-    """Return K of every Replica rendering: focal length half the width, principal point in the middle.
-
-    The centre in the files, 599.5 of 1200 px, is relative to the first pixel's centre.
-    """
-    height, width = size_hw
-    return np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
-
-
-def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """Return K and its image size, from `cam_params.json` beside a NICE-SLAM sequence, else Replica's own.
+def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
+    """Return K and its image size from `cam_params.json`, which is beside a NICE-SLAM sequence.
 
     Raises:
         SceneError: the file is damaged.
     """
-    path = folder.parent / "cam_params.json"
-    if layout_of(folder) is not NICE_SLAM or not path.is_file():
-        size_hw = size_of_image(image)
-        return intrinsics(size_hw), size_hw
     camera = read_json_object(path, ("camera",))["camera"]
     try:
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
@@ -97,15 +86,14 @@ def read_lens(folder: Path, image: Path) -> tuple[Float[np.ndarray, "3 3"], tupl
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
 
 
-def frames_of(folder: Path, part: tuple[str, str]) -> list[tuple[int, Path]]:
-    """Return images named prefix and number, by number, which excludes colour visualisations."""
-    place, prefix = part
-    paths = [
-        path
-        for path in list_images(folder / place)
-        if path.stem.startswith(prefix) and path.stem.removeprefix(prefix).isdecimal()
-    ]
-    return by_number(paths, prefix)
+def default_lens(image: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
+    """Return K of every Replica rendering: focal length half the width, principal point in the middle.
+
+    The centre in the files, 599.5 of 1200 px, is relative to the first pixel's centre.
+    """
+    height, width = image_size_hw(image)
+    K = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
+    return K, (height, width)
 
 
 def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
@@ -122,17 +110,24 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
     layout = layout_of(folder)
     path = folder / layout.poses
     poses = read_numbers(path, 16).reshape(-1, 4, 4)
-    frames = frames_of(folder, layout.colour)
+    named = [
+        image
+        for image in list_images(folder / layout.folder)
+        if image.stem.startswith(layout.prefix) and image.stem.removeprefix(layout.prefix).isdecimal()
+    ]  # the others are depth or colour visualisations
+    frames = by_number(named, layout.prefix)
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:
         raise SceneError(
-            f"{path} does not match the images in {folder / layout.colour[0]}",
+            f"{path} does not match the images in {folder / layout.folder}",
             expected="one line per frame, or more",
             found=f"{len(poses)} lines, {len(frames)} images"
             + (f", the first without a line is frame {beyond[0]}" if beyond else ""),
             fix=UNPACK_AGAIN,
         )
-    K, size_hw = read_lens(folder, frames[0][1])
+    lens = folder.parent / "cam_params.json"
+    own = layout is NICE_SLAM and lens.is_file()
+    K, size_hw = read_lens(lens) if own else default_lens(frames[0][1])
     images = tuple(
         PosedImage(
             image.name, image, cam_from_world_of(poses[number], f"{path}, line {number + 1}"), K, size_hw
@@ -151,12 +146,12 @@ def sequence_folder(root: Path, scene: str) -> Path:
     """
     places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
     for place in places:
-        if (Path(root) / place).is_dir():
-            return Path(root) / place
+        if (root / place).is_dir():
+            return root / place
     raise SceneError(
         f"{scene} has no rendered sequence in {root}",
         expected=" or ".join(f"{place}/" for place in places),
-        found=listing(Path(root)),
+        found=listing(root),
         fix="unpack the rendered sequences there",
     )
 
@@ -165,27 +160,25 @@ def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
     """Read a scene: the sequence, and the labels of the original release or else of OpenNeRF.
 
     Args:
-        root: the data set's folder.
         scene: name as spelt in the release, such as room_0.
         every: use every n-th frame.
 
     Raises:
         SceneError: a file is missing, damaged or does not match the others.
     """
-    habitat, short = Path(root) / scene / "habitat", scene.replace("_", "")
-    text = Path(root) / f"semantic_labels_{short}.txt"
+    habitat, short = root / scene / "habitat", scene.replace("_", "")
+    text = root / f"semantic_labels_{short}.txt"
     if habitat.is_dir():
         truth = read_semantic_mesh(habitat)
     elif text.is_file():
-        instances = Path(root) / f"instance_labels_{short}.txt"
-        truth = read_labelled_mesh(
-            Path(root) / f"{short}_mesh.ply", text, instances if instances.is_file() else None
-        )
+        instances = root / f"instance_labels_{short}.txt"
+        mesh = root / f"{short}_mesh.ply"
+        truth = read_labelled_mesh(mesh, text, instances if instances.is_file() else None)
     else:
         raise SceneError(
             f"{scene} of Replica has no labels in {root}",
             expected=f"{scene}/habitat/mesh_semantic.ply, or {text.name} with {short}_mesh.ply",
-            found=listing(Path(root)),
+            found=listing(root),
             fix="unpack the original release there",
         )
     images, warnings = read_images(sequence_folder(root, scene), every)

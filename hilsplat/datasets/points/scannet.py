@@ -7,7 +7,7 @@ The layout is that of the ScanNet release, with the frames exported from `.sens`
 import csv
 import logging
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,12 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.datasets.classes.scannet import OPENGAUSSIAN_SCENES
 from hilsplat.datasets.classes.scannet200 import SCANNET200
-from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.dataset import Dataset, listing
+from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
-from hilsplat.datasets.points.numbered import by_number, size_of_image
 from hilsplat.datasets.points.point_files import (
     UNPACK_AGAIN,
+    by_number,
     ply_column,
     ply_faces,
     ply_places,
@@ -39,27 +40,14 @@ SAME_PLACE_M = 1e-4
 """Tolerance between vertices of the labelled and the plain mesh, for printed or rounded copies."""
 
 
-@dataclass(frozen=True)
-class LabelTable:
-    """Class ids of raw categories.
-
-    Attributes:
-        nyu40: raw category -> NYU40 id, 0 if the table has none.
-        scannet200: raw category -> id, 0 if it is not one of the 200.
-    """
-
-    nyu40: dict[str, int]
-    scannet200: dict[str, int]
-
-
 def scan_folder(root: Path, scan: str) -> Path:
     """Return the folder of a scan, `scans/<scan>` below the data set's folder.
 
     Raises:
         SceneError: it is in the wrong place, or contains a `.sens` archive whose frames are not exported.
     """
-    folder = Path(root) / "scans" / scan
-    for wrong in (folder / scan, Path(root) / scan, Path(root) / "scans" / "scans" / scan):
+    folder = root / "scans" / scan
+    for wrong in (folder / scan, root / scan, root / "scans" / "scans" / scan):
         if not (folder / f"{scan}_vh_clean_2.ply").is_file() and wrong.is_dir():
             raise SceneError(
                 f"scan {scan} is in the wrong place",
@@ -77,16 +65,14 @@ def scan_folder(root: Path, scan: str) -> Path:
     return folder
 
 
-def read_label_table(path: Path) -> LabelTable:
-    """Read `scannetv2-labels.combined.tsv`.
-
-    `nyu40id` is looked up by raw category, because ids 107 and 188 have rows with two.
+def read_label_table(path: Path) -> dict[str, int]:
+    """Return the id of each raw category in `scannetv2-labels.combined.tsv`, 0 if it is not one of the 200.
 
     Raises:
-        SceneError: it is missing, lacks one of the three columns, or has an id that is not a number.
+        SceneError: it is missing, lacks a column, or has an id that is not a number.
     """
     require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
-    nyu40, scannet200 = {}, {}
+    found = {}
     with path.open(encoding="utf-8", newline="") as stream:
         rows = csv.DictReader(stream, delimiter="\t")
         needed = {"id", "raw_category", "nyu40id"}
@@ -99,12 +85,11 @@ def read_label_table(path: Path) -> LabelTable:
             )
         for row in rows:
             try:
-                number, broad = int(row["id"] or 0), int(row["nyu40id"] or 0)
+                label = int(row["id"] or 0)
             except ValueError as error:
                 raise SceneError(f"{path}, line {rows.line_num}: {error}", fix=UNPACK_AGAIN) from error
-            nyu40[row["raw_category"]] = broad
-            scannet200[row["raw_category"]] = number if number in SCANNET200.ids else 0
-    return LabelTable(nyu40, scannet200)
+            found[row["raw_category"]] = label if label in SCANNET200.ids else 0
+    return found
 
 
 def read_scan_info(path: Path) -> dict[str, str]:
@@ -114,18 +99,18 @@ def read_scan_info(path: Path) -> dict[str, str]:
     return {key.strip(): value.strip() for key, value in pairs}
 
 
-def axis_alignment(info: dict[str, str], where: str) -> Float[np.ndarray, "4 4"]:
+def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
     """Return the matrix that aligns a scan's walls with the axes.
 
     Raises:
         SceneError: the scan has none (test scans) or a damaged one.
     """
-    words = info.get("axisAlignment", "").split()
+    words = read_scan_info(folder / f"{scan}.txt").get("axisAlignment", "").split()
     try:
         return np.array([float(word) for word in words]).reshape(4, 4)
     except ValueError as error:
         raise SceneError(
-            f"{where} has no usable axisAlignment",
+            f"{scan} has no usable axisAlignment",
             expected="16 numbers",
             found=f"{len(words)} words",
             fix="leave mesh and poses as they are (aligned=False)",
@@ -139,8 +124,6 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     640), so half a pixel is added to the centre of K.
 
     Args:
-        folder: folder of the scan.
-        scan: name of the scan.
         every: use every n-th frame by number; lost frames are counted.
 
     Returns:
@@ -153,7 +136,7 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
         raise SceneError(
             f"{folder} has no folder color/",
             expected="color/, pose/ and intrinsic/ exported from the .sens file",
-            found=", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "an empty folder",
+            found=listing(folder),
             fix="export the frames with ScanNet's SensReader",
         )
     frames = by_number(list_images(folder / "color"))
@@ -191,11 +174,11 @@ def _stated_size(folder: Path, scan: str, image: Path) -> tuple[int, int]:
         info = read_scan_info(folder / f"{scan}.txt")
         if "colorHeight" in info and "colorWidth" in info:
             return int(info["colorHeight"]), int(info["colorWidth"])
-    return size_of_image(image)
+    return image_size_hw(image)
 
 
 def read_truth(
-    folder: Path, scan: str, table: LabelTable
+    folder: Path, scan: str, table: dict[str, int]
 ) -> tuple[dict[str, LabelledPoints], tuple[str, ...]]:
     """Return labels of the evaluated mesh's vertices, in NYU40 and ScanNet200 ids, with instances.
 
@@ -228,13 +211,12 @@ def read_truth(
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
         warnings.append(f"categories that {LABEL_TABLE} lacks have no ScanNet200 class: {listed}")
     points = LabelledPoints(xyz, nyu40, instance, "nyu40", faces)
-    return {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}, tuple(
-        warnings
-    )
+    truth = {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}
+    return truth, tuple(warnings)
 
 
 def _from_aggregation(
-    folder: Path, scan: str, table: LabelTable, num_points: int
+    folder: Path, scan: str, table: dict[str, int], num_points: int
 ) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter]:
     """Return ScanNet200 id and instance of each vertex, and raw categories missing from the table."""
     segments_path = folder / f"{scan}_vh_clean_2.0.010000.segs.json"
@@ -265,9 +247,9 @@ def _from_aggregation(
                 f"{path}, group {row} ({category}): none of its segments is in {segments_path.name}",
                 fix="take the aggregation of the decimated mesh, not that of the full one",
             )
-        if category not in table.scannet200:
+        if category not in table:
             unknown[category] += 1
-        fine[rows], instance[rows] = table.scannet200.get(category, 0), number
+        fine[rows], instance[rows] = table.get(category, 0), number
     return fine, instance, unknown
 
 
@@ -276,7 +258,6 @@ def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> P
 
     Args:
         root: folder with `scans/` and the label table.
-        scan: such as scene0000_00.
         every: use every n-th frame.
         aligned: rotate mesh and poses by the scan's axisAlignment; by default neither is rotated.
 
@@ -285,10 +266,10 @@ def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> P
     """
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
-    truth, of_labels = read_truth(folder, scan, read_label_table(Path(root) / LABEL_TABLE))
+    truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))
     images, of_images = read_images(folder, scan, every)
     if aligned:
-        turn = axis_alignment(read_scan_info(folder / f"{scan}.txt"), scan)
+        turn = axis_alignment(folder, scan)
         images = tuple(
             replace(image, cam_from_world=image.cam_from_world @ np.linalg.inv(turn)) for image in images
         )

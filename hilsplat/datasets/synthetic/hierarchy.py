@@ -99,7 +99,6 @@ class HierarchyAnnotations:
         Raises:
             ArtifactError: annotations.json is missing or in a different format.
         """
-        folder = Path(folder)
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(
@@ -113,14 +112,13 @@ class HierarchyAnnotations:
             )
             for node in record["nodes"]
         )
-        return HierarchyAnnotations(
-            folder, nodes, {view: tuple(ids) for view, ids in record["views"].items()}
-        )
+        views = {view: tuple(ids) for view, ids in record["views"].items()}
+        return HierarchyAnnotations(folder, nodes, views)
 
 
 def label_path(folder: Path, view: str, level: Level) -> Path:
     """Return the path of a view's label image at a level."""
-    return Path(folder) / "labels" / f"{view}.{level.label}.png"
+    return folder / "labels" / f"{view}.{level.label}.png"
 
 
 def write_hierarchy(
@@ -132,7 +130,6 @@ def write_hierarchy(
     """Write annotations: label images first, `annotations.json` last.
 
     Args:
-        folder: output folder, created if missing.
         nodes: nodes with ids 0, 1, 2, ... in order.
         labels: per view and level, node id per pixel, -1 for none.
         views: annotated node ids per view.
@@ -140,11 +137,9 @@ def write_hierarchy(
     for view, levels in labels.items():
         for level in LEVELS:
             write_png(label_path(folder, view, level), (levels[level] + 1).astype(np.uint16))
-    write_json(
-        Path(folder) / "annotations.json",
-        {
-            "format": FORMAT,
-            "nodes": [asdict(node) for node in nodes],
-            "views": {view: list(ids) for view, ids in views.items()},
-        },
-    )
+    record = {
+        "format": FORMAT,
+        "nodes": [asdict(node) for node in nodes],
+        "views": {view: list(ids) for view, ids in views.items()},
+    }
+    write_json(folder / "annotations.json", record)

@@ -1,6 +1,6 @@
 """Lidar frames and camera images of Waymo, independent of the file format."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,9 +40,6 @@ class LidarFrame:
     """One revolution of the top lidar.
 
     Attributes:
-        timestamp_micros: time stamp of the frame.
-        world_from_vehicle: the frame's pose.
-        vehicle_from_lidar: pose of the lidar on the vehicle.
         inclinations: inclinations of the rows, radians, highest first.
         pixel_pose: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel, for both returns.
         returns: first and, if there is one, second return.
@@ -62,7 +59,6 @@ class CameraShot:
 
     Attributes:
         timestamp_micros: time stamp of its frame.
-        camera: name and calibration of the camera.
         encoded: JPEG bytes.
         world_from_vehicle: pose of the vehicle when the image was taken, not that of the frame.
     """
@@ -79,13 +75,14 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
     Raises:
         SceneError: the images of a return differ in size, or a class is unknown.
     """
-    xyz, labels, visible = [], [], []
+    parts = []
     for number, part in enumerate(frame.returns, start=1):
         if part.labels is None:
             continue
         where = f"return {number} of the top lidar at {frame.timestamp_micros}"
         sizes = {part.image.shape[:2], part.labels.shape[:2], frame.pixel_pose.shape[:2]}
-        sizes |= {part.projection.shape[:2]} if part.projection is not None else set()
+        if part.projection is not None:
+            sizes.add(part.projection.shape[:2])
         if len(sizes) > 1 or len(frame.inclinations) != part.image.shape[0]:
             raise SceneError(
                 f"{where}: ranges, labels, poses and projections do not belong together",
@@ -100,14 +97,13 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
             ),
             frame.pixel_pose,
         )[hit]
-        xyz.append(places @ segment_from_world[:3, :3].T + segment_from_world[:3, 3])
-        labels.append(part.labels[hit])
-        if part.projection is not None:
-            visible.append(part.projection[hit][:, 0] > 0)
-    if not xyz:
-        xyz, labels = [np.zeros((0, 3))], [np.zeros((0, 2), np.int32)]
-    of_point = np.concatenate(labels).astype(np.int32)
-    classes = of_point[:, CLASS]
+        xyz = places @ segment_from_world[:3, :3].T + segment_from_world[:3, 3]
+        labels = part.labels[hit]
+        visible = None if part.projection is None else part.projection[hit][:, 0] > 0
+        parts.append(LabelledPoints(xyz, labels[:, CLASS], labels[:, INSTANCE], "waymo", visible=visible))
+    nothing = LabelledPoints(np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0, np.int32), "waymo")
+    points = joined_points(parts or [nothing])
+    classes = points.class_id
     if classes.size and (classes.min() < 0 or classes.max() > max(WAYMO_22.ids)):
         raise SceneError(
             f"labels of the top lidar at {frame.timestamp_micros} have an unknown class",
@@ -115,18 +111,11 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
             found=f"{classes.min()} to {classes.max()}",
             fix="use the 3D semantic segmentation of release 1.4.3 or 2.0.1",
         )
-    return LabelledPoints(
-        np.concatenate(xyz),
-        classes.copy(),
-        of_point[:, INSTANCE].copy(),
-        "waymo",
-        visible=np.concatenate(visible) if visible and len(visible) == len(xyz) else None,
-    )
+    return points
 
 
-def joined_points(frames: Iterable[LabelledPoints]) -> LabelledPoints:
-    """Concatenate the points of several frames; visibility is kept if every frame has it."""
-    parts = list(frames)
+def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
+    """Concatenate points, of at least one frame or return; visibility is kept if every part has it."""
     seen = [part.visible for part in parts if part.visible is not None]
     return LabelledPoints(
         np.concatenate([part.xyz for part in parts]),

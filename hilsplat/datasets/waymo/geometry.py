@@ -7,15 +7,12 @@ camera axes are x forward, y left, z up.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 CV_FROM_WAYMO = np.array(
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 """Camera axes: OpenCV's x is Waymo's -y, y is -z, z is x."""
-
-RADIAL_RANGE = (0.8, 1.2)
-"""Range of the radial distortion factor; outside it Waymo considers a projection invalid."""
 
 
 def beam_inclinations(
@@ -94,11 +91,9 @@ class WaymoCamera:
     """One camera of the car.
 
     Attributes:
-        name: such as FRONT.
         intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0, as in
             this project.
         vehicle_from_cam: pose on the vehicle, Waymo's camera axes.
-        size_hw: height and width, px.
     """
 
     name: str
@@ -125,22 +120,3 @@ class WaymoCamera:
             world_from_vehicle: the pose stored with the image; the frame's pose has a different time.
         """
         return CV_FROM_WAYMO @ np.linalg.inv(world_from_vehicle @ self.vehicle_from_cam)
-
-    def project(
-        self, points: Float[np.ndarray, "P 3"]
-    ) -> tuple[Float[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
-        """Project points given in this camera's Waymo axes, with distortion but without rolling shutter.
-
-        Returns:
-            Pixel positions, px (subtract 0.5 for samplers that put the first pixel's centre at 0), and
-            whether each point is in front with a radial factor inside `RADIAL_RANGE`.
-        """
-        f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = self.intrinsic
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = -points[:, 1] / points[:, 0], -points[:, 2] / points[:, 0]
-        r2 = u * u + v * v
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        x = f_u * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + c_u
-        y = f_v * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + c_v
-        valid = (points[:, 0] > 0) & (radial >= RADIAL_RANGE[0]) & (radial <= RADIAL_RANGE[1])
-        return np.stack([x, y], axis=1), valid

@@ -1,6 +1,7 @@
 """Waymo v2 (2.0.1): one parquet file per component and segment, read by pyarrow."""
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.points.point_files import UNPACK_AGAIN, listing
+from hilsplat.datasets.dataset import listing
+from hilsplat.datasets.points.point_files import UNPACK_AGAIN
 from hilsplat.datasets.waymo.frames import CAMERAS, TOP, CameraShot, LidarFrame, LidarReturn
 from hilsplat.datasets.waymo.geometry import WaymoCamera, beam_inclinations
 
@@ -28,26 +30,22 @@ FRAME, LASER, CAMERA = "key.frame_timestamp_micros", "key.laser_name", "key.came
 
 def component_path(split: Path, tag: str, segment: str) -> Path:
     """Return the path of a component: `<split>/<tag>/<segment>.parquet`."""
-    return Path(split) / tag / f"{segment}.parquet"
+    return split / tag / f"{segment}.parquet"
 
 
 def read_component(
-    split: Path, tag: str, segment: str, columns: list[str], only: dict[str, list[int]] | None = None
+    split: Path, tag: str, segment: str, columns: list[str], only: dict[str, int] | None = None
 ) -> list[dict[str, Any]]:
     """Return the rows of a component in file order: lists as arrays, other values unchanged.
 
     Args:
-        split: folder such as `validation`.
-        tag: name of the component.
-        segment: context name.
         columns: column names, including keys.
-        only: allowed values per column; other rows are not decoded.
+        only: required value by column; other rows are not decoded.
 
     Raises:
         SceneError: the file is missing, damaged, or lacks a column.
     """
     import pyarrow as pa
-    import pyarrow.dataset as dataset
     import pyarrow.parquet as parquet
 
     path = component_path(split, tag, segment)
@@ -68,19 +66,16 @@ def read_component(
                 found=", ".join(known[:12]),
                 fix="download the component again",
             )
-        keep = None
-        for name, allowed in (only or {}).items():
-            condition = dataset.field(name).isin(allowed)
-            keep = condition if keep is None else keep & condition
-        table = dataset.dataset(path, format="parquet").to_table(columns=columns, filter=keep)
+        keep = [(name, "==", value) for name, value in (only or {}).items()]
+        table = parquet.read_table(path, columns=columns, filters=keep or None, partitioning=None)
     except (pa.ArrowInvalid, OSError) as error:
         raise SceneError(
             f"{path} cannot be read: {error}",
             found=f"a file of {path.stat().st_size} bytes",
             fix=UNPACK_AGAIN,
         ) from error
-    values = {name: [_plain(value) for value in table.column(name)] for name in columns}
-    return [{name: values[name][row] for name in columns} for row in range(table.num_rows)]
+    values = [[_plain(value) for value in table.column(name)] for name in columns]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
 def _plain(value: Any) -> Any:
@@ -91,25 +86,9 @@ def _plain(value: Any) -> Any:
     return value.as_py() if listed is None else listed.to_numpy(zero_copy_only=False)
 
 
-def _image(row: dict[str, Any], name: str, depth: int, where: str) -> np.ndarray | None:
-    """Return a range image of H x W x depth; None if it is null."""
-    values, shape = row[f"{name}.values"], row[f"{name}.shape"]
-    if values is None or shape is None:
-        return None
-    shape = tuple(int(size) for size in shape)
-    if len(shape) != 3 or shape[2] != depth or np.prod(shape) != len(values):
-        raise SceneError(
-            f"{where}: {name} has the wrong shape",
-            expected=f"height x width x {depth}",
-            found=f"{len(values)} values for {' x '.join(map(str, shape))}",
-            fix=UNPACK_AGAIN,
-        )
-    return values.reshape(shape)
-
-
 def labelled_frames(split: Path, segment: str) -> tuple[int, ...]:
     """Return the time stamps of the labelled frames, in order."""
-    rows = read_component(split, "lidar_segmentation", segment, [FRAME, LASER], {LASER: [TOP]})
+    rows = read_component(split, "lidar_segmentation", segment, [FRAME], {LASER: TOP})
     return tuple(sorted(row[FRAME] for row in rows))
 
 
@@ -130,41 +109,31 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
     calibration = "[LiDARCalibrationComponent]"
     place, beams = f"{calibration}.extrinsic.transform", f"{calibration}.beam_inclination"
     columns = [place, f"{beams}.min", f"{beams}.max", f"{beams}.values"]
-    lidar = read_component(split, "lidar_calibration", segment, [LASER, *columns], {LASER: [TOP]})
+    lidar = read_component(split, "lidar_calibration", segment, columns, {LASER: TOP})
     if len(lidar) != 1:
         raise SceneError(
             f"lidar_calibration of {segment} has {len(lidar)} rows for the top lidar", fix=UNPACK_AGAIN
         )
-    vehicle_from_lidar = lidar[0][place].reshape(4, 4)
     projected = component_path(split, "lidar_camera_projection", segment).is_file()
     for time in labelled_frames(split, segment):
-        where = f"segment {segment}, frame {time}"
-        ranges = _top(split, segment, "lidar", "LiDARComponent", time, 2)
-        labels = _top(split, segment, "lidar_segmentation", "LiDARSegmentationLabelComponent", time, 2)
-        cells = (
-            _top(split, segment, "lidar_camera_projection", "LiDARCameraProjectionComponent", time, 2)
-            if projected
-            else None
-        )
-        pose = _top(split, segment, "lidar_pose", "LiDARPoseComponent", time, 1)
-        pixel_pose = _image(pose, "[LiDARPoseComponent].range_image_return1", 6, where)
+        read = partial(_range_images, split, segment, time)
+        images = read("lidar", "LiDARComponent", depth=4)
+        labels = read("lidar_segmentation", "LiDARSegmentationLabelComponent", depth=2)
+        cells: list[np.ndarray | None] = [None, None]
+        if projected:
+            cells = read("lidar_camera_projection", "LiDARCameraProjectionComponent", depth=6)
+        (pixel_pose,) = read("lidar_pose", "LiDARPoseComponent", depth=6, returns=1)
         if time not in poses or pixel_pose is None:
-            raise SceneError(f"{where} has labels but no pose", fix=UNPACK_AGAIN)
-        returns = []
-        for number in (1, 2):
-            image = _image(ranges, f"[LiDARComponent].range_image_return{number}", 4, where)
-            name = f"[LiDARSegmentationLabelComponent].range_image_return{number}"
-            label = _image(labels, name, 2, where)
-            name = f"[LiDARCameraProjectionComponent].range_image_return{number}"
-            cell = _image(cells, name, 6, where) if cells is not None else None
-            if image is not None:
-                returns.append(
-                    LidarReturn(
-                        image.astype(np.float32),
-                        None if label is None else label.astype(np.int32),
-                        None if cell is None else cell.astype(np.int32),
-                    )
-                )
+            raise SceneError(f"segment {segment}, frame {time} has labels but no pose", fix=UNPACK_AGAIN)
+        returns = [
+            LidarReturn(
+                image.astype(np.float32),
+                None if label is None else label.astype(np.int32),
+                None if cell is None else cell.astype(np.int32),
+            )
+            for image, label, cell in zip(images, labels, cells, strict=True)
+            if image is not None
+        ]
         inclinations = beam_inclinations(
             lidar[0][f"{beams}.values"],
             lidar[0][f"{beams}.min"],
@@ -174,18 +143,20 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
         yield LidarFrame(
             time,
             poses[time],
-            vehicle_from_lidar,
+            lidar[0][place].reshape(4, 4),
             inclinations,
             pixel_pose.astype(np.float32),
             tuple(returns),
         )
 
 
-def _top(split: Path, segment: str, tag: str, component: str, time: int, returns: int) -> dict[str, Any]:
-    """Return the row of the top lidar at a time stamp."""
-    names = [f"[{component}].range_image_return{number + 1}" for number in range(returns)]
+def _range_images(
+    split: Path, segment: str, time: int, tag: str, component: str, depth: int, returns: int = 2
+) -> list[np.ndarray | None]:
+    """Return the images (H x W x depth) of the top lidar's returns at a time stamp; None for a null."""
+    names = [f"[{component}].range_image_return{number}" for number in range(1, returns + 1)]
     columns = [f"{name}.{part}" for name in names for part in ("values", "shape")]
-    rows = read_component(split, tag, segment, [FRAME, LASER, *columns], {FRAME: [time], LASER: [TOP]})
+    rows = read_component(split, tag, segment, columns, {FRAME: time, LASER: TOP})
     if len(rows) != 1:
         raise SceneError(
             f"component {tag} of segment {segment} does not match lidar_segmentation",
@@ -193,7 +164,22 @@ def _top(split: Path, segment: str, tag: str, component: str, time: int, returns
             found=f"{len(rows)}",
             fix="download all components of the segment from the same release",
         )
-    return rows[0]
+    images: list[np.ndarray | None] = []
+    for name in names:
+        values, sizes = rows[0][f"{name}.values"], rows[0][f"{name}.shape"]
+        if values is None or sizes is None:
+            images.append(None)
+            continue
+        shape = tuple(int(size) for size in sizes)
+        if len(shape) != 3 or shape[2] != depth or np.prod(shape) != len(values):
+            raise SceneError(
+                f"segment {segment}, frame {time}: {name} has the wrong shape",
+                expected=f"height x width x {depth}",
+                found=f"{len(values)} values for {' x '.join(map(str, shape))}",
+                fix=UNPACK_AGAIN,
+            )
+        images.append(values.reshape(shape))
+    return images
 
 
 def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
@@ -217,8 +203,6 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
     """Yield images by time, then camera.
 
     Args:
-        split: folder such as `validation`.
-        segment: context name.
         every: use every n-th frame, with all its cameras.
 
     Raises:
@@ -236,8 +220,8 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
             fix="download camera_image and camera_calibration from the same release",
         )
     for time in sorted({row[FRAME] for row in rows})[::every]:
-        columns = [FRAME, CAMERA, "[CameraImageComponent].image", pose]
-        of_frame = read_component(split, "camera_image", segment, columns, {FRAME: [time]})
+        columns = [CAMERA, "[CameraImageComponent].image", pose]
+        of_frame = read_component(split, "camera_image", segment, columns, {FRAME: time})
         for row in sorted(of_frame, key=lambda row: row[CAMERA]):
             encoded = row["[CameraImageComponent].image"]
             yield CameraShot(time, known[row[CAMERA]], encoded, row[pose].reshape(4, 4))

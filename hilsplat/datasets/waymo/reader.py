@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset
+from hilsplat.datasets.dataset import Dataset, listing
 from hilsplat.datasets.points.labelled_points import PointScene
-from hilsplat.datasets.points.point_files import listing
 from hilsplat.datasets.waymo import parquet, records
 from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_image
 
@@ -29,8 +28,8 @@ RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord
 def find_parquet(root: Path, segment: str) -> Path | None:
     """Return the split folder that contains a segment in release 2, or None."""
     for split in SPLITS:
-        if parquet.component_path(Path(root) / split, "lidar_segmentation", segment).is_file():
-            return Path(root) / split
+        if parquet.component_path(root / split, "lidar_segmentation", segment).is_file():
+            return root / split
     return None
 
 
@@ -39,27 +38,16 @@ def find_record(root: Path, segment: str) -> Path | None:
     for split in SPLITS:
         whole = RECORD.format(split=split, segment=segment)
         for name in (whole, whole.removeprefix(f"individual_files_{split}_")):
-            for folder in (Path(root) / split, Path(root)):
+            for folder in (root / split, root):
                 if (folder / name).is_file():
                     return folder / name
     return None
-
-
-def segments_of(root: Path) -> tuple[str, ...]:
-    """Return the labelled segments below the data set's folder."""
-    found = set()
-    for split in SPLITS:
-        found |= {path.stem for path in (Path(root) / split).glob("lidar_segmentation/*.parquet")}
-    for path in (*Path(root).glob("*.tfrecord"), *Path(root).glob("*/*.tfrecord")):
-        found.add(path.stem.split("segment-")[-1].removesuffix("_with_camera_labels"))
-    return tuple(sorted(found))
 
 
 def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     """Read a segment: all labelled frames of the top lidar with both returns, and the images.
 
     Args:
-        root: the data set's folder.
         segment: context name, such as 10023947602400723454_1120_000_1140_000.
         every: use images of every n-th frame only; all labelled frames are read.
 
@@ -80,12 +68,12 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
         frames, shots = records.lidar_frames(record), records.camera_shots(record, every)
         release = "1"
     else:
-        wrong = sorted(Path(root).glob(f"*/*/*/{segment}.parquet"))
+        wrong = sorted(root.glob(f"*/*/*/{segment}.parquet"))
         raise SceneError(
             f"segment {segment} is not in {root}",
             expected=f"<split>/lidar_segmentation/{segment}.parquet, split one of {', '.join(SPLITS)}",
-            found=f"{wrong[0]}, one level too deep" if wrong else listing(Path(root)),
-            fix=f"move {wrong[0].parents[1]} to {Path(root)}"
+            found=f"{wrong[0]}, one level too deep" if wrong else listing(root),
+            fix=f"move {wrong[0].parents[1]} to {root}"
             if wrong
             else "download all components of the segment, or its .tfrecord; testing has no labels",
         )
@@ -115,8 +103,13 @@ class Segments(Dataset):
     """A data set for which the paper names no scenes; its scenes are the segments present."""
 
     def found(self, root: Path) -> tuple[str, ...]:
-        """Return the segments with labels below the folder."""
-        return segments_of(root)
+        """Return the labelled segments below the folder."""
+        found = set()
+        for split in SPLITS:
+            found |= {path.stem for path in (root / split).glob("lidar_segmentation/*.parquet")}
+        for path in (*root.glob("*.tfrecord"), *root.glob("*/*.tfrecord")):
+            found.add(path.stem.split("segment-")[-1].removesuffix("_with_camera_labels"))
+        return tuple(sorted(found))
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the missing paths of a segment; none if it is a file of release 1."""
@@ -126,10 +119,7 @@ class Segments(Dataset):
         places = self.required(scene)
         if split is not None:
             places = tuple(place.replace(f"{SPLITS[0]}/", f"{split.name}/", 1) for place in places)
-        return tuple(place for place in places if not (Path(root) / place).is_file())
-
-    def _has_begun(self, root: Path) -> bool:
-        return bool(segments_of(root))
+        return tuple(place for place in places if not (root / place).is_file())
 
 
 DATASET = Segments(

@@ -45,7 +45,7 @@ are always present are marked required."""
 def message_classes(fields: str) -> dict[str, Any]:
     """Return message classes by name, from lines like `Frame: required int64 timestamp_micros 2, ...`."""
     field_type = descriptor_pb2.FieldDescriptorProto
-    file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", package="waymo", syntax="proto2")
+    file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", syntax="proto2")
     for line in fields.replace("\\\n", "").strip().splitlines():
         name, _, listed = line.partition(":")
         message = file.message_type.add(name=name)
@@ -55,15 +55,12 @@ def message_classes(fields: str) -> dict[str, Any]:
                 name=field, number=int(number), label=field_type.Label.Value(f"LABEL_{label.upper()}")
             )
             if kind[0].isupper():
-                added.type, added.type_name = field_type.TYPE_MESSAGE, f".waymo.{kind}"
+                added.type, added.type_name = field_type.TYPE_MESSAGE, f".{kind}"
             else:
                 added.type = field_type.Type.Value(f"TYPE_{kind.upper()}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    names = [message.name for message in file.message_type]
-    return {
-        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"waymo.{name}")) for name in names
-    }
+    return message_factory.GetMessageClassesForFiles([file.name], pool)
 
 
 MESSAGES = message_classes(_FIELDS)
@@ -184,7 +181,6 @@ def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
     """Yield images by frame, then camera.
 
     Args:
-        path: the file.
         every: use every n-th frame, with all its cameras.
 
     Raises:

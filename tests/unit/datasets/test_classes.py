@@ -38,9 +38,8 @@ def test_scannet_sets_nest():
 
 def test_scannet200_has_its_splits():
     assert len(scannet200.SCANNET200) == 200
-    assert {
-        split: sum(members) for split, members in scannet200.splits_of(scannet200.SCANNET200).items()
-    } == {
+    splits = scannet200.splits_of(scannet200.SCANNET200)
+    assert {split: sum(members) for split, members in splits.items()} == {
         "head": 66,
         "common": 68,
         "tail": 66,
@@ -93,5 +92,5 @@ def test_classes_equal_the_companion_lists(listed):
     assert tuple(label for _, label in opennerf) == replica.EVALUATED_51
     assert tuple(int(row["id"]) for row in rows if row["in48"] == "1") == replica.REPLICA_48.ids
     labelled = [row for row in listed("waymo_semseg_classes.csv") if row["id"] != "0"]
-    expected = [(int(row["id"]), row["enum"], row["suggested_prompt"]) for row in labelled]
-    assert tuple(expected) == waymo.CLASSES
+    expected = [(int(row["id"]), row["suggested_prompt"]) for row in labelled]
+    assert expected == list(zip(waymo.WAYMO_22.ids, waymo.WAYMO_22.texts, strict=True))

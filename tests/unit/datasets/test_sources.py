@@ -47,9 +47,14 @@ def test_only_known_data_sets_are_published_ones():
     assert published("lerf_ovs/figurines") is None
 
 
-def test_what_is_there_is_not_absent(root):
-    assert absence("data:lerf_ovs/figurines", str(root)) is None
-    assert absence("world:tabletop:201", "") is None
+def test_a_source_that_cannot_be_used_has_a_reason_in_one_line(root):
+    for usable in ("data:lerf_ovs/figurines", "world:tabletop:201"):
+        assert absence(usable, str(root)) is None
+    assert absence("data:lerf_ovs/figurines", "") == "data_root is not set"
+    assert absence("data:desk/mine", str(root)) == f"{root / 'desk/mine'} is missing"
+    (root / "lerf_ovs/figurines/sparse").rename(root / "aside")
+    reason = absence("data:lerf_ovs/figurines", str(root))
+    assert "incomplete" in reason and "sparse" in reason and "\n" not in reason
 
 
 def test_segments_on_disk_without_a_row_are_listed(root):
@@ -58,36 +63,6 @@ def test_segments_on_disk_without_a_row_are_listed(root):
     sources = {"data:waymo/one", "data:lerf_ovs/figurines"}
     assert unlisted(sources, ["lerf", "waymo"], str(root)) == ["waymo/two"]
     assert unlisted(sources, ["lerf"], str(root)) == unlisted(sources, ["waymo"], "") == []
-
-
-def test_without_a_data_root_everything_is_absent():
-    assert absence("data:lerf_ovs/figurines", "") == "data_root is not set"
-
-
-def test_a_missing_folder_of_no_known_data_set_is_named(root):
-    assert absence("data:desk/mine", str(root)) == f"{root / 'desk/mine'} is missing"
-
-
-def test_a_half_extracted_archive_names_what_it_lacks(root):
-    (root / "lerf_ovs/figurines/sparse/0/cameras.bin").unlink()
-    (root / "lerf_ovs/figurines/sparse/0").rmdir()
-    (root / "lerf_ovs/figurines/sparse").rmdir()
-    reason = absence("data:lerf_ovs/figurines", str(root))
-    assert "incomplete" in reason
-    assert "sparse" in reason
-    assert "\n" not in reason
-
-
-def test_a_data_set_one_level_too_deep_says_so(root, tmp_path):
-    deeper = tmp_path / "lerf_ovs/lerf_ovs"
-    deeper.mkdir()
-    for part in ("figurines", "label"):
-        (tmp_path / "lerf_ovs" / part).rename(deeper / part)
-    assert "one level too deep" in absence("data:lerf_ovs/figurines", str(root))
-
-
-def test_a_data_root_that_is_one_folder_too_high_says_so(root, tmp_path):
-    assert "one level deeper" in absence("data:lerf_ovs/figurines", str(tmp_path.parent))
 
 
 def test_a_scene_is_scored_against_all_labels_on_its_images(root):
@@ -119,7 +94,7 @@ def test_scenes_with_labelled_points_are_exported_first(root):
 
 
 def test_images_that_lie_in_a_folder_need_no_export(root, monkeypatch):
-    monkeypatch.setattr("hilsplat.datasets.registry.open_labels", lambda *_: object())
+    monkeypatch.setattr("hilsplat.datasets.sources.open_labels", lambda *_: object())
     with pytest.raises(SceneError, match="needs no export"):
         export_images("lerf_ovs/figurines", root, root / "out")
 

@@ -8,12 +8,11 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.datasets.images.isat import read_isat
-from hilsplat.datasets.images.lerf_ovs import DATASET, open_scene
-from hilsplat.datasets.images.polygons import fill_polygon
+from hilsplat.datasets.images.lerf_ovs import open_scene
+from hilsplat.datasets.images.polygons import fill_polygons
 from hilsplat.datasets.labelled import posed_images
 from hilsplat.datasets.published import PAIRS, PROMPTS
 from tests.unit.datasets.writers.labelled import write_lerf_ovs
-from tests.unit.datasets.writers.polygons import polygons_of
 
 SQUARE = [[2.0, 3.0], [5.0, 3.0], [5.0, 6.0], [2.0, 6.0]]
 
@@ -37,33 +36,12 @@ def root(tmp_path, true_world):
     return tmp_path / "lerf_ovs"
 
 
-def test_a_polygon_covers_its_border_pixels():
-    mask = fill_polygon(np.array([[0, 0], [2, 0], [0, 2]], float), (4, 4))
-    assert mask.tolist() == [
-        [True, True, True, False],
-        [True, True, False, False],
-        [True, False, False, False],
-        [False] * 4,
-    ]
-
-
-def test_vertices_are_cut_to_whole_numbers_not_rounded():
-    assert fill_polygon(np.array([[0.9, 0.9], [1.9, 0.9], [1.9, 0.2]]), (3, 3)).sum() == 2
-
-
-def test_even_odd_fill_leaves_the_middle_of_a_pentagram_empty():
-    angle = 2 * np.pi * np.arange(5) * 2 / 5
-    star = 50 + 45 * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
-    mask = fill_polygon(star, (100, 100))
-    assert not mask[50, 50] and mask[20, 50]
-
-
-def test_polygons_of_any_region_give_it_back_exactly():
-    generator = np.random.default_rng(1)
-    for share in (0.2, 0.5, 0.8):  # rings, pinches, single pixels and lines among them
-        mask = generator.random((13, 17)) < share
-        back = np.any([fill_polygon(p.astype(float), mask.shape) for p in polygons_of(mask)], axis=0)
-        assert np.array_equal(back, mask)
+def test_polygons_are_filled_with_border_by_whole_vertices_and_even_odd():
+    triangle, angle = np.array([[0.9, 0.2], [2, 0], [0, 2.7]]), 4 * np.pi * np.arange(5) / 5
+    filled = ["###.", "##..", "#...", "...."]
+    assert np.where(fill_polygons([triangle], (4, 4)), "#", ".").tolist() == [list(row) for row in filled]
+    star = fill_polygons([50 + 45 * np.stack([np.sin(angle), -np.cos(angle)], axis=1)], (100, 100))
+    assert not star[50, 50] and star[20, 50]
 
 
 def test_a_written_world_is_read_back_equal(true_world, root):
@@ -220,10 +198,3 @@ def test_a_wrong_count_of_pairs_is_reported_for_whole_published_scenes(tmp_path,
     label_file(root / "label" / "figurines", [thing("bag")], name="frame_00041")
     (warning,) = open_scene(root, "figurines").warnings
     assert warning.startswith("43 pairs of frame and category")
-
-
-def test_a_half_extracted_archive_is_refused_with_what_is_missing(root):
-    (root / "label" / "figurines").rename(root / "label" / "elsewhere")
-    with pytest.raises(SceneError, match=r"incomplete.*\n.*also label/figurines"):
-        open_scene(root, "figurines")
-    assert DATASET.missing(root, "figurines") == ("label/figurines",)

@@ -13,7 +13,6 @@ from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.datasets.sources import export_images
 from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.importers.known_views import read_transforms
 from hilsplat.scene.posed_images import PosedImage, write_posed_images
@@ -156,14 +155,9 @@ def test_nyu40_follows_from_the_category_and_ids_outside_the_200_are_none(root):
     # real rows: id 107 occurs with two NYU40 ids; cells may be empty
     path.write_text("id\traw_category\tcount\tnyu40id\n107\tone\t\t38\n107\tother\t\t40\n5\tdoor\t\t\n")
     table = read_label_table(path)
-    assert table.nyu40 == {"one": 38, "other": 40, "door": 0}
-    assert table.scannet200["door"] == 5
+    assert table == {"one": 107, "other": 107, "door": 5}
     write_label_table(root, CATEGORIES)
-    assert read_label_table(path).scannet200["gizmo"] == 0
-
-
-def break_json(folder: Path) -> None:
-    (folder / f"{SCAN}.aggregation.json").write_text('{"segGroups": [')
+    assert read_label_table(path)["gizmo"] == 0
 
 
 def break_labels(folder: Path) -> None:
@@ -187,38 +181,12 @@ def break_mesh(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-20])
 
 
-def break_segments(folder: Path) -> None:
-    (folder / f"{SCAN}_vh_clean_2.0.010000.segs.json").write_text('{"segIndices": [1, 2]}')
-
-
-def break_groups(folder: Path) -> None:
-    path = folder / f"{SCAN}.aggregation.json"
-    path.write_text(json.dumps({"segGroups": [{"objectId": 0, "label": "wall", "segments": [123456]}]}))
-
-
-def break_group(folder: Path) -> None:
-    path = folder / f"{SCAN}.aggregation.json"
-    path.write_text(json.dumps({"segGroups": [{"label": "wall", "segments": [7]}]}))
-
-
 def break_archive(folder: Path) -> None:
     (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink()
 
 
 def break_name(folder: Path) -> None:
     (folder / "color" / "0.jpg").rename(folder / "color" / "first.jpg")
-
-
-def break_pose(folder: Path) -> None:
-    (folder / "pose" / "0.txt").write_text("2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-
-
-def break_pose_shape(folder: Path) -> None:
-    (folder / "pose" / "0.txt").write_text("1 0 0\n")
-
-
-def break_table(folder: Path) -> None:
-    (folder.parents[1] / LABEL_TABLE).write_text("id,raw_category,nyu40id\n")
 
 
 def break_depth_of_folder(folder: Path) -> None:
@@ -240,18 +208,11 @@ def break_sens(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (break_json, r"aggregation\.json is not valid JSON(.|\n)*fix "),
         (break_labels, r"does not belong to(.|\n)*expected  the same 6 vertices(.|\n)*found     5 vertices"),
         (break_places, r"does not belong to(.|\n)*found     vertices in other positions"),
         (break_mesh, r"labels\.ply cannot be read(.|\n)*found     a file of \d+ bytes(.|\n)*fix "),
-        (break_segments, r"segs\.json does not belong(.|\n)*each of 5 vertices(.|\n)*found     2 values"),
-        (break_groups, r"group 0 \(wall\): none of its segments(.|\n)*fix "),
-        (break_group, r"group 0: cannot be read: KeyError\('objectId'\)"),
         (break_archive, r"scene0000_00 of ScanNet v2 is incomplete(.|\n)*labels\.ply(.|\n)*unpack"),
         (break_name, r"first\.jpg is not named like a frame\n  expected  <number>\.jpg"),
-        (break_pose, r"0\.txt: the pose is not a rotation"),
-        (break_pose_shape, r"0\.txt, line 1: cannot be read\n  expected  4 numbers\n  found     1 0 0"),
-        (break_table, r"is not the table of ScanNet's labels(.|\n)*found     id,raw_category,nyu40id"),
         (break_depth_of_folder, r"wrong place(.|\n)*fix       move .*scene0000_00/scene0000_00 to"),
         (break_scans_folder, r"wrong place(.|\n)*fix       move .*scannet/scene0000_00 to .*scans"),
         (break_sens, r"still inside scene0000_00\.sens(.|\n)*SensReader"),
@@ -259,6 +220,43 @@ def break_sens(folder: Path) -> None:
 )
 def test_damage_is_answered_by_a_sentence_that_says_what_to_do(root, damage, message):
     damage(root / "scans" / SCAN)
+    with pytest.raises(SceneError, match=message):
+        open_scan(root, SCAN)
+
+
+GROUPS, SEGMENTS = f"{SCAN}.aggregation.json", f"{SCAN}_vh_clean_2.0.010000.segs.json"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (GROUPS, '{"segGroups": [', r"aggregation\.json is not valid JSON(.|\n)*fix "),
+        (
+            GROUPS,
+            '{"segGroups": [{"objectId": 0, "label": "wall", "segments": [123456]}]}',
+            r"group 0 \(wall\): none of its segments(.|\n)*fix ",
+        ),
+        (
+            GROUPS,
+            '{"segGroups": [{"label": "wall", "segments": [7]}]}',
+            r"group 0: cannot be read: KeyError\('objectId'\)",
+        ),
+        (
+            SEGMENTS,
+            '{"segIndices": [1, 2]}',
+            r"segs\.json does not belong(.|\n)*each of 5 vertices(.|\n)*found     2 values",
+        ),
+        ("pose/0.txt", "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"0\.txt: the pose is not a rotation"),
+        ("pose/0.txt", "1 0 0\n", r"line 1: cannot be read\n  expected  4 numbers\n  found     1 0 0"),
+        (
+            f"../../{LABEL_TABLE}",
+            "id,raw_category,nyu40id\n",
+            r"is not the table of ScanNet's labels(.|\n)*found     id,raw_category,nyu40id",
+        ),
+    ],
+)
+def test_a_file_of_other_content_is_refused_with_a_sentence(root, name, text, message):
+    (root / "scans" / SCAN / name).write_text(text)
     with pytest.raises(SceneError, match=message):
         open_scan(root, SCAN)
 
@@ -277,14 +275,6 @@ def test_the_importer_reads_the_same_cameras(root, tmp_path):
         assert (view.camera.height, view.camera.width) == image.size_hw
     with pytest.raises(SceneError, match=r"twice: 0\.jpg"):
         write_posed_images(folder, [images[0], images[0]])
-
-
-def test_the_mesh_becomes_the_sparse_points_in_its_order(root, tmp_path):
-    export_images(f"scannet/{SCAN}", root.parent, tmp_path / "source")
-    views, (xyz, _) = read_transforms(find_known_poses(tmp_path / "source"))
-    truth = open_scan(root, SCAN)
-    assert len(views) == len(truth.images)
-    np.testing.assert_array_equal(xyz, truth.truth["nyu40"].xyz.astype(np.float32))
 
 
 def test_registry_checks_a_scan(root):

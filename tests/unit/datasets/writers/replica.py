@@ -1,15 +1,15 @@
-"""Write a scene in Replica's layout, so that its reader can be held to something known."""
+"""Write a scene in Replica's layout."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from hilsplat.base.artifacts import atomic_folder, write_json, write_text
+from hilsplat.base.artifacts import write_json
 from hilsplat.datasets.classes.replica import NAMES
-from hilsplat.datasets.points.replica import NICE_SLAM
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 from tests.unit.datasets.writers.ply import write_ply
 
@@ -27,8 +27,6 @@ def write_semantic_mesh(
     """Write `mesh_semantic.ply` and `info_semantic.json` of a scene.
 
     Args:
-        habitat: the folder `<scene>/habitat`.
-        xyz: vertices, metres.
         faces: triangles; each becomes a quad whose last corner occurs twice.
         object_of_face: row of `classes`, -1 for none. In the files objects count from 1.
         classes: Replica's class id of each object, 0 if it has none for it.
@@ -49,28 +47,21 @@ def write_semantic_mesh(
         "id_to_label": labels,
         "objects": objects[::-1],  # real files do not sort them either
     }
-    with atomic_folder(habitat) as folder:
-        write_ply(folder / "mesh_semantic.ply", {**places, **colours}, quads, {"object_id": of_face})
-        write_text(folder / "info_semantic.json", json.dumps(info, indent=1))
+    habitat.mkdir(parents=True)
+    write_ply(habitat / "mesh_semantic.ply", {**places, **colours}, quads, {"object_id": of_face})
+    (habitat / "info_semantic.json").write_text(json.dumps(info, indent=1))
 
 
 def write_sequence(folder: Path, images: Sequence[PosedImage]) -> None:
     """Write a sequence in the layout of NICE-SLAM: `traj.txt`, `results/`, and `cam_params.json` beside it.
 
-    Args:
-        folder: such as `room0`; the lens in the folder above is that of all its sequences.
-        images: image files with their cameras, in order; all share K and size.
+    The lens in the folder above is that of all its sequences, so all images must share K and size.
     """
     K, (height, width) = images[0].K - HALF_PIXEL, images[0].size_hw
     lens = {"w": width, "h": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    write_json(Path(folder).parent / "cam_params.json", {"camera": {**lens, "scale": 6553.5}})
-    with atomic_folder(folder) as temporary:
-        place, prefix = NICE_SLAM.colour
-        lines = []
-        for number, image in enumerate(images):
-            assert isinstance(image.image, Path)
-            target = temporary / place / f"{prefix}{number:06d}{image.image.suffix}"
-            target.parent.mkdir(exist_ok=True)
-            target.write_bytes(image.image.read_bytes())
-            lines.append(" ".join(repr(float(value)) for value in image.world_from_cam.ravel()))
-        write_text(temporary / NICE_SLAM.poses, "\n".join(lines) + "\n")
+    write_json(folder.parent / "cam_params.json", {"camera": {**lens, "scale": 6553.5}})
+    (folder / "results").mkdir(parents=True)
+    for number, image in enumerate(images):
+        assert isinstance(image.image, Path)
+        shutil.copyfile(image.image, folder / "results" / f"frame{number:06d}{image.image.suffix}")
+    np.savetxt(folder / "traj.txt", [image.world_from_cam.ravel() for image in images])

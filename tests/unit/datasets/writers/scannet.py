@@ -1,14 +1,14 @@
-"""Write a scene in ScanNet's layout, so that its reader can be held to something known."""
+"""Write a scene in ScanNet's layout."""
 
-import csv
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from hilsplat.base.artifacts import atomic_folder, atomic_path, write_text
+from hilsplat.base.artifacts import write_text
 from hilsplat.datasets.points.scannet import LABEL_TABLE
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
 from tests.unit.datasets.writers.ply import write_ply
@@ -19,20 +19,9 @@ GREY = 128
 
 
 def write_label_table(root: Path, categories: Mapping[str, tuple[int, int]]) -> None:
-    """Write `scannetv2-labels.combined.tsv` with the columns that are read.
-
-    Args:
-        root: the data set's folder.
-        categories: raw category -> (id, NYU40 id).
-    """
-    with (
-        atomic_path(Path(root) / LABEL_TABLE) as path,
-        path.open("w", encoding="utf-8", newline="") as stream,
-    ):
-        rows = csv.writer(stream, delimiter="\t", lineterminator="\n")
-        rows.writerow(["id", "raw_category", "category", "nyu40id"])
-        for category, (number, nyu40) in categories.items():
-            rows.writerow([number, category, category, nyu40])
+    """Write `scannetv2-labels.combined.tsv`, given raw category -> (id, NYU40 id)."""
+    rows = [f"{number}\t{category}\t{category}\t{nyu40}" for category, (number, nyu40) in categories.items()]
+    write_text(root / LABEL_TABLE, "\n".join(["id\traw_category\tcategory\tnyu40id", *rows, ""]))
 
 
 def write_scan(
@@ -49,55 +38,26 @@ def write_scan(
     """Write `scans/<scan>`: frames numbered 0, 1, ..., mesh, labels, segments and aggregation.
 
     Args:
-        root: the data set's folder.
-        scan: name of the scan.
-        images: image files with their cameras; all share K and size, as ScanNet's do.
-        xyz: vertices, metres.
-        faces: corners of triangles.
+        images: all share K and size, as ScanNet's do.
         object_of_vertex: row of `objects`, -1 for none.
         objects: raw category of each object.
         categories: raw category -> (id, NYU40 id).
         lost: frames that get the infinite pose of lost tracking.
     """
-    with atomic_folder(Path(root) / "scans" / scan) as folder:
-        for name in ("color", "pose", "intrinsic"):
-            (folder / name).mkdir()
-        for number, image in enumerate(images):
-            assert isinstance(image.image, Path)
-            target = folder / "color" / f"{number}{image.image.suffix}"
-            target.write_bytes(image.image.read_bytes())
-            pose = np.full((4, 4), -np.inf) if number in lost else image.world_from_cam
-            write_text(folder / "pose" / f"{number}.txt", matrix_text(pose))
-        K = np.eye(4)
-        K[:3, :3] = images[0].K - HALF_PIXEL
-        write_text(folder / "intrinsic" / "intrinsic_color.txt", matrix_text(K))
-        height, width = images[0].size_hw
-        info = {
-            "axisAlignment": " ".join(f"{value:.6f}" for value in np.eye(4).ravel()),
-            "colorHeight": height,
-            "colorWidth": width,
-            "numColorFrames": len(images),
-            "sceneType": "Synthetic room",
-        }
-        write_text(folder / f"{scan}.txt", "".join(f"{key} = {value}\n" for key, value in info.items()))
-        _write_meshes(folder, scan, xyz, faces, object_of_vertex, objects, categories)
-        _write_groups(folder, scan, xyz, object_of_vertex, objects)
-
-
-def matrix_text(matrix: np.ndarray) -> str:
-    """A matrix as lines of numbers that read back equal."""
-    return "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in matrix)
-
-
-def _write_meshes(
-    folder: Path,
-    scan: str,
-    xyz: np.ndarray,
-    faces: np.ndarray,
-    object_of_vertex: np.ndarray,
-    objects: Sequence[str],
-    categories: Mapping[str, tuple[int, int]],
-) -> None:
+    folder = root / "scans" / scan
+    for name in ("color", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    for number, image in enumerate(images):
+        assert isinstance(image.image, Path)
+        shutil.copyfile(image.image, folder / "color" / f"{number}{image.image.suffix}")
+        pose = np.full((4, 4), -np.inf) if number in lost else image.world_from_cam
+        np.savetxt(folder / "pose" / f"{number}.txt", pose)
+    K = np.eye(4)
+    K[:3, :3] = images[0].K - HALF_PIXEL
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", K)
+    height, width = images[0].size_hw
+    info = f"colorHeight = {height}\ncolorWidth = {width}\nsceneType = Synthetic room\n"
+    write_text(folder / f"{scan}.txt", info)
     places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
     grey = np.full(len(xyz), GREY, dtype=np.uint8)
     colours = dict.fromkeys(("red", "green", "blue", "alpha"), grey)
@@ -105,6 +65,7 @@ def _write_meshes(
     of_object = np.array([categories[name][1] for name in objects] + [0], dtype=np.uint16)
     labels = of_object[object_of_vertex]  # -1, none, is the last
     write_ply(folder / f"{scan}_vh_clean_2.labels.ply", {**places, **colours, "label": labels}, faces, {})
+    _write_groups(folder, scan, xyz, object_of_vertex, objects)
 
 
 def _write_groups(

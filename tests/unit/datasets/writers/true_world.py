@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from PIL import Image
 
-from hilsplat.base.artifacts import atomic_path
-from hilsplat.base.errors import SceneError
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -29,8 +27,6 @@ class TrueWorld:
 
     Attributes:
         images: folder of images, by view name.
-        cameras: the true cameras.
-        annotations: what is annotated in each view.
         points_xyz: places on the surface that cameras see, scene units; none without a mesh.
     """
 
@@ -41,12 +37,7 @@ class TrueWorld:
 
     @staticmethod
     def open(folder: Path) -> "TrueWorld":
-        """Read a folder that the world stage wrote: `images/` and `truth/`.
-
-        Raises:
-            ArtifactError: a part is missing or damaged.
-        """
-        folder = Path(folder)
+        """Read a folder that the world stage wrote: `images/` and `truth/`."""
         truth = folder / "truth"
         cameras, annotations = Cameras.load(truth / "cameras.npz"), HierarchyAnnotations.load(truth)
         mesh = truth / "mesh.ply"
@@ -82,29 +73,16 @@ def _mesh_points(path: Path) -> Float64[np.ndarray, "P 3"]:
     return xyz[:: max(1, -(-len(xyz) // MAX_POINTS))]
 
 
-def write_image(path: Path, pixels: UInt8[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W"]) -> None:
-    """Write an image in the format of its suffix: .png exact, .jpg at quality 95, as photographs come."""
-    with atomic_path(path) as temporary:
-        image = Image.fromarray(np.ascontiguousarray(pixels))
-        image.save(temporary, **({"quality": 95} if path.suffix == ".jpg" else {}))
-
-
-def write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
-    """Write a mask as grey PNG, 0 and 255."""
-    write_image(path, mask.astype(np.uint8) * np.uint8(255))
+def write_jpeg(path: Path, pixels: UInt8[np.ndarray, "H W 3"]) -> None:
+    """Write an image at quality 95, as photographs come."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=95)
 
 
 def write_sparse(
     folder: Path, cameras: Sequence[Camera], names: Sequence[str], points_xyz: Float64[np.ndarray, "P 3"]
 ) -> None:
-    """Write a COLMAP model (binary) of pinhole cameras and grey points.
-
-    Args:
-        folder: such as `<scene>/sparse/0`.
-        cameras: one per image.
-        names: name of the image of each camera.
-        points_xyz: points, without tracks.
-    """
+    """Write a COLMAP model (binary) of pinhole cameras and grey points without tracks."""
     folder.mkdir(parents=True, exist_ok=True)
     model = pycolmap.Reconstruction()
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
@@ -122,22 +100,6 @@ def write_sparse(
     for xyz in points_xyz:
         model.add_point3D(xyz, pycolmap.Track(), np.full(3, 128, np.uint8))
     model.write(folder)
-
-
-def chosen_views(world: TrueWorld, views: Sequence[str]) -> Sequence[str]:
-    """The views, checked.
-
-    Raises:
-        SceneError: the world has no such view.
-    """
-    unknown = sorted(set(views) - set(world.cameras.names))
-    if unknown:
-        raise SceneError(
-            f"the world in {world.images.parent} has no view {', '.join(unknown)}",
-            expected=f"views from {world.cameras.names[0]} to {world.cameras.names[-1]}",
-            fix="name views as its images are named",
-        )
-    return views
 
 
 def stems_from(world: TrueWorld, pattern: str, first: int) -> Mapping[str, str]:

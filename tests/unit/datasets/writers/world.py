@@ -9,11 +9,10 @@ from jaxtyping import Float, Float32, Int32
 from PIL import Image
 
 from hilsplat.base.artifacts import read_npz
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.images import read_image
 from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.synthetic.world_points import replica_id, scannet_ids, waymo_labels
+from hilsplat.datasets.synthetic.world_labels import replica_id, scannet_ids, waymo_labels
 from hilsplat.datasets.waymo.frames import CameraShot, LidarFrame, LidarReturn
 from hilsplat.datasets.waymo.geometry import CV_FROM_WAYMO, WaymoCamera, column_azimuths, rotation_of
 from hilsplat.scene.cameras import Cameras
@@ -27,20 +26,14 @@ LIDAR_AT = (1.4, 0.0, 2.2)
 """Place of the lidar on the vehicle, metres; that of the true drive is in its poses."""
 LIDAR_TURN_DEG = 148.0
 """The lidar is mounted turned, as Waymo's is: columns are counted from the vehicle's back all the same."""
+AZIMUTH_STEPS, BEAMS = 400, 64
+"""Directions per turn of the scan, and evenly spaced beams: columns and rows of the range images."""
 FRAME_MICROS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledMesh:
-    """The labelled surface of a synthetic scene.
-
-    Attributes:
-        xyz: vertices, metres.
-        whole: row of `texts` of each vertex, -1 none.
-        faces: corners of triangles.
-        whole_of_face: likewise, of faces.
-        texts: class of each node.
-    """
+    """The labelled surface of a synthetic scene; `whole` is a row of `texts`, -1 for none."""
 
     xyz: Float32[np.ndarray, "P 3"]
     whole: Int32[np.ndarray, " P"]
@@ -51,7 +44,7 @@ class LabelledMesh:
     @staticmethod
     def open(world: Path) -> "LabelledMesh":
         """Read `truth/mesh.ply` and the texts of `truth/annotations.json`."""
-        path = Path(world) / "truth" / "mesh.ply"
+        path = world / "truth" / "mesh.ply"
         mesh = read_ply(path, 3)
         nodes = HierarchyAnnotations.load(path.parent).nodes
         return LabelledMesh(
@@ -65,23 +58,15 @@ class LabelledMesh:
 
 def posed_images(world: Path) -> list[PosedImage]:
     """Images of a synthetic scene with their true cameras."""
-    cameras = Cameras.load(Path(world) / "truth" / "cameras.npz")
-    found = []
-    for name in cameras.names:
-        camera = cameras[name]
-        path = Path(world) / "images" / name
-        found.append(PosedImage(name, path, camera.cam_from_world, camera.K, camera.size_hw))
-    return found
+    cameras = Cameras.load(world / "truth" / "cameras.npz")
+    return [
+        PosedImage(name, world / "images" / name, camera.cam_from_world, camera.K, camera.size_hw)
+        for name, camera in ((name, cameras[name]) for name in cameras.names)
+    ]
 
 
 def write_room_as_scannet(world: Path, root: Path, scan: str) -> None:
-    """Write a room as `scans/<scan>`; nodes count as objects in their order.
-
-    Args:
-        world: what the world stage wrote: `images/` and `truth/`.
-        root: the data set's folder. Its table of labels is replaced by one of all classes of this room.
-        scan: name of the scan.
-    """
+    """Write a room as `scans/<scan>`; nodes count as objects in their order."""
     mesh = LabelledMesh.open(world)
     categories = {text: scannet_ids(text) for text in mesh.texts}
     write_label_table(root, categories)
@@ -89,43 +74,24 @@ def write_room_as_scannet(world: Path, root: Path, scan: str) -> None:
 
 
 def write_room_as_replica(world: Path, root: Path, scene: str) -> None:
-    """Write a room as a scene of Replica with the sequence in the layout of NICE-SLAM.
-
-    Args:
-        world: what the world stage wrote.
-        root: the data set's folder.
-        scene: such as room_0.
-    """
+    """Write a room as a scene of Replica with the sequence in the layout of NICE-SLAM."""
     mesh = LabelledMesh.open(world)
     classes = [replica_id(text) for text in mesh.texts]
-    write_semantic_mesh(Path(root) / scene / "habitat", mesh.xyz, mesh.faces, mesh.whole_of_face, classes)
-    write_sequence(Path(root) / scene.replace("_", ""), posed_images(world))
+    write_semantic_mesh(root / scene / "habitat", mesh.xyz, mesh.faces, mesh.whole_of_face, classes)
+    write_sequence(root / scene.replace("_", ""), posed_images(world))
 
 
-def write_street_as_waymo(
-    world: Path, split: Path, segment: str, azimuth_steps: int = 400, beams: int = 64
-) -> None:
-    """Write a street as a segment of Waymo's release 2: range images of its scan, its views as FRONT.
-
-    Args:
-        world: what the world stage wrote.
-        split: folder such as `validation`.
-        segment: context name.
-        azimuth_steps: directions per turn of the scan; columns of the range images.
-        beams: evenly spaced beams of the scanner; rows of the range images.
-
-    Raises:
-        MisalignedArtifactError: the scan has other directions.
-    """
-    scan = read_npz(Path(world) / "truth" / "lidar.npz")
-    nodes = HierarchyAnnotations.load(Path(world) / "truth").nodes
+def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
+    """Write a street as a segment of Waymo's release 2: range images of its scan, its views as FRONT."""
+    scan = read_npz(world / "truth" / "lidar.npz")
+    nodes = HierarchyAnnotations.load(world / "truth").nodes
     labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
     images = posed_images(world)
     shots = [_shot(image, FRAME_MICROS * (number + 1)) for number, image in enumerate(images)]
     centres = np.stack([image.world_from_cam[:3, 3] for image in images])
     up = np.arcsin((scan["points"] - scan["origins"][scan["pose_index"]])[:, 2] / scan["range_m"])
     slope, start = np.polyfit(scan["beam"], up.astype(np.float64), 1)
-    inclinations = (start + slope * np.arange(beams))[::-1]
+    inclinations = (start + slope * np.arange(BEAMS))[::-1]
     frames = []
     for pose, origin in enumerate(scan["origins"]):
         view = int(np.linalg.norm(centres - origin, axis=1).argmin())
@@ -137,7 +103,6 @@ def write_street_as_waymo(
                 origin,
                 inclinations,
                 shots[view],
-                azimuth_steps,
             )
         )
     write_segment(split, segment, frames, shots)
@@ -161,10 +126,9 @@ def _lidar_frame(
     origin: Float[np.ndarray, " 3"],
     inclinations: Float[np.ndarray, " H"],
     shot: CameraShot,
-    width: int,
 ) -> LidarFrame:
     """One turn of the scan as a range image. The vehicle heads along the axis x of the world."""
-    height = len(inclinations)
+    height, width = len(inclinations), AZIMUTH_STEPS
     turn = np.radians(LIDAR_TURN_DEG)
     vehicle_from_lidar = np.eye(4)
     vehicle_from_lidar[:3, :3] = rotation_of(np.array([0.0, 0.0, turn]))
@@ -175,25 +139,19 @@ def _lidar_frame(
     azimuth = np.arctan2(away[:, 1], away[:, 0])
     first = column_azimuths(width, vehicle_from_lidar)[0] + turn
     column = (first - azimuth) / (2 * np.pi / width)
-    if np.abs(column - column.round()).max(initial=0) > 0.1:
-        raise MisalignedArtifactError(
-            "the scan has other directions than the columns of a range image",
-            expected=f"azimuths at odd multiples of 180 / {width} degrees",
-            found=f"up to {np.abs(column - column.round()).max():.2f} columns off",
-            fix="give the number of directions per turn of the scan",
-        )
+    assert np.abs(column - column.round()).max(initial=0) < 0.1  # the scan has the directions of the columns
     place = height - 1 - scan["beam"], column.round().astype(int) % width
     image = np.zeros((height, width, 4), dtype=np.float32)
     image[..., 0] = -1
     image[*place, 0] = scan["range_m"]
     of_pixel = np.zeros((height, width, 2), dtype=np.int32)
     of_pixel[place] = labels
-    in_camera = np.linalg.inv(shot.world_from_vehicle @ shot.camera.vehicle_from_cam)
-    pixel, valid = shot.camera.project(
-        scan["points"].astype(np.float64) @ in_camera[:3, :3].T + in_camera[:3, 3]
-    )
+    in_camera = shot.camera.cam_from_world(shot.world_from_vehicle)
+    local = scan["points"].astype(np.float64) @ in_camera[:3, :3].T + in_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel = (local @ shot.camera.K.T)[:, :2] / local[:, 2:]  # the front camera has no distortion
     rows, columns = shot.camera.size_hw
-    inside = valid & (pixel >= 0).all(axis=1) & (pixel < [columns, rows]).all(axis=1)
+    inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < [columns, rows]).all(axis=1)
     cells = np.zeros((height, width, 6), dtype=np.int32)
     cells[place] = np.where(
         inside[:, None], np.stack([inside, *np.floor(pixel.T), *np.zeros((3, len(pixel)))], axis=1), 0

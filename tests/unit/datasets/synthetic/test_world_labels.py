@@ -11,8 +11,7 @@ from hilsplat.datasets.points.point_files import read_ply
 from hilsplat.datasets.registry import open_labels
 from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.datasets.synthetic.world_points import replica_id, scannet_ids, waymo_labels
+from hilsplat.datasets.synthetic.world_labels import labelled_points, replica_id, scannet_ids, waymo_labels
 from hilsplat.datasets.waymo import reader as waymo
 from hilsplat.scene.importers.importing import import_poses
 from hilsplat.scene.importers.known_poses import find_known_poses
