@@ -31,9 +31,7 @@ class PosedView:
     """One view with its lens, before undistortion.
 
     Attributes:
-        view: view name.
         image: PNG file whose pixels the lens describes.
-        camera: COLMAP camera of that image, distorted or not.
         cam_from_source: world-to-camera transform in source coordinates.
     """
 
@@ -160,12 +158,8 @@ def write_scene(
     """Write the scene artifact with its registration report, atomically.
 
     Args:
-        out: the scene folder.
         name: `<dataset>/<scene>`.
         unit: "metre" keeps the source's scale; for any other unit, the scale is normalised.
-        views: posed views, at least one.
-        points_xyz: sparse points, source coordinates.
-        points_rgb: their colours.
         split: "train" or "test" per view.
         report: registration report; this function adds split, size and focal length per view.
         turn: rotate the scene so that +z is up.

@@ -12,8 +12,6 @@ from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
 MAX_SIDE_PX = 2**15
-LAST_ROW = (0, 0, 0, 1)
-"""Last row of a pose matrix."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +48,7 @@ class Cameras:
 
     Attributes:
         names: view names (file names of the images), in the order of the rows.
-        cam_from_world: V world-to-camera transforms, scene units.
-        K: V intrinsics, px.
-        size_hw: V image sizes (height, width), px.
+        cam_from_world, K, size_hw: as in `Camera`, one row per view.
     """
 
     names: tuple[str, ...]
@@ -95,9 +91,10 @@ class Cameras:
         numbers = {name: array for name, array in arrays.items() if name != "names"}
         require_types(Cameras, numbers, path, {"size_hw": (1, MAX_SIDE_PX)})
         names, poses, K = arrays["names"], arrays["cam_from_world"], arrays["K"]
+        are_rigid = are_rotations(poses[:, :3, :3], RIGID_TOLERANCE)
         if names.dtype.kind != "U" or names.shape != (len(poses),) or len(set(names.tolist())) != len(names):
             fault = f"{len(names)} names of {len(poses)} cameras, each another"
-        elif not are_rotations(poses[:, :3, :3], RIGID_TOLERANCE).all() or (poses[:, 3] != LAST_ROW).any():
+        elif not are_rigid.all() or (poses[:, 3] != (0, 0, 0, 1)).any():
             fault = "rigid poses"
         elif not (K[:, [0, 1], [0, 1]] > 0).all() or (K[:, 2] != (0, 0, 1)).any():
             fault = "focal lengths above 0"
@@ -105,9 +102,4 @@ class Cameras:
             fault = ""
         if fault:
             raise ArtifactError(f"{path} does not hold cameras", expected=fault, fix=remake(path))
-        return Cameras(
-            tuple(str(name) for name in arrays["names"]),
-            arrays["cam_from_world"],
-            arrays["K"],
-            arrays["size_hw"],
-        )
+        return Cameras(tuple(str(name) for name in names), poses, K, arrays["size_hw"])

@@ -1,12 +1,52 @@
-"""pycolmap, loaded after Pillow; import it from here, never directly.
+"""pycolmap, loaded after Pillow (import it from here, never directly), and its models as arrays.
 
 Measured with pycolmap 4.2.1 and Pillow 13.0: if pycolmap is loaded before Pillow's core, writing a PNG with
 Pillow corrupts the heap, and the process aborts or hangs. The other order works.
 """
 
+import numpy as np
+from jaxtyping import Float64, UInt8
 from PIL import Image
 
 # isort: split
 import pycolmap
 
-__all__ = ["Image", "pycolmap"]
+__all__ = ["Image", "camera_of", "pose_matrix", "pycolmap", "reprojection_errors", "sparse_points"]
+
+
+def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
+    """Return a COLMAP pose as a matrix."""
+    return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def camera_of(image: pycolmap.Image) -> pycolmap.Camera:
+    """Return the camera of an image that is part of a model."""
+    assert image.camera is not None  # only images outside a model have no camera
+    return image.camera
+
+
+def sparse_points(
+    model: pycolmap.Reconstruction,
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Return the sparse points and colours of a model, sorted by point id."""
+    points = [model.points3D[point_id] for point_id in sorted(model.points3D)]
+    xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
+    return xyz, rgb
+
+
+def reprojection_errors(model: pycolmap.Reconstruction) -> dict[str, Float64[np.ndarray, " n"]]:
+    """Compute the distance in px between each observation and its point's projection, per registered view."""
+    errors = {}
+    for image_id in model.reg_image_ids():
+        image = model.images[image_id]
+        seen = image.get_observation_points2D()
+        if not seen:
+            errors[image.name] = np.zeros(0)
+            continue
+        measured = np.array([point.xy for point in seen])
+        xyz = np.array([model.points3D[point.point3D_id].xyz for point in seen])
+        pose = image.cam_from_world().matrix()
+        projected = camera_of(image).img_from_cam(xyz @ pose[:, :3].T + pose[:, 3], check_cheirality=False)
+        errors[image.name] = np.linalg.norm(projected - measured, axis=1)
+    return errors

@@ -1,13 +1,12 @@
 """Features and verified matches of photographs: upright work images, initial cameras, SIFT, pairs."""
 
 import logging
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import UnidentifiedImageError
+from PIL import ExifTags, UnidentifiedImageError
 
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
@@ -37,15 +36,9 @@ MAX_TRIALS = 1000
 WORK_COMPRESSION = 1
 """zlib level of work images: it saves a third of the time of level 6, and COLMAP reads them only once."""
 
-EXIF_35MM_FOCAL = 0xA405
-EXIF_FOCAL = 0x920A
-EXIF_PLANE_RESOLUTION = 0xA20E
-EXIF_PLANE_UNIT = 0xA210
-EXIF_STORED_WIDTH, EXIF_STORED_HEIGHT = 0xA002, 0xA003
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF unit of the focal plane resolution -> mm (default: inch)."""
-EXIF_SUB_FOLDER = 0x8769
-EXIF_ORIENTATION = 0x0112
+EXIF_ORIENTATION = ExifTags.Base.Orientation
 DIAGONAL_35MM = 43.2666
 """Diagonal of a 35 mm frame in mm, the reference of the equivalent focal length in EXIF."""
 
@@ -57,7 +50,6 @@ class WorkImage:
     Attributes:
         view: view name, which is the file name of the work image.
         source: the original photograph.
-        size_hw: height and width of the work image, px.
         focal_px: focal length from EXIF, in px of the work image, or None.
     """
 
@@ -74,24 +66,26 @@ def exif_focal_px(path: Path, size_hw: tuple[int, int]) -> float | None:
     """
     try:
         with open_image(path) as image:
-            tags = image.getexif().get_ifd(EXIF_SUB_FOLDER)
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
             size = image.size
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
         return None  # damaged EXIF is ignored; whether the pixels can be read is checked elsewhere
 
-    def number(tag: int) -> float:
+    def number(tag: ExifTags.Base) -> float:
         try:
             value = float(tags.get(tag) or 0)
         except (TypeError, ValueError, ZeroDivisionError):
             return 0.0
         return value if np.isfinite(value) and value > 0 else 0.0
 
-    if focal := number(EXIF_35MM_FOCAL):
+    if focal := number(ExifTags.Base.FocalLengthIn35mmFilm):
         return focal / DIAGONAL_35MM * float(np.hypot(*size_hw))
-    pixels_per_mm = number(EXIF_PLANE_RESOLUTION) / PLANE_UNIT_MM.get(int(number(EXIF_PLANE_UNIT)), 25.4)
+    unit_mm = PLANE_UNIT_MM.get(int(number(ExifTags.Base.FocalPlaneResolutionUnit)), 25.4)
+    pixels_per_mm = number(ExifTags.Base.FocalPlaneXResolution) / unit_mm
     # The resolution refers to the picture as stored by the camera; programs that shrink it keep these tags.
-    stored_px = max(number(EXIF_STORED_WIDTH), number(EXIF_STORED_HEIGHT)) or max(size)
-    return number(EXIF_FOCAL) * pixels_per_mm * max(size_hw) / stored_px or None
+    stored = (number(ExifTags.Base.ExifImageWidth), number(ExifTags.Base.ExifImageHeight))
+    stored_px = max(stored) or max(size)
+    return number(ExifTags.Base.FocalLength) * pixels_per_mm * max(size_hw) / stored_px or None
 
 
 def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> list[WorkImage]:
@@ -104,9 +98,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
     folder.mkdir(parents=True, exist_ok=True)
     images = []
     damaged: list[tuple[Path, str]] = []
-    for source, view in track(
-        list(zip(sources, view_names(sources), strict=True)), "photographs read", total=len(sources)
-    ):
+    for source, view in track(list(zip(sources, view_names(sources), strict=True)), "photographs read"):
         try:
             pixels = resize_to_fit(read_image(source), max_side_px)
         except ImageError as error:
@@ -130,9 +122,6 @@ def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[
     """Group the views that share intrinsics, in the order of their first view.
 
     "auto" groups views with the same size and EXIF focal length, "yes" groups all views, "no" none.
-
-    Raises:
-        SceneError: "yes" with images of different sizes.
     """
     if single_camera == "no":
         return [[image] for image in images]
@@ -151,25 +140,15 @@ def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[
     return list(groups.values())
 
 
-def register_images(
-    database: Path, folder: Path, images: Sequence[WorkImage], camera_model: str, single_camera: str
+def import_images(
+    database: Path, folder: Path, views: Sequence[str], camera_model: str, camera: pycolmap.Camera | None
 ) -> None:
-    """Add cameras and images to a new database.
-
-    Feature extraction would add them as its threads finish, so ids and results would depend on timing.
-    """
-    pycolmap.Database.open(database).close()  # creates the file
-    for group in camera_groups(images, single_camera):
-        options = pycolmap.ImageReaderOptions()
-        options.camera_model = camera_model.upper()
-        height, width = group[0].size_hw
-        focal = group[0].focal_px
-        if focal is not None:
-            camera = pycolmap.Camera.create_from_model_name(1, camera_model.upper(), focal, width, height)
-            options.camera_params = ", ".join(repr(float(value)) for value in camera.params)
-        pycolmap.import_images(
-            database, folder, pycolmap.CameraMode.SINGLE, [image.view for image in group], options
-        )
+    """Add images that share a camera to a database; without a camera, COLMAP guesses its parameters."""
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = camera_model
+    if camera is not None:
+        options.camera_params = ", ".join(repr(float(value)) for value in camera.params)
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, list(views), options)
 
 
 def find_matches(
@@ -181,12 +160,19 @@ def find_matches(
     seed: int,
     threads: int,
 ) -> str:
-    """Register images, extract features and match them; return the matcher that was used.
+    """Add images to a new database, extract features and match them; return the matcher that was used.
 
     Call this in a separate process: if the database cannot be written, COLMAP throws in a C++ thread.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    register_images(database, folder, images, camera_model, settings.single_camera)
+    pycolmap.Database.open(database).close()  # creates the file
+    # Feature extraction would add images as its threads finish, so ids and results would depend on timing.
+    for group in camera_groups(images, settings.single_camera):
+        (height, width), focal = group[0].size_hw, group[0].focal_px
+        name, camera = camera_model.upper(), None
+        if focal is not None:
+            camera = pycolmap.Camera.create_from_model_name(1, name, focal, width, height)
+        import_images(database, folder, [image.view for image in group], name, camera)
     return features_and_matches(database, folder, [image.view for image in images], settings, seed, threads)
 
 
@@ -195,17 +181,10 @@ def features_and_matches(
 ) -> str:
     """Extract features of registered images and match them; return the matcher that was used.
 
-    Call this in a separate process, as `find_matches`.
+    Features are extracted on the CPU; the result does not depend on `threads`. Call this in a separate
+    process, as `find_matches`.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    extract_features(database, folder, views, settings, threads)
-    return match_features(database, len(views), settings, seed, threads)
-
-
-def extract_features(
-    database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, threads: int
-) -> None:
-    """Extract SIFT features of registered images (on the CPU; the result does not depend on `threads`)."""
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
@@ -215,11 +194,7 @@ def extract_features(
     pycolmap.extract_features(
         database, folder, list(views), extraction_options=options, device=pycolmap.Device.cpu
     )
-
-
-def match_features(database: Path, num_views: int, settings: PosesSettings, seed: int, threads: int) -> str:
-    """Match pairs and verify them geometrically; return the matcher that was used."""
-    matcher = settings.matcher
+    num_views, matcher = len(views), settings.matcher
     if matcher == "auto":
         matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
     verification = pycolmap.TwoViewGeometryOptions()
@@ -245,31 +220,34 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 @dataclass(frozen=True)
 class MatchCounts:
-    """Numbers of features and matches of a view.
-
-    Attributes:
-        features: number of SIFT features.
-        pairs: number of other views with at least `MIN_INLIERS` verified matches.
-        best_pair: number of verified matches with the best of these views.
-    """
+    """Numbers of features of a view, of pairs with `MIN_INLIERS` matches, and of the best pair's matches."""
 
     features: int
     pairs: int
     best_pair: int
 
 
-def count_matches(database: Path) -> dict[str, MatchCounts]:
-    """Count the features and verified pairs of every view in the database, by view name."""
+def verified_matches(database: Path) -> dict[str, dict[str, int]]:
+    """Return the number of verified matches of each view with each other view, by their names."""
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
-        features = {image_id: opened.num_keypoints_for_image(image_id) for image_id in names}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
-    of_view: dict[int, list[int]] = defaultdict(list)
+    shared: dict[str, dict[str, int]] = {name: {} for name in names.values()}
     for pair_id, count in zip(pair_ids, inliers, strict=True):
-        if count >= MIN_INLIERS:
-            for image_id in pycolmap.pair_id_to_image_pair(pair_id):
-                of_view[image_id].append(count)
-    return {
-        name: MatchCounts(features[image_id], len(of_view[image_id]), max(of_view[image_id], default=0))
-        for image_id, name in sorted(names.items(), key=lambda entry: entry[1])
-    }
+        one, other = (names[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
+        shared[one][other] = shared[other][one] = int(count)
+    return shared
+
+
+def count_matches(database: Path) -> dict[str, MatchCounts]:
+    """Count the features and verified pairs of every view in the database, by view name."""
+    shared = verified_matches(database)
+    with pycolmap.Database.open(database) as opened:
+        features = {
+            image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()
+        }
+    counts = {}
+    for name in sorted(features):
+        pairs = [count for count in shared[name].values() if count >= MIN_INLIERS]
+        counts[name] = MatchCounts(features[name], len(pairs), max(pairs, default=0))
+    return counts

@@ -3,14 +3,13 @@
 import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
-from hilsplat.base.artifacts import provenance_path, read_index, sha256_of_file
+from hilsplat.base.artifacts import read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.provenance import read_provenance
-from hilsplat.settings import EvaluateSettings, Section
+from hilsplat.settings import EvaluateSettings
 
 KEY_VIEWS = "key-views"
 """Variant computed from the masks of a subset of the views, used for queries until `default` is finished."""
@@ -23,13 +22,9 @@ class SceneParts:
     """Paths of the artifacts that are needed for queries: one variant of one scene.
 
     Attributes:
-        scene: cameras, photographs, split.
-        gaussians: 3DGS PLY.
-        semantic_tree: nodes.
         field: language field; None if it does not exist yet, in which case queries use the tree alone.
         autoencoder: decoder from the field's features to CLIP vectors; None if there is no field.
         clip: CLIP vectors of the masks; its index records the model, which also embeds the queries.
-        masks: masks of the training views.
     """
 
     scene: Path
@@ -48,13 +43,7 @@ class SceneParts:
 
 @dataclass(frozen=True)
 class FinishedScene:
-    """One variant of a finished scene; it may share artifacts with another variant.
-
-    Attributes:
-        folder: `results/<dataset>/<scene>`, or a moved copy of it.
-        variant: named set of settings.
-        parts: its artifacts.
-    """
+    """One variant of a finished scene; it may share artifacts with another variant."""
 
     folder: Path
     variant: str
@@ -128,17 +117,27 @@ class FinishedScene:
         They are read from the provenance of its scores. A scene without labels has no scores, but its panel
         was drawn with the same settings.
         """
-        scores = self.folder / self.variant / "scores.csv"
-        if provenance_path(scores).is_file():
-            return _section(EvaluateSettings, _recorded_settings(scores))
-        place = self.folder.resolve()
+        scores, place = self.folder / self.variant / "scores.csv", self.folder.resolve()
         panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
-        if not provenance_path(panel).is_file():
+        if (record := read_provenance(scores)) is not None:
+            found = record.settings
+        elif (record := read_provenance(panel)) is not None:
+            found = record.settings.get("evaluate", {})
+        else:
+            found = {}
             logger.warning(
                 "%s: no scores and no panel record the settings of queries; using the default settings",
                 self.folder,
             )
-        return _section(EvaluateSettings, _recorded_settings(panel).get("evaluate", {}))
+        known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
+        try:
+            return EvaluateSettings(**known)
+        except ValidationError as error:
+            raise ArtifactError(
+                f"recorded settings cannot be used: {error.errors(include_url=False)[0]['msg']}",
+                expected="values of EvaluateSettings",
+                fix="remove the damaged provenance of the scores, or run the workflow again",
+            ) from error
 
 
 def refining(folder: Path) -> str:
@@ -153,23 +152,6 @@ def is_drawn(scene: Path) -> bool:
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
     return images is not None and Path(images.path).parts[-2:] == ("world", "images")
-
-
-def _recorded_settings(artifact: Path) -> dict[str, Any]:
-    record = read_provenance(artifact)
-    return record.settings if record else {}
-
-
-def _section(section: type[Section], found: dict[str, Any]) -> Any:
-    """Create a section from recorded settings; missing settings get their defaults."""
-    try:
-        return section(**{name: value for name, value in found.items() if name in section.model_fields})
-    except ValidationError as error:
-        raise ArtifactError(
-            f"recorded settings cannot be used: {error.errors(include_url=False)[0]['msg']}",
-            expected=f"values of {section.__name__}",
-            fix="remove the damaged provenance of the scores, or run the workflow again",
-        ) from error
 
 
 def finished_variants(folder: Path) -> list[str]:
@@ -199,26 +181,12 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Check that an artifact was made for this file.
-
-    Raises:
-        MisalignedArtifactError: the file has another digest.
-    """
+    """Refuse a file with another digest than the one that an artifact was made for."""
     require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
 
 
 def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
-    """Check that artifacts were made for this file.
-
-    Args:
-        path: the file.
-        found_sha256: its digest.
-        scene: name of the scene, for the message.
-        made_for: name of each artifact -> digest of the file that it was made for.
-
-    Raises:
-        MisalignedArtifactError: the file has another digest.
-    """
+    """Refuse a file that artifacts were not made for: `made_for` has the file's digest by artifact."""
     for what, expected in made_for.items():
         if found_sha256 != expected:
             raise MisalignedArtifactError(

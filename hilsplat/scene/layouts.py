@@ -13,12 +13,14 @@ MODELS = ("sparse/0", "sparse")
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 """Pose files of nerfstudio and other programs, in order of preference."""
 
+POSES_BOUNDS = "poses_bounds.npy"
+"""Pose file of LLFF."""
+
 NO_POSES = Path("none")
 """Value instead of a path, which means that poses in the folder are ignored."""
 
 DATAPARSER = "dataparser_transforms.json"
 """File in which nerfstudio records its training coordinates."""
-
 
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY of 3DGS is preferred."""
@@ -100,7 +102,7 @@ def has_known_poses(folder: Path, named: Path | None = None) -> bool:
     return (
         (folder / "sparse").is_dir()
         or any(folder.glob("transforms*.json"))
-        or (folder / "poses_bounds.npy").is_file()
+        or (folder / POSES_BOUNDS).is_file()
         or polycam_folders(folder) is not None
         or record3d_export(folder) is not None
     )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.images import read_image, resize_to_fit, write_png
-from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.features import verified_matches
 
 NEIGHBOURS = 3
 """Number of registered photographs reported for each lost one."""
@@ -26,17 +26,9 @@ ADVICE = (
 def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
     """Add `belongs_near` to every lost view: the registered views with the most shared verified matches.
 
-    Args:
-        database: COLMAP's database, after matching.
-        views: entries of the registration report by view name; entries of lost views are modified in place.
+    `views` has the entries of the registration report, which are modified in place.
     """
-    shared: dict[str, dict[str, int]] = {view: {} for view in views}
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
-    for pair_id, count in zip(pair_ids, inliers, strict=True):
-        one, other = (names[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
-        shared[one][other] = shared[other][one] = int(count)
+    shared = verified_matches(database)
     for view, entry in views.items():
         if entry["registered"]:
             continue
@@ -50,13 +42,7 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
     """Draw each lost photograph in a row with its registered neighbours, below the advice.
 
-    Args:
-        path: PNG to write.
-        images: folder of the photographs by view name.
-        report: registration report with neighbours.
-
-    Returns:
-        Whether a picture was written, which is not the case without lost photographs.
+    Without lost photographs, nothing is written. Return whether a picture was written.
     """
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
@@ -73,7 +59,7 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
     cells = figure.subplots(len(shown), 1 + NEIGHBOURS, squeeze=False)
     for row, (view, entry) in zip(cells, shown, strict=True):
         near = entry["belongs_near"]
-        titles = [f"{entry['file']}: {_short(entry['why_not'])}"]
+        titles = [f"{entry['file']}: {entry['why_not'].partition(':')[0]}"]
         titles += [f"{each['view']}: {each['matches']} shared matches" for each in near]
         for axes, name, title in zip(row, [view, *(each["view"] for each in near)], titles, strict=False):
             axes.imshow(resize_to_fit(read_image(images / name), THUMBNAIL_PX))
@@ -86,20 +72,12 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
     return True
 
 
-def _short(reason: str) -> str:
-    return reason.split(":")[0]
-
-
 def stack_pictures(upper: Path, lower: Path) -> None:
     """Append a picture below another one, in place, and pad the narrower one with white."""
     pictures = [read_image(path) for path in (upper, lower)]
     width = max(picture.shape[1] for picture in pictures)
-    write_png(
-        upper,
-        np.concatenate(
-            [
-                np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0)), constant_values=255)
-                for picture in pictures
-            ]
-        ),
-    )
+    padded = [
+        np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0)), constant_values=255)
+        for picture in pictures
+    ]
+    write_png(upper, np.concatenate(padded))

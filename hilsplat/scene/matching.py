@@ -38,8 +38,6 @@ class ViewFeatures:
     """The N features of one view.
 
     Attributes:
-        image_id: id of the view in COLMAP's database.
-        camera: its lens.
         points: positions, px.
         descriptors: SIFT descriptors of length 512.
         columns: descriptors minus 128, one feature per column.
@@ -73,7 +71,6 @@ def match_pairs(
     """Match pairs of views, verify the matches, and write both to COLMAP's database.
 
     Args:
-        database: database with features and without matches.
         partners: for each view, in the order of names, the rows of the later views to match with.
         options: verification options; RANSAC makes fewer trials for pairs with few matches (see `_matched`).
         threads: number of threads; the result does not depend on it.

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,6 @@ class PosedImage:
         image: the file, or its encoded bytes if the data set stores images inside other files.
         cam_from_world: world-to-camera transform, OpenCV axes, in the unit of the scene.
         K: intrinsics, px; the centre of the first pixel is (0.5, 0.5).
-        size_hw: height and width, px.
         distortion: k1, k2, p1, p2, k3 as defined by OpenCV.
     """
 
@@ -46,11 +46,7 @@ class PosedImage:
 
 
 def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> Float[np.ndarray, "4 4"]:
-    """Invert a camera-to-world matrix.
-
-    Raises:
-        SceneError: the matrix is not a rotation and translation; the message begins with `where`.
-    """
+    """Invert a camera-to-world matrix, and refuse one that is not a rotation and translation."""
     rigid = are_rotations(world_from_cam[:3, :3], RIGID_TOLERANCE)
     if not rigid or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
         raise SceneError(
@@ -73,17 +69,10 @@ def write_posed_images(
     Images are copied byte for byte; distortion is kept, because `poses` undistorts. Points, if any, are
     written to `points.ply` and become the scene's sparse points, in the same order.
 
-    Args:
-        folder: folder to write atomically; an existing one is replaced.
-        images: at least one image; names must be unique.
-        points: positions from the data set, in the unit of the poses.
-        colours: colours of the points, if known.
-
-    Raises:
-        SceneError: two images share a name, or there are none.
+    An existing folder is replaced. Points are in the unit of the poses.
     """
     names = [image.name for image in images]
-    twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice or not images:
         raise SceneError(
             f"posed images cannot be written to {folder}",

@@ -14,7 +14,7 @@ from hilsplat.base.files import list_images
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
 from hilsplat.scene.assemble import PosedView, split_views, write_scene
-from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
     MIN_INLIERS,
     MatchCounts,
@@ -28,7 +28,6 @@ from hilsplat.scene.importers.importing import import_poses
 from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.layouts import photo_folder
 from hilsplat.scene.lost_views import name_neighbours, plot_lost
-from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
 from hilsplat.scene.sheet import MIN_PHOTOS
 from hilsplat.settings import PosesSettings
 
@@ -67,14 +66,10 @@ def run_poses(
     Structure from motion cannot recover metric scale, so its scenes always have the unit "arbitrary".
 
     Args:
-        images: folder of photographs, or of images with known poses.
-        out: scene folder to write.
         name: `<dataset>/<scene>`.
         unit: "metre" or "arbitrary": the unit of imported poses.
         is_render: images are renders of a pinhole camera without distortion.
-        settings: the `poses` section.
         seed: seed of RANSAC and the mapper.
-        threads: threads for feature extraction and matching.
         named: poses to use instead of those in the folder (`find_known_poses`).
 
     Raises:
@@ -152,12 +147,10 @@ def _reconstruct(
             error.add_line("picture", f"{kept} shows the lost photographs and where they belong")
         raise
     assert model is not None
-    views = [
-        PosedView(
-            image.name, work / "images" / image.name, camera_of(image), pose_matrix(image.cam_from_world())
-        )
-        for image in (model.images[image_id] for image_id in model.reg_image_ids())
-    ]
+    views = []
+    for image in (model.images[image_id] for image_id in model.reg_image_ids()):
+        pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
+        views.append(PosedView(image.name, file, camera_of(image), pose))
     xyz, rgb = sparse_points(model)
     split = split_views([view.view for view in views], settings.test_every)
     lost = picture if has_lost else None
@@ -291,11 +284,7 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:
-    """Refuse a reconstruction with too few views or separate models, and log warnings about an accepted one.
-
-    Raises:
-        RegistrationError: it is refused; the message names the lost photographs and the fix.
-    """
+    """Refuse a reconstruction with too few views or several models; log warnings about an accepted one."""
     total, registered = report["images"], report["registered"]
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
     listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)

@@ -20,10 +20,7 @@ class Scene:
         folder: the scene artifact; images are `folder/images/<view name>`.
         name: `<dataset>/<scene>`.
         unit: unit of length, "metre" or "arbitrary".
-        cameras: V undistorted pinhole cameras.
         split: "train" or "test" per view name. No stage between poses and evaluate uses test views.
-        points_xyz: sparse points, scene units.
-        points_rgb: their colours.
         scene_from_source: similarity that maps source coordinates to the scene's.
     """
 

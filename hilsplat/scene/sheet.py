@@ -50,8 +50,7 @@ class SceneRow:
     """One scene in the sheet.
 
     Attributes:
-        dataset: data set, first part of the scene's path under `results/`.
-        scene: scene name, second part.
+        dataset: first part of the scene's path under `results/`; `scene` is the second.
         group: "benchmark", "development", "ci", "photos" or a real data set such as "lerf".
         source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
@@ -101,7 +100,6 @@ def read_sheet(
     cell or "-" has the same meaning.
 
     Args:
-        path: the sheet; relative sources are relative to its project root.
         checked_groups: groups whose source folders must exist and contain images; None for all. A run checks
             only the groups it runs, so that a missing folder of another group does not stop it.
         data_root: folder of the real data sets, the base of `data:` sources; if it is empty, such rows have
@@ -113,7 +111,7 @@ def read_sheet(
     path = Path(path)
     lines = content_lines(path)
     if not lines:
-        raise SceneError(f"scene sheet {path} is empty", fix=f"begin it with the line: {_joined(COLUMNS)}")
+        raise SceneError(f"scene sheet {path} is empty", fix=f"begin it with the line: {' '.join(COLUMNS)}")
     header_line, header_text = lines[0]
     header = [cell.strip() for cell in header_text.split("\t")]
     _check_header(path, header_line, header)
@@ -126,7 +124,7 @@ def read_sheet(
         if len(cells) != len(header):
             raise SceneError(
                 f"{path}, line {line}: wrong number of columns",
-                expected=f"{len(header)} columns, separated by tabs ({_joined(header)})",
+                expected=f"{len(header)} columns, separated by tabs ({' '.join(header)})",
                 found=f"{len(cells)}: {text!r}",
                 fix="separate the columns with one tab each; only optional ones at the end may be missing",
             )
@@ -156,13 +154,8 @@ def choose_scenes(
     """Return the scenes of a run in the order of the sheet: all scenes of the groups, or only named ones.
 
     Args:
-        rows: the sheet.
-        groups: groups of the run.
         only: names such as `table-1` or `synthetic/table-1`; empty for all scenes of the groups. A name
             selects scenes in the groups or, if there is none of that name, in any group.
-
-    Raises:
-        SceneError: no row has one of the names.
     """
     in_groups = [row for row in rows if row.group in groups]
     if not only:
@@ -200,10 +193,6 @@ def content_lines(path: Path) -> list[tuple[int, str]]:
     ]
 
 
-def _joined(columns: tuple[str, ...] | list[str]) -> str:
-    return " ".join(columns)
-
-
 def _check_header(path: Path, line: int, header: list[str]) -> None:
     """Refuse missing, unknown or repeated columns."""
     missing = [column for column in COLUMNS if column not in header]
@@ -217,7 +206,7 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
         ]
         raise SceneError(
             f"{path}, line {line}: the header cannot be used",
-            expected=f"the columns {_joined(COLUMNS)}, separated by tabs; also {_joined(OPTIONAL_COLUMNS)}",
+            expected=f"the columns {' '.join(COLUMNS)}, separated by tabs; also {' '.join(OPTIONAL_COLUMNS)}",
             found="; ".join(problems),
             fix="correct the header line; spaces or commas do not separate columns",
         )
@@ -226,69 +215,42 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
 def _row(
     path: Path, line: int, cells: dict[str, str], checked_groups: Collection[str] | None, data_root: str
 ) -> SceneRow:
+    def fault(column: str, problem: str, **lines: str) -> SceneError:
+        return SceneError(f"{path}, line {line}, column {column}: {problem}", **lines)
+
+    def optional(column: str) -> Path | None:
+        cell = cells.get(column, "")
+        return None if cell in NOTHING else _resolved(path, cell, data_root)
+
     for column in ("dataset", "scene"):
         if problem := name_problem(cells[column]):
-            raise SceneError(
-                f"{path}, line {line}, column {column}: {cells[column]!r} cannot be a name",
-                expected=NAME_RULE,
-                found=problem,
-                fix="choose another name, such as my-desk_2",
-            )
+            fix = "choose another name, such as my-desk_2"
+            problem_of_name = f"{cells[column]!r} cannot be a name"
+            raise fault(column, problem_of_name, expected=NAME_RULE, found=problem, fix=fix)
     for column, allowed in (("group", GROUPS), ("unit", UNITS)):
         if cells[column] not in allowed:
-            raise SceneError(
-                f"{path}, line {line}, column {column}: {cells[column]!r} is unknown",
-                expected=f"one of {', '.join(allowed)}",
-                fix=f"correct column {column} of that line",
-            )
-    source = cells["source"]
-    where = f"{path}, line {line}, column source"
+            expected, fix = f"one of {', '.join(allowed)}", f"correct column {column} of that line"
+            raise fault(column, f"{cells[column]!r} is unknown", expected=expected, fix=fix)
+    source, folder = cells["source"], None
     is_checked = checked_groups is None or cells["group"] in checked_groups
     if not source:
-        raise SceneError(f"{where}: it is empty", fix="give world:<kind>:<seed>, or a folder of images")
+        raise fault("source", "it is empty", fix="give world:<kind>:<seed>, or a folder of images")
     if source.startswith("world:"):
         if not WORLD_SOURCE.fullmatch(source):
-            raise SceneError(
-                f"{where}: {source!r} is not the name of a synthetic world",
+            raise fault(
+                "source",
+                f"{source!r} is not the name of a synthetic world",
                 expected="world:<kind>:<seed>, as in world:tabletop:201",
                 fix="correct the source",
             )
-        folder = None
     else:
         folder = _resolved(path, source, data_root)
         # The workflow skips and reports missing scenes of a published data set.
         if folder is not None and is_checked and not source.startswith(DATA_PREFIX):
-            _check_source(where, folder)
-    gaussians = None
-    if (cell := cells.get("gaussians", "")) not in NOTHING:
-        gaussians = _resolved(path, cell, data_root)
-        where = f"{path}, line {line}, column gaussians"
-        if gaussians is None and folder is not None and is_checked:
-            raise SceneError(
-                f"{where}: {cell!r} is relative to data_root, which is not set",
-                fix="set data_root, or give a path relative to the project folder",
-            )
-        if gaussians is not None and is_checked:
-            _check_gaussians(where, gaussians)
-    features = None
-    if (cell := cells.get("features", "")) not in NOTHING:
-        features = _resolved(path, cell, data_root)
-        if features is not None and is_checked and not any(features.glob("*_s.npy")):
-            raise SceneError(
-                f"{path}, line {line}, column features: folder {features} holds no masks of LangSplat",
-                expected="<image>_s.npy and <image>_f.npy for each image",
-                fix='correct the path, or write "-" to have the masks computed',
-            )
-    poses = None
-    if (cell := cells.get("poses", "")) not in NOTHING:
-        poses = NO_POSES if cell == str(NO_POSES) else _resolved(path, cell, data_root)
-        if poses not in (None, NO_POSES) and is_checked and not poses.exists():
-            raise SceneError(
-                f"{path}, line {line}, column poses: {poses} is missing",
-                expected=f"a COLMAP model, a transforms.json, or {NO_POSES}",
-                fix='correct the path, or write "-" to use the poses in the folder',
-            )
-    return SceneRow(
+            _check_source(f"{path}, line {line}, column source", folder)
+    gaussians, features = optional("gaussians"), optional("features")
+    poses = NO_POSES if cells.get("poses") == str(NO_POSES) else optional("poses")
+    row = SceneRow(
         cells["dataset"],
         cells["scene"],
         cells["group"],
@@ -299,6 +261,36 @@ def _row(
         features,
         poses,
     )
+    if not is_checked:
+        return row
+    if gaussians is not None and (problem := _ply_problem(gaussians)):
+        raise fault(
+            "gaussians",
+            f"file {gaussians} {problem}",
+            expected="a 3DGS PLY; relative paths start from the project folder",
+            fix='correct the path, or write "-" to have the Gaussians fitted',
+        )
+    if gaussians is None and folder is not None and cells.get("gaussians", "") not in NOTHING:
+        raise fault(
+            "gaussians",
+            f"{cells['gaussians']!r} is relative to data_root, which is not set",
+            fix="set data_root, or give a path relative to the project folder",
+        )
+    if features is not None and not any(features.glob("*_s.npy")):
+        raise fault(
+            "features",
+            f"folder {features} holds no masks of LangSplat",
+            expected="<image>_s.npy and <image>_f.npy for each image",
+            fix='correct the path, or write "-" to have the masks computed',
+        )
+    if poses not in (None, NO_POSES) and not poses.exists():
+        raise fault(
+            "poses",
+            f"{poses} is missing",
+            expected=f"a COLMAP model, a transforms.json, or {NO_POSES}",
+            fix='correct the path, or write "-" to use the poses in the folder',
+        )
+    return row
 
 
 def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
@@ -311,20 +303,13 @@ def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
     return (start / Path(place.removeprefix(DATA_PREFIX)).expanduser()).resolve()
 
 
-def _check_gaussians(where: str, ply: Path) -> None:
+def _ply_problem(ply: Path) -> str:
+    """Return why a file cannot be a PLY; empty if it can."""
     if not ply.is_file():
-        problem = "is a folder" if ply.exists() else "is missing"
-    else:
-        with ply.open("rb") as stream:
-            head = stream.read(4)
-        if head in (b"ply\n", b"ply\r"):
-            return
-        problem = f"is not a PLY: it begins with {head!r}"
-    raise SceneError(
-        f"{where}: file {ply} {problem}",
-        expected="a 3DGS PLY; relative paths start from the project folder",
-        fix='correct the path, or write "-" to have the Gaussians fitted',
-    )
+        return "is a folder" if ply.exists() else "is missing"
+    with ply.open("rb") as stream:
+        head = stream.read(4)
+    return "" if head in (b"ply\n", b"ply\r") else f"is not a PLY: it begins with {head!r}"
 
 
 def _check_source(where: str, folder: Path) -> None:

@@ -18,10 +18,9 @@ LONGEST_NAME = 200
 
 
 def require_usable_name(photo: Path) -> None:
-    """Check that files of later stages can be named after a photograph.
+    """Refuse a photograph after which files of later stages cannot be named.
 
-    Raises:
-        SceneError: its name is too long, is not printable, or has braces, which are wildcards in Snakemake.
+    Braces are wildcards in Snakemake.
     """
     if "{" in photo.name or "}" in photo.name or not photo.name.isprintable():
         raise SceneError(

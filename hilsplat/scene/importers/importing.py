@@ -2,23 +2,23 @@
 
 import logging
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image, read_image, resize_to_fit, write_png
+from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import PosedView, split_views, undistort, write_scene
-from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.features import EXIF_ORIENTATION
-from hilsplat.scene.first_points import MIN_TRIANGULATED, NUM_RANDOM_POINTS, random_points, triangulate
+from hilsplat.scene.colmap import pycolmap, sparse_points
+from hilsplat.scene.features import EXIF_ORIENTATION, features_and_matches, import_images, incremental_options
 from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
-from hilsplat.scene.importers.known_views import known_views, read_colmap, read_transforms
+from hilsplat.scene.importers.known_views import read_source
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 
@@ -26,6 +26,11 @@ logger = logging.getLogger(__name__)
 
 ASPECT_TOLERANCE = 0.01
 """Relative tolerance of an image's aspect ratio: a scaled copy is accepted, another crop is not."""
+
+MIN_TRIANGULATED = 100
+"""Number of triangulated points below which random points in front of the cameras are used instead."""
+
+NUM_RANDOM_POINTS = 20_000
 
 TRAIN_FOLDER = "images_train"
 """Folder beside `images` with the training views of Gaussian Grouping's data (LERF-Mask)."""
@@ -50,23 +55,15 @@ def import_poses(
         SceneError: the model or transforms file cannot be used.
         RegistrationError: too few of its views have an image.
     """
-    points: tuple[np.ndarray, np.ndarray] | None = None
-    errors: dict[str, dict[str, Any]] = {}
-    if known.kind == "colmap":
-        described, points, errors = read_colmap(known)
-    elif known.kind == "transforms":
-        described, points = read_transforms(known)
-    else:
-        described = known_views(known)
+    described, points, errors = read_source(known)
     present = [view for view in described if view.image is not None]
     files = [view.image for view in described if view.image is not None]
     missing = sorted(view.name for view in described if view.image is None)
     _check_present(known, name, present, missing, settings)
+    named = list(zip(present, files, view_names(files), strict=True))
     views = [
         _with_pixels(view, file, view_name, work / "images", settings.max_side_px)
-        for view, file, view_name in track(
-            list(zip(present, files, view_names(files), strict=True)), "images read"
-        )
+        for view, file, view_name in track(named, "images read")
     ]
     origin_of_points = "source"
     warnings = [f"{len(missing)} of {len(described)} posed views have no image file"] if missing else []
@@ -81,7 +78,9 @@ def import_poses(
             )
             points = random_points(views, seed)
             origin_of_points = "random"
-    unposed = _images_without_pose(known, set(files))
+    beside, used = known.root / "images", set(files)
+    others = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
+    unposed = [path for path in others if path not in used]
     if unposed:
         warnings.append(f"{len(unposed)} images have no pose and are left out")
     for warning in warnings:
@@ -147,13 +146,6 @@ def _check_present(
         )
 
 
-def _images_without_pose(known: KnownPoses, used: Collection[Path]) -> list[Path]:
-    """Return the images beside a COLMAP model that have no pose in it."""
-    if known.kind != "colmap" or not (known.root / "images").is_dir():
-        return []
-    return [path for path in list_images(known.root / "images") if path not in used]
-
-
 def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
     """Read an image in the orientation of its camera, write the work image, and adapt the lens to it."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -183,11 +175,7 @@ def _without_border(
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image in the orientation whose shape fits the camera, or as stored if both do.
-
-    Raises:
-        ImageError: the image cannot be read, or no orientation fits the camera.
-    """
+    """Read an image in the orientation whose shape fits the camera, or as stored if both do."""
     upright = read_image(path)
     candidates = [upright]
     with open_image(path) as image:
@@ -203,3 +191,62 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
         found=f"{upright.shape[1]} x {upright.shape[0]} px",
         fix="use the images that the poses were computed from",
     )
+
+
+def triangulate(
+    views: Sequence[PosedView], work: Path, settings: PosesSettings, seed: int, threads: int
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Triangulate sparse points of pinhole views at their known poses, after feature matching."""
+    if len(views) < 2:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
+    folder, database = views[0].image.parent, work / "triangulation.db"
+    pycolmap.Database.open(database).close()
+    for view in views:
+        import_images(database, folder, [view.view], view.camera.model_name, view.camera)
+    names = [view.view for view in views]
+    in_own_process(features_and_matches, database, folder, names, settings, seed, threads)
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for view in views:
+            entry = opened.read_image_with_name(view.view)
+            assert entry is not None  # imported above
+            model.add_camera_with_trivial_rig(opened.read_camera(entry.camera_id))
+            image = pycolmap.Image(name=view.view, camera_id=entry.camera_id, image_id=entry.image_id)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_source[:3]))
+    target = work / "triangulated"
+    target.mkdir()
+    model = pycolmap.triangulate_points(model, database, folder, target, options=incremental_options(seed))
+    return sparse_points(model)
+
+
+def random_points(
+    views: Sequence[PosedView], seed: int
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Sample random grey points in front of the cameras, to start a fit if triangulation gives too few.
+
+    Each is on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the distance
+    from the camera to the point nearest to all optical axes.
+    """
+    generator = np.random.default_rng(seed)
+    centres = np.stack([view.centre for view in views])
+    looks = np.stack([view.cam_from_source[2, :3] for view in views])
+    # Least squares for the point nearest to all axes, with a weak prior at one camera spread ahead.
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
+    across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
+    prior = 1e-3
+    ahead = (centres + spread * looks).mean(axis=0)
+    focus = np.linalg.solve(
+        across.mean(axis=0) + prior * np.eye(3),
+        np.einsum("vij,vj->i", across, centres) / len(views) + prior * ahead,
+    )
+    rows = generator.integers(len(views), size=NUM_RANDOM_POINTS)
+    depth = np.maximum(np.linalg.norm(centres - focus, axis=1), 1e-3 * spread)[rows]
+    depth = depth * generator.uniform(0.3, 2.0, NUM_RANDOM_POINTS)
+    xyz = np.empty((NUM_RANDOM_POINTS, 3))
+    for row, view in enumerate(views):
+        chosen = rows == row
+        pixels = generator.random((int(chosen.sum()), 2)) * [view.camera.width, view.camera.height]
+        K = view.camera.calibration_matrix()
+        rays = np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=1)
+        xyz[chosen] = centres[row] + (rays * depth[chosen, None]) @ view.cam_from_source[:3, :3]
+    return xyz, np.full(xyz.shape, 128, dtype=np.uint8)

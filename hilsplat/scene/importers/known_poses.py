@@ -10,8 +10,14 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.importers.llff import POSES_BOUNDS
-from hilsplat.scene.layouts import MODELS, NO_POSES, TRANSFORMS, polycam_folders, record3d_export
+from hilsplat.scene.layouts import (
+    MODELS,
+    NO_POSES,
+    POSES_BOUNDS,
+    TRANSFORMS,
+    polycam_folders,
+    record3d_export,
+)
 
 MODEL_FILES = ("cameras", "images", "points3D")
 
@@ -37,11 +43,9 @@ class KnownView:
     """A posed view as described by its source, before its image is read.
 
     Attributes:
-        name: name in the source.
         image: its file, or None if missing.
         camera: its lens, for the image size stated by the source.
         cam_from_source: world-to-camera transform, OpenCV axes.
-        is_test: whether it is a test view in the source.
         border_px: width of a blank border to crop, px of the camera.
     """
 
@@ -54,11 +58,7 @@ class KnownView:
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Return the views after checking their lenses and poses.
-
-    Raises:
-        SceneError: a lens or pose is invalid, or three or more views all have the same pose.
-    """
+    """Return the views; refuse an invalid lens or pose, and three or more views with the same pose."""
     for view in views:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
         focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
@@ -99,7 +99,6 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
     """Search for poses of COLMAP, transforms files, LLFF, Polycam and Record3D, in this order; None if none.
 
     Args:
-        folder: folder of the images.
         named: a COLMAP model, a transforms file, or a folder with either, used instead of the poses in
             `folder`; `layouts.NO_POSES` to ignore all poses.
 

@@ -10,63 +10,44 @@ import numpy as np
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, list_images
+from hilsplat.base.files import IMAGE_SUFFIXES
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
-from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.importers.known_poses import KnownPoses, KnownView, checked
-from hilsplat.scene.importers.llff import llff_views
+from hilsplat.scene.importers.llff import read_llff
 from hilsplat.scene.importers.model_files import require_whole_files
 from hilsplat.scene.importers.phone_exports import OPENGL_TO_OPENCV, read_polycam, read_record3d
-from hilsplat.scene.model import camera_of, pose_matrix, reprojection_errors, sparse_points
+
+Points = tuple[np.ndarray, np.ndarray]
+"""Positions and colours."""
+
+Errors = dict[str, dict[str, Any]]
+"""Number of observations and mean reprojection error of each view."""
 
 
-def known_views(known: KnownPoses) -> list[KnownView]:
-    """Read the posed views of a folder in any supported format.
-
-    Raises:
-        SceneError: they cannot be read.
-    """
+def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Errors]:
+    """Read the posed views of a folder in any supported format, with points and errors if it has them."""
     if known.kind == "colmap":
-        return read_colmap(known)[0]
+        return read_colmap(known)
     if known.kind == "transforms":
-        return read_transforms(known)[0]
-    if known.kind == "polycam":
-        return checked(read_polycam(known), known)
-    if known.kind == "record3d":
-        return checked(read_record3d(known), known)
-    folder = known.root / "images"
-    images = list_images(folder if folder.is_dir() else known.root)
-    views = [
-        KnownView(image.name, image, camera, pose)
-        for image, camera, pose in llff_views(known.files[0], images)
-    ]
-    return checked(views, known)
+        return *read_transforms(known), {}
+    readers = {"polycam": read_polycam, "record3d": read_record3d, "llff": read_llff}
+    return checked(readers[known.kind](known), known), None, {}
 
 
-def read_colmap(
-    known: KnownPoses,
-) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray], dict[str, dict[str, Any]]]:
-    """Read a COLMAP model: views, points, and observations and reprojection error per view.
-
-    Raises:
-        SceneError: the model cannot be read.
-    """
+def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points, Errors]:
+    """Read a COLMAP model."""
     folder = known.files[0]
     require_whole_files(folder)
     try:
         model = pycolmap.Reconstruction(folder)
-        images = sorted((model.images[row] for row in model.reg_image_ids()), key=lambda image: image.name)
-        views = [
-            KnownView(
-                image.name,
-                _find_image(known.root, image.name),
-                pycolmap.Camera(camera_of(image).todict()),
-                pose_matrix(image.cam_from_world()),
-            )
-            for image in images
-        ]
+        views = []
+        images = (model.images[image_id] for image_id in model.reg_image_ids())
+        for image in sorted(images, key=lambda image: image.name):
+            file, camera = _find_image(known.root, image.name), pycolmap.Camera(camera_of(image).todict())
+            views.append(KnownView(image.name, file, camera, pose_matrix(image.cam_from_world())))
         errors = {
             name: {
                 "observations": len(of_view),
@@ -83,11 +64,7 @@ def read_colmap(
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """Find an image named in a source, with or without a suffix, in the folder or its images/.
-
-    Raises:
-        SceneError: the name leads out of the folder.
-    """
+    """Find an image named in a source, with or without a suffix, in the folder or its images/."""
     _check_inside(root, name)
     for base in (root / "images", root):
         candidate = base / name
@@ -109,15 +86,10 @@ def _check_inside(root: Path, name: str) -> None:
         )
 
 
-def read_transforms(
-    known: KnownPoses,
-) -> tuple[list[KnownView], tuple[np.ndarray, np.ndarray] | None]:
+def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
     """Read transforms files: camera-to-world in OpenGL axes, with common intrinsics or intrinsics per frame.
 
     Returns the views and, if a file contains `ply_file_path`, its points.
-
-    Raises:
-        SceneError: a file is not valid JSON, or a key is missing or unusable.
     """
     views: list[KnownView] = []
     points = None
@@ -208,16 +180,12 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
             found=f"{focal_x:g} and {focal_y:g}, {width:g} x {height:g} px",
             fix="export it again",
         )
-    params = [focal_x, focal_y, *centre]
-    return pycolmap.Camera(
-        model="OPENCV" if any(lens) else "PINHOLE",
-        width=width,
-        height=height,
-        params=[*params, *lens] if any(lens) else params,
-    )
+    name, distortion = ("OPENCV", lens) if any(lens) else ("PINHOLE", [])
+    params = [focal_x, focal_y, *centre, *distortion]
+    return pycolmap.Camera(model=name, width=width, height=height, params=params)
 
 
-def _read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_ply_points(path: Path) -> Points:
     """Read the points and colours of a PLY file (grey if it has no colours)."""
     from plyfile import PlyData, PlyParseError
 

@@ -1,6 +1,5 @@
 """Reader of LLFF's `poses_bounds.npy`, which 3D-OVS and other forward-facing data sets provide."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +7,11 @@ from jaxtyping import Float64
 
 from hilsplat.base.artifacts import read_npy
 from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.colmap import pycolmap
-
-POSES_BOUNDS = "poses_bounds.npy"
+from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
 
 
 def read_poses_bounds(
@@ -26,9 +25,6 @@ def read_poses_bounds(
 
     Returns:
         World-to-camera transforms (OpenCV axes), rows (height, width, focal) in px, rows (near, far).
-
-    Raises:
-        SceneError: the file does not contain such an array, or a matrix is not a rotation.
     """
     try:
         rows = read_npy(path)
@@ -57,18 +53,14 @@ def read_poses_bounds(
     return np.linalg.inv(world_from_cam), matrices[:, :, 4], rows[:, 15:]
 
 
-def llff_views(
-    path: Path, images: Sequence[Path]
-) -> list[tuple[Path, pycolmap.Camera, Float64[np.ndarray, "4 4"]]]:
-    """Return image, lens and world-to-camera transform of every row; row i is that of the i-th image by name.
+def read_llff(known: KnownPoses) -> list[KnownView]:
+    """Read the posed views of an LLFF scene; row i is that of the i-th image by name.
 
     The lens is SIMPLE_PINHOLE with its centre in the middle, for the image size on disk.
-
-    Raises:
-        SceneError: as in `read_poses_bounds`, or the number of images differs from the number of rows.
     """
+    path, folder = known.files[0], known.root / "images"
     poses, sizes, _ = read_poses_bounds(path)
-    images = sorted(images, key=lambda image: image.stem)
+    images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
     if len(images) != len(poses):
         raise SceneError(
             f"{path} has {len(poses)} poses for {len(images)} images",
@@ -80,11 +72,7 @@ def llff_views(
     for image, pose, (_, width_px, focal_px) in zip(images, poses, sizes, strict=True):
         with open_image(image) as opened:
             width, height = opened.size
-        camera = pycolmap.Camera(
-            model="SIMPLE_PINHOLE",
-            width=width,
-            height=height,
-            params=[float(focal_px * width / width_px), width / 2, height / 2],
-        )
-        views.append((image, camera, pose))
+        params = [float(focal_px * width / width_px), width / 2, height / 2]
+        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+        views.append(KnownView(image.name, image, camera, pose))
     return views

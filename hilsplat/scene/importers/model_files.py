@@ -83,11 +83,7 @@ RECORDS: dict[str, Callable[[_Walk], None]] = {
 
 
 def require_whole_files(folder: Path) -> None:
-    """Check that each binary file of a COLMAP model ends exactly after its records.
-
-    Raises:
-        SceneError: a file is damaged.
-    """
+    """Check that each binary file of a COLMAP model ends exactly after its records."""
     for name, record in RECORDS.items():
         path = folder / f"{name}.bin"
         if not path.is_file():

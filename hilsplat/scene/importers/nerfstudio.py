@@ -19,13 +19,7 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
     `dataparser_transforms.json` maps original coordinates, usually COLMAP's, to training coordinates:
     `x_training = scale * (transform @ [x_original, 1])`. The poses in `transforms.json` are in a third
     coordinate system, which `applied_transform` and `applied_scale` in that file relate to the original one.
-
-    Args:
-        dataparser: the `dataparser_transforms.json` of the training run.
-        transforms: the `transforms.json` with the source's poses; None if a COLMAP model has them.
-
-    Raises:
-        SceneError: a file is damaged, or a transform cannot be inverted.
+    Without `transforms`, a COLMAP model has the poses.
     """
     content = _read(dataparser)
     applied, applied_scale = np.eye(4), 1.0

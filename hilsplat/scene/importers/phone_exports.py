@@ -33,9 +33,6 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
 
     `keyframes/cameras/<stem>.json` or its corrected version contains fx, fy, cx, cy, width, height in px, and
     t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
-
-    Raises:
-        SceneError: a camera is not valid JSON, lacks a key, or is not a rigid pose.
     """
     images, cameras = known.files
     border_px = POLYCAM_BORDER_PX if images.name.startswith("corrected") else 0
@@ -70,9 +67,6 @@ def read_record3d(known: KnownPoses) -> list[KnownView]:
 
     `metadata` contains `K` by columns, `w` and `h` in px, and `poses`, one row per image <number>.jpg:
     quaternion xyzw and position of the camera in the world, metres, OpenGL axes.
-
-    Raises:
-        SceneError: the file is not such JSON, or a row is not a rigid pose.
     """
     from scipy.spatial.transform import Rotation
 
@@ -90,22 +84,13 @@ def read_record3d(known: KnownPoses) -> list[KnownView]:
             fix="export the recording again",
         ) from error
     images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}
-    camera = {
-        "model": "PINHOLE",
-        "width": width,
-        "height": height,
-        "params": [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]],
-    }
-    numbers = _spread(sorted(number for number in images if number < len(matrices)))
-    return [
-        KnownView(
-            images[number].name,
-            images[number],
-            pycolmap.Camera(**camera),
-            _pose(matrices[number], f"{file}, pose {number}"),
-        )
-        for number in numbers
-    ]
+    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+    views = []
+    for number in _spread(sorted(number for number in images if number < len(matrices))):
+        camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+        pose = _pose(matrices[number], f"{file}, pose {number}")
+        views.append(KnownView(images[number].name, images[number], camera, pose))
+    return views
 
 
 def _spread(items: list[Any]) -> list[Any]:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import zipfile
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -112,22 +113,6 @@ def test_an_exported_scene_is_read_back_in_the_sources_coordinates(tmp_path, wri
     assert again.image_path("a.png").read_bytes() == scene.image_path("a.png").read_bytes()
 
 
-def test_pycolmap_reads_an_exported_model(tmp_path):
-    write_colmap(tmp_path / "in")
-    export_colmap(import_scene(tmp_path / "in", tmp_path / "scene", unit="arbitrary"), tmp_path / "out")
-    before, after = (pycolmap.Reconstruction(tmp_path / name / "sparse/0") for name in ("in", "out"))
-    assert (after.num_reg_images(), after.num_points3D()) == (3, 2)
-    for number in (1, 2, 3):
-        np.testing.assert_allclose(
-            after.images[number].cam_from_world().matrix(),
-            before.images[number].cam_from_world().matrix(),
-            atol=1e-9,
-        )
-        np.testing.assert_allclose(
-            after.images[number].camera.calibration_matrix(), [[50, 0, 19], [0, 51, 16], [0, 0, 1]]
-        )
-
-
 @pytest.mark.parametrize("place", ["poses", "poses/sparse/0", "poses/transforms.json"])
 def test_poses_named_by_the_user_replace_those_in_the_folder(tmp_path, place):
     write_colmap(tmp_path / "in")
@@ -202,15 +187,20 @@ def test_unusable_transforms_are_refused(tmp_path, more, message):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
 
+@contextmanager
+def changed_frame(path):
+    content = json.loads(path.read_text())
+    yield content["frames"][1]
+    path.write_text(json.dumps(content))
+
+
 @pytest.mark.parametrize("factors", [(1, 1, -1), (1.01, 1, 1), (np.nan, 1, 1)])
 def test_poses_that_mirror_or_scale_are_refused(tmp_path, factors):
     write_transforms(tmp_path / "in", fl_x=40)
-    path = tmp_path / "in" / "transforms.json"
-    content = json.loads(path.read_text())
-    pose = np.array(content["frames"][1]["transform_matrix"])
-    pose[:3, :3] *= factors
-    content["frames"][1]["transform_matrix"] = pose.tolist()
-    path.write_text(json.dumps(content))
+    with changed_frame(tmp_path / "in/transforms.json") as frame:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, :3] *= factors
+        frame["transform_matrix"] = pose.tolist()
     with pytest.raises(SceneError, match=r"frame 1 \(images/b\): transform_matrix is not a rigid pose"):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
@@ -218,10 +208,8 @@ def test_poses_that_mirror_or_scale_are_refused(tmp_path, factors):
 @pytest.mark.parametrize("name", ["../secret", "images/../../secret", "/etc/secret"])
 def test_names_that_lead_out_of_the_folder_are_refused(tmp_path, name):
     write_transforms(tmp_path / "in", fl_x=40)
-    path = tmp_path / "in" / "transforms.json"
-    content = json.loads(path.read_text())
-    content["frames"][1]["file_path"] = name
-    path.write_text(json.dumps(content))
+    with changed_frame(tmp_path / "in/transforms.json") as frame:
+        frame["file_path"] = name
     with pytest.raises(SceneError, match=rf"name a file outside it: {name}"):
         import_scene(tmp_path / "in", tmp_path / "scene")
     write_transforms(tmp_path / "points", fl_x=40, ply_file_path=name)
@@ -290,9 +278,8 @@ def write_record3d(folder, metadata="metadata.json", images="rgb", count=3):
     )
 
 
-@pytest.mark.parametrize(("metadata", "images"), [("metadata.json", "rgb"), ("metadata", "rgbd")])
-def test_record3d_exports_are_turned_to_z_up(tmp_path, metadata, images):
-    write_record3d(tmp_path / "in", metadata, images)
+def test_record3d_exports_are_turned_to_z_up(tmp_path):
+    write_record3d(tmp_path / "in")
     scene = import_scene(tmp_path / "in", tmp_path / "scene")
     check_phone_scene(scene)
     np.testing.assert_allclose(scene.cameras["0.png"].K, [[100, 0, 61], [0, 101, 44], [0, 0, 1]])
@@ -301,12 +288,8 @@ def test_record3d_exports_are_turned_to_z_up(tmp_path, metadata, images):
 def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
     monkeypatch.setattr(phone_exports, "MAX_VIEWS", 4)
     write_record3d(tmp_path / "in", count=10)
-    assert import_scene(tmp_path / "in", tmp_path / "scene").cameras.names == (
-        "0.png",
-        "3.png",
-        "6.png",
-        "9.png",
-    )
+    scene = import_scene(tmp_path / "in", tmp_path / "scene")
+    assert scene.cameras.names == tuple(f"{number}.png" for number in (0, 3, 6, 9))
 
 
 def test_an_r3d_archive_is_imported(tmp_path):

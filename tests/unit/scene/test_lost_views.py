@@ -74,7 +74,7 @@ def test_pictures_are_stacked_with_a_white_margin(tmp_path):
 
 def test_a_stranger_among_photographs_is_shown_in_the_report(tmp_path):
     plane_views(tmp_path / "photos")
-    write_noise(tmp_path / "other", 1, size=160)
+    write_noise(tmp_path / "other", 1, (160, 160))
     (tmp_path / "other/0.png").rename(tmp_path / "photos/stranger.png")
     pose_photos(tmp_path / "photos", tmp_path / "scene")
     views = json.loads((tmp_path / "scene/registration.json").read_text())["views"]

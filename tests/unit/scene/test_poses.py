@@ -1,6 +1,7 @@
 """Photographs that cannot be posed are refused with names and numbers; renders are posed."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,12 +9,7 @@ from PIL import Image
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image, resize_to_fit
-from hilsplat.scene.features import (
-    EXIF_ORIENTATION,
-    WorkImage,
-    camera_groups,
-    prepare_images,
-)
+from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, camera_groups, prepare_images
 from hilsplat.scene.poses import check_registration, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import view_name, view_names
@@ -24,11 +20,11 @@ def pose_photos(folder, out, **settings):
     run_poses(folder, out, "photos/test", "arbitrary", False, PosesSettings(**settings), 0, 1)
 
 
-def write_noise(folder, count, size=48):
-    folder.mkdir(exist_ok=True)
+def write_noise(folder, count, size_hw=(48, 48), suffix=".png"):
+    folder.mkdir(parents=True, exist_ok=True)
     for number in range(count):
-        pixels = np.random.default_rng(number).integers(0, 256, (size, size, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{number}.png")
+        pixels = np.random.default_rng(number).integers(0, 256, (*size_hw, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{number}{suffix}")
     return folder
 
 
@@ -189,17 +185,20 @@ def found(registered, models):
     return {"images": 10, "registered": registered, "models": models, "warnings": [], "views": views}
 
 
-def test_the_gate_on_the_registered_share_names_the_lost_photographs(tmp_path):
-    settings = PosesSettings(min_registered_share=0.7)
-    check_registration(tmp_path, "photos/test", found(7, [7]), settings)
-    with pytest.raises(
-        RegistrationError,
-        match=r"at least 70% of 10(.|\n)*6 \(60\.0%\); models of 6, 4 (.|\n)*9\.jpg: no features(.|\n)*0\.60",
-    ):
-        check_registration(tmp_path, "photos/test", found(6, [6, 4]), settings)
-
-
-def test_several_models_stop_the_stage_only_if_asked(tmp_path):
-    check_registration(tmp_path, "photos/test", found(8, [8, 3]), PosesSettings())
-    with pytest.raises(RegistrationError, match=r"2 separate models(.|\n)*8\.jpg"):
-        check_registration(tmp_path, "photos/test", found(8, [8, 3]), PosesSettings(several_models="stop"))
+@pytest.mark.parametrize(
+    ("accepted", "refused", "settings", "message"),
+    [
+        (
+            found(7, [7]),
+            found(6, [6, 4]),
+            {"min_registered_share": 0.7},
+            r"at least 70% of 10(.|\n)*6 \(60\.0%\); models of 6, 4 (.|\n)*9\.jpg: no features(.|\n)*0\.60",
+        ),
+        (found(8, [8]), found(8, [8, 3]), {"several_models": "stop"}, r"2 separate models(.|\n)*8\.jpg"),
+        (found(8, [8, 3]), found(0, []), {}, r"no camera pose could be found(.|\n)*0\.jpg: no features"),
+    ],
+)
+def test_too_few_views_and_separate_models_are_refused_as_configured(accepted, refused, settings, message):
+    check_registration(Path("photos"), "photos/test", accepted, PosesSettings(**settings))
+    with pytest.raises(RegistrationError, match=message):
+        check_registration(Path("photos"), "photos/test", refused, PosesSettings(**settings))
