@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import NAME_RULE, list_images, name_problem
 from hilsplat.base.images import open_image, read_image, resize_to_fit
@@ -47,7 +47,6 @@ class PhotoReport:
     """Report on a folder of photographs.
 
     Attributes:
-        folder: folder of the photographs.
         sizes: number of readable photographs per upright size (height, width), px.
         unreadable: (file name, reason) of each image that cannot be read.
         num_rotated: number of photographs that an EXIF flag rotates.
@@ -96,9 +95,7 @@ class PhotoReport:
 def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     """Read every photograph in a folder (or its `images/`) in full, and report contents and likely problems.
 
-    Args:
-        folder: folder of the photographs.
-        poses: poses that replace those in the folder (`has_known_poses`).
+    Other `poses` may replace those in the folder (`has_known_poses`).
 
     Raises:
         SceneError: the folder does not exist, or two photographs differ only in their suffix.
@@ -118,11 +115,10 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     checked: list[CheckedPhoto] = []
     for path in track(list_images(where), "photographs checked"):
         require_usable_name(path)
-        if not path.exists():
-            unreadable.append((path.name, "it is a link to a file that does not exist"))
-            continue
-        if path.stat().st_size == 0:
-            unreadable.append((path.name, "the file is empty"))
+        if not path.exists() or path.stat().st_size == 0:
+            is_link = not path.exists()
+            reason = "it is a link to a file that does not exist" if is_link else "the file is empty"
+            unreadable.append((path.name, reason))
             continue
         try:
             pixels = read_image(path)
@@ -185,8 +181,6 @@ def add_scene(
     Frames of a video and the contents of an archive are written to `photos/<name>/` in the project.
 
     Args:
-        sheet: the scene sheet.
-        name: name of the new scene.
         photos: folder of photographs or of videos, a video, or a zip archive of photographs.
         unit: unit of lengths, for a folder with metric poses.
         frames: maximum number of frames taken from videos.
@@ -225,10 +219,8 @@ def add_scene(
     with prepared_photographs(photos, root / PHOTOS / name, frames) as existing:
         extra = _trained(existing.folder, {"poses": poses, "gaussians": gaussians, "features": features})
         notes = _notes(existing.folder, extra)
-        if skipped := sorted(existing.folder.rglob("*.pth"))[:3]:
-            notes.append(
-                f"not read, because a pickle can run code: {', '.join(path.name for path in skipped)}"
-            )
+        if skipped := [path.name for path in sorted(existing.folder.rglob("*.pth"))[:3]]:
+            notes.append(f"not read, because a pickle can run code: {', '.join(skipped)}")
         files = _labels(existing.folder, labels)
         annotated = root / "annotated" / PHOTOS / name
         if files and not annotated.exists():
@@ -247,9 +239,6 @@ def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
     """Return the user's paths, else those of other programs' files in the folder, by sheet column.
 
     Without known poses, the coordinates of another program's Gaussians are unknown, so they are not used.
-
-    Raises:
-        SceneError: a path given by the user does not exist.
     """
     for what, path in named.items():
         if path is not None and path != NONE and not path.exists():
@@ -268,11 +257,7 @@ def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
 
 
 def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
-    """Return notes about the files used in addition to the photographs.
-
-    Raises:
-        SceneError: the poses in the folder are incomplete, or those given cannot be used.
-    """
+    """Return notes about the files used in addition to the photographs."""
     known = find_known_poses(folder, extra.get("poses"))
     notes = [f"poses: {', '.join(map(str, known.files)) if known else 'structure from motion'}"]
     notes += [f"{what}: {path}" for what, path in extra.items() if what != "poses"]
@@ -282,11 +267,7 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
 
 
 def _labels(folder: Path, asked: Path | None) -> list[Path]:
-    """Return the label files given by the user, or else those found.
-
-    Raises:
-        SceneError: the given folder contains no label file.
-    """
+    """Return the label files given by the user, or else those found."""
     if asked is None or asked == NONE:
         return label_files(folder) if asked is None else []
     files = sorted(asked.glob("*.json"))
@@ -318,8 +299,6 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
 
 def _append(sheet: Path, name: str, photos: Path, unit: str, extra: dict[str, Path]) -> None:
     """Append the row of a scene to the sheet, and add missing columns."""
-    from hilsplat.base.artifacts import write_text
-
     root = project_root(sheet)
     places = {
         what: path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)

@@ -61,8 +61,6 @@ class CheckedPhoto:
     """The data of a photograph that the checks use.
 
     Attributes:
-        name: file name.
-        size_hw: height and width, upright, px.
         focal_px: focal length from EXIF, px of the full picture; None if unknown.
         grey: upright grey copy, longer side at most `CHECK_SIDE_PX`.
     """

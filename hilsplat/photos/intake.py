@@ -1,29 +1,33 @@
-"""Conversion of videos and archives into a folder of photographs."""
+"""Conversion of videos, and of archives from untrusted sources, into a folder of photographs."""
 
 import shutil
+import stat
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from hilsplat.base.artifacts import atomic_folder, read_json, write_json
+from hilsplat.base.artifacts import atomic_folder, read_json, require_free_space, write_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import VIDEO_SUFFIXES, list_images, list_videos
+from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_images, list_videos
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
 MARK = ".made_from.json"
 """Hidden file that records the source files of a converted folder."""
 
+MAX_FILES = 50_000
+MAX_TOTAL_GIB = 20
+"""Limits on the contents of an archive; a capture has a few hundred files and rarely a gigabyte."""
+
+POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
+"""Suffixes of files that may contain poses or points; Record3D's `metadata` has no suffix."""
+
 
 @dataclass(frozen=True)
 class PreparedFolder:
-    """A folder to be registered as a scene's source.
-
-    Attributes:
-        folder: the folder.
-        notes: sentences about the conversion and about skipped files.
-    """
+    """A folder to be registered as a scene's source, with notes on the conversion and on skipped files."""
 
     folder: Path
     notes: tuple[str, ...] = ()
@@ -37,7 +41,6 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
 
     Args:
         source: a folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d).
-        target: folder to create if the source must be converted.
         frames: maximum number of frames taken from videos.
 
     Raises:
@@ -66,8 +69,6 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
     elif source.suffix.lower() in (".zip", ".r3d"):
 
         def make(folder: Path) -> list[str]:
-            from hilsplat.photos.archive import unpack_photographs
-
             unpack_photographs(source, folder)
             return [f"{source.name} unpacked to {target}"]
 
@@ -97,8 +98,8 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
 
 
 def _mark(files: list[Path], frames: int) -> dict[str, Any]:
-    found = [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
-    return {"files": [list(each) for each in found], "frames": frames}
+    found = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    return {"files": found, "frames": frames}
 
 
 def _videos_of(source: Path) -> list[Path]:
@@ -108,3 +109,69 @@ def _videos_of(source: Path) -> list[Path]:
     if list_images(photo_folder(source)) or has_known_poses(source):
         return []
     return list_videos(source)
+
+
+def unpack_photographs(archive: Path, folder: Path) -> None:
+    """Unpack the images and pose files of a zip archive into an existing, empty folder.
+
+    Every entry is checked before anything is written, and at most the declared sizes are written.
+
+    Raises:
+        SceneError: it is not a zip archive, is damaged, encrypted or too large, or contains links or names
+            that lead out of the folder.
+        DiskSpaceError: there is too little free space.
+    """
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            entries = [entry for entry in opened.infolist() if not entry.is_dir()]
+            _check_entries(archive, entries)
+            chosen = [entry for entry in entries if _is_wanted(PurePosixPath(entry.filename))]
+            require_free_space(folder, sum(entry.file_size for entry in chosen) / 2**20 + 200)
+            for entry in chosen:
+                target = folder / PurePosixPath(entry.filename)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                # zipfile stops at the declared size, and checks the size and the CRC.
+                with opened.open(entry) as source, target.open("xb") as sink:
+                    while block := source.read(1 << 20):
+                        sink.write(block)
+    except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, RuntimeError) as error:
+        raise SceneError(
+            f"archive {archive} cannot be unpacked: {error}",
+            found=f"a file of {archive.stat().st_size} bytes" if archive.is_file() else "no file",
+            fix="copy it again, or unpack it yourself and give the folder",
+        ) from error
+
+
+def _is_wanted(name: PurePosixPath) -> bool:
+    """Return whether an entry is an image or may contain poses; files that operating systems add are not."""
+    if any(part.startswith(".") or part == "__MACOSX" for part in name.parts):
+        return False
+    return name.suffix.lower() in IMAGE_SUFFIXES | POSE_SUFFIXES or name.name == "metadata"
+
+
+def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse an archive that is too large or could write outside the folder."""
+    fix = "unpack it yourself with a program that you trust, look at it, and give the folder"
+    total_gib = sum(entry.file_size for entry in entries) / 2**30
+    if len(entries) > MAX_FILES or total_gib > MAX_TOTAL_GIB:
+        raise SceneError(
+            f"archive {archive} is too large for a set of photographs",
+            expected=f"at most {MAX_FILES} files and {MAX_TOTAL_GIB} GiB unpacked",
+            found=f"{len(entries)} files and {total_gib:.1f} GiB",
+            fix=fix,
+        )
+    names: set[str] = set()
+    for entry in entries:
+        name = PurePosixPath(entry.filename)
+        if name.is_absolute() or ".." in name.parts or "\\" in entry.filename:
+            problem = "leads out of the archive's folder"
+        elif stat.S_ISLNK(entry.external_attr >> 16):
+            problem = "is a link"
+        elif entry.flag_bits & 1:
+            problem = "is encrypted"
+        elif str(name) in names:
+            problem = "is there twice"
+        else:
+            names.add(str(name))
+            continue
+        raise SceneError(f"archive {archive}: entry {entry.filename!r} {problem}", fix=fix)

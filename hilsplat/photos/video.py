@@ -8,6 +8,7 @@ from itertools import groupby, pairwise
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
@@ -17,7 +18,6 @@ from PIL import Image
 from hilsplat.base.artifacts import sha256_of_file, write_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.progress import track
-from hilsplat.photos.motion import displacement, sharpness
 from hilsplat.photos.video_colours import rgb_pixels
 
 logger = logging.getLogger(__name__)
@@ -37,16 +37,21 @@ JPEG_QUALITY = 95
 USUAL_RATE = 30.0
 """Assumed frames per second for files without a frame rate or time stamps."""
 
+NUM_CORNERS = 300
+PYRAMID_LEVELS = 4
+LOST = 0.25
+"""Displacement, as a share of the diagonal, assumed if too few corners can be tracked."""
+
+MIN_FOLLOWED = 20
+"""Minimum number of corners tracked forwards and backwards for a valid measurement."""
+
 
 @dataclass(frozen=True)
 class Frame:
     """A video frame that may become a photograph.
 
     Attributes:
-        video: index of its video.
         number: index of the frame among the intact frames of its video.
-        time_s: presentation time.
-        sharpness: variance of the Laplacian.
         grey: small copy, as stored (not rotated).
     """
 
@@ -64,7 +69,6 @@ class Decoding:
     Attributes:
         stated_s: duration according to the file, or None.
         decoded_s: presentation time of the last intact frame.
-        num_frames: number of intact frames.
         num_damaged: number of packets and frames that could not be decoded.
     """
 
@@ -86,13 +90,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
     A video is decoded twice, once to select and once to write frames, so that memory contains only small
     copies. The same videos give the same bytes.
 
-    Args:
-        videos: files, in the order of their frames.
-        folder: an existing, empty folder.
-        count: maximum number of frames.
-
-    Returns:
-        notes for the user: damaged parts, and fewer frames than requested.
+    Return notes for the user: damaged parts, and fewer frames than requested.
 
     Raises:
         SceneError: a video cannot be read or has no intact frame.
@@ -116,10 +114,10 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
         notes.append(
             f"{len(chosen)} frames instead of {count}: no more of them differ enough from each other"
         )
-    names = {(frame.video, frame.number): f"{row:04d}.jpg" for row, frame in enumerate(chosen, start=1)}
+    named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
     for position, video in enumerate(videos):
-        name_of_frame = {number: name for (of_video, number), name in names.items() if of_video == position}
-        _write_frames(video, name_of_frame, folder)
+        names = {frame.number: name for name, frame in named.items() if frame.video == position}
+        _write_frames(video, names, folder)
     origin = {
         "videos": [
             {
@@ -133,12 +131,12 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
         ],
         "settings": {"frames": count, "min_step": MIN_STEP, "jpeg_quality": JPEG_QUALITY},
         "frames": {
-            names[frame.video, frame.number]: {
+            name: {
                 "video": videos[frame.video].name,
                 "seconds": round(frame.time_s, 3),
                 "sharpness": round(frame.sharpness, 2),
             }
-            for frame in chosen
+            for name, frame in named.items()
         },
         "notes": notes,
     }
@@ -164,11 +162,7 @@ def _damage(video: Path, decoding: Decoding) -> list[str]:
 
 @contextmanager
 def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open the first video stream of a file.
-
-    Raises:
-        SceneError: the file is not a video, or its header is missing.
-    """
+    """Open the first video stream of a file."""
     try:
         container = av.open(str(video), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
@@ -334,3 +328,42 @@ def _step(one: Frame, other: Frame) -> float:
     if one.video != other.video or one.grey.shape != other.grey.shape:
         return MIN_STEP
     return displacement(one.grey, other.grey)
+
+
+# ---- two pictures of one camera ----------------------------------------------------------------
+
+
+def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for steep edges.
+
+    It can compare pictures of the same place only, because it depends on the content.
+    """
+    return float(cv2.Laplacian(grey, cv2.CV_32F, ksize=3).var())
+
+
+def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"]) -> float:
+    """Return the upper quartile of corner displacements between two pictures, as a share of the diagonal.
+
+    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that miss their start by a
+    pixel are ignored. Unlike the median, the upper quartile captures an object on a turntable before a static
+    background. The result is 0 for pictures with too few corners, and `LOST` if too few can be tracked.
+    """
+    corners = cv2.goodFeaturesToTrack(one, NUM_CORNERS, qualityLevel=0.01, minDistance=7)
+    if corners is None or len(corners) < MIN_FOLLOWED:
+        return 0.0
+    there, found = _followed(one, other, corners)
+    back, returned = _followed(other, one, there)
+    sound = found & returned & (np.linalg.norm(back - corners, axis=2).ravel() < 1)
+    if sound.sum() < MIN_FOLLOWED:
+        return LOST
+    moved = np.linalg.norm((there - corners)[sound].reshape(-1, 2), axis=1)
+    return float(np.percentile(moved, 75) / np.hypot(*one.shape))
+
+
+def _followed(
+    one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"], corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions of corners in the other picture, (n, 1, 2), and whether each was found, (n)."""
+    start = np.zeros_like(corners)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, start, maxLevel=PYRAMID_LEVELS)
+    return np.asarray(there), np.asarray(found).ravel() > 0

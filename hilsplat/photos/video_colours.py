@@ -1,13 +1,11 @@
 """Conversion of video frames to 8-bit sRGB by the stream's matrix and range, with tone-mapped HDR."""
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
+from av import VideoFrame
+from av.video.reformatter import Interpolation
 from jaxtyping import Float32, Float64, UInt8, UInt16
-
-if TYPE_CHECKING:
-    from av import VideoFrame
 
 PQ, HLG = 16, 18
 """Transfer characteristics of HDR video (ITU-T H.273): SMPTE ST 2084 and ARIB STD-B67."""
@@ -36,24 +34,20 @@ BT709_FROM_BT2020: Float64[np.ndarray, "3 3"] = np.array(
 BT2020_LUMA = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
 
 
-def rgb_pixels(frame: "VideoFrame") -> UInt8[np.ndarray, "H W 3"]:
+def rgb_pixels(frame: VideoFrame) -> UInt8[np.ndarray, "H W 3"]:
     """Convert a decoded frame as stored (not rotated) to 8-bit sRGB.
 
     If a stream states no matrix, the default of players is used: BT.709 for 720 lines or more, else BT.601.
     HDR (PQ or HLG) is converted to linear light with BT.709 primaries and compressed highlights.
     """
-    from av.video.reformatter import Interpolation
-
     exact = Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
     exact |= Interpolation.BITEXACT
     matrix = int(frame.colorspace)
     if matrix == UNSPECIFIED:
         matrix = BT709 if min(frame.width, frame.height) >= 720 else BT601
     is_hdr = int(frame.color_trc) in (PQ, HLG)
-    turned = frame.reformat(
-        format="rgb48le" if is_hdr else "rgb24", src_colorspace=matrix, interpolation=exact, threads=1
-    )
-    pixels = turned.to_ndarray()
+    kind = "rgb48le" if is_hdr else "rgb24"
+    pixels = frame.reformat(format=kind, src_colorspace=matrix, interpolation=exact, threads=1).to_ndarray()
     if not is_hdr:
         return pixels
     is_hlg = int(frame.color_trc) == HLG

@@ -4,24 +4,15 @@ import json
 import stat
 import zipfile
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.photos import archive
+from hilsplat.photos import intake
 from hilsplat.photos.add import add_scene
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.sheet import read_sheet
 from tests.unit.photos.test_video import pan, write_video
-
-
-def write_photos(folder, count, suffix=".jpg"):
-    folder.mkdir(parents=True, exist_ok=True)
-    for number in range(count):
-        pixels = np.random.default_rng(number).integers(0, 256, (60, 80, 3), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / f"{number}{suffix}")
-    return folder
+from tests.unit.scene.test_poses import write_noise
 
 
 def zipped(path, entries):
@@ -77,7 +68,7 @@ def test_a_video_in_which_nothing_moves_leaves_nothing_behind(tmp_path, sheet):
 
 def test_what_is_in_the_way_stays(tmp_path, sheet):
     mine = tmp_path / "project/photos/desk"
-    write_photos(mine, 1)
+    write_noise(mine, 1)
     with pytest.raises(SceneError, match=r"photos/desk is in the way"):
         add_scene(sheet, "desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20)))
     assert len(list(mine.iterdir())) == 1
@@ -96,7 +87,7 @@ def test_live_photos_are_read_as_photographs_and_said(tmp_path, sheet):
     import pillow_heif
 
     pillow_heif.register_heif_opener()
-    folder = write_photos(tmp_path / "phone", 4, ".HEIC")
+    folder = write_noise(tmp_path / "phone", 4, suffix=".HEIC")
     (folder / "0.MOV").write_bytes(b"never opened")
     report = add_scene(sheet, "desk", folder)
     assert report.num_readable == 4
@@ -114,20 +105,15 @@ def test_other_files_are_refused(tmp_path, sheet):
 
 
 def test_a_zip_is_unpacked_and_its_only_folder_unwrapped(tmp_path, sheet):
-    photos = write_photos(tmp_path / "source", 4)
+    photos = write_noise(tmp_path / "source", 4, suffix=".jpg")
     entries = photo_entries(photos, "Trip 1/best/")
     junk = [("__MACOSX/Trip 1/._0.jpg", b"x"), ("Trip 1/.DS_Store", b"x"), ("Trip 1/run.sh", b"rm -rf")]
     report = add_scene(sheet, "desk", zipped(tmp_path / "trip.ZIP", entries + junk))
     assert report.num_readable == 4
     assert sources(sheet) == {"desk": "photos/desk/Trip 1/best"}
     unpacked = tmp_path / "project/photos/desk"
-    assert sorted(p.name for p in unpacked.rglob("[!.]*") if p.is_file()) == [
-        "0.jpg",
-        "1.jpg",
-        "2.jpg",
-        "3.jpg",
-    ]
-    assert (unpacked / "Trip 1/best/2.jpg").read_bytes() == (photos / "2.jpg").read_bytes()
+    files = {path.name: path.read_bytes() for path in unpacked.rglob("[!.]*") if path.is_file()}
+    assert files == {path.name: path.read_bytes() for path in photos.iterdir()}
 
 
 def link(name):
@@ -136,20 +122,15 @@ def link(name):
     return entry
 
 
+OUTSIDE = [(name, "leads out") for name in ("../evil.jpg", "a/../../evil.jpg", "/evil.jpg", "..\\evil.jpg")]
+
+
 @pytest.mark.parametrize(
-    ("entry", "problem"),
-    [
-        ("../evil.jpg", "leads out"),
-        ("a/../../evil.jpg", "leads out"),
-        ("/evil.jpg", "leads out"),
-        ("..\\evil.jpg", "leads out"),
-        (link("evil.jpg"), "is a link"),
-        ("0.jpg", "is there twice"),
-    ],
+    ("entry", "problem"), [*OUTSIDE, (link("evil.jpg"), "is a link"), ("0.jpg", "is there twice")]
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_archives_that_could_write_elsewhere_are_refused_whole(tmp_path, sheet, entry, problem):
-    entries = photo_entries(write_photos(tmp_path / "source", 4))
+    entries = photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
     bad = zipped(tmp_path / "bad.zip", [*entries, (entry, b"x")])
     with pytest.raises(SceneError, match=rf"bad\.zip: entry '.*(evil|0)\.jpg' {problem}"):
         add_scene(sheet, "desk", bad)
@@ -158,15 +139,12 @@ def test_archives_that_could_write_elsewhere_are_refused_whole(tmp_path, sheet, 
 
 
 def test_archives_that_state_too_much_are_refused(tmp_path, sheet, monkeypatch):
-    entries = photo_entries(write_photos(tmp_path / "source", 4))
+    entries = photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
     good = zipped(tmp_path / "good.zip", entries)
-    monkeypatch.setattr(archive, "MAX_FILES", 3)
-    with pytest.raises(SceneError, match=r"too large(.|\n)*at most 3 files(.|\n)*4 files"):
-        add_scene(sheet, "desk", good)
-    monkeypatch.setattr(archive, "MAX_FILES", 10)
-    monkeypatch.setattr(archive, "MAX_TOTAL_GIB", 1e-6)
-    with pytest.raises(SceneError, match=r"too large(.|\n)*GiB unpacked"):
-        add_scene(sheet, "desk", good)
+    for limit, value, message in (("MAX_TOTAL_GIB", 1e-6, "GiB"), ("MAX_FILES", 3, r"3 files(.|\n)*4 files")):
+        monkeypatch.setattr(intake, limit, value)
+        with pytest.raises(SceneError, match=rf"too large(.|\n)*at most (.|\n)*{message}"):
+            add_scene(sheet, "desk", good)
 
 
 def test_an_archive_that_lies_about_a_size_writes_no_more_than_it_states(tmp_path):
@@ -177,12 +155,14 @@ def test_an_archive_that_lies_about_a_size_writes_no_more_than_it_states(tmp_pat
     bomb.write_bytes(content)
     (tmp_path / "out").mkdir()
     with pytest.raises(SceneError, match=r"bomb\.zip cannot be unpacked"):
-        archive.unpack_photographs(bomb, tmp_path / "out")
+        intake.unpack_photographs(bomb, tmp_path / "out")
     assert (tmp_path / "out/a.jpg").stat().st_size <= 1000
 
 
 def test_damaged_and_encrypted_archives_are_refused(tmp_path, sheet):
-    whole = zipped(tmp_path / "a.zip", photo_entries(write_photos(tmp_path / "source", 4))).read_bytes()
+    whole = zipped(
+        tmp_path / "a.zip", photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
+    ).read_bytes()
     (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
     hurt = bytearray(whole)
     hurt[200:300] = bytes(100)

@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.photos.motion import displacement
-from hilsplat.photos.video import MIN_STEP, extract_frames
+from hilsplat.photos.video import MIN_STEP, displacement, extract_frames
 from hilsplat.photos.video_colours import _pq_light, srgb_from_hdr
 
 
