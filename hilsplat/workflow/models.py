@@ -11,13 +11,7 @@ from hilsplat.scene.sheet import PHOTOS
 
 
 def check_models(stages: StageSettings, where: str) -> None:
-    """Raise an error if a model folder is missing or contains another kind of model.
-
-    The settings have no `auto` (`StageSettings.with_models`); `where` names scene and variant in the message.
-
-    Raises:
-        HilsplatError: the message names the setting.
-    """
+    """Refuse a model folder that is missing or contains another kind of model; `stages` has no `auto`."""
     models = [("clip", "clip", stages.clip.model, stages.clip.variant)]
     if stages.masks.segmenter == "sam":
         models.append(("masks", "sam", stages.masks.model, stages.masks.variant))
@@ -29,11 +23,7 @@ def check_models(stages: StageSettings, where: str) -> None:
 
 
 def check_device(stages: StageSettings, where: str) -> None:
-    """Raise an error if a setting is `device: cuda` and this machine has no usable CUDA device.
-
-    Raises:
-        HilsplatError: the message names the setting.
-    """
+    """Refuse a setting `device: cuda` if this machine has no usable CUDA device."""
     from hilsplat.splat.rasterise.device import choose_device
 
     for section, values in stages:
@@ -76,9 +66,6 @@ def models_of_photographs(config: Path, scene: str, features: Path | None = None
     """Return lines about the models that a scene of photographs will use.
 
     If the project has no such configuration, the installed one is read.
-
-    Raises:
-        SettingsError: the configuration is invalid.
     """
     run = parse_run(read_config(config if config.is_file() else INSTALLED / CONFIG))
     stages = run.stages("default", (PHOTOS, f"{PHOTOS}/{scene}")).with_models()

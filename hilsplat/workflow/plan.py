@@ -46,10 +46,7 @@ class Plan:
     """Scenes, settings and targets of a configuration.
 
     Attributes:
-        run: the validated configuration.
-        results: results folder.
         rows: scenes in the sheet, and scenes on disk of data sets whose scenes differ between users.
-        scenes: scenes to run.
         absent: skipped scene -> reason.
     """
 
@@ -96,11 +93,7 @@ class Plan:
             self.data.require_no_braces(row)
 
     def require_usable(self, *, devices: bool) -> None:
-        """Check that the models exist and, with `devices`, that this machine has the devices in the settings.
-
-        Raises:
-            HilsplatError: the message names the setting, and a scene and variant that use it.
-        """
+        """Check that the models exist and, with `devices`, that this machine has the configured devices."""
         if self.results.exists() and not self.results.is_dir():
             raise SettingsError(
                 f"results: {self.results} is not a folder", fix="move that file away, or name another folder"
@@ -388,13 +381,9 @@ class Plan:
 
 
 def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
-    """Raise an error for a misspelt scene in `overrides`, `queries` or `sweep_scenes`.
+    """Refuse a misspelt scene in `overrides`, `queries` or `sweep_scenes`, and suggest the closest name.
 
-    Args:
-        rows: scenes of the sheet and of the default sheet, because settings for the latter are allowed too.
-
-    Raises:
-        SettingsError: the message suggests the closest name.
+    `rows` includes the default sheet, because settings for its scenes are allowed too.
     """
     datasets = {row.dataset for row in rows} | {PHOTOS}
     scenes = [row.name for row in rows]

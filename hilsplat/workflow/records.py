@@ -38,8 +38,6 @@ class Expected:
 
     Attributes:
         output: one of the outputs that its rule declares, if it is not the artifact itself.
-        stage: key of `STAGES`.
-        settings: settings expected in its provenance.
         seed: seed expected in its provenance; None if nothing is random.
         plugins: readers or baselines that are part of its code digest.
     """

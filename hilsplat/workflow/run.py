@@ -29,7 +29,7 @@ from hilsplat.base.files import INSTALLED, project_path
 from hilsplat.base.processes import jobs_end_with_this_process, remove_leftovers
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
-from hilsplat.workflow.forecast import forecasts
+from hilsplat.workflow.estimate import forecasts
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import outdated
 
@@ -109,8 +109,7 @@ def _locked(name: str, kind: int) -> TextIOWrapper:
 def start_project(folder: Path) -> list[Path]:
     """Copy the default configuration and scene sheet into a folder, where they override the installed ones.
 
-    Raises:
-        HilsplatError: one of them already exists; no file is then written.
+    If one of them already exists, nothing is written.
     """
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:

@@ -56,10 +56,7 @@ def options_of(named: Mapping[str, Any]) -> str:
 class SceneData:
     """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels.
 
-    Args:
-        rows: scenes of the sheet.
-        data_root: folder of the published data sets.
-        path: returns a path in the results folder of a job's scene.
+    `path` returns a path in the results folder of a job's scene.
     """
 
     def __init__(self, rows: Iterable[SceneRow], data_root: str, path: Callable[..., str]) -> None:

@@ -41,7 +41,6 @@ def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
     """Return the digest of the code that a stage runs.
 
     Args:
-        stage: key of `STAGES`.
         plugins: readers or baselines that the stage uses in this run (see `base.plugins`).
 
     Raises:

@@ -1,11 +1,14 @@
-"""The table after a dry run: jobs, disk, memory and hours of each data set."""
+"""The table after a dry run, and the times that `hilsplat run` predicts for photographs."""
 
 import re
+from types import SimpleNamespace
 
 import pytest
 
+from hilsplat.workflow import estimate
 from hilsplat.workflow.estimate import GPU_GAIN, RunEstimate
 from hilsplat.workflow.resources import START_S, JobResources
+from tests.unit.workflow import test_plan
 from tests.unit.workflow.test_resources import plan
 
 SCENES = ({"dataset": "synthetic", "scene": "0"}, {"dataset": "synthetic", "scene": "1"})
@@ -21,13 +24,13 @@ def resources(tmp_path, monkeypatch):
 
 
 def test_jobs_are_summed_by_data_set(resources):
-    estimate = RunEstimate(resources)
-    assert estimate.lines() == [], "nothing would run"
+    run = RunEstimate(resources)
+    assert run.lines() == [], "nothing would run"
     for scene in SCENES:
-        estimate.add("poses", scene, 1000)
-        estimate.add("gaussians", scene, 4000)
-    estimate.add("table", {"table": "lerf"}, 500)
-    rows = [re.split(r"\s{2,}", line) for line in estimate.lines()[1:5]]
+        run.add("poses", scene, 1000)
+        run.add("gaussians", scene, 4000)
+    run.add("table", {"table": "lerf"}, 500)
+    rows = [re.split(r"\s{2,}", line) for line in run.lines()[1:5]]
     assert rows[0] == ["", "scenes", "jobs", "disk", "memory", "hours, 2 cores", "hours, GPU"]
     # two scenes of 7920 core seconds on two cores; 7200 of them by the GPU
     gpu = (2 * 7200 / GPU_GAIN["gaussians"] + 720) / 3600
@@ -50,3 +53,48 @@ def test_more_steps_prompts_and_crops_take_longer(tmp_path):
     baseline = {"method": {"name": "langsplat", "steps": 3000}}
     longer = {"method": {"name": "langsplat", "steps": 30000}}
     assert seconds("method", **longer) == pytest.approx(10 * seconds("method", **baseline), rel=0.2)
+
+
+KEY_VIEWS = {"masks": {"key_views": 0.5}, "clip": {"crops_per_node": 3}}
+
+
+@pytest.fixture
+def photographs(tmp_path, monkeypatch):
+    """Seventeen photographs, a SAM of 20 s a view, a CLIP of 0.1 s a crop, and 75 s for each other stage."""
+    (tmp_path / "desk").mkdir()
+    for number in range(16):
+        (tmp_path / f"desk/photo{number}.jpg").touch()
+    for module in ("estimate", "plan", "resources"):
+        monkeypatch.setattr(
+            f"hilsplat.workflow.{module}.read_model", lambda folder: SimpleNamespace(embedded=False)
+        )
+    seconds = {"image": 19 - 10.24, "preview": 0.007, "masks": 0.01, "crop": 0.1}
+    monkeypatch.setattr("hilsplat.embed.model_check.seconds_of", lambda *inputs: seconds)
+    monkeypatch.setattr(estimate.JobResources, "core_seconds", lambda self, rule, job: 75.0)
+    return tmp_path
+
+
+def test_first_answer_and_all_photographs_are_predicted(photographs):
+    masks, variants = {"prompts": "guided"}, {"key-views": KEY_VIEWS}
+    found = test_plan.plan(
+        photographs, groups=["photos"], variants=variants, main_variants=["default"], masks=masks
+    )
+    (line,) = estimate.forecasts(found, 2)
+    # 15 training views: 150 + 7.5 x 20 + 75 + 400 x 3 x 0.1 = 495 core seconds, then 7.5 x 12.3 + 150 + 200
+    assert line.startswith("photos/desk: first answer in about 4 min, all photographs in about 8 min.")
+    assert "20 s of SAM on one of 2 cores, a crop 0.10 s of CLIP" in line
+
+
+def test_without_key_views_there_is_one_time(photographs):
+    found = test_plan.plan(photographs, groups=["photos"], variants={}, main_variants=["default"])
+    (line,) = estimate.forecasts(found, 1)
+    assert line.startswith("photos/desk: all photographs in about 13 min.")
+
+
+def test_scenes_that_answer_and_synthetic_scenes_have_no_forecast(photographs, monkeypatch):
+    monkeypatch.chdir(photographs)
+    found = test_plan.plan(
+        photographs, groups=["photos", "benchmark"], variants={}, main_variants=["default"]
+    )
+    (photographs / "results/photos/desk/default/clip").mkdir(parents=True)
+    assert estimate.forecasts(found, 2) == []

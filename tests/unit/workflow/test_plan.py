@@ -39,6 +39,10 @@ class Job:
     variant: str = "default"
 
 
+def variants_in(paths: list[str]) -> list[str]:
+    return [path.split("/")[3] for path in paths]
+
+
 def plan(folder: Path, **config: object) -> Plan:
     (folder / "config").mkdir(exist_ok=True)
     (folder / "desk").mkdir(exist_ok=True)
@@ -78,10 +82,9 @@ def test_a_run_without_scenes_says_what_there_is(tmp_path):
 
 @pytest.mark.parametrize("name", ["lifted", "in-no-table"])
 def test_an_unknown_method_stops_at_once(tmp_path, name):
+    variants = {**VARIANTS, name: {"method": {"name": "magic"}}}
     with pytest.raises(HilsplatError, match="there is no method 'magic'"):
-        plan(
-            tmp_path, main_variants=list(VARIANTS), variants={**VARIANTS, name: {"method": {"name": "magic"}}}
-        )
+        plan(tmp_path, main_variants=list(VARIANTS), variants=variants)
 
 
 def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(tmp_path):
@@ -96,9 +99,8 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     assert f"--labels annotated/photos/desk --data-root {tmp_path}" in found.data.truth_option(job, None)
     assert found.data.label_readers(job) == ("hilsplat.datasets.images.annotated:DATASET",)
     both = plan(tmp_path, groups=["photos", "benchmark"], data_root=str(tmp_path))
-    assert "results/tables/lerf.csv" in targets.default(both) and not any(
-        "desk" in path for path in targets.scores(both, "lerf")
-    )
+    assert "results/tables/lerf.csv" in targets.default(both)
+    assert not any("desk" in path for path in targets.scores(both, "lerf"))
 
 
 @pytest.mark.parametrize(
@@ -136,11 +138,8 @@ def test_what_variants_share_keeps_its_place_when_the_tables_change(tmp_path):
 def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     by_tree = {"masks": {"levels": "tree"}, "coverage_tree": {"theta": 0.7}}
     found = plan(tmp_path, variants={**VARIANTS, "levels": by_tree}, main_variants=["default"])
-    masks = [
-        json.loads(found.settings("masks")(Job("synthetic", "one", name)))["theta"]
-        for name in ("default", "theta", "levels")
-    ]
-    assert masks == [None, None, 0.7]
+    for name, theta in (("default", None), ("theta", None), ("levels", 0.7)):
+        assert json.loads(found.settings("masks")(Job("synthetic", "one", name)))["theta"] == theta
     assert found.shared_variant("masks", Job("synthetic", "one", "levels")) == "levels"
 
 
@@ -177,12 +176,8 @@ def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
 def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
     found, job = plan(tmp_path, main_variants=["default", "theta", "network"]), Job("synthetic", "one")
     assert found.compared("masks", "masks")(job) == ["results/synthetic/one/default/masks"]
-    assert [path.split("/")[3] for path in found.compared("field", "f")(job)] == [
-        "default",
-        "theta",
-        "network",
-    ]
-    assert [path.split("/")[3] for path in found.compared_scores(job)] == ["default", "theta", "network"]
+    assert variants_in(found.compared("field", "f")(job)) == ["default", "theta", "network"]
+    assert variants_in(found.compared_scores(job)) == ["default", "theta", "network"]
 
 
 def test_fields_are_ours_or_a_baseline_s(tmp_path):
@@ -272,23 +267,15 @@ def test_tables_take_the_scenes_and_variants_that_are_theirs(tmp_path):
     assert targets.scores(found, "theta") == ["results/synthetic/two/theta/scores.csv"]
     assert targets.scores(found, "waymo") == []
     with_network = plan(tmp_path, main_variants=["default", "network"], seeds=2)
-    assert [
-        path.split("/")[3]
-        for path in targets.scores(with_network, "waymo") + targets.scores(with_network, "replica")
-    ] == [
-        "default",
-        "network",
-        "network.seed1",
-    ]
+    assert variants_in(targets.scores(with_network, "replica")) == ["default", "network", "network.seed1"]
 
 
 def test_a_sweep_without_variants_has_no_table_and_no_plot(tmp_path):
     found = plan(tmp_path, ablation_variants=[], theta_variants=[], omega_variants=["theta"])
     assert "results/tables/omega.csv" in targets.tables(found)
     assert not {"results/tables/ablation.csv", "results/tables/theta.csv"} & set(targets.tables(found))
-    assert [name for name in targets.default(found) if "sweep-" in name] == [
-        "results/figures/sweep-omega.png"
-    ]
+    plots = [name for name in targets.default(found) if "sweep-" in name]
+    assert plots == ["results/figures/sweep-omega.png"]
 
 
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
@@ -368,25 +355,18 @@ def test_a_run_names_its_models_and_warns_if_answers_mean_nothing(tmp_path, monk
     config = {"groups": ["benchmark", "photos"], "overrides": OF_PHOTOGRAPHS}
     drawn, photo, doubt = plan(tmp_path, **config).model_lines()
     assert drawn == "synthetic/one, synthetic/two, rooms/room: masks by sam-tiny; text queries by clip-tiny"
-    assert (
-        photo.startswith("photos/desk: masks by the graph segmenter") and "text queries by clip-tiny" in photo
-    )
+    assert photo.startswith("photos/desk: masks by the graph segmenter")
+    assert "text queries by clip-tiny" in photo
     assert "answers about photographs mean nothing" in doubt and "hilsplat models get" in doubt
-    (tmp_path / "config/config.yaml").write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
-    assert models_of_photographs(tmp_path / "config/config.yaml", "desk") == [
-        photo.removeprefix("photos/desk: "),
-        doubt,
-    ]
+    own = tmp_path / "config/config.yaml"
+    own.write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
+    assert models_of_photographs(own, "desk") == [photo.removeprefix("photos/desk: "), doubt]
     lay_model("clip-vit-base-patch16", "clip")
     lay_model("sam-vit-base", "sam")
-    assert plan(tmp_path, **config).model_lines()[1:] == [
-        "photos/desk: masks by sam-vit-base; text queries by clip-vit-base-patch16"
-    ]
-    assert models_of_photographs(tmp_path / "config/config.yaml", "desk") == [
-        "masks by sam-vit-base; text queries by clip-vit-base-patch16"
-    ]
-    installed = models_of_photographs(tmp_path / "nowhere.yaml", "desk")
-    assert installed == ["masks by sam-vit-base; text queries by clip-vit-base-patch16"]
+    line = "masks by sam-vit-base; text queries by clip-vit-base-patch16"
+    assert plan(tmp_path, **config).model_lines()[1:] == [f"photos/desk: {line}"]
+    for file in (own, tmp_path / "nowhere.yaml"):  # the installed one
+        assert models_of_photographs(file, "desk") == [line]
 
 
 def test_names_match_themselves_alone():

@@ -72,9 +72,7 @@ def test_memory_and_minutes_grow_with_the_work(tmp_path):
     )
     for rule in ("contributions", "semantic_tree", "field", "gaussians", "poses", "evaluate"):
         for name in ("memory_mb", "minutes"):
-            less, more = (
-                getattr(each, name)(rule)(wildcards(), threads=1, attempt=1) for each in (small, large)
-            )
+            less, more = (getattr(each, name)(rule)(wildcards(), 1, 1) for each in (small, large))
             assert more > less, (rule, name)
 
 
@@ -174,11 +172,8 @@ def test_a_plan_of_many_scenes_reads_and_validates_no_more_than_one_of_few(tmp_p
 
 def ask_everything(chosen: Plan, scenes: int) -> None:
     """What Snakemake asks for each job."""
-    (
-        expected_artifacts(chosen),
-        targets.default(chosen),
-        [targets.scores(chosen, name) for name in ("lerf", "theta")],
-    )
+    expected_artifacts(chosen), targets.default(chosen)
+    targets.scores(chosen, "lerf"), targets.scores(chosen, "theta")
     asked = JobResources(chosen)
     for scene in range(scenes):
         for variant in ("default", *VARIANTS):
