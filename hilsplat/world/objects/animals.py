@@ -11,13 +11,8 @@ def _duck(b: Builder) -> None:
     bill_paint, dark = b.paint("plain", "orange", "red"), b.paint("plastic", "black")
     length, head_r = b.between(0.40, 0.46), b.between(0.22, 0.26)
     body = b.part("body", "belly").put(rubber, ellipsoid((length, 0.33, 0.27), (0, 0, 0.27)))
-    body.subpart("tail", "tail feathers", at="of").put(
-        b.paint("plain"),
-        sweep(
-            [(-length * 0.72, 0, 0.34), (-length * 1.0, 0, 0.46), (-length * 1.14, 0, 0.58)],
-            [0.2, 0.13, 0.03],
-        ),
-    )
+    path = [(-length * 0.72, 0, 0.34), (-length * 1.0, 0, 0.46), (-length * 1.14, 0, 0.58)]
+    body.subpart("tail", "tail feathers", at="of").put(b.paint("plain"), sweep(path, [0.2, 0.13, 0.03]))
     x, z = length * 0.52, 0.46 + head_r * 0.9
     head = b.part("head").put(rubber, sphere(head_r, (x, 0, z)))
     head.subpart("bill", "beak").put(
@@ -156,11 +151,9 @@ def _rabbit(b: Builder) -> None:
         leg.subpart("foot", "paw", at="of").put(
             pad, ellipsoid((0.22, 0.10, 0.075), (0.20, side * r * 0.95, 0.075))
         )
+    profile = [(0, 0), (0.06, 0.08), (0.10, 0.30), (0.07, 0.36), (0, 0.37)]
     carrot = b.part("carrot").put(
-        b.paint("plain", "orange"),
-        lathe([(0, 0), (0.06, 0.08), (0.10, 0.30), (0.07, 0.36), (0, 0.37)])
-        .turned("x", 62)
-        .moved(r * 1.12 + 0.05, 0.19, r * 1.05),
+        b.paint("plain", "orange"), lathe(profile).turned("x", 62).moved(r * 1.12 + 0.05, 0.19, r * 1.05)
     )
     top = lathe([(0, 0), (0.08, 0.04), (0.085, 0.13), (0, 0.20)]).turned("x", 62)
     up = np.array([0, -np.sin(np.radians(62)), np.cos(np.radians(62))]) * 0.35

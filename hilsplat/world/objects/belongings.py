@@ -86,27 +86,19 @@ def _boot(b: Builder) -> None:
     sole.subpart("heel", at="of").put(
         b.paint("plastic"), box((0.30, w * 1.02, 0.13), (heel_x + 0.15, 0, 0.065), 0.02)
     )
-    foot = b.part("foot", "vamp").put(
-        leather,
-        loft(
-            [
-                outline(0.12, 1.0, toe_x),
-                outline(0.24, 0.98, toe_x * 0.97),
-                outline(0.34, 0.88, toe_x * 0.72),
-                outline(0.42, 0.80, toe_x * 0.36),
-            ]
-        ),
-    )
+    sections = [
+        outline(0.12, 1.0, toe_x),
+        outline(0.24, 0.98, toe_x * 0.97),
+        outline(0.34, 0.88, toe_x * 0.72),
+        outline(0.42, 0.80, toe_x * 0.36),
+    ]
+    foot = b.part("foot", "vamp").put(leather, loft(sections))
     foot.subpart("toe cap", "toe", at="of").put(
         b.paint("plastic"), ellipsoid((0.22, w * 0.50, 0.185), (toe_x - 0.17, 0, 0.15))
     )
     cx = heel_x + 0.20
-    shaft = b.part("shaft", "leg").put(
-        upper,
-        lathe([(0.175, 0.20), (0.165, 0.42), (0.19, h), (0.15, h), (0.14, 0.5), (0, 0.45)])
-        .scaled(1.1, 0.9, 1)
-        .moved(cx),
-    )
+    profile = [(0.175, 0.20), (0.165, 0.42), (0.19, h), (0.15, h), (0.14, 0.5), (0, 0.45)]
+    shaft = b.part("shaft", "leg").put(upper, lathe(profile).scaled(1.1, 0.9, 1).moved(cx))
     shaft.subpart("cuff", "fur trim").put(
         b.paint("fur"), ring(0.185, 0.07, (0, 0, h - 0.03)).scaled(1.1, 0.92, 1).moved(cx)
     )
@@ -165,12 +157,14 @@ def _lantern(b: Builder) -> None:
         cage.put(bar, box((0.05, 0.05, h), (r * 0.92, 0, low + h / 2), 0.012).turned("z", a))
     cage.subpart("hoop", "middle ring").put(b.paint("metal"), ring(r * 0.95, 0.032, (0, 0, low + h * 0.16)))
     roof, top = b.part("roof", "cap", "hood"), low + h
-    roof.put(
-        metal,
-        lathe(
-            [(0, top - 0.01), (r * 1.2, top), (r * 1.12, top + 0.06), (r * 0.55, top + 0.20), (0, top + 0.21)]
-        ),
-    )
+    profile = [
+        (0, top - 0.01),
+        (r * 1.2, top),
+        (r * 1.12, top + 0.06),
+        (r * 0.55, top + 0.20),
+        (0, top + 0.21),
+    ]
+    roof.put(metal, lathe(profile))
     roof.subpart("chimney", "vent").put(
         b.paint("plastic"),
         lathe([(0.085, 0), (0.085, 0.08), (0.14, 0.09), (0.14, 0.145), (0, 0.17)]).moved(z=top + 0.17),

@@ -21,14 +21,9 @@ def _door(b: Builder) -> None:
     panel_paint = b.paint("plain")
     for y in (-1.0, 1.0):
         for low, high in ((0.14, 0.44), (0.5, 0.94)):
-            leaf.subpart("panel", "inlay").put(
-                panel_paint,
-                box(
-                    (0.02, width * 0.36, (high - low) * height),
-                    (0.042, y * width * 0.23, (low + high) / 2 * height),
-                    0.008,
-                ),
-            )
+            size = (0.02, width * 0.36, (high - low) * height)
+            place = (0.042, y * width * 0.23, (low + high) / 2 * height)
+            leaf.subpart("panel", "inlay").put(panel_paint, box(size, place, 0.008))
     y = -width / 2 + 0.07
     handle = b.part("handle", "latch").put(metal, box((0.02, 0.055, 0.22), (0.048, y, 1.02), 0.006))
     handle.subpart("lever", "knob").put(
@@ -137,12 +132,8 @@ def _upright(outline: list[tuple[float, float]], depth: float) -> Mesh:
 def _mirror(b: Builder) -> None:
     rim_paint, glass = b.paint("metal"), b.paint("plain", "grey", "white", "blue", "teal")
     r = b.between(0.26, 0.32)
-    rim = b.part("frame", "rim").put(
-        rim_paint,
-        lathe([(r - 0.04, 0), (r, 0), (r, 0.03), (r - 0.02, 0.045), (r - 0.05, 0.04), (r - 0.05, 0.0)], 48)
-        .turned("y", 90)
-        .moved(0, 0, r),
-    )
+    profile = [(r - 0.04, 0), (r, 0), (r, 0.03), (r - 0.02, 0.045), (r - 0.05, 0.04), (r - 0.05, 0.0)]
+    rim = b.part("frame", "rim").put(rim_paint, lathe(profile, 48).turned("y", 90).moved(0, 0, r))
     knobs = rim.subpart("beads", "studs")
     bead = b.paint("ceramic")
     for i in range(8):

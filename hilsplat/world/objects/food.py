@@ -34,12 +34,8 @@ def _frying_pan(b: Builder) -> None:
         x = -0.18 + 0.09 * k
         bacon.put(strip, box((0.095, 0.13, 0.05), (x, -0.26 + 0.02 * (k % 2), 0.075 + 0.02 * (k % 2)), 0.01))
     bacon.subpart("fat", "fat stripe").put(fat, box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01))
-    handle = b.part("handle").put(
-        b.paint("metal"),
-        sweep(
-            [(r * 0.9, 0, h * 0.7), (r + 0.12, 0, h + 0.07), (r + 0.22, 0, h + 0.11)], [0.07, 0.065, 0.065]
-        ),
-    )
+    path = [(r * 0.9, 0, h * 0.7), (r + 0.12, 0, h + 0.07), (r + 0.22, 0, h + 0.11)]
+    handle = b.part("handle").put(b.paint("metal"), sweep(path, [0.07, 0.065, 0.065]))
     end = r + 0.46
     handle.subpart("grip", at="of").put(
         b.paint("plastic"),
@@ -70,12 +66,8 @@ def _burger(b: Builder) -> None:
             for a in range(0, 360, 45)
         ],
     )
-    patty = b.part("patty", "meat").put(
-        meat,
-        lathe(
-            [(0, 0.19), (r * 0.98, 0.20), (r * 1.04, 0.25), (r * 1.04, 0.31), (r * 0.96, 0.35), (0, 0.36)], 32
-        ),
-    )
+    profile = [(0, 0.19), (r * 0.98, 0.20), (r * 1.04, 0.25), (r * 1.04, 0.31), (r * 0.96, 0.35), (0, 0.36)]
+    patty = b.part("patty", "meat").put(meat, lathe(profile, 32))
     slab = box((r * 1.62, r * 1.62, 0.045), (0, 0, 0.365), 0.01)
     drip = [
         extrude([(-0.16, 0), (0.16, 0), (0, -0.14)], 0.04)
@@ -92,12 +84,8 @@ def _burger(b: Builder) -> None:
             for a in (0.5, 2.6, 4.7)
         ],
     )
-    top = b.part("top bun", "upper bun").put(
-        bread,
-        lathe(
-            [(0, 0.44), (r * 0.98, 0.45), (r * 1.02, 0.52), (r * 0.92, 0.64), (r * 0.6, 0.75), (0, 0.80)], 32
-        ),
-    )
+    profile = [(0, 0.44), (r * 0.98, 0.45), (r * 1.02, 0.52), (r * 0.92, 0.64), (r * 0.6, 0.75), (0, 0.80)]
+    top = b.part("top bun", "upper bun").put(bread, lathe(profile, 32))
     top.subpart("seeds", "sesame").put(
         seeds,
         *[
@@ -119,13 +107,8 @@ def _burger(b: Builder) -> None:
 def _fruit_basket(b: Builder) -> None:
     straw, trim = b.paint("cloth", "beige", "brown", "orange", "white"), b.paint("wood")
     r, h = b.between(0.38, 0.42), b.between(0.24, 0.28)
-    basket = b.part("bowl", "basket").put(
-        straw,
-        lathe(
-            [(0, 0), (r * 0.74, 0), (r * 0.92, h * 0.5), (r, h), (r - 0.05, h), (r * 0.7, 0.10), (0, 0.10)],
-            36,
-        ),
-    )
+    profile = [(0, 0), (r * 0.74, 0), (r * 0.92, h * 0.5), (r, h), (r - 0.05, h), (r * 0.7, 0.10), (0, 0.10)]
+    basket = b.part("bowl", "basket").put(straw, lathe(profile, 36))
     basket.subpart("rim", "edge", at="of").put(trim, ring(r - 0.01, 0.052, (0, 0, h), segments=36))
     basket.subpart("band", "stripe").put(
         b.paint("cloth"),
@@ -172,37 +155,27 @@ def _fruit_basket(b: Builder) -> None:
 def _ice_cream(b: Builder) -> None:
     waffle, cup = b.paint("plain", "orange", "brown", "beige"), b.paint("ceramic")
     r, h = b.between(0.24, 0.28), b.between(0.50, 0.58)
-    stand = b.part("holder", "stand").put(
-        cup,
-        lathe(
-            [
-                (0, 0),
-                (r * 1.25, 0),
-                (r * 1.25, 0.05),
-                (r * 0.55, 0.10),
-                (r * 0.55, 0.22),
-                (r * 0.9, 0.34),
-                (r * 0.7, 0.34),
-                (0, 0.25),
-            ],
-            32,
-        ),
-    )
+    profile = [
+        (0, 0),
+        (r * 1.25, 0),
+        (r * 1.25, 0.05),
+        (r * 0.55, 0.10),
+        (r * 0.55, 0.22),
+        (r * 0.9, 0.34),
+        (r * 0.7, 0.34),
+        (0, 0.25),
+    ]
+    stand = b.part("holder", "stand").put(cup, lathe(profile, 32))
     stand.subpart("ring", "band", at="of").put(b.paint("metal"), ring(r * 0.62, 0.055, (0, 0, 0.16)))
     low = 0.24
     cone = b.part("cone", "waffle").put(waffle, lathe([(0, low), (r * 0.45, low + 0.05), (r, low + h)], 32))
-    cone.subpart("rim", "edge", at="of").put(
-        b.paint("plain"),
-        lathe(
-            [
-                (r * 0.86, low + h - 0.12),
-                (r * 1.08, low + h - 0.10),
-                (r * 1.14, low + h + 0.03),
-                (r * 0.8, low + h + 0.03),
-            ],
-            32,
-        ),
-    )
+    profile = [
+        (r * 0.86, low + h - 0.12),
+        (r * 1.08, low + h - 0.10),
+        (r * 1.14, low + h + 0.03),
+        (r * 0.8, low + h + 0.03),
+    ]
+    cone.subpart("rim", "edge", at="of").put(b.paint("plain"), lathe(profile, 32))
     z = low + h + 0.10
     taste, crumb = b.paint("snow"), b.paint("plastic")
     for side in (-1, 1):
@@ -216,11 +189,10 @@ def _ice_cream(b: Builder) -> None:
             )
             sprinkles.put(crumb, sphere(0.055, place, 10))
     top = b.part("top scoop", "upper scoop").put(b.paint("snow"), sphere(r * 0.74, (0, 0, z + r * 0.85)))
+    profile = [(r * 0.80, -0.06), (r * 0.74, 0.05), (r * 0.45, 0.17), (0, 0.21)]
     top.subpart("sauce", "syrup").put(
         b.paint("plastic", "brown", "red", "purple", "black"),
-        lathe([(r * 0.80, -0.06), (r * 0.74, 0.05), (r * 0.45, 0.17), (0, 0.21)], 28).moved(
-            z=z + r * 0.86 + 0.02
-        ),
+        lathe(profile, 28).moved(z=z + r * 0.86 + 0.02),
         *[
             ellipsoid((0.06, 0.06, 0.10), (r * 0.72 * np.cos(a), r * 0.72 * np.sin(a), z + r * 0.72))
             for a in (0.3, 1.6, 2.8, 4.1, 5.2)

@@ -46,14 +46,9 @@ def _bed(b: Builder) -> None:
     )
     share = b.between(0.56, 0.64)
     start = length / 2 - share * length
-    bedding.subpart("blanket", "duvet", "comforter").put(
-        blanket_paint,
-        box(
-            (share * length - 0.03, width + 0.02, mattress + 0.02),
-            (start + share * length / 2 - 0.02, 0, middle + 0.025),
-            0.05,
-        ),
-    )
+    size = (share * length - 0.03, width + 0.02, mattress + 0.02)
+    place = (start + share * length / 2 - 0.02, 0, middle + 0.025)
+    bedding.subpart("blanket", "duvet", "comforter").put(blanket_paint, box(size, place, 0.05))
     bedding.subpart("fold", "turned sheet").put(
         b.paint("plain"), box((0.2, width + 0.03, mattress + 0.05), (start, 0, middle + 0.025), 0.05)
     )
@@ -75,11 +70,9 @@ def _sofa(b: Builder) -> None:
     inner, arm_w = seats * b.between(0.54, 0.62), b.between(0.14, 0.2)
     width, seat_z, top = inner + 2 * arm_w, b.between(0.28, 0.32), b.between(0.78, 0.88)
     for x, y in CORNERS:
+        profile = [(0, 0), (0.03, 0), (0.045, 0.1), (0, 0.1)]
         b.part("leg", "foot").put(
-            wood,
-            lathe([(0, 0), (0.03, 0), (0.045, 0.1), (0, 0.1)], 16).moved(
-                x * (depth / 2 - 0.08), y * (width / 2 - 0.08), 0
-            ),
+            wood, lathe(profile, 16).moved(x * (depth / 2 - 0.08), y * (width / 2 - 0.08), 0)
         )
     seat = b.part("seat", "base").put(
         cloth, box((depth - 0.02, inner + 0.02, seat_z - 0.09), (0, 0, (seat_z + 0.09) / 2), 0.02)
@@ -214,29 +207,21 @@ def _floor_lamp(b: Builder) -> None:
         lathe([(radius, low), (upper, height), (upper - 0.01, height), (radius - 0.01, low), (radius, low)]),
     )
     higher = radius + (upper - radius) * 0.09 / 0.34
-    shade.subpart("border", "trim").put(
-        b.paint("plain"),
-        lathe(
-            [
-                (radius - 0.012, low - 0.012),
-                (radius + 0.013, low - 0.012),
-                (higher + 0.013, low + 0.09),
-                (higher - 0.004, low + 0.095),
-            ]
-        ),
-    )
-    shade.subpart("finial", "top knob").put(
-        accent,
-        lathe(
-            [
-                (0, height - 0.03),
-                (upper - 0.005, height - 0.015),
-                (0.04, height + 0.01),
-                (0.045, height + 0.05),
-                (0, height + 0.08),
-            ]
-        ),
-    )
+    profile = [
+        (radius - 0.012, low - 0.012),
+        (radius + 0.013, low - 0.012),
+        (higher + 0.013, low + 0.09),
+        (higher - 0.004, low + 0.095),
+    ]
+    shade.subpart("border", "trim").put(b.paint("plain"), lathe(profile))
+    profile = [
+        (0, height - 0.03),
+        (upper - 0.005, height - 0.015),
+        (0.04, height + 0.01),
+        (0.045, height + 0.05),
+        (0, height + 0.08),
+    ]
+    shade.subpart("finial", "top knob").put(accent, lathe(profile))
 
 
 def _rug(b: Builder) -> None:

@@ -26,21 +26,17 @@ def _guitar(b: Builder) -> None:
         b.paint("plain", "black"), disc(0.125, x - 0.01, x + 0.012, 24).moved(z=wide * 1.62)
     )
     body.subpart("bridge", "saddle").put(dark, box((0.07, 0.32, 0.12), (x + 0.02, 0, wide * 0.66), 0.02))
-    body.subpart("pickguard", "scratch plate").put(
-        b.paint("plastic"),
-        loft(
-            [
-                [
-                    (at, 0.02, wide * 0.78),
-                    (at, 0.24, wide * 0.85),
-                    (at, 0.25, wide * 1.25),
-                    (at, 0.14, wide * 1.50),
-                    (at, 0.10, wide * 1.2),
-                ]
-                for at in (x - 0.01, x + 0.018)
-            ]
-        ),
-    )
+    sections = [
+        [
+            (at, 0.02, wide * 0.78),
+            (at, 0.24, wide * 0.85),
+            (at, 0.25, wide * 1.25),
+            (at, 0.14, wide * 1.50),
+            (at, 0.10, wide * 1.2),
+        ]
+        for at in (x - 0.01, x + 0.018)
+    ]
+    body.subpart("pickguard", "scratch plate").put(b.paint("plastic"), loft(sections))
     body.subpart("back plate", "back panel").put(
         b.paint("plain"), box((0.03, 0.16, wide * 1.9), (-x - 0.005, 0, wide * 1.5), 0.01)
     )
@@ -52,20 +48,16 @@ def _guitar(b: Builder) -> None:
     neck.subpart("fretboard", "fingerboard").put(
         dark, box((0.035, 0.115, high - start), (x + 0.01, 0, (start + high) / 2), 0.008)
     )
-    head = b.part("headstock", "head").put(
-        b.paint("plain"),
-        loft(
-            [
-                [
-                    (at, -0.075, high - 0.01),
-                    (at, 0.075, high - 0.01),
-                    (at, 0.13, high + 0.26),
-                    (at, -0.13, high + 0.26),
-                ]
-                for at in (x - 0.08, x - 0.01)
-            ]
-        ),
-    )
+    sections = [
+        [
+            (at, -0.075, high - 0.01),
+            (at, 0.075, high - 0.01),
+            (at, 0.13, high + 0.26),
+            (at, -0.13, high + 0.26),
+        ]
+        for at in (x - 0.08, x - 0.01)
+    ]
+    head = b.part("headstock", "head").put(b.paint("plain"), loft(sections))
     pegs = head.subpart("tuning pegs", "tuners", "pegs")
     for side in (-1, 1):
         for k in range(2):
@@ -154,15 +146,11 @@ def _camera(b: Builder) -> None:
         b.paint("ceramic", "blue", "teal", "purple", "white", "green"),
         lathe([(r * 0.74, 0), (r * 0.5, 0.04), (0, 0.06)], 28).turned("y", 90).moved(x + 0.295, 0.05, z),
     )
-    finder = b.part("viewfinder", "prism").put(
-        metal,
-        loft(
-            [
-                [(back, -half, z), (front, -half, z), (front, half, z), (back, half, z)]
-                for back, front, half, z in ((-0.11, 0.13, 0.15, h + 0.06), (-0.09, 0.11, 0.10, h + 0.22))
-            ]
-        ).moved(0, 0.05),
-    )
+    sections = [
+        [(back, -half, z), (front, -half, z), (front, half, z), (back, half, z)]
+        for back, front, half, z in ((-0.11, 0.13, 0.15, h + 0.06), (-0.09, 0.11, 0.10, h + 0.22))
+    ]
+    finder = b.part("viewfinder", "prism").put(metal, loft(sections).moved(0, 0.05))
     finder.subpart("flash", "flash lamp").put(
         b.paint("plain", "white", "yellow"),
         box((0.06, 0.23, 0.12), (0.13, 0, h + 0.14), 0.015).moved(0, 0.05),

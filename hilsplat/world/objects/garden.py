@@ -106,12 +106,8 @@ def _birdhouse(b: Builder) -> None:
     rise, half = 0.24, w / 2
     post = b.part("post", "pole").put(b.paint("wood"), box((0.11, 0.11, low), (0, 0, low / 2), 0.015))
     post.subpart("base", "foot", at="of").put(b.paint("stone"), cylinder(0.27, 0, 0.085, 32, 0.02))
-    body = b.part("box", "nest box", "walls").put(
-        wood,
-        extrude(
-            [(-half, low), (half, low), (half, low + h), (0, low + h + rise), (-half, low + h)], w * 0.86
-        ).turned("z", 90),
-    )
+    outline = [(-half, low), (half, low), (half, low + h), (0, low + h + rise), (-half, low + h)]
+    body = b.part("box", "nest box", "walls").put(wood, extrude(outline, w * 0.86).turned("z", 90))
     x = w * 0.43
     body.subpart("hole", "entrance").put(dark, disc(0.10, -0.01, 0.015, 28).moved(x, 0, low + h * 0.70))
     body.subpart("perch", "stick").put(
@@ -131,11 +127,12 @@ def _birdhouse(b: Builder) -> None:
     )
     feather = b.paint("plain", "red", "blue", "yellow", "orange", "teal", "purple")
     z = low + h + rise + 0.18
+    path = [(-0.10, 0, z), (-0.28, 0, z + 0.06)]
     bird = b.part("bird", "little bird").put(
         feather,
         ellipsoid((0.155, 0.115, 0.115), (0, 0, z)),
         sphere(0.095, (0.12, 0, z + 0.115)),
-        sweep([(-0.10, 0, z), (-0.28, 0, z + 0.06)], [0.075, 0.04]),
+        sweep(path, [0.075, 0.04]),
     )
     bird.subpart("beak", "bill").put(
         b.paint("plain", "orange", "yellow", "black"),
@@ -157,19 +154,14 @@ def _watering_can(b: Builder) -> None:
         b.paint("plain"),
         lathe([(r * 0.94, h * 0.46), (r * 0.995, h * 0.47), (r * 0.96, h * 0.74), (r * 0.90, h * 0.75)], 32),
     )
-    body.subpart("collar", "top cover", at="of").put(
-        second,
-        lathe(
-            [
-                (r * 0.90, h - 0.05),
-                (r * 0.94, h - 0.04),
-                (r * 0.94, h + 0.03),
-                (r * 0.5, h + 0.05),
-                (0, h + 0.05),
-            ],
-            32,
-        ),
-    )
+    profile = [
+        (r * 0.90, h - 0.05),
+        (r * 0.94, h - 0.04),
+        (r * 0.94, h + 0.03),
+        (r * 0.5, h + 0.05),
+        (0, h + 0.05),
+    ]
+    body.subpart("collar", "top cover", at="of").put(second, lathe(profile, 32))
     start, end = np.array([r * 0.80, 0, 0.14]), np.array([r + 0.40, 0, h + 0.12])
     spout = b.part("spout", "pipe").put(
         b.paint("metal"), sweep([start, start + np.array([0.14, 0, 0.05]), end], [0.085, 0.075, 0.055])

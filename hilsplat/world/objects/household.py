@@ -15,14 +15,9 @@ def _chair(b: Builder) -> None:
     )
     back = b.part("back", "backrest")
     for side in (-1, 1):
-        back.put(
-            wood,
-            box(
-                (0.075, 0.085, top - seat_z),
-                (-w / 2 + 0.04, side * (w / 2 - 0.045), (top + seat_z) / 2),
-                0.015,
-            ),
-        )
+        size = (0.075, 0.085, top - seat_z)
+        place = (-w / 2 + 0.04, side * (w / 2 - 0.045), (top + seat_z) / 2)
+        back.put(wood, box(size, place, 0.015))
     back.subpart("top rail", "headrest").put(
         accent, box((0.09, w + 0.04, 0.17), (-w / 2 + 0.04, 0, top - 0.05), 0.03)
     )
@@ -97,17 +92,13 @@ def _lamp(b: Builder) -> None:
         cloth, lathe([(shade_r, low), (upper, h), (upper - 0.03, h), (shade_r - 0.03, low), (shade_r, low)])
     )
     trim = b.paint("cloth")
-    shade.subpart("border", "trim").put(
-        trim,
-        lathe(
-            [
-                (shade_r - 0.035, low - 0.01),
-                (shade_r + 0.022, low - 0.01),
-                (radius(low + 0.115) + 0.022, low + 0.115),
-                (radius(low + 0.115), low + 0.12),
-            ]
-        ),
-    )
+    profile = [
+        (shade_r - 0.035, low - 0.01),
+        (shade_r + 0.022, low - 0.01),
+        (radius(low + 0.115) + 0.022, low + 0.115),
+        (radius(low + 0.115), low + 0.12),
+    ]
+    shade.subpart("border", "trim").put(trim, lathe(profile))
     shade.subpart("finial", "top knob").put(
         accent,
         lathe([(0, h - 0.03), (upper - 0.01, h - 0.03), (0.06, h + 0.01), (0.075, h + 0.07), (0, h + 0.12)]),

@@ -13,18 +13,14 @@ def _mug(b: Builder) -> None:
     top = r * flare
     cup = b.part("cup", "body").put(glaze, lathe([(0, 0), (r * 0.92, 0), (r, 0.06), (top, h * 0.86)]))
     cup.subpart("inside", "interior").put(inner, lathe([(top - 0.05, h), (r - 0.05, 0.12), (0, 0.12)]))
-    cup.subpart("rim", "edge").put(
-        accent,
-        lathe(
-            [
-                (top, h * 0.86),
-                (top + 0.035, h * 0.88),
-                (top + 0.035, h),
-                (top - 0.05, h),
-                (top - 0.06, h - 0.04),
-            ]
-        ),
-    )
+    profile = [
+        (top, h * 0.86),
+        (top + 0.035, h * 0.88),
+        (top + 0.035, h),
+        (top - 0.05, h),
+        (top - 0.06, h - 0.04),
+    ]
+    cup.subpart("rim", "edge").put(accent, lathe(profile))
     low, high = h * 0.34, h * 0.54
     cup.subpart("band", "stripe").put(
         b.paint("ceramic"), lathe([(r, low), (r * 1.05, low + 0.02), (r * 1.05, high - 0.02), (r, high)])
@@ -48,12 +44,8 @@ def _kettle(b: Builder) -> None:
     )
     lid.subpart("knob", "button").put(dark, ellipsoid((0.12, 0.12, 0.10), (0, 0, h + 0.20)))
     start = np.array([r * 0.85, 0, h * 0.35])
-    spout = b.part("spout").put(
-        metal,
-        sweep(
-            [start, start + np.array([0.18, 0, 0.10]), start + np.array([0.27, 0, 0.26])], [0.14, 0.10, 0.075]
-        ),
-    )
+    path = [start, start + np.array([0.18, 0, 0.10]), start + np.array([0.27, 0, 0.26])]
+    spout = b.part("spout").put(metal, sweep(path, [0.14, 0.10, 0.075]))
     lip = [start + np.array([0.255, 0, 0.235]), start + np.array([0.33, 0, 0.37])]
     spout.subpart("tip", "mouth").put(accent, sweep(lip, [0.085, 0.10]))
     handle = b.part("handle").put(
@@ -109,32 +101,24 @@ def _cake(b: Builder) -> None:
     )
     lower = b.part("bottom tier", "lower layer").put(sponge, cylinder(r, 0.06, 0.06 + h))
     top = 0.06 + h
-    lower.subpart("icing", "frosting").put(
-        icing,
-        lathe(
-            [
-                (r, top - 0.09),
-                (r + 0.03, top - 0.08),
-                (r + 0.03, top),
-                (r - 0.02, top + 0.03),
-                (0, top + 0.03),
-            ]
-        ),
-    )
+    profile = [
+        (r, top - 0.09),
+        (r + 0.03, top - 0.08),
+        (r + 0.03, top),
+        (r - 0.02, top + 0.03),
+        (0, top + 0.03),
+    ]
+    lower.subpart("icing", "frosting").put(icing, lathe(profile))
     r2, top2 = r * b.between(0.55, 0.64), top + 0.03 + h * 0.85
     upper = b.part("top tier", "upper layer").put(cream, cylinder(r2, top + 0.02, top2))
-    upper.subpart("glaze", "topping").put(
-        b.paint("snow"),
-        lathe(
-            [
-                (r2, top2 - 0.07),
-                (r2 + 0.03, top2 - 0.06),
-                (r2 + 0.03, top2),
-                (r2 - 0.02, top2 + 0.03),
-                (0, top2 + 0.03),
-            ]
-        ),
-    )
+    profile = [
+        (r2, top2 - 0.07),
+        (r2 + 0.03, top2 - 0.06),
+        (r2 + 0.03, top2),
+        (r2 - 0.02, top2 + 0.03),
+        (0, top2 + 0.03),
+    ]
+    upper.subpart("glaze", "topping").put(b.paint("snow"), lathe(profile))
     cherries = lower.subpart("cherries", "berries")
     for i in range(6):
         a = 2 * np.pi * i / 6

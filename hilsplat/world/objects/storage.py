@@ -17,14 +17,9 @@ def _bookshelf(b: Builder) -> None:
     rows = 4
     gap = (height - 0.08) / rows
     for i in range(rows + 1):
-        boards.put(
-            board_paint,
-            box(
-                (depth + 0.012, width - 0.08, 0.04),
-                (0.006, 0, 0.06 + i * gap - (0.02 if i == rows else 0)),
-                0.008,
-            ),
-        )
+        size = (depth + 0.012, width - 0.08, 0.04)
+        place = (0.006, 0, 0.06 + i * gap - (0.02 if i == rows else 0))
+        boards.put(board_paint, box(size, place, 0.008))
     crate_row = int(b.rng.integers(0, 2))
     for i in range(rows):
         bottom = 0.08 + i * gap
@@ -60,14 +55,9 @@ def _crates(b: Builder, depth: float, width: float, bottom: float, gap: float) -
         crate = b.part("box", "storage box", "basket").put(
             cloth, box((depth * 0.82, crate_w, crate_h), (0.01, y, bottom + crate_h / 2), 0.012)
         )
-        crate.subpart("label", "tag").put(
-            label,
-            box(
-                (0.025, crate_w * 0.45, crate_h * 0.4),
-                (0.01 + depth * 0.41, y, bottom + crate_h * 0.55),
-                0.005,
-            ),
-        )
+        size = (0.025, crate_w * 0.45, crate_h * 0.4)
+        place = (0.01 + depth * 0.41, y, bottom + crate_h * 0.55)
+        crate.subpart("label", "tag").put(label, box(size, place, 0.005))
 
 
 def _refrigerator(b: Builder) -> None:
@@ -147,29 +137,19 @@ def _counter(b: Builder) -> None:
 def _sink(b: Builder) -> None:
     white, metal, accent = b.paint("ceramic"), b.paint("metal"), b.paint("plain")
     r, h = b.between(0.18, 0.21), b.between(0.13, 0.16)
-    basin = b.part("basin", "bowl").put(
-        white,
-        lathe(
-            [
-                (0, 0),
-                (r * 0.6, 0),
-                (r * 0.9, h * 0.5),
-                (r, h),
-                (r - 0.02, h),
-                (r * 0.84, h * 0.55),
-                (r * 0.5, 0.03),
-                (0, 0.03),
-            ],
-            40,
-        ),
-    )
-    basin.subpart("rim", "edge").put(
-        b.paint("plain"),
-        lathe(
-            [(r - 0.025, h - 0.01), (r + 0.012, h - 0.012), (r + 0.012, h + 0.012), (r - 0.025, h + 0.012)],
-            40,
-        ),
-    )
+    profile = [
+        (0, 0),
+        (r * 0.6, 0),
+        (r * 0.9, h * 0.5),
+        (r, h),
+        (r - 0.02, h),
+        (r * 0.84, h * 0.55),
+        (r * 0.5, 0.03),
+        (0, 0.03),
+    ]
+    basin = b.part("basin", "bowl").put(white, lathe(profile, 40))
+    profile = [(r - 0.025, h - 0.01), (r + 0.012, h - 0.012), (r + 0.012, h + 0.012), (r - 0.025, h + 0.012)]
+    basin.subpart("rim", "edge").put(b.paint("plain"), lathe(profile, 40))
     basin.subpart("drain", "plug").put(accent, cylinder(0.045, 0.02, 0.04, 20))
     x, top = -r - 0.05, b.between(0.26, 0.32)
     spout = [

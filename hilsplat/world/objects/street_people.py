@@ -35,13 +35,9 @@ def _pedestrian(b: Builder) -> None:
     tall = b.between(1.62, 1.86)
     hip, shoulder = 0.49 * tall, 0.80 * tall
     stride = b.between(0.12, 0.26)
+    spine = [(0, 0, hip - 0.08), (0, 0, hip + 0.2), (0, 0, shoulder - 0.12), (0, 0, shoulder + 0.03)]
     torso = b.part("torso", "upper body").put(
-        coat,
-        sweep(
-            [(0, 0, hip - 0.08), (0, 0, hip + 0.2), (0, 0, shoulder - 0.12), (0, 0, shoulder + 0.03)],
-            [0.21, 0.22, 0.25, 0.13],
-            16,
-        ).scaled(0.78, 1.0, 1.0),
+        coat, sweep(spine, [0.21, 0.22, 0.25, 0.13], 16).scaled(0.78, 1.0, 1.0)
     )
     torso.subpart("belt").put(
         plain(b, "black"), cylinder(0.24, hip + 0.03, hip + 0.13, 18, 0.01).scaled(0.78, 1.0, 1.0)
@@ -55,30 +51,19 @@ def _pedestrian(b: Builder) -> None:
         bag = torso.subpart("shoulder bag", "bag", "handbag").put(
             bag_paint, box((0.32, 0.14, 0.3), (0.02, -0.36, hip + 0.05), 0.04)
         )
-        bag.put(
-            bag_paint,
-            sweep(
-                [(0.03, -0.36, hip + 0.18), (0.12, -0.2, shoulder - 0.18), (0.0, 0.12, shoulder + 0.02)],
-                0.025,
-                8,
-            ),
-        )
+        strap = [(0.03, -0.36, hip + 0.18), (0.12, -0.2, shoulder - 0.18), (0.0, 0.12, shoulder + 0.02)]
+        bag.put(bag_paint, sweep(strap, 0.025, 8))
     _head(b, skin, 0.02, shoulder + 0.25, 0.15)
     shoes = b.paint("plain", "white", "red", "brown", "black", "orange")
     for side in (-1, 1):
         swing = side * stride
         hand = (0.9 * swing + 0.05, side * 0.33, hip + 0.02)
-        path = [(0, side * 0.22, shoulder - 0.05), (0.2 * swing, side * 0.31, (shoulder + hip) / 2), hand]
-        arm = b.part("arm", "sleeve").put(coat, limb(path, [0.085, 0.075, 0.06]))
+        arm_path = [(0, side * 0.22, shoulder - 0.05), (0.2 * swing, side * 0.31, (shoulder + hip) / 2), hand]
+        arm = b.part("arm", "sleeve").put(coat, limb(arm_path, [0.085, 0.075, 0.06]))
         arm.subpart("hand").put(skin, sphere(0.075, (hand[0], hand[1], hand[2] - 0.04), 12))
         foot = (-1.2 * swing, side * 0.12)
-        leg = b.part("leg", "trousers").put(
-            trousers,
-            limb(
-                [(0, side * 0.11, hip), (-0.4 * swing, side * 0.12, 0.27 * tall), (*foot, 0.1)],
-                [0.13, 0.1, 0.075],
-            ),
-        )
+        leg_path = [(0, side * 0.11, hip), (-0.4 * swing, side * 0.12, 0.27 * tall), (*foot, 0.1)]
+        leg = b.part("leg", "trousers").put(trousers, limb(leg_path, [0.13, 0.1, 0.075]))
         leg.subpart("shoe", "foot").put(
             shoes, box((0.31, 0.14, 0.13), (foot[0] + 0.06, foot[1], 0.065), 0.04)
         )
@@ -129,26 +114,16 @@ def _cyclist(b: Builder) -> None:
     )
     _head(b, skin, 0.2, 1.8, 0.15)
     for side in (-1, 1):
-        arm = b.part("arm", "sleeve").put(
-            shirt,
-            limb(
-                [(0.05, side * 0.2, 1.52), (0.2, side * 0.3, 1.3), (0.36, side * 0.28, 1.16)],
-                [0.085, 0.075, 0.06],
-            ),
-        )
+        arm_path = [(0.05, side * 0.2, 1.52), (0.2, side * 0.3, 1.3), (0.36, side * 0.28, 1.16)]
+        arm = b.part("arm", "sleeve").put(shirt, limb(arm_path, [0.085, 0.075, 0.06]))
         arm.subpart("hand").put(skin, sphere(0.07, (0.37, side * 0.27, 1.13), 12))
         low = 0.2 if side > 0 else 0.5
-        leg = b.part("leg", "trousers").put(
-            trousers,
-            limb(
-                [
-                    (-0.18, side * 0.12, 1.02),
-                    (0.2, side * 0.15, 0.62 + 0.5 * low),
-                    (-0.02, side * 0.16, low + 0.07),
-                ],
-                [0.13, 0.1, 0.07],
-            ),
-        )
+        leg_path = [
+            (-0.18, side * 0.12, 1.02),
+            (0.2, side * 0.15, 0.62 + 0.5 * low),
+            (-0.02, side * 0.16, low + 0.07),
+        ]
+        leg = b.part("leg", "trousers").put(trousers, limb(leg_path, [0.13, 0.1, 0.07]))
         leg.subpart("shoe", "foot").put(
             plain(b, "white"), box((0.28, 0.12, 0.11), (0.03, side * 0.16, low), 0.035)
         )

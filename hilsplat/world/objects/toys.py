@@ -28,17 +28,12 @@ def _bear(b: Builder) -> None:
     nose.put(light, ellipsoid((0.12, 0.13, 0.10), (0.03 + head_r * 0.82, 0, z - head_r * 0.28)))
     nose.put(dark, ellipsoid((0.03, 0.045, 0.03), (0.03 + head_r * 0.82 + 0.10, 0, z - head_r * 0.16)))
     for side in (-1, 1):
-        arm = b.part("arm").put(
-            fur,
-            sweep(
-                [
-                    (0.02, side * body_r * 0.75, 0.46),
-                    (0.10, side * body_r * 1.2, 0.38),
-                    (0.20, side * body_r * 1.25, 0.28),
-                ],
-                [0.075, 0.085, 0.075],
-            ),
-        )
+        path = [
+            (0.02, side * body_r * 0.75, 0.46),
+            (0.10, side * body_r * 1.2, 0.38),
+            (0.20, side * body_r * 1.25, 0.28),
+        ]
+        arm = b.part("arm").put(fur, sweep(path, [0.075, 0.085, 0.075]))
         arm.subpart("paw", "hand").put(light, sphere(0.092, (0.22, side * body_r * 1.25, 0.26)))
         leg = b.part("leg").put(
             fur, sweep([(0.05, side * 0.15, 0.12), (0.2, side * 0.19, 0.11), (0.34, side * 0.21, 0.11)], 0.11)
@@ -80,20 +75,17 @@ def _snowman(b: Builder) -> None:
     top = z2 + r2 * 0.62
     hat = b.part("hat", "top hat").put(hat_paint, cylinder(r2 * 0.80, top + 0.02, top + 0.27, bevel=0.015))
     hat.subpart("brim", "hat edge").put(hat_paint, cylinder(r2 * 1.35, top - 0.01, top + 0.05, bevel=0.015))
-    hat.subpart("band", "ribbon").put(
-        b.paint("cloth"),
-        lathe(
-            [(r2 * 0.8, top + 0.05), (r2 * 0.86, top + 0.05), (r2 * 0.86, top + 0.13), (r2 * 0.8, top + 0.13)]
-        ),
-    )
+    profile = [
+        (r2 * 0.8, top + 0.05),
+        (r2 * 0.86, top + 0.05),
+        (r2 * 0.86, top + 0.13),
+        (r2 * 0.8, top + 0.13),
+    ]
+    hat.subpart("band", "ribbon").put(b.paint("cloth"), lathe(profile))
     for side in (-1, 1):
         elbow = np.array([0.06, side * (r1 + 0.16), z1 + 0.08])
-        arm = b.part("arm", "stick").put(
-            b.paint("wood", "brown"),
-            sweep(
-                [(0, side * r1 * 0.85, z1 + 0.03), elbow, elbow + np.array([0.06, side * 0.05, 0.10])], 0.035
-            ),
-        )
+        path = [(0, side * r1 * 0.85, z1 + 0.03), elbow, elbow + np.array([0.06, side * 0.05, 0.10])]
+        arm = b.part("arm", "stick").put(b.paint("wood", "brown"), sweep(path, 0.035))
         arm.subpart("mitten", "glove").put(
             boots, sphere(0.085, tuple(elbow + np.array([0.07, side * 0.06, 0.14])))
         )

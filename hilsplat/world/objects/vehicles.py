@@ -11,20 +11,16 @@ def _train(b: Builder) -> None:
     axis = 0.24 + r
     frame = b.part("frame", "chassis").put(dark, box((length + 0.42, 0.34, 0.12), (0, 0, 0.21), 0.02))
     front = length / 2 + 0.20
-    frame.subpart("cowcatcher", "plough").put(
-        b.paint("plastic"),
-        loft(
-            [
-                [(front, -0.22, 0.04), (front, 0.22, 0.04), (front, 0.16, 0.27), (front, -0.16, 0.27)],
-                [
-                    (front + 0.20, -0.06, 0.04),
-                    (front + 0.20, 0.06, 0.04),
-                    (front + 0.06, 0.05, 0.25),
-                    (front + 0.06, -0.05, 0.25),
-                ],
-            ]
-        ),
-    )
+    sections = [
+        [(front, -0.22, 0.04), (front, 0.22, 0.04), (front, 0.16, 0.27), (front, -0.16, 0.27)],
+        [
+            (front + 0.20, -0.06, 0.04),
+            (front + 0.20, 0.06, 0.04),
+            (front + 0.06, 0.05, 0.25),
+            (front + 0.06, -0.05, 0.25),
+        ],
+    ]
+    frame.subpart("cowcatcher", "plough").put(b.paint("plastic"), loft(sections))
     back = -length / 2 + 0.22
     boiler = b.part("boiler", "tank").put(tank, disc(r, back, front - 0.04).moved(z=axis))
     boiler.subpart("front plate", "smokebox door").put(
@@ -91,29 +87,21 @@ def _sailboat(b: Builder) -> None:
         (x * length * 1.012, (w + 0.045) * beam * 1.03, high - 0.075, high - 0.015)
         for x, w, low, high in stations
     ]
-    hull.subpart("stripe", "band").put(
-        b.paint("plastic"),
-        loft(
-            [
-                [(x, -w * 0.475, low), (x, w * 0.475, low), (x, w / 2, high), (x, -w / 2, high)]
-                for x, w, low, high in lifted
-            ]
-        ),
-    )
-    hull.subpart("deck", "floor").put(
-        wood,
-        loft(
-            [
-                [
-                    (x * length * 0.94, -w * beam * 0.44, high - 0.02),
-                    (x * length * 0.94, w * beam * 0.44, high - 0.02),
-                    (x * length * 0.94, w * beam * 0.40, high + 0.03),
-                    (x * length * 0.94, -w * beam * 0.40, high + 0.03),
-                ]
-                for x, w, _, high in stations
-            ]
-        ),
-    )
+    sections = [
+        [(x, -w * 0.475, low), (x, w * 0.475, low), (x, w / 2, high), (x, -w / 2, high)]
+        for x, w, low, high in lifted
+    ]
+    hull.subpart("stripe", "band").put(b.paint("plastic"), loft(sections))
+    sections = [
+        [
+            (x * length * 0.94, -w * beam * 0.44, high - 0.02),
+            (x * length * 0.94, w * beam * 0.44, high - 0.02),
+            (x * length * 0.94, w * beam * 0.40, high + 0.03),
+            (x * length * 0.94, -w * beam * 0.40, high + 0.03),
+        ]
+        for x, w, _, high in stations
+    ]
+    hull.subpart("deck", "floor").put(wood, loft(sections))
     hull.subpart("rudder", "tiller").put(
         b.paint("wood"), box((0.16, 0.08, 0.42), (-length / 2 - 0.06, 0, 0.23), 0.015)
     )
@@ -132,18 +120,13 @@ def _sailboat(b: Builder) -> None:
     tall, foot = top - 0.10 - low, length * 0.50
     main.put(cloth, extrude([(0, 0), (-foot, 0), (0, tall)], 0.035).moved(mast_x - 0.04, 0, low))
     cut = 0.34
-    main.subpart("panel", "sail panel").put(
-        patch,
-        extrude(
-            [
-                (0, 0.02),
-                (-foot * 0.93, 0.02),
-                (-foot * (1 - cut) * 0.95, tall * cut * 0.8),
-                (0, tall * cut * 0.8),
-            ],
-            0.055,
-        ).moved(mast_x - 0.045, 0, low),
-    )
+    outline = [
+        (0, 0.02),
+        (-foot * 0.93, 0.02),
+        (-foot * (1 - cut) * 0.95, tall * cut * 0.8),
+        (0, tall * cut * 0.8),
+    ]
+    main.subpart("panel", "sail panel").put(patch, extrude(outline, 0.055).moved(mast_x - 0.045, 0, low))
     tall, foot = tall * 0.85, length * 0.36
     jib = b.part("jib", "front sail").put(
         b.paint("cloth"), extrude([(0, 0), (foot, 0), (0, tall)], 0.035).moved(mast_x + 0.05, 0, low - 0.10)
@@ -219,13 +202,8 @@ def _airplane(b: Builder) -> None:
     tail = b.part("tail", "tail unit").put(
         wing_paint, box((0.19, 0.56, 0.045), (back + 0.10, 0, z + 0.03), 0.015)
     )
-    tail.subpart("rudder", "tail fin").put(
-        b.paint("plain"),
-        extrude(
-            [(back, z + 0.03), (back + 0.26, z + 0.03), (back + 0.10, z + 0.34), (back - 0.03, z + 0.34)],
-            0.055,
-        ),
-    )
+    outline = [(back, z + 0.03), (back + 0.26, z + 0.03), (back + 0.10, z + 0.34), (back - 0.03, z + 0.34)]
+    tail.subpart("rudder", "tail fin").put(b.paint("plain"), extrude(outline, 0.055))
     gear = b.part("landing gear", "undercarriage")
     wheels = gear.subpart("wheels", "tires")
     for side in (-1, 1):
