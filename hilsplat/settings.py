@@ -413,7 +413,6 @@ class SemanticTreeSettings(Section):
         origin="paper: features",
     )
     feature_size: int = knob(6, "features: numbers of a feature", ge=2, le=64, origin="OpenGaussian: 6")
-    feature_steps: int = knob(60, "features: L-BFGS steps", ge=1)
     link_threshold: float = knob(
         0.3, "clusters of masks are joined while their pooled IoU is at least this", gt=0, lt=1
     )
@@ -555,9 +554,6 @@ class MethodSettings(Section):
         "all but hilsplat, lifted, occam, dr_splat: every n-th pixel of every n-th row is used",
         ge=1,
         origin="LangSplat: 1",
-    )
-    top_gaussians: int = knob(
-        45, "dr_splat: heaviest Gaussians of a pixel that take its vector", ge=1, origin="Dr. Splat"
     )
     codebook: tuple[Size, Size] = knob(
         (64, 10),

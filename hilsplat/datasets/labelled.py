@@ -220,8 +220,6 @@ def check_label_size(
 
     Args:
         where: description of the label that starts the message.
-        label_hw: height and width of the label, px.
-        image_hw: height and width of its image, px.
         share: tolerated height difference at equal widths, beyond rounding, as a share of the image's height.
 
     Returns:

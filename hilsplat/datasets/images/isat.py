@@ -93,7 +93,7 @@ def parse_isat(path: Path, content: Any) -> IsatFile:
             found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
             fix="labels of other tools (labelme, COCO) must be converted",
         )
-    info = content.get("info")
+    info: Any = content.get("info")
     if not isinstance(info, dict):
         info = {}
     size_hw = height, width = info.get("height"), info.get("width")

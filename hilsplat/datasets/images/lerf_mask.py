@@ -68,8 +68,8 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
                 )
             size_hw = image_size_hw(path)
             warnings += check_label_size(f"mask {path}", size_hw, image_hw)
-            read = partial(read_mask_file, path, FOREGROUND)
-            regions.append(LabelledRegion(text, size_hw, read, path=(text,)))
+            pixels = partial(read_mask_file, path, FOREGROUND)
+            regions.append(LabelledRegion(text, size_hw, pixels, path=(text,)))
         if not regions:
             raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
         views[view] = tuple(regions)

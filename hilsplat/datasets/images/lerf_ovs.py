@@ -28,8 +28,7 @@ from hilsplat.datasets.labelled import (
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
 from hilsplat.scene.view_names import view_name
 
-LAYOUT = """\
-lerf_ovs/
+LAYOUT = """lerf_ovs/
   figurines/  ramen/  teatime/  waldo_kitchen/
     images/frame_00001.jpg ...        undistorted
     sparse/0/{cameras,images,points3D}.bin

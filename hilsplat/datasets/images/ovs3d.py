@@ -30,8 +30,7 @@ FOREGROUND = 255
 SHAPE_TOLERANCE = 0.01
 """Relative tolerance, because mask and photograph of a view differ slightly in aspect ratio."""
 
-LAYOUT = """\
-3d_ovs/
+LAYOUT = """3d_ovs/
   bed/  bench/  blue_sofa/  covered_desk/  lawn/  office_desk/  room/  snacks/  sofa/  table/
     images/00.jpg ...                 (or .png)
     segmentations/classes.txt         one prompt per line

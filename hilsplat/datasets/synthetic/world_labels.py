@@ -105,9 +105,8 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
     whole = ply_column(path, mesh, "vertex", "whole").astype(np.int32)[seen]
     xyz = ply_places(path, mesh)[seen].astype(np.float64)
     ids = [scannet_ids(text) for text in texts]
-    instance = (whole + 1).astype(np.int32)
     fine = _of_nodes([fine for fine, _ in ids], whole)
-    nyu40 = LabelledPoints(xyz, _of_nodes([broad for _, broad in ids], whole), instance, "nyu40")
+    nyu40 = LabelledPoints(xyz, _of_nodes([broad for _, broad in ids], whole), whole + 1, "nyu40")
     of_replica = _of_nodes([replica_id(text) for text in texts], whole)
     return {
         "nyu40": nyu40,

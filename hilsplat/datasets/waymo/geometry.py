@@ -24,7 +24,6 @@ def beam_inclinations(
         values: calibrated inclinations, ascending; None if beams are evenly spaced.
         lowest: border of the lowest beam, for evenly spaced ones.
         highest: border of the highest beam.
-        height: number of rows.
     """
     if values is None:
         values = lowest + (np.arange(height) + 0.5) / height * (highest - lowest)

@@ -200,10 +200,7 @@ def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
 
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
-    """Yield images by time, then camera.
-
-    Args:
-        every: use every n-th frame, with all its cameras.
+    """Yield the images of every n-th frame, by time, then camera.
 
     Raises:
         SceneError: a component is missing or damaged, or a camera has no calibration.

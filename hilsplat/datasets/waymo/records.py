@@ -178,10 +178,7 @@ def _named(messages: Iterable[Any], name: int) -> Any:
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
-    """Yield images by frame, then camera.
-
-    Args:
-        every: use every n-th frame, with all its cameras.
+    """Yield the images of every n-th frame, by frame, then camera.
 
     Raises:
         SceneError: the file is damaged.

@@ -43,12 +43,6 @@ def test_a_written_world_is_read_back_equal(true_world, root):
     assert not any("parent" in line for line in scene.warnings)
 
 
-def test_two_objects_may_share_a_text(root):
-    paws = [region for region in HI_LERF.open(root, "ramen").views["frame_00002.png"] if region.text == "paw"]
-    assert [int(paw.mask().sum()) for paw in paws] == [16, 24]
-    assert {paw.path for paw in paws} == {("bear", "paw")}
-
-
 def test_hi_3dovs_takes_images_of_3d_ovs(tmp_path, true_world):
     write_hi(true_world, tmp_path / "hi_3dovs", tmp_path / "3d_ovs", "bed", ["001.png"], OVS_STEMS)
     scene = HI_3DOVS.open(tmp_path / "hi_3dovs", "bed")

@@ -8,10 +8,8 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
 from hilsplat.datasets.points.replica import open_scene, read_images
 from hilsplat.datasets.points.replica_mesh import (
-    class_of_objects,
     object_of_vertices,
     read_labelled_mesh,
     read_semantic_mesh,
@@ -20,7 +18,8 @@ from hilsplat.datasets.points.replica_mesh import (
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.posed_images import PosedImage
 from tests.unit.datasets.writers.ply import write_ply
-from tests.unit.datasets.writers.replica import write_semantic_mesh, write_sequence
+from tests.unit.datasets.writers.replica import write_sequence
+from tests.unit.datasets.writers.true_world import flat_images
 
 # Three quads in a row, of objects 2, 1 and 3:   0--1--2--3
 #                                                4--5--6--7
@@ -40,16 +39,7 @@ def make_habitat(folder: Path, labels=(-2, 20, 93, -1)) -> Path:
 
 
 def make_images(folder: Path, frames: int) -> list[PosedImage]:
-    folder.mkdir(parents=True, exist_ok=True)
-    images = []
-    for number in range(frames):
-        path = folder / f"{number}.jpg"
-        Image.fromarray(np.full((6, 10, 3), number, np.uint8)).save(path)
-        pose = np.eye(4)
-        pose[0, 3] = number
-        K = np.array([[7.0, 0, 5], [0, 7.0, 3], [0, 0, 1]])
-        images.append(PosedImage(path.name, path, np.linalg.inv(pose), K, (6, 10)))
-    return images
+    return flat_images(folder, [np.eye(4)] * frames, np.array([[7.0, 0, 5], [0, 7.0, 3], [0, 0, 1]]), (6, 10))
 
 
 def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> Path:
@@ -78,17 +68,6 @@ def test_vertices_take_the_object_of_most_faces_and_of_equally_many_the_smallest
     assert object_of_vertices(faces, np.array([3, 3, 1]), 5).tolist() == [3, 3, 3, 1, -1]
 
 
-def test_negative_classes_are_none(tmp_path):
-    path = make_habitat(tmp_path) / "info_semantic.json"
-    assert class_of_objects(path).tolist() == [0, 20, 93, 0]
-
-
-def test_sets_with_and_without_walls(tmp_path):
-    points = read_semantic_mesh(make_habitat(tmp_path))
-    assert points.labels(REPLICA_51)[0] == 1 and points.labels(REPLICA_48)[0] == 0  # 93 is the wall
-    assert REPLICA_48.texts[points.labels(REPLICA_48)[1] - 1] == "chair"
-
-
 def test_quads_become_two_triangles_unless_a_corner_repeats():
     assert triangles_of(np.array([[0, 1, 2, 3]], np.int32)).tolist() == [[0, 1, 2], [0, 2, 3]]
     assert triangles_of(np.array([[0, 1, 2, 2]], np.int32)).tolist() == [[0, 1, 2]]
@@ -109,16 +88,6 @@ def test_lens_is_half_the_width_unless_the_sequence_says(tmp_path):
     assert images[0].K.tolist() == [[7, 0, 5], [0, 7, 3], [0, 0, 1]]
     lens = json.loads((tmp_path / "slam" / "cam_params.json").read_text())["camera"]
     assert (lens["cx"], lens["cy"], lens["scale"]) == (4.5, 2.5, 6553.5)  # pixel centres from 0, as 599.5
-
-
-def test_published_lens_of_nice_slam(tmp_path):
-    Image.fromarray(np.zeros((68, 120, 3), np.uint8)).save(tmp_path / "small.png")
-    path = tmp_path / "room0" / "results"
-    path.mkdir(parents=True)
-    Image.fromarray(np.zeros((680, 1200, 3), np.uint8)).save(path / "frame000000.jpg")
-    (tmp_path / "room0" / "traj.txt").write_text(" ".join(map(str, np.eye(4).ravel())) + "\n")
-    images, _ = read_images(tmp_path / "room0")
-    assert images[0].K[0, 0] == 600 and images[0].K[:2, 2].tolist() == [600, 340]  # 599.5, 339.5 from 0
 
 
 def test_labels_per_vertex_as_text(tmp_path):
@@ -151,16 +120,6 @@ def test_a_scene_is_read_from_either_sequence(tmp_path):
     assert [image.name for image in scene.images] == ["frame000000.jpg", "frame000001.jpg"]
     assert open_scene(tmp_path, "room_0").report().facts["replica classes"] == 2
     assert DATASETS["replica"].found(tmp_path) == ("room_0",)
-
-
-def test_written_objects_count_from_one_and_undefined_ones_are_negative(tmp_path):
-    faces = np.array([[0, 1, 4], [1, 5, 4], [2, 3, 6]], np.int32)
-    write_semantic_mesh(tmp_path / "habitat", XYZ, faces, np.array([0, 1, -1], np.int32), [20, 0])
-    info = json.loads((tmp_path / "habitat" / "info_semantic.json").read_text())
-    assert info["id_to_label"] == [-2, 20, -1] and len(info["classes"]) == 101
-    points = read_semantic_mesh(tmp_path / "habitat")
-    assert points.class_id.tolist() == [20, 20, 0, 0, 20, 0, 0, 0]
-    np.testing.assert_array_equal(points.faces, faces)
 
 
 def refuse(message):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.datasets.classes.replica import REPLICA_48
@@ -15,8 +14,10 @@ from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.importers.known_views import read_transforms
-from hilsplat.scene.posed_images import PosedImage, write_posed_images
+from hilsplat.scene.posed_images import write_posed_images
+from tests.unit.datasets.writers.ply import write_ply
 from tests.unit.datasets.writers.scannet import write_label_table, write_scan
+from tests.unit.datasets.writers.true_world import flat_images
 
 SCAN = "scene0000_00"
 CATEGORIES = {
@@ -43,14 +44,8 @@ def turned(degrees: float) -> np.ndarray:
 
 def make_scan(root: Path, frames: int = 12, lost: tuple[int, ...] = ()) -> Path:
     """Write the scan; frame n is turned by n degrees. Returns its folder."""
-    pictures = root.parent / "pictures"
-    pictures.mkdir(parents=True, exist_ok=True)
     K = np.array([[10.0, 0, 8.25], [0, 10.0, 6.5], [0, 0, 1]])
-    images = []
-    for number in range(frames):
-        path = pictures / f"{number}.jpg"
-        Image.fromarray(np.full((12, 16, 3), number, np.uint8)).save(path)
-        images.append(PosedImage(path.name, path, np.linalg.inv(turned(number)), K, (12, 16)))
+    images = flat_images(root.parent / "pictures", [turned(number) for number in range(frames)], K, (12, 16))
     write_label_table(root, CATEGORIES)
     write_scan(root, SCAN, images, XYZ, FACES, OWNER, OBJECTS, CATEGORIES, lost)
     return root / "scans" / SCAN
@@ -162,8 +157,6 @@ def test_nyu40_follows_from_the_category_and_ids_outside_the_200_are_none(root):
 
 def break_labels(folder: Path) -> None:
     # the plain mesh gets a vertex more than its labels
-    from tests.unit.datasets.writers.ply import write_ply
-
     more = np.concatenate([XYZ, XYZ[:1]])
     write_ply(folder / f"{SCAN}_vh_clean_2.ply", {a: more[:, i] for i, a in enumerate("xyz")}, FACES, {})
 
@@ -181,14 +174,6 @@ def break_mesh(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-20])
 
 
-def break_archive(folder: Path) -> None:
-    (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink()
-
-
-def break_name(folder: Path) -> None:
-    (folder / "color" / "0.jpg").rename(folder / "color" / "first.jpg")
-
-
 def break_depth_of_folder(folder: Path) -> None:
     inner = folder / SCAN
     folder.rename(folder.with_name("aside"))
@@ -196,12 +181,8 @@ def break_depth_of_folder(folder: Path) -> None:
     folder.with_name("aside").rename(inner)
 
 
-def break_scans_folder(folder: Path) -> None:
-    folder.rename(folder.parents[1] / SCAN)
-
-
 def break_sens(folder: Path) -> None:
-    (folder / f"{SCAN}.sens").write_bytes(b"")
+    (folder / f"{SCAN}.sens").touch()
     (folder / "color").rename(folder / "colour")
 
 
@@ -211,10 +192,19 @@ def break_sens(folder: Path) -> None:
         (break_labels, r"does not belong to(.|\n)*expected  the same 6 vertices(.|\n)*found     5 vertices"),
         (break_places, r"does not belong to(.|\n)*found     vertices in other positions"),
         (break_mesh, r"labels\.ply cannot be read(.|\n)*found     a file of \d+ bytes(.|\n)*fix "),
-        (break_archive, r"scene0000_00 of ScanNet v2 is incomplete(.|\n)*labels\.ply(.|\n)*unpack"),
-        (break_name, r"first\.jpg is not named like a frame\n  expected  <number>\.jpg"),
+        (
+            lambda folder: (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink(),
+            r"scene0000_00 of ScanNet v2 is incomplete(.|\n)*labels\.ply(.|\n)*unpack",
+        ),
+        (
+            lambda folder: (folder / "color/0.jpg").rename(folder / "color/first.jpg"),
+            r"first\.jpg is not named like a frame\n  expected  <number>\.jpg",
+        ),
         (break_depth_of_folder, r"wrong place(.|\n)*fix       move .*scene0000_00/scene0000_00 to"),
-        (break_scans_folder, r"wrong place(.|\n)*fix       move .*scannet/scene0000_00 to .*scans"),
+        (
+            lambda folder: folder.rename(folder.parents[1] / SCAN),
+            r"wrong place(.|\n)*fix       move .*scannet/scene0000_00 to .*scans",
+        ),
         (break_sens, r"still inside scene0000_00\.sens(.|\n)*SensReader"),
     ],
 )

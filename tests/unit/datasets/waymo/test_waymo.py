@@ -81,14 +81,10 @@ def make_shots(vehicle: np.ndarray) -> list[CameraShot]:
 # --- geometry -------------------------------------------------------------------------------------
 
 
-def test_columns_look_from_the_left_back_round_to_the_right_back():
-    np.testing.assert_allclose(np.degrees(column_azimuths(4, np.eye(4))), [135, 45, -45, -135])
-    # a lidar turned by 30 degrees: its own azimuths are 30 less, those in the vehicle stay
-    np.testing.assert_allclose(np.degrees(column_azimuths(4, turned(30))), [105, 15, -75, -165])
-
-
 @pytest.mark.parametrize("turn", [0, 30, 148])
-def test_four_columns_at_range_two(turn):
+def test_four_columns_at_range_two_look_from_the_left_back_round_to_the_right_back(turn):
+    azimuths = np.degrees(column_azimuths(4, turned(turn)))  # in the lidar's own frame
+    np.testing.assert_allclose(azimuths, np.array([135, 45, -45, -135]) - turn)
     points = range_image_points(np.full((1, 4), 2.0), np.zeros(1), turned(turn))[0]
     expected = [[-SQRT2, SQRT2, 0], [SQRT2, SQRT2, 0], [SQRT2, -SQRT2, 0], [-SQRT2, -SQRT2, 0]]
     np.testing.assert_allclose(points, expected, atol=1e-12)

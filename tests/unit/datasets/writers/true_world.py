@@ -16,6 +16,7 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.posed_images import PosedImage
 
 MAX_POINTS = 5000
 """Sparse points that are written into a COLMAP model, taken evenly from the mesh."""
@@ -105,3 +106,18 @@ def write_sparse(
 def stems_from(world: TrueWorld, pattern: str, first: int) -> Mapping[str, str]:
     """New stem per view, numbered in camera order: ("frame_{:05d}", 1) gives frame_00001, ..."""
     return {view: pattern.format(row) for row, view in enumerate(world.cameras.names, start=first)}
+
+
+def flat_images(
+    folder: Path,
+    poses: Sequence[Float64[np.ndarray, "4 4"]],
+    K: Float64[np.ndarray, "3 3"],
+    size_hw: tuple[int, int],
+) -> list[PosedImage]:
+    """Write one grey image per camera-to-world pose, with its number as value."""
+    images = []
+    for number, pose in enumerate(poses):
+        path = folder / f"{number}.jpg"
+        write_jpeg(path, np.full((*size_hw, 3), number, np.uint8))
+        images.append(PosedImage(path.name, path, np.linalg.inv(pose), K, size_hw))
+    return images
