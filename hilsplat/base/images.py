@@ -13,19 +13,6 @@ from PIL import Image, ImageCms, ImageOps, PngImagePlugin, UnidentifiedImageErro
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ImageError
-from hilsplat.base.files import IMAGE_SUFFIXES, list_images
-
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "list_images",
-    "open_image",
-    "read_image",
-    "resize_to_fit",
-    "to_float",
-    "to_uint8",
-    "write_png",
-]
-
 
 logger = logging.getLogger(__name__)
 
@@ -141,7 +128,6 @@ def write_png(
     """Write an image (8-bit RGB or grey, or 16-bit grey) as PNG, atomically.
 
     Args:
-        path: file to write.
         pixels: (H, W, 3) or (H, W).
         compression: zlib level, 0 to 9.
         text: text entries of the file's metadata, by key.

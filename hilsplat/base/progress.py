@@ -49,14 +49,12 @@ def _tail(log: Path) -> str:
         return ""
 
 
-def _bar(*measures: str) -> "Progress":
-    """Return a terminal bar with the given columns of `rich.progress` before the time left."""
-    from rich import progress  # slow to import
-    from rich.console import Console
+def _bar() -> "Progress":
+    from rich.console import Console  # slow to import
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = [progress.TextColumn("{task.description}"), progress.BarColumn()]
-    columns += [getattr(progress, name)() for name in (*measures, "TimeRemainingColumn")]
-    return progress.Progress(*columns, console=Console(stderr=True), transient=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
@@ -69,7 +67,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
     if total is None:
         total = len(items) if isinstance(items, Sized) else None
     if sys.stderr.isatty():
-        with _bar("MofNCompleteColumn") as progress:
+        with _bar() as progress:
             task = progress.add_task(what, total=total)
             for item in items:
                 yield item

@@ -6,7 +6,8 @@ from plyfile import PlyData
 
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_path
 from hilsplat.base.errors import ArtifactError, SceneError
-from hilsplat.base.images import list_images, read_image
+from hilsplat.base.files import list_images
+from hilsplat.base.images import read_image
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
