@@ -189,9 +189,10 @@ class ClipModel:
         return crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px, as_langsplat)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
-        """Return the unit vectors of texts, each inserted into the template (ModelError: one has no token).
+        """Return the unit vectors of texts, each inserted into the template.
 
-        Texts are embedded one by one, so a vector never depends on other queries. Vectors are cached.
+        Texts are embedded one by one, so a vector never depends on other queries. Vectors are cached. A text
+        without a token raises a ModelError.
         """
         for text in texts:
             if text not in self._known_texts:
