@@ -25,6 +25,9 @@ from hilsplat.methods.common.quantise import ProductQuantiser
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
+TOP_GAUSSIANS = 45
+"""Heaviest Gaussians of a pixel that take its vector, as in the published code."""
+
 PART = 4
 """Elements of a CLIP vector that share a byte."""
 
@@ -44,11 +47,9 @@ def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
 def register(
     inputs: MethodInputs, vectors: Float32[np.ndarray, "M C"], count: int
 ) -> Float32[np.ndarray, "N 3 C"]:
-    """Return unit averages of mask vectors over the pixels that a Gaussian dominates; zero without any.
+    """Return unit averages of unit mask vectors over the pixels that a Gaussian dominates; zero without any.
 
     Args:
-        inputs: artifacts of the scene.
-        vectors: one unit vector per mask.
         count: number of Gaussians that dominate a pixel, those with the largest weights.
     """
     contributions = inputs.contributions
@@ -69,7 +70,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     """Average, quantise and decode mask vectors; Gaussians that dominate no pixel get zeros."""
     code = inputs.linear_code("dr_splat")
     vectors = code.decode_array(inputs.latents)
-    averages = register(inputs, vectors, settings.top_gaussians)
+    averages = register(inputs, vectors, TOP_GAUSSIANS)
     quantiser = ProductQuantiser.fit(vectors, PART, seed)
     features = np.zeros((*averages.shape[:2], code.latent), np.float32)
     for level in LEVELS:
@@ -98,10 +99,4 @@ def _drop_lighter(indptr, data, count):
                 data[k] = 0
 
 
-METHOD = Method(
-    "dr_splat",
-    "Dr. Splat",
-    "kaist-ami/Dr-Splat train.py; departs: product quantiser trained on the scene's own mask vectors, "
-    "weights divided by alpha, three levels, bytes decoded and rendered for queries",
-    fit,
-)
+METHOD = Method("dr_splat", "Dr. Splat", "kaist-ami/Dr-Splat train.py", fit)

@@ -14,7 +14,6 @@ The paper only states "train and cluster point-level features"; the distance thr
 from pathlib import Path
 
 import numpy as np
-import scipy.cluster.hierarchy
 from jaxtyping import Float32, Int64
 
 from hilsplat.base.levels import LEVELS, NONE, Level
@@ -24,20 +23,18 @@ from hilsplat.field.contrast import Contrast, view_relations
 from hilsplat.field.field import read_parents
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import solve_field
-from hilsplat.methods.common.groups import group_means
-from hilsplat.methods.common.quantise import kmeans
+from hilsplat.methods.common.groups import CENTRES, group_means, merged_centres
+from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.level_nodes import MIN_FIT, LevelNodes
 from hilsplat.semantic_tree.nodes import best_fits, level_ious
-from hilsplat.semantic_tree.tree import run_semantic_tree
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
-
-CENTRES = 256
-"""Maximum number of k-means centres, which are then merged."""
 
 CENTRE_OF = 4
 """Minimum number of Gaussians per centre."""
 
-KMEANS_ROUNDS = 10
+STEPS = 60
+"""L-BFGS steps of the features."""
+
 RIDGE = 1e-3
 """Weight of the penalty towards the random start, which keeps unobserved directions from drifting."""
 
@@ -54,12 +51,9 @@ def identity_features(
     """Train features with L alone, from a random start.
 
     Args:
-        contributions: mask weights of the Gaussians.
         parents: per view, the coverage tree's parent of each mask.
         settings: weights and readings of L_h, L_ins and L_part.
-        size: D.
         steps: L-BFGS steps.
-        seed: seed of the random start.
         threads: threads for matrix products; the result does not depend on it.
 
     Returns:
@@ -87,13 +81,7 @@ def identity_features(
 def farthest_alike(
     means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
 ) -> tuple[float, ...]:
-    """Return, per level, half the median distance of two masks that share a view, a level and a parent.
-
-    Args:
-        means: mean feature of each mask.
-        contributions: rows for the masks.
-        parents: per view, the coverage tree's parent of each mask, -1 for none.
-    """
+    """Return, per level, half the median distance of two masks that share a view, a level and a parent."""
     found: list[list[float]] = [[] for _ in LEVELS]
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
         level, parent = contributions.level[rows], parents[view]
@@ -107,15 +95,9 @@ def farthest_alike(
 def joined_clusters(
     features: Float32[np.ndarray, "n D"], farthest: float, seed: int
 ) -> Int64[np.ndarray, " n"]:
-    """Return each row's cluster: k-means centres, merged while their average distance is below `farthest`."""
+    """Return each row's cluster: k-means centres, merged up to an average distance of `farthest`."""
     count = int(np.clip(len(features) // CENTRE_OF, 1, CENTRES))
-    _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
-    used, centre = np.unique(centre, return_inverse=True)
-    if len(used) < 2:
-        return np.zeros(len(features), np.int64)
-    means, _ = group_means(features, centre, len(used))
-    joined = scipy.cluster.hierarchy.linkage(means, "average")
-    return (scipy.cluster.hierarchy.fcluster(joined, farthest, "distance") - 1)[centre].astype(np.int64)
+    return merged_centres(features, count, (farthest,), seed, "euclidean")[:, 0]
 
 
 def nested_clusters(
@@ -132,9 +114,8 @@ def nested_clusters(
             own = joined_clusters(features[inside, level.index], farthest[level.index], seed)
             found[inside, level.index] = number + own
             number += int(own.max()) + 1
-        around = np.where(
-            has, found[:, level.index], -2 - around
-        )  # Gaussians without a cluster remain grouped by their whole
+        # Gaussians without a cluster remain grouped by their whole.
+        around = np.where(has, found[:, level.index], -2 - around)
     return found
 
 
@@ -151,13 +132,8 @@ def run_feature_tree(
     """Write a semantic tree whose nodes are clusters of features trained with L alone.
 
     Args:
-        contributions_folder: weights of each Gaussian in each mask, with G.
-        masks_folder: masks of the views.
-        coverage_folder: coverage trees of the views, for L_ins and L_part.
         out: output folder, as in `run_semantic_tree`.
-        settings: settings of the tree.
         field_settings: weights and readings of L.
-        seed: seed of the features' start and of k-means.
         threads: number of threads; results do not depend on it.
 
     Raises:
@@ -166,7 +142,7 @@ def run_feature_tree(
     contributions = Contributions.load(contributions_folder)
     parents = read_parents(coverage_folder, contributions)
     features, means = identity_features(
-        contributions, parents, field_settings, settings.feature_size, settings.feature_steps, seed, threads
+        contributions, parents, field_settings, settings.feature_size, STEPS, seed, threads
     )
     clusters = nested_clusters(features, farthest_alike(means, contributions, parents), seed)
     S, mass = contributions.matrix("S"), contributions.mass()

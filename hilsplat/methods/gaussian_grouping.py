@@ -22,19 +22,18 @@ Departs:
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int64
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import cross_entropy, log_softmax
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import features_of_groups, group_means
+from hilsplat.methods.common.groups import features_of_groups, group_means, nearest
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import product, train
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.semantic_tree.level_nodes import level_nodes
-from hilsplat.semantic_tree.tree import MIN_VISIBLE_PX
+from hilsplat.semantic_tree.nodes import MIN_VISIBLE_PX
 from hilsplat.settings import MethodSettings, SemanticTreeSettings
 
 CHANNELS = 16
@@ -75,24 +74,18 @@ def identity_of_gaussians(
     """Train codes and classifier of a level, and classify the Gaussians.
 
     Args:
-        views: labelled pixels.
-        contributions: mask weights of the Gaussians.
         identity: identity of every mask of the scene at the level, -1 for none.
-        level: the level.
         settings: steps and rate.
-        seed: seed of the first codes and all samples.
     """
     num_classes = int(identity.max()) + 1
     draw = torch.Generator().manual_seed(seed)
     codes = (0.1 * torch.randn(contributions.num_gaussians, CHANNELS, generator=draw)).requires_grad_()
     classifier = (torch.randn(CHANNELS, num_classes, generator=draw) / CHANNELS**0.5).requires_grad_()
-    means = contributions.means()
-    count = min(NEIGHBOURS + 1, len(means))
-    neighbours = cKDTree(means).query(means, count)[1].reshape(len(means), count)[:, 1:]
-    of_view = [np.append(identity[rows], NONE) for rows in contributions.rows_of_views()]
+    neighbours = nearest(contributions.means(), NEIGHBOURS + 1)[:, 1:]
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        target = torch.from_numpy(of_view[view.number][view.labels[:, level.index]])
+        of_label = np.append(identity[view.rows], NONE)
+        target = torch.from_numpy(of_label[view.labels[:, level.index]])
         logits = product(view.weights, codes)[target >= 0] @ classifier
         total = classifier.sum() * 0
         if len(logits):
@@ -133,11 +126,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return features
 
 
-METHOD = Method(
-    "gaussian_grouping",
-    "Gaussian Grouping",
-    "lkeab/gaussian-grouping train.py; departs: identities by shared Gaussians in place of a video tracker, "
-    "once per level, frozen geometry, fewer steps on 4096 pixels of a view, CLIP of an identity in place of "
-    "Grounding-DINO",
-    fit,
-)
+METHOD = Method("gaussian_grouping", "Gaussian Grouping", "lkeab/gaussian-grouping train.py", fit)

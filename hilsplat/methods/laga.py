@@ -30,7 +30,7 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means
+from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means, unit_rows
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.quantise import kmeans
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
@@ -81,7 +81,6 @@ def nested_loss(
     """Return the contrast of pixels with mask prototypes per prefix, plus a penalty for slice lengths not 1.
 
     Args:
-        rendered: features of pixels.
         masks: pixels of the masks of whole, part, subpart.
         random: draws the pixels used outside a mask: as many as inside, besides all hard ones.
     """
@@ -129,11 +128,9 @@ def train_features(
 def objects(
     features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
-    """Return the object of each Gaussian and of each mask, -1 for none.
+    """Return the object of each Gaussian and of each mask, -1 for none; features and prototypes are unit.
 
     Args:
-        features: unit features of the Gaussians.
-        prototypes: unit prototypes of the masks.
         radius: radius of density clusters of prototypes.
         least: minimum number of masks within the radius of a dense one, including itself.
     """
@@ -144,8 +141,7 @@ def objects(
     has = of_mask != NONE
     centres = np.zeros((num, prototypes.shape[1]), np.float32)
     np.add.at(centres, of_mask[has], prototypes[has])
-    centres /= np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-12)
-    return (features @ centres.T).argmax(axis=1).astype(np.int64), of_mask
+    return (features @ unit_rows(centres).T).argmax(axis=1).astype(np.int64), of_mask
 
 
 def silhouette(distance: Float[np.ndarray, "n n"], group: Int64[np.ndarray, " n"]) -> float:
@@ -165,11 +161,7 @@ def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[
     """Return the weight of each mask's vector in the sum of its object's weighted descriptors.
 
     A descriptor is the unit centroid c of a cluster of vectors. Its weight is c.a, with the unit average a of
-    all vectors, so that a scattered cluster has less weight.
-
-    Args:
-        vectors: unit CLIP vectors of the masks of one object.
-        seed: seed of the k-means starts.
+    all vectors, so that a scattered cluster has less weight. Vectors are the unit CLIP vectors of one object.
     """
     group, best = np.zeros(len(vectors), np.int64), -1.0
     distance = cdist(vectors, vectors)
@@ -203,7 +195,7 @@ def object_latents(
 
 def large_masks(inputs: MethodInputs, contributions: Contributions) -> Bool[np.ndarray, " M"]:
     """Return whether each mask is visible in some pixels and has at least the minimum share of its view."""
-    image = np.array([np.prod(inputs.view_size_hw(view)) for view in contributions.views])
+    image = np.array([np.prod(inputs.view_camera(view).size_hw) for view in contributions.views])
     return (contributions.pixels > 0) & (contributions.area_px > MIN_SHARE * image[contributions.view])
 
 
@@ -217,21 +209,13 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     for level in LEVELS:
         rows = contributions.rows_of(level)
         rows = rows[large[rows]]
-        own = features[:, : PREFIX[level.index]]
-        own = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-12)
-        shown = unit_slices(torch.from_numpy(A[rows] @ features)).numpy()[:, : PREFIX[level.index]]
-        prototypes = shown / np.maximum(np.linalg.norm(shown, axis=1, keepdims=True), 1e-12)
+        prefix = slice(PREFIX[level.index])
+        shown = unit_slices(torch.from_numpy(A[rows] @ features)).numpy()[:, prefix]
+        own, prototypes = unit_rows(features[:, prefix]), unit_rows(shown)
         group, of_mask = objects(own, prototypes, RADIUS[level.index], least)
         latents = object_latents(of_mask, inputs.latents[rows], code, seed)
         fields.append(features_of_groups(group, latents))
     return np.stack(fields, axis=1)
 
 
-METHOD = Method(
-    "laga",
-    "LaGa",
-    "SJTU-DeepVisionLab/LaGa train_affinity_features.py, inference.ipynb; departs: descriptors of an object "
-    "added by their weights in place of the best per text, levels answer by themselves, DBSCAN* in place of "
-    "HDBSCAN, fewer steps on 2048 pixels",
-    fit,
-)
+METHOD = Method("laga", "LaGa", "SJTU-DeepVisionLab/LaGa train_affinity_features.py, inference.ipynb", fit)

@@ -18,107 +18,44 @@ LangSplat. It also differs in drawing views with replacement and training all le
 alpha and unit length like this module.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-import scipy.sparse as sp
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam
-from hilsplat.methods.common.pixels import labelled_views
+from hilsplat.methods.common.pixels import LabelledView, in_random_order, labelled_views
 from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
 
-@dataclass(frozen=True)
-class LevelPixels:
-    """Labelled pixels of one view at one level.
-
-    Attributes:
-        weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        targets: code of the mask painted at each pixel.
-    """
-
-    weights: sp.csr_matrix
-    targets: Float32[np.ndarray, "p D"]
-
-
-@dataclass(frozen=True)
-class ViewPixels:
-    """Covered pixels of one view that are labelled at any level.
-
-    Most are labelled at all levels, so their weights are stored once.
-
-    Attributes:
-        weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row of the mask painted at each pixel and level, -1 for none.
-        latents: code of each mask of the view.
-    """
-
-    weights: sp.csr_matrix
-    labels: Int32[np.ndarray, "p 3"]
-    latents: Float32[np.ndarray, "m D"]
-
-    def is_labelled(self, level: Level) -> bool:
-        """Return whether any pixel shows a mask of the level."""
-        return bool((self.labels[:, level.index] >= 0).any())
-
-    def at(self, level: Level) -> LevelPixels:
-        """Copy the pixels labelled at a level, in order."""
-        rows = np.flatnonzero(self.labels[:, level.index] >= 0)
-        return LevelPixels(self.weights[rows], self.latents[self.labels[rows, level.index]])
-
-
-class ViewQueue:
-    """Views in random order, each once before any is repeated."""
-
-    def __init__(self, views: list[ViewPixels], seed: int) -> None:
-        self._views, self._order, self._queue = views, np.random.default_rng(seed), list[int]()
-
-    def next(self) -> ViewPixels:
-        """Return the view of the next step."""
-        if not self._queue:
-            self._queue = list(self._order.permutation(len(self._views)))
-        return self._views[self._queue.pop()]
-
-
-def views_of(inputs: MethodInputs, pixel_step: int) -> list[ViewPixels]:
-    """Return the labelled grid pixels of the train views that have any, and the codes of their masks.
-
-    Raises:
-        ArtifactError: no view has a labelled pixel.
-    """
-    rows = inputs.contributions.rows_of_views()
-    views = labelled_views(inputs, pixel_step)
-    return [ViewPixels(view.weights, view.labels, inputs.latents[rows[view.number]]) for view in views]
-
-
 def train_level(
-    views: list[ViewPixels], level: Level, num_gaussians: int, settings: MethodSettings, seed: int
+    views: list[LabelledView],
+    latents: Float32[np.ndarray, "M D"],
+    level: Level,
+    num_gaussians: int,
+    settings: MethodSettings,
+    seed: int,
 ) -> Float32[np.ndarray, "N D"]:
     """Train by Adam from zero, one random view per step, each once before any is repeated.
 
     Args:
         views: train views with labelled pixels at this level, at least one.
-        level: the level to train.
-        num_gaussians: N.
         settings: steps and rate.
         seed: seed of the order of views.
     """
-    channels = views[0].latents.shape[1]
+    channels = latents.shape[1]
     wide = channels + -channels % WIDTH
     features, gradient = np.zeros((2, num_gaussians * wide), np.float32)
-    codes = {id(view): np.pad(view.latents, ((0, 0), (0, wide - channels))).reshape(-1) for view in views}
-    queue, adam = ViewQueue(views, seed), Adam(features, settings.rate)
+    adam = Adam(features, settings.rate)
+    codes = [np.pad(latents[view.rows], ((0, 0), (0, wide - channels))).reshape(-1) for view in views]
+    order = in_random_order(list(zip(views, codes, strict=True)), np.random.default_rng(seed))
     for _ in range(settings.steps):
-        view = queue.next()
-        weights, labels = view.weights, view.labels[:, level.index]
-        rows = weights.indptr, weights.indices, weights.data
-        l1_gradient(*rows, labels, codes[id(view)], channels, wide, features, gradient)
+        view, own = next(order)
+        rows = view.weights.indptr, view.weights.indices, view.weights.data
+        l1_gradient(*rows, view.labels[:, level.index], own, channels, wide, features, gradient)
         adam.step(gradient)
     return features.reshape(num_gaussians, wide)[:, :channels].copy()
 
@@ -160,22 +97,14 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other, each with its own seed."""
-    views = views_of(inputs, settings.pixel_step)
-    num_gaussians = inputs.contributions.num_gaussians
-    features = np.zeros((num_gaussians, len(LEVELS), inputs.latents.shape[1]), np.float32)
+    views, latents = labelled_views(inputs, settings.pixel_step), inputs.latents
+    num = inputs.contributions.num_gaussians
+    features = np.zeros((num, len(LEVELS), latents.shape[1]), np.float32)
     for level in track(list(LEVELS), "levels trained"):
-        if labelled := [view for view in views if view.is_labelled(level)]:
-            features[:, level.index] = train_level(
-                labelled, level, num_gaussians, settings, seed + level.index
-            )
+        if labelled := [view for view in views if len(view.at(level))]:
+            own_seed = seed + level.index
+            features[:, level.index] = train_level(labelled, latents, level, num, settings, own_seed)
     return features
 
 
-METHOD = Method(
-    "langsplat",
-    "LangSplat",
-    "minghanqin/LangSplat train.py; departs: fewer steps, pixels of a grid, L1 averaged over labelled pixels "
-    "in place of all, rendered codes divided by alpha and thinly covered pixels left out, codes of Gaussians "
-    "not scaled to unit length, small compositing weights dropped",
-    fit,
-)
+METHOD = Method("langsplat", "LangSplat", "minghanqin/LangSplat train.py", fit)

@@ -15,6 +15,7 @@ Departs from the published code:
 """
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float32, Int64
 
 from hilsplat.base.compiled import compiled
@@ -22,8 +23,8 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam
 from hilsplat.field.linear_code import LinearCode
+from hilsplat.methods.common.pixels import LabelledView, in_random_order, labelled_views
 from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.langsplat import LevelPixels, ViewPixels, ViewQueue, views_of
 from hilsplat.methods.method import Method, MethodInputs
 from hilsplat.settings import MethodSettings
 
@@ -64,18 +65,23 @@ def cosine_loss(
 def step(
     logits: Float32[np.ndarray, "N E"],
     codebook: Float32[np.ndarray, "E D"],
-    pixels: LevelPixels,
+    weights: sp.csr_matrix,
+    targets: Float32[np.ndarray, "p D"],
     code: LinearCode,
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
-    """Return the loss of a view's labelled pixels, and its gradients for logits and codebook."""
+    """Return the loss of a view's labelled pixels, and its gradients for logits and codebook.
+
+    Args:
+        weights: compositing weights (pixels x Gaussians), rows summing to 1.
+        targets: code of the mask painted at each pixel.
+    """
     chosen, shares = largest_shares(logits)
-    weights = pixels.weights
     mixed = np.zeros((weights.shape[0], len(codebook)), np.float32)
     _mix(weights.indptr, weights.indices, weights.data, chosen, shares, mixed)
-    targets = as_vectors(pixels.targets, code)
-    targets /= np.linalg.norm(targets, axis=1, keepdims=True)
+    vectors = as_vectors(targets, code)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     entries = as_vectors(codebook, code)
-    loss, by_rendered = cosine_loss(mixed @ entries, targets)
+    loss, by_rendered = cosine_loss(mixed @ entries, vectors)
     by_mixed = by_rendered @ entries.T
     by_share, by_logits = np.zeros_like(shares), np.zeros_like(logits)
     _pull(weights.indptr, weights.indices, weights.data, chosen, shares, by_mixed, by_share, by_logits)
@@ -83,7 +89,8 @@ def step(
 
 
 def train_level(
-    views: list[ViewPixels],
+    views: list[LabelledView],
+    latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
     codebook: Float32[np.ndarray, "E D"],
@@ -95,18 +102,18 @@ def train_level(
 
     Args:
         views: train views with labelled pixels at this level, at least one.
-        level: the level to train.
-        num_gaussians: N.
         codebook: initial entries, at least `KEPT`.
-        code: the scene's linear code.
         settings: steps and rate.
         seed: seed of the order of views.
     """
     logits, entries = np.zeros((num_gaussians, len(codebook)), np.float32), codebook.copy()
     of_logits, of_entries = Adam(logits, settings.rate), Adam(entries, settings.rate)
-    queue = ViewQueue(views, seed)
+    order = in_random_order(views, np.random.default_rng(seed))
     for _ in range(settings.steps):
-        _, by_logits, by_entries = step(logits, entries, queue.next().at(level), code)
+        view = next(order)
+        pixels = view.at(level)
+        targets = latents[view.rows[view.labels[pixels, level.index]]]
+        _, by_logits, by_entries = step(logits, entries, view.weights[pixels], targets, code)
         of_logits.step(by_logits)
         of_entries.step(by_entries)
     chosen, shares = largest_shares(logits)
@@ -116,13 +123,14 @@ def train_level(
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other; Gaussians in no mask of a level get zeros."""
     contributions, latents, code = inputs.contributions, inputs.latents, inputs.linear_code("langsplat_v2")
-    views = views_of(inputs, settings.pixel_step)
+    views = labelled_views(inputs, settings.pixel_step)
     features = np.zeros((contributions.num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
     for level in track(list(LEVELS), "levels trained"):
-        if labelled := [view for view in views if view.is_labelled(level)]:
-            codebook, _ = kmeans(latents[contributions.rows_of(level)], ENTRIES, seed + level.index)
+        if labelled := [view for view in views if len(view.at(level))]:
+            own_seed = seed + level.index
+            codebook, _ = kmeans(latents[contributions.rows_of(level)], ENTRIES, own_seed)
             features[:, level.index] = train_level(
-                labelled, level, len(features), codebook, code, settings, seed + level.index
+                labelled, latents, level, len(features), codebook, code, settings, own_seed
             )
     return np.where(inputs.seen()[..., None], features, np.float32(0))
 
@@ -176,10 +184,4 @@ def _pull(indptr, indices, data, chosen, shares, by_mixed, by_share, by_logits):
             by_logits[g, chosen[g, k]] = shares[g, k] * (by_share[g, k] - mean)
 
 
-METHOD = Method(
-    "langsplat_v2",
-    "LangSplatV2",
-    "ZhaoYujie2002/LangSplatV2 train.py; departs: fewer and larger steps, pixels of a grid, codebook within "
-    "the scene's linear code, rendered mixtures divided by alpha",
-    fit,
-)
+METHOD = Method("langsplat_v2", "LangSplatV2", "ZhaoYujie2002/LangSplatV2 train.py", fit)

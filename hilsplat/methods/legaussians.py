@@ -83,7 +83,6 @@ def smoothing_loss(
 def entries_of_gaussians(
     views: list[LabelledView],
     entry: Int64[np.ndarray, " M"],
-    of_view: list[Int64[np.ndarray, " m"]],
     means: Float32[np.ndarray, "N 3"],
     settings: MethodSettings,
     seed: int,
@@ -91,12 +90,9 @@ def entries_of_gaussians(
     """Train codes, uncertainties and networks of all levels; return the entry of each Gaussian.
 
     Args:
-        views: labelled pixels.
         entry: codebook index of every mask of the scene, at the mask's level.
-        of_view: rows of the masks of each view.
         means: Gaussian centres, scene units.
         settings: steps and rate.
-        seed: seed of the initial codes and networks and all samples.
     """
     num, levels = len(means), len(LEVELS)
     codes = alike(num, levels * CHANNELS, seed)
@@ -119,10 +115,9 @@ def entries_of_gaussians(
             doubt[chosen].sigmoid().reshape(-1),
         )
         for level in LEVELS:
-            label = view.labels[:, level.index]
-            inside = np.flatnonzero(label >= 0)
+            inside = view.at(level)
             if len(inside):
-                target = torch.from_numpy(entry[of_view[view.number][label[inside]]])
+                target = torch.from_numpy(entry[view.rows[view.labels[inside, level.index]]])
                 logits = decoders[level.index](unit(rendered[inside, level.index]))
                 total = total + index_loss(logits, target, uncertainty[inside, level.index])
         return total
@@ -147,18 +142,10 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         rows = contributions.rows_of(level)
         codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
         codebooks.append(codebook)
-    of_view = contributions.rows_of_views()
     views = labelled_views(inputs, settings.pixel_step)
-    found = entries_of_gaussians(views, entry, of_view, contributions.means(), settings, seed)
+    found = entries_of_gaussians(views, entry, contributions.means(), settings, seed)
     features = np.stack([codebook[own] for codebook, own in zip(codebooks, found.T, strict=True)], axis=1)
     return np.where(inputs.seen()[..., None], features, np.float32(0))
 
 
-METHOD = Method(
-    "legaussians",
-    "LEGaussians",
-    "buaavrcg/LEGaussians train.py; departs: indices of the masks' CLIP vectors in place of dense CLIP and "
-    "DINO, once per level, k-means codebook, frozen geometry, fewer steps on 1024 pixels, entries decoded "
-    "at each Gaussian in place of each pixel",
-    fit,
-)
+METHOD = Method("legaussians", "LEGaussians", "buaavrcg/LEGaussians train.py", fit)

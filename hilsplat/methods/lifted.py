@@ -1,4 +1,8 @@
-"""Training-free lifting: the weighted average of mask codes at each Gaussian (the idea of Occam's LGS)."""
+"""Training-free lifting: the weighted average of mask codes at each Gaussian (the idea of Occam's LGS).
+
+Departs: exact weights of all pixels of a mask instead of those at projected centres, and codes of the scene's
+linear code (pca, 64) instead of 512 numbers.
+"""
 
 import numpy as np
 from jaxtyping import Float32
@@ -17,10 +21,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return lifted_average(masks, mass, pixels, inputs.latents)
 
 
-METHOD = Method(
-    "lifted",
-    "lifted CLIP, training-free",
-    "the idea of Occam's LGS; departs: exact weights of all pixels of a mask in place of those at projected "
-    "centres, and codes of the scene's linear code (pca, 64) in place of 512 numbers",
-    fit,
-)
+METHOD = Method("lifted", "lifted CLIP, training-free", "the idea of Occam's LGS", fit)

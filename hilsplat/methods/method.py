@@ -36,10 +36,6 @@ class MethodInputs:
 
     Attributes:
         scene_folder: scene artifact; a method may use only its train views.
-        gaussians_ply: 3DGS PLY, frozen.
-        masks_folder: masks of the train views.
-        contributions_folder: weights of each Gaussian in each mask.
-        autoencoder_folder: the scene's code of CLIP vectors.
         threads: rasteriser threads; results must not depend on it.
     """
 
@@ -63,12 +59,8 @@ class MethodInputs:
     def view_weights(self, view: str) -> sp.csr_matrix:
         """Return a view's compositing weights (pixels x Gaussians), rows summing to 1, empty if uncovered."""
         gaussians, scene = self._loaded
-        weights = pixel_weights(
-            gaussians,
-            scene.cameras[view],
-            min_weight=self.contributions.min_weight,
-            threads=self.threads,
-        )
+        least = self.contributions.min_weight
+        weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=self.threads)
         return normalised_weights(weights)
 
     def view_masks(self, view: str) -> HierarchicalMasks:
@@ -79,12 +71,8 @@ class MethodInputs:
         """Return the row of the view's painted mask at each pixel and level, -1 for none."""
         return label_maps(self.view_masks(view))
 
-    def view_size_hw(self, view: str) -> tuple[int, int]:
-        """Return height and width of a view, px."""
-        return self.view_camera(view).size_hw
-
     def view_camera(self, view: str) -> Camera:
-        """Return the camera of a view."""
+        """Return a view's camera."""
         return self._loaded[1].cameras[view]
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
@@ -125,7 +113,7 @@ class Method:
     Attributes:
         name: key in the registry, and value of `method.name` in a variant.
         title: name in tables.
-        source: repository or paper that it follows, and departures from it.
+        source: repository or paper that it follows; departures are in the module's docstring.
         fit: maps (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
     """
 

@@ -54,10 +54,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return np.where(total[..., None] > 0, sums / np.maximum(total, 1e-12)[..., None], np.float32(0))
 
 
-METHOD = Method(
-    "occam",
-    "Occam's LGS",
-    "insait-institute/OccamLGS, arXiv 2412.01807; departs: codes of the scene's linear code in place of 512 "
-    "numbers, weights divided by alpha",
-    fit,
-)
+METHOD = Method("occam", "Occam's LGS", "insait-institute/OccamLGS, arXiv 2412.01807", fit)

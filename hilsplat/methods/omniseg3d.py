@@ -125,11 +125,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return cluster_field(inputs, clusters(features, thresholds, seed))
 
 
-METHOD = Method(
-    "omniseg3d",
-    "OmniSeg3D",
-    "OceanYing/OmniSeg3D-GS train.py; departs: patches of painted masks, fewer steps on 4096 pixels, "
-    "unit length by division, clusters at three thresholds of the cosine in place of a click, CLIP of the "
-    "masks that fit a cluster",
-    fit,
-)
+METHOD = Method("omniseg3d", "OmniSeg3D", "OceanYing/OmniSeg3D-GS train.py", fit)

@@ -41,9 +41,6 @@ POSITION = 0.5
 LEAST_WEIGHT, HARD_WEIGHT = 0.1, 0.9
 HARD_FROM = 0.5
 """Share of the steps after which only the closest pairs keep their weight."""
-MIN_SCORE = 0.2
-MIN_VIEWS = 2
-"""OpenGaussian's value for ScanNet; its value for LERF is 5."""
 
 
 def smoothing_loss(
@@ -81,15 +78,14 @@ def instance_features(
     start = np.random.default_rng(seed).random((num, levels, CHANNELS), dtype=np.float32)
     features = torch.from_numpy(start * 2 - 1).requires_grad_()
     A = contributions.matrix("A")
-    rows = contributions.rows_of_views()
-    means_of = {view.number: A[rows[view.number]] for view in views}
+    means_of = {view.number: A[view.rows] for view in views}
 
     def loss(view: LabelledView, _: np.random.Generator, done: float) -> Tensor:
         shown = (unit(features).reshape(num, -1) + 1) / 2
         rendered = product(view.weights, shown).reshape(-1, levels, CHANNELS)
         means = product(means_of[view.number], shown).reshape(-1, levels, CHANNELS)
-        level = contributions.level[rows[view.number]]
-        used = contributions.pixels[rows[view.number]] > 0
+        level = contributions.level[view.rows]
+        used = contributions.pixels[view.rows] > 0
         total = shown.sum() * 0
         for each in LEVELS:
             label = torch.from_numpy(view.labels[:, each.index].astype(np.int64))
@@ -117,7 +113,6 @@ def instances(
         features: instance features of a level.
         means: Gaussian centres, scene units.
         codebook: number of coarse groups, and of fine groups in each.
-        seed: seed of the first centres.
     """
     num_coarse, num_fine = codebook
     placed = np.concatenate([features, np.float32(POSITION) * standardised(means)], axis=1)
@@ -152,17 +147,7 @@ def level_field(
     def closeness(mask: np.ndarray, group: np.ndarray) -> np.ndarray:
         return 1 - np.abs(of_mask[mask] - of_leaf[group]).mean(axis=1)
 
-    latents, _ = group_latents(
-        leaf,
-        num,
-        contributions,
-        rows,
-        inputs.latents,
-        min_score=MIN_SCORE,
-        min_views=MIN_VIEWS,
-        closeness=closeness,
-    )
-    return features_of_groups(leaf, latents)
+    return features_of_groups(leaf, group_latents(leaf, num, contributions, rows, inputs.latents, closeness))
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
@@ -176,11 +161,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return np.stack(fields, axis=1)
 
 
-METHOD = Method(
-    "opengaussian",
-    "OpenGaussian",
-    "yanmin-wu/OpenGaussian train.py; departs: once per level, fewer steps on 4096 pixels of a view, no "
-    "training towards the codebooks, IoU of visible weights, answers by relevancy in place of the best "
-    "instances",
-    fit,
-)
+METHOD = Method("opengaussian", "OpenGaussian", "yanmin-wu/OpenGaussian train.py", fit)

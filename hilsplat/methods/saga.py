@@ -24,12 +24,11 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int32
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import cluster_field, clusters
+from hilsplat.methods.common.groups import cluster_field, clusters, nearest
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
@@ -99,7 +98,6 @@ def affinity_loss(
     Pairs used are those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
 
     Args:
-        rendered: features of pixels.
         gates: gate of each scale.
         same: whether two pixels are together at each scale.
         weight: weight of each pair.
@@ -127,8 +125,8 @@ def affinity_loss(
 
 def neighbour_mean(means: Float32[np.ndarray, "N 3"]) -> sp.csr_matrix:
     """Return the matrix that averages over each Gaussian and its nearest neighbours, 16 in total."""
-    count = min(NEIGHBOURS, len(means))
-    near = cKDTree(means).query(means, count)[1].reshape(len(means), count)
+    near = nearest(means, NEIGHBOURS)
+    count = near.shape[1]
     rows = np.repeat(np.arange(len(means)), count)
     data = np.full(near.size, 1 / count, np.float32)
     return sp.csr_matrix((data, (rows, near.ravel())), shape=(len(means), len(means)))
@@ -145,26 +143,22 @@ def train_features(
     """Train features and gate; return the unit features gated for each scale.
 
     Args:
-        views: labelled pixels.
-        contributions: mask weights of the Gaussians.
         scales: scales of all masks.
         asked: scales of the returned features.
         settings: steps and rate.
-        seed: seed of the initial features and gate and all samples.
     """
     features = alike(contributions.num_gaussians, CHANNELS, seed)
     draw = torch.Generator().manual_seed(seed)
     gate = (2 * torch.rand(2, CHANNELS, generator=draw) - 1).requires_grad_()  # slope and offset
     smooth = neighbour_mean(contributions.means())
     quantile = np.linspace(0, 1, len(scales)), np.sort(scales)
-    of_view = contributions.rows_of_views()
 
     def gates(at: Float64[np.ndarray, " s"]) -> Tensor:
         share = torch.from_numpy(np.interp(at, quantile[1], quantile[0]).astype(np.float32))
         return (share[:, None] * gate[0] + gate[1]).sigmoid()
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        own, has = of_view[view.number], view.labels >= 0
+        own, has = view.rows, view.labels >= 0
         scale = np.where(has, scales[own][view.labels], 0)
         area = np.where(has, contributions.area_px[own][view.labels], 0).sum(axis=1) / has.sum(axis=1)
         at = drawn_scales(scales[own], random)
@@ -192,11 +186,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return cluster_field(inputs, group)
 
 
-METHOD = Method(
-    "saga",
-    "SAGA",
-    "Jumpat/SegAnyGAussians train_contrastive_feature.py; departs: scales of the shown Gaussians, painted "
-    "masks, fewer steps on 256 pixels, clusters at the median scale of each level in place of a click, CLIP "
-    "of the masks that fit a cluster",
-    fit,
-)
+METHOD = Method("saga", "SAGA", "Jumpat/SegAnyGAussians train_contrastive_feature.py", fit)

@@ -19,10 +19,8 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
     """Compute the field of a scene by a baseline.
 
     Args:
-        inputs: artifacts of the scene.
         out: `field.safetensors`.
         settings: name and settings of the method.
-        seed: random seed.
 
     Raises:
         SettingsError: there is no such method.

@@ -29,7 +29,7 @@ from torch.nn.functional import softplus
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import NONE
-from hilsplat.methods.common.groups import cluster_field, thresholds_of
+from hilsplat.methods.common.groups import cluster_field, nearest, thresholds_of
 from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import alike, product, train, unit
 from hilsplat.methods.method import Method, MethodInputs
@@ -91,8 +91,6 @@ def ultrametric(
     """Return the longest edge between each pair of pixels in the minimum spanning tree; differentiable.
 
     Args:
-        vectors: vectors of pixels.
-        edges: edges of the graph.
         penalty: added to an edge's length when the tree is chosen, not in the result.
         pairs: pairs of pixels; the distance is 2 without a path and 0 from a pixel to itself.
     """
@@ -116,9 +114,8 @@ def ultrametric(
 
 def neighbouring_pixels(xy: Int64[np.ndarray, "p 2"]) -> Int64[np.ndarray, "2 e"]:
     """Return the distinct edges from each pixel to its nearest ones in the image."""
-    count = min(PIXEL_NEIGHBOURS + 1, len(xy))
-    near = cKDTree(xy).query(xy, count)[1].reshape(len(xy), count)
-    edges = np.stack([np.repeat(np.arange(len(xy)), count), near.ravel()])
+    near = nearest(xy, PIXEL_NEIGHBOURS + 1)
+    edges = np.stack([np.repeat(np.arange(len(xy)), near.shape[1]), near.ravel()])
     return np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
 
 
@@ -143,9 +140,7 @@ def triplets(
         around = np.ones(len(labels), bool) if above == NONE else labels[:, level[above] - 1] == above
         own, other = np.flatnonzero(inside), np.flatnonzero(around & ~inside)
         if len(own) > 1 and len(other):
-            found.append(
-                np.stack([random.choice(own, PAIRS), random.choice(own, PAIRS), random.choice(other, PAIRS)])
-            )
+            found.append(np.stack([random.choice(each, PAIRS) for each in (own, own, other)]))
     return np.concatenate(found, axis=1) if found else np.zeros((3, 0), np.int64)
 
 
@@ -156,15 +151,7 @@ def train_features(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Return trained unit vectors of Gaussians.
-
-    Args:
-        views: labelled pixels.
-        trees: level and parent of the masks, by view number.
-        num_gaussians: N.
-        settings: steps and rate.
-        seed: seed of the initial vectors, pixels and triplets.
-    """
+    """Return trained unit vectors of Gaussians; `trees` has level and parent of masks, by view number."""
     features = alike(num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
@@ -194,9 +181,8 @@ def components(
     Gaussians outside the 200 largest components join that of the nearest Gaussian inside them.
     """
     num = len(means)
-    count = min(NEIGHBOURS + 1, num)
-    near = cKDTree(means).query(means, count)[1].reshape(num, count)
-    a, b = np.repeat(np.arange(num), count), near.ravel()
+    near = nearest(means, NEIGHBOURS + 1)
+    a, b = np.repeat(np.arange(num), near.shape[1]), near.ravel()
     apart = np.sqrt(np.square(features[a] - features[b]).sum(axis=1))
     found = []
     for most in thresholds:
@@ -230,11 +216,4 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     return cluster_field(inputs, components(features, contributions.means(), thresholds))
 
 
-METHOD = Method(
-    "vch",
-    "VCH",
-    "hardyho/ultrametric_feature_fields; departs: 16 numbers on frozen Gaussians in place of a radiance "
-    "field of 128, unit length by division, no smoothing of depth, components of Gaussians, not voxels, "
-    "CLIP of the masks that fit a component",
-    fit,
-)
+METHOD = Method("vch", "VCH", "hardyho/ultrametric_feature_fields", fit)

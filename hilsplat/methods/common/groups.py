@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.cluster.hierarchy
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
+from jaxtyping import Float, Float32, Float64, Int, Int32, Int64, Shaped
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -20,7 +20,8 @@ CENTRES = 256
 KMEANS_ROUNDS = 10
 MIN_SCORE = 0.2
 MIN_VIEWS = 2
-"""Minimum score of a mask and minimum number of views for a cluster's code (OpenGaussian, for ScanNet)."""
+"""Minimum score of a mask and minimum number of views for a cluster's code: OpenGaussian's values for
+ScanNet; its number of views for LERF is 5."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
 
@@ -29,6 +30,17 @@ def standardised(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"
     """Centre the Gaussians' positions and scale them to a standard deviation of 1 over all three axes."""
     apart = means - means.mean(axis=0)
     return apart / max(float(apart.std()), 1e-12)
+
+
+def unit_rows(rows: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n D"]:
+    """Scale rows to length 1; a row of zeros is unchanged."""
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+
+
+def nearest(points: Shaped[np.ndarray, "n C"], count: int) -> Int64[np.ndarray, "n k"]:
+    """Return each point's `count` nearest points (or all if fewer), itself included, nearest first."""
+    count = min(count, len(points))
+    return cKDTree(points).query(points, count)[1].reshape(len(points), count)
 
 
 def group_means(
@@ -46,28 +58,21 @@ def group_latents(
     contributions: Contributions,
     rows: Int64[np.ndarray, " m"],
     latents: Float32[np.ndarray, "M D"],
-    *,
-    min_score: float,
-    min_views: int,
     closeness: Closeness | None = None,
-) -> tuple[Float32[np.ndarray, "T D"], Bool[np.ndarray, " T"]]:
+) -> Float32[np.ndarray, "T D"]:
     """Return each group's code by association: the best-fitting mask of every view, averaged over views.
 
     Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU uses visible weights instead of a group
     rendered alone, so that hidden Gaussians do not count.
 
+    A mask is chosen only if its score is above `MIN_SCORE`. Groups with masks in fewer than `MIN_VIEWS` views
+    get 0; in a scene of one view, one is enough.
+
     Args:
         group: group of each Gaussian, -1 for none.
-        num_groups: T.
-        contributions: mask weights of the Gaussians.
         rows: candidate masks.
         latents: code of every mask of the scene.
-        min_score: a mask is chosen only if its score is above this.
-        min_views: groups with masks in fewer views get no code; capped at the number of views.
         closeness: factor of the score for pairs of a mask (index into `rows`) and a group; 1 if None.
-
-    Returns:
-        codes, 0 for groups without one, and whether each group has one.
     """
     has = np.flatnonzero(group != NONE)
     num = len(group)
@@ -84,10 +89,10 @@ def group_latents(
     order = np.lexsort((mask, -score, of, view))
     key = view[order].astype(np.int64) * num_groups + of[order]
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]
-    best = first[score[first] > min_score]
+    best = first[score[first] > MIN_SCORE]
     means, counts = group_means(latents[rows[mask[best]]], of[best], num_groups)
-    found = counts >= max(min(min_views, len(size)), 1)
-    return np.where(found[:, None], means, 0).astype(np.float32), found
+    found = counts >= min(MIN_VIEWS, len(size))
+    return np.where(found[:, None], means, 0).astype(np.float32)
 
 
 def features_of_groups(
@@ -102,14 +107,22 @@ def clusters(
     features: Float32[np.ndarray, "N D"], thresholds: tuple[float, ...], seed: int
 ) -> Int64[np.ndarray, "N K"]:
     """Return each Gaussian's cluster at every cosine threshold; clusters of higher thresholds are nested."""
-    _, centre = kmeans(features, CENTRES, seed, KMEANS_ROUNDS)
+    return merged_centres(features, CENTRES, tuple(1 - least for least in thresholds), seed, "cosine")
+
+
+def merged_centres(
+    features: Float32[np.ndarray, "N D"], count: int, distances: tuple[float, ...], seed: int, metric: str
+) -> Int64[np.ndarray, "N K"]:
+    """Return each row's cluster: k-means centres, merged while their average distance is at most each one."""
+    _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
-    means, _ = group_means(features, centre, len(used))
-    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     if len(used) < 2:
-        return np.zeros((len(features), len(thresholds)), np.int64)
-    joined = scipy.cluster.hierarchy.linkage(means, "average", metric="cosine")
-    cut = [scipy.cluster.hierarchy.fcluster(joined, 1 - least, "distance") - 1 for least in thresholds]
+        return np.zeros((len(features), len(distances)), np.int64)
+    means, _ = group_means(features, centre, len(used))
+    if metric == "cosine":
+        means = unit_rows(means)
+    joined = scipy.cluster.hierarchy.linkage(means, "average", metric)
+    cut = [scipy.cluster.hierarchy.fcluster(joined, most, "distance") - 1 for most in distances]
     return np.stack(cut, axis=1)[centre].astype(np.int64)
 
 
@@ -124,15 +137,7 @@ def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Floa
         if not len(inputs.contributions.rows_of(level)):
             own = np.full_like(own, NONE)
         num = int(own.max(initial=NONE)) + 1
-        latents, _ = group_latents(
-            own,
-            num,
-            inputs.contributions,
-            every,
-            inputs.latents,
-            min_score=MIN_SCORE,
-            min_views=MIN_VIEWS,
-        )
+        latents = group_latents(own, num, inputs.contributions, every, inputs.latents)
         features.append(features_of_groups(own, latents))
     return np.stack(features, axis=1)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.progress import track
-from hilsplat.methods.common.pixels import LabelledView
+from hilsplat.methods.common.pixels import LabelledView, in_random_order
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096
@@ -47,9 +47,8 @@ def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
     """Return the non-empty columns and their indices; a step's pixels show few of the Gaussians."""
     columns, place = np.unique(matrix.indices, return_inverse=True)
     parts = matrix.data, place.reshape(-1), matrix.indptr
-    return sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns))), torch.from_numpy(
-        columns.astype(np.int64)
-    )
+    small = sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns)))
+    return small, torch.from_numpy(columns.astype(np.int64))
 
 
 def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
@@ -83,9 +82,7 @@ def train(
     """Minimise in place by Adam: each step uses one view, each view once before any is repeated.
 
     Args:
-        views: views from which pixels are drawn.
         groups: parameter groups of `torch.optim.Adam`, each with its rate.
-        loss: loss of random pixels of a view.
         settings: number of steps.
         seed: seed of the order of views and the pixels.
         pixels: maximum pixels per step.
@@ -93,11 +90,9 @@ def train(
     random = np.random.default_rng(seed)
     with one_torch_thread():
         optimiser = torch.optim.Adam(groups, eps=1e-15)
-        queue: list[int] = []
-        for step in track(range(settings.steps), "steps", settings.steps):
-            if not queue:
-                queue = list(random.permutation(len(views)))
-            view = views[queue.pop()]
+        order = in_random_order(views, random)
+        for step in track(range(settings.steps), "steps"):
+            view = next(order)
             chosen = random.permutation(len(view))[:pixels]
             optimiser.zero_grad()
             loss(view.chosen(chosen), random, step / settings.steps).backward()

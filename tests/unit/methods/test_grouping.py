@@ -10,7 +10,8 @@ import torch
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.methods import gaussian_grouping, laga, legaussians, omniseg3d, opengaussian, saga, vch
+from hilsplat.methods import laga, omniseg3d, vch
+from hilsplat.methods.common import groups
 from hilsplat.methods.common.groups import (
     clusters,
     features_of_groups,
@@ -23,82 +24,53 @@ from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
+from hilsplat.methods.registry import method_of
 from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
 from hilsplat.settings import MethodSettings
 from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
 from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, region_mask
 
 RNG = np.random.default_rng(0)
+EVERY, LARGE = tuple(range(len(REGIONS))), (0, 1, 2, 3, 5, 6)
+"""LARGE lacks part "B top", which covers its box too little to be told from the rest."""
 FITS = {
-    "opengaussian": (
-        opengaussian,
-        MethodSettings(name="opengaussian", steps=150, rate=0.05, pixel_step=1, codebook=(2, 2)),
-    ),
-    "gaussian_grouping": (
-        gaussian_grouping,
-        MethodSettings(name="gaussian_grouping", steps=100, rate=0.05, pixel_step=1),
-    ),
-    "laga": (laga, MethodSettings(name="laga", steps=150, rate=0.05, pixel_step=1)),
-    "legaussians": (legaussians, MethodSettings(name="legaussians", steps=150, rate=0.02, pixel_step=1)),
-    "saga": (saga, MethodSettings(name="saga", steps=150, rate=0.05, pixel_step=1)),
-    "omniseg3d": (
-        omniseg3d,
-        MethodSettings(name="omniseg3d", steps=150, rate=0.05, pixel_step=1, thresholds=(0.05, 0.4, 0.7)),
-    ),
-    "vch": (vch, MethodSettings(name="vch", steps=100, rate=0.05, pixel_step=1, thresholds=(0.8, 0.5, 0.3))),
+    # method: settings, regions that it finds, least share of a region's Gaussians with its code
+    "opengaussian": ({"codebook": (2, 2)}, EVERY, 0.8),
+    "gaussian_grouping": ({"steps": 100}, EVERY, 0.8),
+    "laga": ({}, EVERY, 0.8),
+    "legaussians": ({"rate": 0.02}, EVERY, 0.8),
+    "saga": ({}, (0, 1, 2, 3), 0.6),
+    "omniseg3d": ({"thresholds": (0.05, 0.4, 0.7)}, LARGE, 0.6),
+    "vch": ({"steps": 100, "thresholds": (0.8, 0.5, 0.3)}, LARGE, 0.6),  # a third of "A top" is a subpart
 }
 
 
-def fit_of(name, inputs, settings=None):
+def fit_of(name, inputs, **changed):
     """Features of a method."""
-    module, own = FITS[name]
-    return module.fit(inputs, settings or own, 0)
+    own = {"steps": 150, "rate": 0.05, "pixel_step": 1, **FITS[name][0], **changed}
+    return method_of(name).fit(inputs, MethodSettings(name=name, **own), 0)
 
 
-def answered(features, level, row):
-    """Share of a region's Gaussians whose largest code at the level is that of the region."""
-    inside = np.flatnonzero(region_mask(row).ravel())
-    own = features[inside, level.index]
-    return np.mean((own.argmax(axis=1) == row) & (own.max(axis=1) > 0.5))
-
-
-@pytest.mark.parametrize("name", ["opengaussian", "gaussian_grouping", "legaussians"])
-def test_methods_that_group_a_level_give_every_region_its_own_code(two_boxes_contributions, name):
-    features = fit_of(name, two_boxes_inputs(*two_boxes_contributions))
-    for row, (_, level, *_) in enumerate(REGIONS):
-        assert answered(features, Level(level), row) > 0.8, REGIONS[row][0]
-
-
-@pytest.mark.parametrize("name", ["omniseg3d", "vch"])
-def test_methods_with_thresholds_find_the_hierarchy_from_masks_of_single_views(two_boxes_contributions, name):
-    features = fit_of(name, two_boxes_inputs(*two_boxes_contributions))
-    for row in (0, 1, 2, 3, 5, 6):  # part "B top" covers its box too little to be told from the rest
-        level = Level(REGIONS[row][1])
-        assert answered(features, level, row) > 0.6, REGIONS[row][0]  # a third of "A top" is a subpart
-
-
-def test_laga_finds_the_objects_of_every_level(two_boxes_contributions, monkeypatch):
+@pytest.mark.parametrize("name", sorted(FITS))
+def test_regions_of_every_level_get_their_own_code(two_boxes_contributions, monkeypatch, name):
     monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # some regions have masks in three of the four views
-    features = fit_of("laga", two_boxes_inputs(*two_boxes_contributions))
-    for row, (name, level, *_) in enumerate(REGIONS):
-        assert answered(features, Level(level), row) > 0.8, name
-
-
-def test_saga_tells_wholes_from_parts_by_scale(two_boxes_contributions):
-    features = fit_of("saga", two_boxes_inputs(*two_boxes_contributions))
-    for row in (0, 1, 2, 3):
-        assert answered(features, Level(REGIONS[row][1]), row) > 0.6, REGIONS[row][0]
+    features = fit_of(name, two_boxes_inputs(*two_boxes_contributions))
+    _, rows, least = FITS[name]
+    for row in rows:
+        inside = np.flatnonzero(region_mask(row).ravel())
+        own = features[inside, Level(REGIONS[row][1]).index]
+        right = (own.argmax(axis=1) == row) & (own.max(axis=1) > 0.5)
+        assert np.mean(right) > least, REGIONS[row][0]
 
 
 @pytest.mark.parametrize("name", sorted(FITS))
 def test_a_fit_repeats_to_the_byte_on_any_number_of_threads(two_boxes_contributions, name):
-    settings = FITS[name][1].model_copy(update={"steps": 5})
     before = torch.get_num_threads()
     made = []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            made.append(fit_of(name, two_boxes_inputs(*two_boxes_contributions, threads), settings))
+            made.append(fit_of(name, two_boxes_inputs(*two_boxes_contributions, threads), steps=5))
     finally:
         torch.set_num_threads(before)
     assert made[0].tobytes() == made[1].tobytes()
@@ -106,36 +78,38 @@ def test_a_fit_repeats_to_the_byte_on_any_number_of_threads(two_boxes_contributi
 
 
 @pytest.mark.parametrize(
-    ("name", "wrong", "direction"), [("omniseg3d", (0.9, 0.7, 0.5), "grow"), ("vch", (0.1, 0.2, 0.2), "fall")]
+    ("method", "wrong", "direction"),
+    [(omniseg3d, (0.9, 0.7, 0.5), "grow"), (vch, (0.1, 0.2, 0.2), "fall")],
 )
-def test_thresholds_out_of_order_are_refused(name, wrong, direction):
-    settings = MethodSettings(name=name, thresholds=wrong)
-    with pytest.raises(SettingsError, match=rf"method.thresholds: {name} .*\n.*numbers that {direction}"):
-        thresholds_of(settings, FITS[name][0].THRESHOLDS)
+def test_thresholds_out_of_order_are_refused(method, wrong, direction):
+    settings = MethodSettings(name=method.METHOD.name, thresholds=wrong)
+    with pytest.raises(
+        SettingsError, match=rf"method.thresholds: {settings.name} .*\n.*numbers that {direction}"
+    ):
+        thresholds_of(settings, method.THRESHOLDS)
+
+
+def one_view(weights, labels, size_hw):
+    """Stand-in inputs with one view."""
+    return types.SimpleNamespace(
+        contributions=types.SimpleNamespace(views=("a",), rows_of_views=lambda: [np.arange(1)]),
+        view_weights=lambda view: sp.csr_matrix(np.float32(weights)[:, None]),
+        view_labels=lambda view: labels,
+        view_camera=lambda view: types.SimpleNamespace(size_hw=size_hw),
+    )
 
 
 def test_views_without_labelled_pixels_are_refused():
-    inputs = types.SimpleNamespace(
-        contributions=types.SimpleNamespace(views=("a",)),
-        view_weights=lambda view: sp.csr_matrix(np.ones((2, 1), np.float32)),
-        view_labels=lambda view: np.full((2, 3), -1, np.int32),
-        view_size_hw=lambda view: (1, 2),
-    )
+    inputs = one_view([1, 1], np.full((2, 3), -1, np.int32), (1, 2))
     with pytest.raises(ArtifactError, match="no train view has a pixel on a grid of 3 px"):
         inspect.unwrap(labelled_views)(inputs, 3)
 
 
 def test_labelled_pixels_know_their_place_and_are_covered():
     # 2 x 3 pixels: 0 not labelled, 4 not covered
-    weights = sp.csr_matrix(np.float32([[1], [1], [1], [1], [0], [1]]))
     labels = np.full((6, 3), 0, np.int32)
     labels[0] = -1
-    inputs = types.SimpleNamespace(
-        contributions=types.SimpleNamespace(views=("a",)),
-        view_weights=lambda view: weights,
-        view_labels=lambda view: labels,
-        view_size_hw=lambda view: (2, 3),
-    )
+    inputs = one_view([1, 1, 1, 1, 0, 1], labels, (2, 3))
     (view,) = inspect.unwrap(labelled_views)(inputs, 2)  # columns 0 and 2 of row 0
     assert view.xy.tolist() == [[2, 0]]
     (view,) = inspect.unwrap(labelled_views)(inputs, 1)
@@ -151,12 +125,8 @@ def test_gradient_of_the_sparse_product_is_that_of_the_dense_one():
 
 
 def test_training_finds_the_mean_of_what_a_gaussian_shows_and_visits_all_views():
-    views = [
-        LabelledView(
-            n, sp.csr_matrix(np.ones((2, 1), np.float32)), np.full((2, 3), n, np.int32), np.zeros((2, 2), int)
-        )
-        for n in range(3)
-    ]
+    weights, xy = sp.csr_matrix(np.ones((2, 1), np.float32)), np.zeros((2, 2), int)
+    views = [LabelledView(n, np.arange(3), weights, np.full((2, 3), n, np.int32), xy) for n in range(3)]
     feature, seen = torch.zeros(1, 1, requires_grad=True), []
 
     def loss(view, random, done):
@@ -171,7 +141,8 @@ def test_training_finds_the_mean_of_what_a_gaussian_shows_and_visits_all_views()
 @pytest.mark.parametrize(("most", "expected"), [(3, 3), (5, 5), (9, 5)])
 def test_a_step_sees_some_pixels_of_a_view_each_once(most, expected):
     matrix = sp.csr_matrix(np.eye(5, dtype=np.float32))
-    view = LabelledView(0, matrix, np.zeros((5, 3), np.int32), np.stack([np.arange(5)] * 2, axis=1))
+    xy = np.stack([np.arange(5)] * 2, axis=1)
+    view = LabelledView(0, np.arange(1), matrix, np.zeros((5, 3), np.int32), xy)
     feature, seen = torch.zeros(5, 1, requires_grad=True), []
 
     def loss(view, random, done):
@@ -218,35 +189,29 @@ def test_codebooks_split_by_position_first_and_by_feature_then():
     assert len(np.unique(leaf)) == 4
 
 
-def association(S, mass, view):
-    """Stand-in contributions."""
-    return types.SimpleNamespace(
-        matrix={"S": sp.csr_matrix(np.float32(S))}.get, mass=lambda: np.float32(mass), view=np.array(view)
-    )
-
-
-def associated(contributions, group, num, latents, **options):
-    settings = {"min_score": 0.2, "min_views": 1} | options
-    rows = np.arange(len(latents))
-    return inspect.unwrap(group_latents)(
-        np.array(group), num, contributions, rows, np.float32(latents), **settings
-    )
-
-
-def test_a_group_takes_the_best_mask_of_each_view():
+@pytest.mark.parametrize(
+    ("least", "views", "num_views", "far", "expected"),
+    [
+        (0.2, 1, 2, None, 1.5),  # mask 0 wins view 0, mask 2 is alone in view 1
+        (0.2, 1, 2, 0, 3.5),  # with mask 0 far in features, mask 1 wins view 0
+        (0.7, 1, 2, None, 1.0),  # the IoU of mask 2 is too small
+        (0.2, 3, 2, None, 1.5),  # both of two views are as good as three
+        (0.2, 3, 3, None, 0.0),  # two of three views are not
+    ],
+)
+def test_a_group_takes_the_best_mask_of_each_view(monkeypatch, least, views, num_views, far, expected):
+    monkeypatch.setattr(groups, "MIN_SCORE", least)
+    monkeypatch.setattr(groups, "MIN_VIEWS", views)
     # view 0: mask 0 holds both Gaussians of group 0 (IoU 1), mask 1 one of them; view 1: mask 2, IoU 2/3
-    S = [[1, 1, 0], [1, 0, 0], [1, 1, 1]]
-    contributions = association(S, np.ones((2, 3)), [0, 0, 1])
-    latents, found = associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]])
-    assert latents.tolist() == [[1.5], [0.0]] and found.tolist() == [True, False]
-    # with mask 0 far in features mask 1 wins its view; views below the least score do not count
-    far = lambda mask, group: np.where(mask == 0, 0.1, 1.0)  # noqa: E731
-    assert associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], closeness=far)[0][0] == 3.5
-    assert associated(contributions, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_score=0.7)[0][0] == 1.0
-    # three views are as good as all of two, but not as two of three
-    three = association(S, np.ones((3, 3)), [0, 0, 1])
-    for scene, expected in ((contributions, [True, False]), (three, [False, False])):
-        assert associated(scene, [0, 0, -1], 2, [[1.0], [5.0], [2.0]], min_views=3)[1].tolist() == expected
+    contributions = types.SimpleNamespace(
+        matrix={"S": sp.csr_matrix(np.float32([[1, 1, 0], [1, 0, 0], [1, 1, 1]]))}.get,
+        mass=lambda: np.ones((num_views, 3), np.float32),
+        view=np.array([0, 0, 1]),
+    )
+    codes, rows = np.float32([[1], [5], [2]]), np.arange(3)
+    closeness = lambda mask, group: np.where(mask == far, 0.1, 1.0)  # noqa: E731
+    found = inspect.unwrap(group_latents)(np.array([0, 0, -1]), 2, contributions, rows, codes, closeness)
+    assert found.tolist() == [[expected], [0.0]]
 
 
 def test_means_of_groups_are_zero_where_a_group_is_empty():
@@ -262,10 +227,8 @@ def test_identities_link_the_masks_of_a_region_over_views(two_boxes_contribution
     inputs = two_boxes_inputs(*two_boxes_contributions)
     for level in LEVELS:
         rows = inputs.contributions.rows_of(level)
-        identity, region = (
-            mask_identities(inputs.contributions, level, 1),
-            inputs.latents[rows].argmax(axis=1),
-        )
+        identity = mask_identities(inputs.contributions, level, 1)
+        region = inputs.latents[rows].argmax(axis=1)
         assert len(np.unique(np.stack([identity, region]), axis=1).T) == len(np.unique(region))
 
 
@@ -382,10 +345,7 @@ def test_components_split_where_features_jump_and_those_beyond_the_largest_join_
     means = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1).astype(np.float32)
     features = np.zeros((60, 2), np.float32)
     features[:30, 0], features[30:50, 1] = 1, 1
-    features[50:] = [
-        0.8,
-        0.6,
-    ]  # 1.41 from the first to the second run, 0.89 on to the third, 0.63 between these
+    features[50:] = 0.8, 0.6  # 1.41 from the first to the second run, 0.89 to the third, 0.63 between these
     found = components(features, means, (1.5, 0.95, 0.1))
     assert [len(np.unique(level)) for level in found.T] == [1, 2, 3]
     assert found[0, 2] == 0 and found[30, 2] == 1 and found[50, 2] == 2  # largest first

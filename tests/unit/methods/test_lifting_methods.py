@@ -12,12 +12,10 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.view_matrices import painted_indicator
-from hilsplat.field.adam import Adam
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.network_code import Autoencoder
 from hilsplat.methods import dr_splat, occam
 from hilsplat.methods.common.quantise import ProductQuantiser
-from hilsplat.methods.langsplat import LevelPixels
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares, step
 from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.registry import method_of
@@ -70,9 +68,6 @@ class OneRowOfPixels(MethodInputs):
 
     def view_labels(self, view):
         return self.labels
-
-    def view_size_hw(self, view):
-        return (1, WIDTH)
 
     def view_camera(self, view):
         return Camera(view, np.eye(4), np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]]), (1, WIDTH))
@@ -141,12 +136,10 @@ def test_gradients_of_a_step_match_finite_differences():
     rng = np.random.default_rng(2)
     code = LinearCode.fit(unit(rng.normal(size=(20, 6))), 4)
     weights = rng.random((5, 3))
-    pixels = LevelPixels(
-        sp.csr_matrix((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)),
-        code.encode_array(unit(rng.normal(size=(5, 6)))),
-    )
+    weights = sp.csr_matrix((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32))
+    pixels = weights, code.encode_array(unit(rng.normal(size=(5, 6))))
     logits, codebook = (rng.normal(size=shape).astype(np.float32) for shape in [(3, 6), (6, 4)])
-    _, by_logits, by_codebook = step(logits, codebook, pixels, code)
+    _, by_logits, by_codebook = step(logits, codebook, *pixels, code)
     chosen, _ = largest_shares(logits)
     for which, values, gradient, place in [
         (0, logits, by_logits, (0, chosen[0, 1])),
@@ -157,14 +150,8 @@ def test_gradients_of_a_step_match_finite_differences():
         for sign in (1, -1):
             moved = values.copy()
             moved[place] += sign * 1e-2
-            sides.append(step(*((moved, codebook) if which == 0 else (logits, moved)), pixels, code)[0])
+            sides.append(step(*((moved, codebook) if which == 0 else (logits, moved)), *pixels, code)[0])
         assert gradient[place] == pytest.approx((sides[0] - sides[1]) / 2e-2, abs=1e-3)
-
-
-def test_adam_takes_a_first_step_of_its_rate_against_the_gradient():
-    values = np.float32([1, 1, 1])
-    Adam(values, 0.25).step(np.float32([3, -1e-3, 0]))
-    assert values == pytest.approx([0.75, 1.25, 1])
 
 
 # ---- Dr. Splat ------------------------------------------------------------------------------------------

@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilsplat.base.errors import ArtifactError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS
 from hilsplat.methods.registry import METHODS, OURS, method_of
 from hilsplat.settings import MethodSettings
 from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
@@ -33,39 +32,27 @@ def fit(tmp_path_factory):
         assert np.isfinite(features).all()
         return features
 
-    fit.inputs_of = inputs_of
     return fit
 
 
-@pytest.mark.parametrize("missing", LEVELS, ids=lambda level: level.name.lower())
+def without(level):
+    """Every region that is not of a level."""
+    return tuple(row for row in EVERY if REGIONS[row][1] != int(level))
+
+
+THIN = {
+    **{f"no {level.label}": (without(level),) * 6 for level in LEVELS},
+    "a single view": (EVERY,),
+    "a single mask of each level": ((0, 2, 5),) * 6,
+    "a single mask of a single view": ((0,),),
+}
+
+
+@pytest.mark.parametrize("regions", THIN.values(), ids=THIN)
 @pytest.mark.parametrize("name", sorted(METHODS))
-def test_a_level_without_masks_gets_zeros_and_the_others_features(fit, name, missing):
-    regions = tuple(row for row in EVERY if REGIONS[row][1] != int(missing))
-    filled = fit(name, (regions,) * 6).any(axis=(0, 2))
-    assert filled.tolist() == [level != missing for level in LEVELS]
-
-
-@pytest.mark.parametrize("name", sorted(METHODS))
-def test_a_single_view_is_enough(fit, name):
-    assert fit(name, (EVERY,)).any(axis=(0, 2)).all()
-
-
-@pytest.mark.parametrize("name", sorted(METHODS))
-def test_a_single_mask_of_each_level_is_enough(fit, name):
-    assert fit(name, ((0, 2, 5),) * 6).any(axis=(0, 2)).all()
-
-
-@pytest.mark.parametrize("name", sorted(METHODS))
-def test_a_single_mask_of_a_single_view_is_enough(fit, name):
-    assert fit(name, ((0,),)).any(axis=(0, 2)).tolist() == [level == Level.WHOLE for level in LEVELS]
-
-
-@pytest.mark.parametrize("name", ["langsplat", "langsplat_v2"])
-def test_a_grid_without_labelled_pixels_is_no_silent_field_of_zeros(name, fit):
-    settings = MethodSettings(name=name, pixel_step=100)
-    inputs = fit.inputs_of(((6,),))  # a mask that the one pixel of the grid is not in
-    with pytest.raises(ArtifactError, match="no train view has a pixel on a grid of 100 px"):
-        method_of(name).fit(inputs, settings, 0)
+def test_levels_with_masks_get_features_and_the_others_zeros(fit, name, regions):
+    present = {REGIONS[row][1] for view in regions for row in view}
+    assert fit(name, regions).any(axis=(0, 2)).tolist() == [int(level) in present for level in LEVELS]
 
 
 def readers(description):
