@@ -26,12 +26,7 @@ SAME_IOU = 0.9
 
 
 class Clicks:
-    """The SAM model of a scene, opened at the first click. Not thread-safe.
-
-    Args:
-        scene: photographs.
-        masks: artifact whose index names the model; it may not exist.
-    """
+    """The SAM model named in the index of a scene's masks, opened at the first click. Not thread-safe."""
 
     def __init__(self, scene: Scene, masks: Path) -> None:
         self.scene = scene

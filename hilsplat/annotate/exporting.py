@@ -20,7 +20,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.viewer.exports import coco_counts
+from hilsplat.web.coco import coco_region
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
 OURS = ("level", "parent", "origin")
@@ -39,16 +39,9 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
 
 
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
-    """Write a scene's annotations, or the true labels of a synthetic scene, as LERF-OVS's labels.
+    """Write a scene's annotations, or the true labels of a synthetic scene, as LERF-OVS's labels to `out`.
 
-    Args:
-        scene: the posed scene.
-        folder: `results/<dataset>/<scene>`.
-        data_root: folder that contains `annotated/<dataset>/<scene>`.
-        out: folder to write.
-
-    Returns:
-        number of labelled views.
+    Annotations are in `annotated/<dataset>/<scene>` below `data_root`. Return the number of labelled views.
 
     Raises:
         SceneError: the scene has no labels.
@@ -72,17 +65,12 @@ def write_lerf_labels(out: Path, known: Mapping[str, Sequence[Label]], scene: Sc
     """Write the annotations of a scene as LERF-OVS's labels: `<view>.json` and the view's image.
 
     Each polygon is an object, as LangSplat's evaluation requires; it ignores the keys for levels and parents.
-
-    Args:
-        out: folder to write, such as `label/teatime`; replaced.
-        known: annotations by view.
-        scene: the scene, for sizes and images.
+    The folder `out`, such as `label/teatime`, is replaced.
     """
     with atomic_folder(out) as folder:
         for view, labels in known.items():
-            write_text(
-                folder / f"{Path(view).stem}.json", _isat(view, scene.cameras[view].size_hw, labels) + "\n"
-            )
+            text = _isat(view, scene.cameras[view].size_hw, labels)
+            write_text(folder / f"{Path(view).stem}.json", text + "\n")
             shutil.copyfile(scene.image_path(view), folder / view)
 
 
@@ -172,18 +160,12 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
         height, width = cameras[view].size_hw
         content["images"].append({"id": number, "file_name": view, "height": height, "width": width})
         for label in labels:
-            mask = label.mask((height, width))
-            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-            box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1)
             content["annotations"].append(
                 {
                     "id": len(content["annotations"]) + 1,
                     "image_id": number,
                     "category_id": 1 + texts.index(label.text),
-                    "iscrowd": 0,
-                    "area": int(mask.sum()),
-                    "bbox": [int(side) for side in box],
-                    "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
+                    **coco_region(label.mask((height, width))),
                     "thing": label.id,
                     **_ours(label),
                 }

@@ -21,12 +21,8 @@ from hilsplat.scene.cameras import Cameras
 def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
     """Read the annotations in a file of any of the four formats, by view.
 
-    Ids count from 1 unless the file has its own.
-
-    Args:
-        name: name of the file, which identifies the photograph if the content does not.
-        text: content of the file.
-        cameras: views of the scene.
+    Ids count from 1 unless the file has its own. The file's name identifies the photograph if the content
+    does not.
 
     Raises:
         SceneError: the format is none of these, or the file does not fit the scene.
@@ -43,10 +39,8 @@ def _imported(name: str, content: Any, cameras: Cameras) -> dict[str, list[Label
     if isinstance(content, dict) and isinstance(content.get("shapes"), list):
         image = str(content.get("imagePath") or name)
         view = _view(name, image, cameras, content.get("imageHeight"), content.get("imageWidth"))
-        pieces = [
-            _labelme_piece(f"{name}, shape {row}", shape) for row, shape in enumerate(content["shapes"])
-        ]
-        found[view] = _joined(name, pieces)
+        shapes = enumerate(content["shapes"])
+        found[view] = _joined(name, [_labelme_piece(f"{name}, shape {row}", shape) for row, shape in shapes])
     elif isinstance(content, dict) and isinstance(content.get("annotations"), list):
         found = _from_coco(name, content, cameras)
     elif isinstance(content, dict) and isinstance(content.get("objects"), list):
@@ -55,16 +49,11 @@ def _imported(name: str, content: Any, cameras: Cameras) -> dict[str, list[Label
         if labels.objects and all("id" in thing.keys for thing in labels.objects):
             found[view] = labels_of(labels)
         else:
-            pieces = [
-                (
-                    thing.category,
-                    thing.keys.get("group") if "level" in thing.keys else None,
-                    polygon,
-                    thing.keys,
-                )
-                for thing in labels.objects
-                for polygon in thing.polygons
-            ]  # without our keys, groups are ignored: in LERF's files they repeat and identify nothing
+            pieces = []
+            for thing in labels.objects:
+                # Without our keys, groups are ignored: in LERF's files they repeat and identify nothing.
+                group = thing.keys.get("group") if "level" in thing.keys else None
+                pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
             found[view] = _joined(name, pieces)
     else:
         raise SceneError(
@@ -86,9 +75,8 @@ def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
         things.setdefault((piece[0], piece[1]) if piece[1] is not None else row, []).append(piece)
     own = [same[0][1] for same in things.values()]
     is_id = all(type(number) is int and number > 0 for number in own) and len(set(own)) == len(own)
-    return [
-        _label(name, own[row] if is_id else 1 + row, same, is_id) for row, same in enumerate(things.values())
-    ]
+    numbers = own if is_id else range(1, 1 + len(own))
+    return [_label(name, number, same, is_id) for number, same in zip(numbers, things.values(), strict=True)]
 
 
 def _label(name: str, number: int, pieces: Sequence[Piece], has_ids: bool) -> Label:
@@ -106,10 +94,8 @@ def _label(name: str, number: int, pieces: Sequence[Piece], has_ids: bool) -> La
 
 def _labelme_piece(where: str, shape: Any) -> Piece:
     try:
-        points, kind = (
-            np.array(shape["points"], np.float64).reshape(-1, 2),
-            shape.get("shape_type", "polygon"),
-        )
+        points = np.array(shape["points"], np.float64).reshape(-1, 2)
+        kind = shape.get("shape_type", "polygon")
         if kind == "rectangle" and len(points) == 2:
             (x0, y0), (x1, y1) = points
             points, kind = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), "polygon"
@@ -132,9 +118,8 @@ def _from_coco(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
         found: dict[str, list[Label]] = {view: [] for view in views.values()}
         for row, each in enumerate(content["annotations"]):
             view = views[each["image_id"]]
-            polygons = _coco_polygons(
-                f"{name}, annotation {row}", each["segmentation"], cameras[view].size_hw
-            )
+            where, size_hw = f"{name}, annotation {row}", cameras[view].size_hw
+            polygons = _coco_polygons(where, each["segmentation"], size_hw)
             number, has_ids = each.get("thing", 1 + len(found[view])), "thing" in each
             pieces = [(texts[each["category_id"]], None, polygon, each) for polygon in polygons]
             if pieces:
@@ -160,7 +145,7 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
 
 
 def _from_counts(runs: Sequence[int], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Return the mask of run lengths: the inverse of `viewer.exports.coco_counts`."""
+    """Return the mask of run lengths: the inverse of `web.coco.coco_counts`."""
     values = np.arange(len(runs)) % 2 == 1
     return np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T)
 

@@ -14,16 +14,14 @@ import numpy as np
 from jaxtyping import Bool
 from pydantic import AfterValidator, Field, ValidationError
 
-from hilsplat.base.artifacts import output_lock, sha256_of_bytes, write_text
+from hilsplat.base.artifacts import output_lock, write_text
 from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, read_isat
 from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
-from hilsplat.viewer.wire import MAX_SIDE_PX, Message, Text
-
-NO_FILE = "none"
-"""Version of a view without a file."""
+from hilsplat.query.names import version_of
+from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
 
 Origin = Literal["drawn", "edited", "accepted", "proposed"]
 Place = Annotated[int, Field(ge=-MAX_SIDE_PX, le=2 * MAX_SIDE_PX)]
@@ -121,13 +119,11 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
             continue
         parent = own.get(label.parent)
         if parent is None or parent.level != label.level - 1:
-            found = (
-                f"{parent.text!r}, a {Level(parent.level).label}" if parent else "nothing of this photograph"
-            )
+            nothing = "nothing of this photograph"
             raise SettingsError(
                 f"the parent of {label.text!r} cannot be its parent",
                 expected=f"a {Level(label.level - 1).label}" if label.level > 1 else "none: it is a whole",
-                found=found,
+                found=f"{parent.text!r}, a {Level(parent.level).label}" if parent else nothing,
                 fix="choose another parent or level",
             )
         inside = mask & masks[parent.id]
@@ -147,11 +143,6 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
 def label_path(folder: Path, view: str) -> Path:
     """Return the path of a view's annotations."""
     return Path(folder) / f"{Path(view).stem}.json"
-
-
-def version_of(path: Path) -> str:
-    """Return the digest of the file, which a change must specify."""
-    return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
 
 
 def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:

@@ -37,12 +37,7 @@ def merged(
     A file's ids are used only together with text and level, because programs without ids number the shapes
     of every photograph from 1. Among the scene's things with the same text and level, a label is matched to
     the one that it overlaps, else to the one with its id, else to one that the photograph does not show yet;
-    otherwise it is a new thing.
-
-    Args:
-        known: labels by view.
-        files: labels of each file by view.
-        sizes_hw: height and width of every view, px.
+    otherwise it is a new thing. Sizes are in px.
     """
     views = {view: list(labels) for view, labels in known.items()}
     things = {label.id: _kind(label) for labels in views.values() for label in labels}

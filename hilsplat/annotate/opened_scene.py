@@ -1,15 +1,16 @@
 """The parts of a scene that the annotation page opened: photographs and sources of proposals."""
 
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 from hilsplat.annotate.clicks import Clicks
+from hilsplat.annotate.labels import Label, label_path, read_labels
 from hilsplat.annotate.proposals import Proposals
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.scene import Scene
-from hilsplat.viewer.file_changes import FileChanges
+from hilsplat.web.file_changes import FileChanges
 
 
 class OpenedScene:
@@ -17,6 +18,7 @@ class OpenedScene:
 
     Args:
         folder: the scene's folder, such as results/photos/desk.
+        labels: folder of its label files; created when the first one is written.
         variant: variant whose masks and tree are proposed.
         threads: number of threads for rendering.
 
@@ -24,8 +26,9 @@ class OpenedScene:
         ArtifactError: the scene has no photographs with poses yet.
     """
 
-    def __init__(self, folder: Path, variant: str, threads: int) -> None:
-        self.photographs = Path(folder) / "scene"
+    def __init__(self, folder: Path, labels: Path, variant: str, threads: int) -> None:
+        self.folder, self.labels, self.variant, self.threads = folder, labels, variant, threads
+        self.photographs = folder / "scene"
         if not (self.photographs / "index.json").is_file():
             raise ArtifactError(
                 f"{folder} has no photographs to annotate yet: {self.photographs} is missing",
@@ -43,22 +46,38 @@ class OpenedScene:
         """Return the parts that were rewritten, created or deleted since the scene was opened."""
         return sorted(path.name for path in self._changes.changed())
 
-    @contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """Guard proposals: fail if any part changed since the scene was opened.
+    def opened_again(self) -> "OpenedScene":
+        """Open the scene as it is on disk now."""
+        return OpenedScene(self.folder, self.labels, self.variant, self.threads)
 
-        Raises:
-            StaleSceneError: a part was rewritten before or during the read.
-        """
-        with self._changes.unchanged(self.scene.name):
-            yield
+    def unchanged(self) -> AbstractContextManager[None]:
+        """Guard proposals: raise StaleSceneError if any part changed before or during the read."""
+        return self._changes.unchanged(self.scene.name)
 
-    @contextmanager
-    def same_photographs(self) -> Iterator[None]:
-        """Guard photographs and drawing: fail if the photographs changed; other parts may change.
+    def same_photographs(self) -> AbstractContextManager[None]:
+        """Guard photographs and drawing: as `unchanged`, but parts other than photographs may change."""
+        return self._changes.unchanged(self.scene.name, self.photographs)
 
-        Raises:
-            StaleSceneError: the photographs were rewritten before or during the read.
-        """
-        with self._changes.unchanged(self.scene.name, self.photographs):
-            yield
+    def described(self) -> dict[str, Any]:
+        """Describe the photographs and available proposals."""
+        cameras = self.scene.cameras
+        return {
+            "name": self.scene.name,
+            "of": self.state,
+            "folder": str(self.labels),
+            "proposes": self.proposals.of,
+            "segments": self.clicks.name,
+            "carries": self.proposals.gaussians is not None,
+            "views": [
+                {"name": name, "split": self.scene.split[name], "size_hw": list(cameras[name].size_hw)}
+                for name in cameras.names
+            ],
+        }
+
+    def known(self) -> dict[str, list[Label]]:
+        """Return the annotations of all views that have any."""
+        cameras = self.scene.cameras
+        found = {
+            view: read_labels(label_path(self.labels, view), cameras[view].size_hw) for view in cameras.names
+        }
+        return {view: labels for view, labels in found.items() if labels}

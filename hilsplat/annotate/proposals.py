@@ -17,8 +17,8 @@ from hilsplat.annotate.labels import Label, traced
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.query.caches import ViewStore
 from hilsplat.query.names import read_names
-from hilsplat.query.view_store import ViewStore
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -40,14 +40,7 @@ VIEWS_MIB = 512.0
 
 @dataclass(frozen=True)
 class Proposal:
-    """An outline and its source.
-
-    Attributes:
-        what: source, such as "node 12" or "mask 3".
-        text: the node's name, if the user gave it one.
-        level: level of the node or mask.
-        polygons: as in `Label`.
-    """
+    """An outline and its source, such as "node 12" or "mask 3"; `text` is the user's name for the node."""
 
     what: str
     text: str
@@ -56,14 +49,7 @@ class Proposal:
 
 
 class Proposals:
-    """Proposals in the views of a scene, from the parts that its run has made. Not thread-safe.
-
-    Args:
-        scene: cameras and photographs.
-        folder: the scene's folder, which may contain Gaussians and a variant's masks and tree.
-        variant: variant whose masks and tree are used.
-        threads: number of threads for rendering.
-    """
+    """Proposals in the views of a scene, from the parts that its run has made. Not thread-safe."""
 
     def __init__(self, scene: Scene, folder: Path, variant: str, threads: int) -> None:
         self.scene, self.threads = scene, threads
@@ -116,10 +102,9 @@ class Proposals:
             return []
         masks = HierarchicalMasks.load(path)
         dense = masks.dense()
-        rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]][
-            -MOST_MASKS:
-        ]
-        return _proposals([(f"mask {row}", "", Level(int(masks.level[row])), dense[row]) for row in rows])
+        rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]]
+        levels = [Level(int(level)) for level in masks.level]
+        return _proposals([(f"mask {row}", "", levels[row], dense[row]) for row in rows[-MOST_MASKS:]])
 
     # -- from other views -------------------------------------------------------------------------
 
@@ -149,18 +134,12 @@ class Proposals:
             )
         size_hw = self.scene.cameras[view].size_hw
         masks = {label.id: label.mask(size_hw) for label in known.get(view, ())}
-        evidence = {
-            number: shown
-            for number in ids
-            if (
-                shown := [
-                    (other, label)
-                    for other, labels in known.items()
-                    for label in labels
-                    if other != view and label.id == number and label.origin != "proposed"
-                ]
-            )
-        }
+        evidence: dict[int, list[tuple[str, Label]]] = {number: [] for number in ids}
+        for other, labels in known.items():
+            for label in labels:
+                if other != view and label.id in evidence and label.origin != "proposed":
+                    evidence[label.id].append((other, label))
+        evidence = {number: shown for number, shown in evidence.items() if shown}
         weights, found = self._weights(view), []
         for number, shown in sorted(evidence.items(), key=lambda item: item[1][0][1].level):
             label = shown[0][1]

@@ -5,7 +5,7 @@ from typing import Annotated
 from pydantic import Field
 
 from hilsplat.annotate.labels import Label, Place, Rings
-from hilsplat.viewer.wire import Message
+from hilsplat.web.messages import Message
 
 
 class Stroke(Message):

@@ -6,14 +6,7 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.apps import datasets_app
-from hilsplat.cli.stage import (
-    DataRoot,
-    PathOut,
-    Results,
-    Threads,
-    stage,
-    start_logging,
-)
+from hilsplat.cli.stage import DataRoot, PathOut, Results, Threads, stage, start_logging
 
 
 @datasets_app.command("list")
@@ -71,13 +64,15 @@ def datasets_fits(
     variant: Annotated[str, typer.Option(help="variant whose masks and tree to measure")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
-    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
     threads: Threads = 2,
 ) -> None:
-    """Measure how well masks and nodes fit annotated regions, by level and without any text."""
+    """Measure how well masks and nodes fit annotated regions, by level and without any text.
+
+    Writes label_fits.csv beside the tree.
+    """
     folder = results / scene
     name, semantic_tree = labels or f"annotated/{scene}", folder / variant / "semantic_tree"
-    target = out or semantic_tree.with_name("label_fits.csv")
+    target = semantic_tree.with_name("label_fits.csv")
     inputs = {
         "scene": folder / "scene",
         "gaussians": folder / "gaussians.ply",

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,9 +19,6 @@ from hilsplat.cli.stage import (
     stage,
     start_logging,
 )
-
-if TYPE_CHECKING:
-    from hilsplat.scene.finished import SceneParts
 
 Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
 LabelledScene = Annotated[
@@ -61,8 +58,10 @@ def evaluate(
     threads: Threads = 1,
 ) -> None:
     """Query every annotated text in every test view, or every labelled view, and score the answers."""
+    from hilsplat.scene.finished import SceneParts
+
     section = section_of("evaluate", settings)
-    parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
+    parts = SceneParts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), **_truth_inputs(truth, labels or (), data_root)}
     with stage(
         "evaluate",
@@ -148,13 +147,6 @@ def _truth_inputs(
     return found | {f"labels {name}": label_files(name, str(data_root)) for name in labels}
 
 
-def _parts(*paths: Path) -> "SceneParts":
-    """Return the parts of a scene, given in the order of `SceneParts`."""
-    from hilsplat.scene.finished import SceneParts
-
-    return SceneParts(*paths)
-
-
 @app.command()
 def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
@@ -198,8 +190,10 @@ def figures(
     threads: Threads = 1,
 ) -> None:
     """Draw the panel of a scene: photograph, masks, field, relevancy, answers, truth."""
+    from hilsplat.scene.finished import SceneParts
+
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    parts = _parts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
+    parts = SceneParts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
     inputs = {**parts.as_inputs(), "fit": fit, **_truth_inputs(truth, [labels] if labels else [], data_root)}
     recorded = {"figures": section, "evaluate": protocol}
     with stage(

@@ -6,9 +6,7 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.apps import models_app
-from hilsplat.cli.stage import (
-    start_logging,
-)
+from hilsplat.cli.stage import start_logging
 
 
 @models_app.command("get")

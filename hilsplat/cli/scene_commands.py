@@ -60,19 +60,10 @@ def new(
     from hilsplat.workflow.models import models_of_photographs
 
     report = add_scene(
-        sheet,
-        name,
-        photos,
-        frames=frames,
-        poses=poses,
-        gaussians=gaussians,
-        features=features,
-        labels=labels,
+        sheet, name, photos, frames=frames, poses=poses, gaussians=gaussians, features=features, labels=labels
     )
-    typer.echo(str(report))
-    typer.echo(
-        f"\nadded photos/{name} to {sheet}. Next:\n  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
-    )
+    following = f"  hilsplat run {name}\n  hilsplat query {name} 'bear nose'"
+    typer.echo(f"{report}\n\nadded photos/{name} to {sheet}. Next:\n{following}")
     features = read_sheet(sheet, checked_groups=())[-1].features
     for line in models_of_photographs(sheet.with_name("config.yaml"), name, features):
         typer.echo(line)

@@ -49,11 +49,7 @@ MIN_FREE_MIB = 200.0
 
 
 def start_logging(*, timestamps: bool = False) -> None:
-    """Send log records to stderr.
-
-    Args:
-        timestamps: start each record with its time, level and logger, unless stderr is a terminal.
-    """
+    """Send log records to stderr; with timestamps (time, level, logger), unless it is a terminal."""
     root = logging.getLogger()
     root.setLevel(logging.INFO)
     root.handlers.clear()
@@ -85,7 +81,6 @@ def stage(
         out: output; its provenance is written next to it.
         settings: the section that the stage uses, or several sections by name.
         seed: seed of everything random; None if nothing is random.
-        threads: number of threads.
         inputs: files and folders that the stage reads, or lists of files, by name.
         plugins: import paths of the readers or baselines that it uses (`base.plugins`).
         beside: further outputs.

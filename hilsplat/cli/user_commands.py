@@ -9,11 +9,7 @@ import typer
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.cli.apps import app
-from hilsplat.cli.stage import (
-    Results,
-    Threads,
-    start_logging,
-)
+from hilsplat.cli.stage import Results, Threads, start_logging
 
 SceneName = Annotated[
     str,

@@ -6,15 +6,12 @@ from typing import Annotated
 import typer
 
 from hilsplat.cli.apps import world_app
-from hilsplat.cli.stage import (
-    PathOut,
-    Results,
-    Settings,
-    Threads,
-    section_of,
-    stage,
-    start_logging,
-)
+from hilsplat.cli.stage import PathOut, Results, Settings, Threads, section_of, stage, start_logging
+
+SceneWithMasks = Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")]
+MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks to measure")]
+NEIGHBOURS = 2
+"""Number of nearest views that each view is compared with."""
 
 
 @world_app.command("make")
@@ -37,13 +34,12 @@ def world_make(
 def world_show(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
     results: Results = Path("results"),
-    out: Annotated[Path | None, typer.Option(help="PNG to write; default: beside the scene")] = None,
 ) -> None:
-    """Draw a contact sheet: views, labels by level, the tree with its texts."""
+    """Draw a contact sheet beside the scene: views, labels by level, the tree with its texts."""
     start_logging()
     from hilsplat.world.sheet import show_world
 
-    target = out or results / scene / "world.png"
+    target = results / scene / "world.png"
     show_world(results / scene / "world", target)
     typer.echo(f"wrote {target}")
 
@@ -64,41 +60,37 @@ def world_classes(
 def world_gallery(
     kind: Annotated[str, typer.Argument(help="kind of scene: tabletop, room or street")],
     seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
-    out: Annotated[Path | None, typer.Option(help="PNG to write; default: world_KIND.png")] = None,
 ) -> None:
-    """Draw one view of each scene, with its true labels by level."""
+    """Draw one view of each scene, with its true labels by level, as world_KIND.png."""
     start_logging()
     from hilsplat.world.gallery import draw_scenes
 
-    target = out or Path(f"world_{kind}.png")
+    target = Path(f"world_{kind}.png")
     draw_scenes(kind, seeds, target)
     typer.echo(f"wrote {target}")
 
 
 @world_app.command("inconsistency")
 def world_inconsistency(
-    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
-    variant: Annotated[str, typer.Option(help="variant whose masks to measure")] = "default",
-    results: Results = Path("results"),
-    neighbours: Annotated[
-        int, typer.Option(min=1, help="number of nearest views that each view is compared with")
-    ] = 2,
-    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the masks")] = None,
+    scene: SceneWithMasks, variant: MeasuredMasks = "default", results: Results = Path("results")
 ) -> None:
-    """Measure with exact geometry how often a surface point has different masks in neighbouring views."""
+    """Measure with exact geometry how often a surface point has different masks in the two nearest views.
+
+    Writes consistency.csv beside the masks.
+    """
     truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
-    target = out or masks_folder.with_name("consistency.csv")
+    target = masks_folder.with_name("consistency.csv")
     with stage("consistency", target, inputs={"truth": truth, "masks": masks_folder}):
         from hilsplat.evaluate.diagnostics.world_consistency import run_consistency
 
-        table = run_consistency(truth, masks_folder, target, neighbours)
+        table = run_consistency(truth, masks_folder, target, NEIGHBOURS)
     typer.echo(table)
 
 
 @world_app.command("masks")
 def world_masks(
-    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")],
-    variant: Annotated[str, typer.Option(help="variant whose masks to measure")] = "default",
+    scene: SceneWithMasks,
+    variant: MeasuredMasks = "default",
     results: Results = Path("results"),
     out: Annotated[
         Path | None,
@@ -122,13 +114,15 @@ def world_tree(
     scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
     variant: Annotated[str, typer.Option(help="variant whose tree to measure")] = "default",
     results: Results = Path("results"),
-    out: Annotated[Path | None, typer.Option(help="CSV to write; default: beside the tree")] = None,
     threads: Threads = 2,
 ) -> None:
-    """Measure the 3D semantic tree against the true nodes: matches, purity, parents."""
+    """Measure the 3D semantic tree against the true nodes: matches, purity, parents.
+
+    Writes tree_truth.csv beside the tree.
+    """
     folder = results / scene
     semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
-    target = out or semantic_tree.with_name("tree_truth.csv")
+    target = semantic_tree.with_name("tree_truth.csv")
     inputs = {
         "scene": folder / "scene",
         "gaussians": folder / "gaussians.ply",

@@ -7,7 +7,7 @@ from pathlib import Path
 from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.provenance import require_own_picture
-from hilsplat.query.hits import Hit, counted, doubts_of, hits_of
+from hilsplat.query.hits import Hit, counted, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.names import PATH_SEPARATOR
 from hilsplat.query.node_search import NodeHits
@@ -39,26 +39,20 @@ def answer(
 
     The answer takes milliseconds. The picture takes one to two seconds, including imports and rendering.
 
+    Other arguments as in `LanguageScene.open` and `LanguageScene.query`.
+
     Args:
-        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
-        text: words, or a path such as "bear > head > nose".
-        level: auto, whole, part or subpart.
-        variant: named set of settings whose files are queried.
-        views: number of views in the panel.
-        answerer: "tree" or "field", see `LanguageScene.query`.
-        view: restricts the answers to what this view shows, and is first in the panel; None: the whole scene.
-        threshold: minimum score of an answer; None: answers near the best.
+        views: number of views in the panel; a given `view` is the first.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
-        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene is not finished.
-        SettingsError: the level, answerer or view is unknown, or the threshold not between 0 and 1.
+        SettingsError: as in `LanguageScene.query`.
     """
     found = FinishedScene.locate(Path(folder), variant)
     scene = LanguageScene.of(found, threads=threads)
     nodes = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
-    hits = hits_of(scene, nodes, LISTED)
+    hits = scene.hits_of(nodes, LISTED)
     label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""
     caution = scene.caution_about(text)
@@ -88,7 +82,7 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
     """Return the answers as text, with doubts; `view` is the view that the query was restricted to."""
     place = scene.scene.name if view is None else f"what {view} shows of {scene.scene.name}"
-    hits, doubts = hits_of(scene, found, LISTED), doubts_of(found)
+    hits, doubts = scene.hits_of(found, LISTED), doubts_of(found)
     if not hits:
         levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
         other = "" if view is None else ", or leave out --view"

@@ -21,16 +21,7 @@ from hilsplat.settings import EvaluateSettings
 
 @dataclass(frozen=True)
 class FieldAnswers:
-    """Answers of a language field.
-
-    Attributes:
-        language: the field.
-        code: decodes the field.
-        views: views of the scene.
-        text_vectors: returns the unit CLIP vectors of texts.
-        settings: canonical phrases and relevancy scale.
-        threads: number of threads for look-ups.
-    """
+    """Answers of a language field; `text_vectors` returns the unit CLIP vectors of texts."""
 
     language: LanguageField
     code: Code
@@ -59,7 +50,7 @@ class FieldAnswers:
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
         """Return cosines of texts with the decoded latents of pixels; see `LanguageScene.field_cosine`."""
-        vectors, code = self.text_vectors(texts), self.code
+        vectors = self.text_vectors(texts)
         height, width = self.views.camera(view).size_hw
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
         for index, (shown, latents) in enumerate(self.latents(view)):
@@ -68,17 +59,16 @@ class FieldAnswers:
             rows = row_of_pixel[pixels]
             spoken = np.flatnonzero(rows >= 0)
             if len(spoken):
-                decoded = code.decode_array(np.ascontiguousarray(latents[rows[spoken]], np.float32))
+                decoded = self.code.decode_array(np.ascontiguousarray(latents[rows[spoken]], np.float32))
                 found[:, index, spoken] = vectors @ decoded.T
         return found
 
     def of_gaussians(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
         """Return each Gaussian's relevancy at a level, or the maximum over levels; 0 without a latent."""
-        named = [each for each in LEVELS if level in ("auto", each.label)]
         features = self.language.features
         out = np.zeros(len(features), np.float32)
         vector = self.text_vectors([text])
-        for each in named:
+        for each in (each for each in LEVELS if level in ("auto", each.label)):
             latents = np.ascontiguousarray(features[:, each.index], np.float32)
             has = np.flatnonzero((latents != 0).any(axis=1))
             if len(has):
@@ -117,12 +107,8 @@ class FieldAnswers:
 
     @cached_property
     def _latent_relevancy(self) -> LatentRelevancy:
-        return LatentRelevancy(
-            self.code,
-            self.text_vectors(self.settings.canonical),
-            self.settings.relevancy_scale,
-            self.threads,
-        )
+        canonical = self.text_vectors(self.settings.canonical)
+        return LatentRelevancy(self.code, canonical, self.settings.relevancy_scale, self.threads)
 
 
 def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "N 3"]:

@@ -1,20 +1,14 @@
 """Human-readable answers: the node, its position, its best views and any doubts."""
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.query.node_search import NodeHits
+from hilsplat.query.scene_views import SceneViews, members_of
 from hilsplat.semantic_tree.boxes import OrientedBox
-
-if TYPE_CHECKING:
-    from hilsplat.query.language_scene import LanguageScene
-
-BEST_VIEWS = 3
-
 
 LIKELY_CHANCE = 0.05
 """An answer is doubtful if more than this share of the words for absent things score as high."""
@@ -25,7 +19,6 @@ class Doubt:
     """A text of a query that may match nothing in the scene.
 
     Attributes:
-        text: the text.
         level: the level that was searched, if a node of any level matches the text; otherwise None.
         chance: share of words for absent things whose best score is as high; None if unknown, in which case
             no node matches the text better than a generic word.
@@ -78,12 +71,12 @@ class Hit:
     route: str
     doubts: tuple[Doubt, ...]
     name: str
-    _scene: "LanguageScene" = field(repr=False, compare=False)
+    _views: SceneViews = field(repr=False, compare=False)
 
     @property
     def gaussians(self) -> Int64[np.ndarray, " g"]:
         """Rows of `gaussians.ply` that belong to the node."""
-        return self._scene.gaussians_of([self.node])
+        return members_of(self._views.tree, [self.node])
 
     def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
         """Return the pixels of a view in which the node's Gaussians have a share above 0.5.
@@ -91,35 +84,7 @@ class Hit:
         Raises:
             SettingsError: the scene has no such view.
         """
-        return self._scene.node_masks(view, [self.node])
-
-
-def hits_of(scene: "LanguageScene", found: NodeHits, limit: int) -> list[Hit]:
-    """Return the best nodes, at most `limit`, as answers."""
-    doubts = doubts_of(found)
-    best = zip(found.ids[:limit].tolist(), found.values[:limit], strict=True)
-    return [hit_of(scene, node, scene.score(value), found.route, doubts) for node, value in best]
-
-
-def hit_of(scene: "LanguageScene", node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
-    """Return one node as an answer."""
-    tree = scene.tree
-    area = tree.view_area_px[node]
-    order = np.lexsort((np.arange(len(area)), -area))[:BEST_VIEWS]
-    low, high = tree.box[node].tolist()
-    return Hit(
-        node,
-        Level(int(tree.level[node])),
-        score,
-        tuple(tree.centroid[node].tolist()),
-        (tuple(low), tuple(high)),
-        OrientedBox.from_array(tree.oriented_box[node]),
-        tuple(tree.view_names[row] for row in order if area[row] > 0),
-        route,
-        doubts,
-        scene.name_of(node),
-        scene,
-    )
+        return self._views.masks(view, [self.node])
 
 
 def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:

@@ -15,21 +15,23 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int64, UInt8
 
+from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.field.code import Code
+from hilsplat.field.code import Code, autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
+from hilsplat.models.store import is_embedded, meaningless
+from hilsplat.query.caches import Opened, ViewStore
 from hilsplat.query.field_answers import FieldAnswers
-from hilsplat.query.hits import Hit, hit_of, hits_of
+from hilsplat.query.hits import Doubt, Hit, doubts_of
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_search import NodeHits, TextAnswer, search
-from hilsplat.query.opening import Opened, OpenedParts
 from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
 from hilsplat.query.scene_views import SceneViews, members_of
-from hilsplat.query.view_store import ViewStore
-from hilsplat.scene.finished import FinishedScene, SceneParts
+from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
 from hilsplat.scene.scene import Scene
+from hilsplat.semantic_tree.boxes import OrientedBox
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 from hilsplat.splat.gaussians import Gaussians
@@ -42,6 +44,9 @@ logger = logging.getLogger(__name__)
 NAMED = 2.0
 """Cosine margin of a node for the name that the user gave it: the maximum, so that it is ranked first."""
 
+BEST_VIEWS = 3
+"""Maximum number of views of an answer."""
+
 TextEncoder = Callable[[list[str]], np.ndarray]
 PictureEncoder = Callable[[np.ndarray], np.ndarray]
 Answerer = Literal["tree", "field"]
@@ -52,15 +57,11 @@ class LanguageScene:
     """A finished scene that accepts text queries.
 
     Attributes:
-        scene: cameras and views.
-        gaussians: frozen geometry.
-        tree: the nodes.
         language: the field; None if the run has not computed it yet, and only the tree accepts queries.
         autoencoder: decodes the field; None if there is no field.
         encode_texts: returns the unit CLIP vectors of texts.
         pixel_weights: returns the compositing weights of a view (pixels x Gaussians).
         settings: canonical phrases, relevancy scale, and selection of nodes.
-        threads: number of threads for look-ups.
         caution: sentence that explains why CLIP's answers are meaningless here; empty if they are not.
         names: the user's names for nodes, which are matched first.
         naming: vocabulary names of the nodes, and words for absent things; None if the stage has not run.
@@ -94,11 +95,6 @@ class LanguageScene:
 
         Canonical phrases, template, scale and node selection are read from the provenance of the variant's
         evaluation, or of its panel if the scene has no labels.
-
-        Args:
-            folder: a finished scene.
-            variant: named set of settings whose files are queried.
-            threads: number of threads for rasterising and look-ups.
 
         Raises:
             ArtifactError: the scene is not finished.
@@ -138,35 +134,57 @@ class LanguageScene:
         Args:
             parts: paths of the artifacts.
             settings: canonical phrases, template, relevancy scale and selection of nodes.
-            threads: as in `open`.
+            threads: number of threads for rasterising and look-ups; results do not depend on it.
             opened: artifacts that other variants of the scene have already opened.
             names: the user's names for nodes; None in evaluation, which scores only the models.
             naming: vocabulary names of the nodes; None in evaluation, which then reports no chance.
 
         Raises:
-            MisalignedArtifactError: as in `OpenedParts.of`.
+            MisalignedArtifactError: the tree or field was made for other Gaussians or cameras, or the field
+                for another autoencoder.
             ModelError: the CLIP that embedded the masks is not found.
         """
+        from hilsplat.embed.clip import open_clip_of
+        from hilsplat.splat.ply import load_ply
         from hilsplat.splat.rasterise.api import pixel_weights
 
-        found = OpenedParts.of(parts, settings.template, threads, opened or Opened())
+        opened = opened or Opened()
+        scene = opened.get(Scene.load, parts.scene)
+        gaussians = opened.get(load_ply, parts.gaussians)
+        tree = opened.get(SemanticTree.load, parts.semantic_tree, parts.clip)
+        made_for = {"semantic tree": tree.gaussians_sha256}
+        clip = opened.get(open_clip_of, parts.clip, threads, settings.template)
+        language = code = None
+        if parts.field is not None and parts.autoencoder is not None:
+            language = opened.get(LanguageField.load, parts.field)
+            made_for["language field"] = language.gaussians_sha256
+            code_file = autoencoder_file(parts.autoencoder)
+            own = {"language field": language.autoencoder_sha256}
+            require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, own)
+            code = opened.get(load_code, parts.autoencoder)
+            clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
+        cameras = parts.scene / "cameras.npz"
+        own = {"semantic tree": tree.cameras_sha256}
+        require_made_for(cameras, opened.get(sha256_of_file, cameras), scene.name, own)
+        require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
+        drawn = is_drawn(parts.scene)
         return LanguageScene(
-            found.scene,
-            found.gaussians,
-            found.tree,
-            found.language,
-            found.code,
-            found.clip.embed_texts,
+            scene,
+            gaussians,
+            tree,
+            language,
+            code,
+            clip.embed_texts,
             lambda view: pixel_weights(
-                found.gaussians, found.scene.cameras[view], min_weight=found.tree.min_weight, threads=threads
+                gaussians, scene.cameras[view], min_weight=tree.min_weight, threads=threads
             ),
             settings,
             threads,
-            found.caution,
+            meaningless(clip.model.folder.name) if is_embedded(clip.model.config) and not drawn else "",
             names=names or NodeNames(),
             naming=naming,
-            unknown_words=found.clip.unknown_words,
-            encode_picture=found.clip.embed_picture,
+            unknown_words=clip.unknown_words,
+            encode_picture=clip.embed_picture,
         )
 
     def show(self, text: str = "", *, height: int = 640, proxy: str = "") -> "EmbeddedViewer":
@@ -229,8 +247,7 @@ class LanguageScene:
             SettingsError: the text is empty, the level, answerer or view is unknown, a path has more texts
                 than levels, or the threshold is not between 0 and 1.
         """
-        found = self.find(text, level, answerer=answerer, view=view, threshold=threshold)
-        return hits_of(self, found, limit)
+        return self.hits_of(self.find(text, level, answerer=answerer, view=view, threshold=threshold), limit)
 
     def like_node(self, node: int, *, limit: int = 10) -> list[Hit]:
         """Return the nodes of a node's own level that look most like it, best first; scores are cosines.
@@ -260,7 +277,31 @@ class LanguageScene:
     ) -> list[Hit]:
         cosine = self.tree.clip[nodes] @ vector
         order = np.lexsort((nodes, -cosine))[:limit]
-        return [hit_of(self, int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
+        return [self._hit(int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
+
+    def hits_of(self, found: NodeHits, limit: int) -> list[Hit]:
+        """Return the best nodes, at most `limit`, as answers."""
+        doubts = doubts_of(found)
+        best = zip(found.ids[:limit].tolist(), found.values[:limit], strict=True)
+        return [self._hit(node, self._score(value), found.route, doubts) for node, value in best]
+
+    def _hit(self, node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
+        area = self.tree.view_area_px[node]
+        order = np.argsort(-area, kind="stable")[:BEST_VIEWS]
+        low, high = self.tree.box[node].tolist()
+        return Hit(
+            node,
+            Level(int(self.tree.level[node])),
+            score,
+            tuple(self.tree.centroid[node].tolist()),
+            (tuple(low), tuple(high)),
+            OrientedBox.from_array(self.tree.oriented_box[node]),
+            tuple(self.tree.view_names[row] for row in order if area[row] > 0),
+            route,
+            doubts,
+            self.name_of(node),
+            self._shown,
+        )
 
     def find(
         self,
@@ -296,17 +337,9 @@ class LanguageScene:
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """Search the nodes for the texts of a path; `query` and `find` call this.
+        """Search the nodes for the texts of a path, coarse to fine; `query` and `find` call this.
 
-        Args:
-            path: one text, or several from coarse to fine.
-            level: level of the last text; None: chosen by the search.
-            answerer: as in `query`.
-            view: as in `query`.
-            threshold: as in `query`.
-
-        Raises:
-            SettingsError: the view is unknown, or the path is empty or has more texts than levels.
+        Arguments and errors as in `query`, but with the last text's level as a `Level`, or None for any.
         """
         shown = None if view is None else self.nodes_shown(view)
         found = search(
@@ -421,8 +454,7 @@ class LanguageScene:
         """Return the relevancy of each node to each text."""
         return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
 
-    def score(self, margin: float) -> float:
-        """Return the relevancy of one margin."""
+    def _score(self, margin: float) -> float:
         return float(relevancy_of_margins(np.array([margin]), self.settings.relevancy_scale)[0])
 
     def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
@@ -447,8 +479,8 @@ class LanguageScene:
         Args:
             texts: queries.
             view: name of the view.
-            exact: if True, a network decodes every pixel at every call; if False, a view is decoded once, and
-                results differ by at most 2e-3 (see `latent_relevancy`). No difference for a linear code.
+            exact: whether a network decodes every pixel at every call; otherwise a view is decoded once, and
+                results differ by at most 2e-3 (see `LatentRelevancy`). No difference for a linear code.
         """
         return self._field.relevancy(texts, view, exact=exact)
 
@@ -457,12 +489,8 @@ class LanguageScene:
     ) -> Float32[np.ndarray, "T 3 P"]:
         """Blend the cosines of texts with the nodes that pixels show by their weights, at each level.
 
-        Gaussians without a node have the lowest cosine of the level; uncovered pixels have -inf.
-
-        Args:
-            texts: queries; user-given names are ignored.
-            view: name of the view.
-            pixels: row * width + column of each pixel.
+        Gaussians without a node have the lowest cosine of the level; uncovered pixels have -inf. User-given
+        names are ignored. A pixel's number is row * width + column.
         """
         cosines = self.text_vectors(texts) @ self.tree.clip.astype(np.float32).T
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)

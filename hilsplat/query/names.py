@@ -55,11 +55,7 @@ def tree_digest(semantic_tree: Path) -> str:
 
 
 def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
-    """Return the names of a tree's nodes; empty if unnamed.
-
-    Args:
-        folder: the scene's folder.
-        semantic_tree: the artifact whose nodes are named.
+    """Return the names of a tree's nodes from the scene's folder; empty if unnamed.
 
     Raises:
         ArtifactError: the file is damaged or of another version, or names nodes that do not exist.
@@ -74,7 +70,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
             found=", ".join(map(str, beyond[:5])),
             fix="correct it, or move it away to start without names",
         )
-    return NodeNames(MappingProxyType(kept), _version(path))
+    return NodeNames(MappingProxyType(kept), version_of(path))
 
 
 def write_names(
@@ -104,7 +100,7 @@ def write_names(
                 expected=f"at most {LONGEST} letters, without {PATH_SEPARATOR!r}, which separates a path",
             )
     with output_lock(path):
-        if _version(path) != version:
+        if version_of(path) != version:
             raise StaleNamesError(
                 f"the names in {path} have changed since they were read",
                 fix="read them again, then change them",
@@ -132,7 +128,8 @@ def _plain(text: str) -> str:
     return " ".join(text.split()).casefold()
 
 
-def _version(path: Path) -> str:
+def version_of(path: Path) -> str:
+    """Return the digest of a file, which a page must send to replace it."""
     return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
 
 

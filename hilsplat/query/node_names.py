@@ -234,14 +234,8 @@ def run_names(
 
 def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32[np.ndarray, "T C"]:
     """Return the unit vectors of texts, cached because a full-size CLIP takes 30 s for a vocabulary."""
-    key = sha256_of_json(
-        {
-            "model": model.digest,
-            "template": model.template,
-            "texts": list(texts),
-            "code": code_digest(ClipModel),
-        }
-    )
+    made_from = {"model": model.digest, "template": model.template, "texts": list(texts)}
+    key = sha256_of_json({**made_from, "code": code_digest(ClipModel)})
 
     def embed() -> dict[str, np.ndarray]:
         vectors = [model.embed_texts([text]) for text in track(texts, "texts", len(texts))]
@@ -260,11 +254,8 @@ def named(
 
     A whole is a thing or a surface. A part or subpart is a part, or a thing: a plate is part of a laid table.
 
-    Args:
-        tree: the nodes, with their vectors.
-        vocabulary: the texts.
-        margin: cosine margins of the nodes for its things, parts and surfaces, in this order.
-        rivals: see `NodeNaming`.
+    `margin` has the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order;
+    `rivals` are as in `NodeNaming`.
     """
     groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
     words = [word for group in groups for word in group]

@@ -34,8 +34,7 @@ class TextAnswer:
     """The best match of one text of a query.
 
     Attributes:
-        text: the text.
-        level: the level at which it was searched.
+        level: the level at which the text was searched.
         margin: cosine margin of the best node that competed there; -inf if none did.
         anywhere: cosine margin of the best node of any level.
         chance: share of words for absent things whose best margin is as high; None if unknown.
@@ -97,7 +96,7 @@ def search(
         tree: the nodes.
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
-        path: the texts, coarse to fine.
+        path: the texts.
         threshold: see `best_nodes`.
         ancestors: share of the mean margin of a node's ancestors that is added to its own; ignored for a path
             of several texts, which names the ancestors itself.
@@ -129,15 +128,13 @@ def best_nodes(
 ) -> Int64[np.ndarray, " h"]:
     """Return the candidates near the best one, and those slightly further away that look like it.
 
-    They are sorted best first, on a tie by row.
+    They are sorted best first, on a tie by row. Vectors and `shown` are as in `search`.
 
     Args:
         value: sort key of every node: its cosine margin plus the ancestors' share.
-        vectors: as in `search`.
         candidates: the nodes of a level, which define the range of values.
         threshold: answers are at most (1 - threshold) times the range below the best one shown, or
             `ALIKE_REACH` times that if they look like it.
-        shown: as in `search`.
     """
     may = candidates if shown is None else candidates[shown[candidates]]
     spread = np.ptp(value[candidates]) if len(candidates) else 0.0
@@ -244,14 +241,11 @@ def _search_path(
 
 @dataclass(frozen=True)
 class _Way:
-    """The result of a path at one combination of levels.
+    """The result of a path at one combination of levels; other attributes as in `NodeHits`.
 
     Attributes:
-        ids: answers to the last text, best first.
-        values: as in `NodeHits`.
         levels: level of each text.
         margins: margin of the best node that competed for each text.
-        route: as in `NodeHits`.
         total: sum of the margins of the best answer and its ancestors.
         complete: whether the best answer is part of a plausible answer to the first text, and has an ancestor
             for every text.

@@ -1,6 +1,7 @@
 """Building blocks of figures: overlays of answers, relevancy colours, a map of the scene from above."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -131,15 +132,9 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
     """Write a PNG atomically; its metadata names this package instead of Matplotlib's version."""
     packed = {"compress_level": 4}  # half the time of the default 6, for 4 % more bytes
+    own: dict[str, Any] = {"format": "png", "metadata": SOFTWARE, "pil_kwargs": packed}
     with atomic_path(out) as temporary:
-        figure.savefig(
-            temporary,
-            format="png",
-            dpi=dpi,
-            facecolor="white",
-            metadata=SOFTWARE,
-            pil_kwargs=packed,
-        )
+        figure.savefig(temporary, dpi=dpi, facecolor="white", **own)
 
 
 def save_png_and_pdf(figure: Figure, out: Path, dpi: int = 110) -> None:

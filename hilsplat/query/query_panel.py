@@ -14,13 +14,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.query.hits import counted, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
-from hilsplat.query.pictures import (
-    TITLE_LETTERS,
-    paint_answer,
-    paint_relevancy,
-    save_figure,
-    show_from_above,
-)
+from hilsplat.query.pictures import TITLE_LETTERS, paint_answer, paint_relevancy, save_figure, show_from_above
 
 DPI = 110
 COLUMNS = 5

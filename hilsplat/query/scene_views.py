@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.query.view_store import ViewStore
+from hilsplat.query.caches import ViewStore
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -22,14 +22,7 @@ MIN_SHOWN_SHARE = 1e-4
 
 @dataclass(frozen=True)
 class SceneViews:
-    """The views of a scene with a semantic tree.
-
-    Attributes:
-        scene: cameras and photographs.
-        tree: the nodes.
-        pixel_weights: compositing weights of a view (pixels x Gaussians).
-        store: caches results.
-    """
+    """The views of a scene with a semantic tree; `pixel_weights` returns W of a view (pixels x Gaussians)."""
 
     scene: Scene
     tree: SemanticTree

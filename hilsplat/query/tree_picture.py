@@ -35,14 +35,7 @@ TEXT_PX = 12
 def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
     """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` of a finished scene.
 
-    Args:
-        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
-        variant: named set of settings whose tree is written.
-        out: folder to write.
-        threads: number of threads for rendering.
-
-    Returns:
-        human-readable summary of the written files.
+    Return a human-readable summary.
     """
     found = FinishedScene.locate(folder, variant)
     scene = LanguageScene.of(found, threads=threads)

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
-from hilsplat.query.hits import Hit, doubts_of, hits_of
+from hilsplat.query.hits import Hit, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.viewer.payload import box_corners
-from hilsplat.viewer.server import view_name
 from hilsplat.viewer.wire import Group, Question
+from hilsplat.web.server import view_name
 
 LISTED = 24
 """Maximum number of answers in the list."""
@@ -54,7 +54,7 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
     begin = time.perf_counter()
     view = None if asked.view is None else view_name(scene.scene, asked.view)
     found = scene.find(asked.text, asked.level, answerer=answerer, view=view, threshold=asked.threshold)
-    hits, path = hits_of(scene, found, LISTED), path_of(asked.text)
+    hits, path = scene.hits_of(found, LISTED), path_of(asked.text)
     relevancy = scene.node_relevancy([path[-1]], "field" if answerer == "field" else "tree")[0]
     return {
         "text": asked.text,

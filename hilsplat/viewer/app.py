@@ -1,7 +1,7 @@
 """HTTP server of the viewer page."""
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +12,27 @@ from starlette.routing import Route
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import StaleNamesError, write_names
-from hilsplat.scene.scene import Scene
 from hilsplat.viewer import answers, exports, wire
-from hilsplat.viewer.file_changes import StaleSceneError
-from hilsplat.viewer.guard import Guard
+from hilsplat.viewer.frames import painted
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.payload import packed_nodes
 from hilsplat.viewer.picking import pick
 from hilsplat.viewer.saved_files import SavedFiles, node_of
-from hilsplat.viewer.scene_thread import SceneThread
-from hilsplat.viewer.server import (
-    BYTES,
+from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.guard import Guard
+from hilsplat.web.scene_thread import SceneThread
+from hilsplat.web.server import (
     Pages,
-    answer_json,
+    answer,
     encoded,
     guarded,
     photograph,
     plain,
     read,
     serve,
-    static_files,
     thumbnail,
+    version_sent,
 )
-from hilsplat.viewer.viewer_scene import ViewerScene
 
 
 class Viewer:
@@ -42,49 +40,48 @@ class Viewer:
 
     def __init__(self, shown: ViewerScene) -> None:
         self.thread = SceneThread(shown)
-        self.pages = Pages("index.html", static_files())
+        self.pages = Pages("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
         """Return the guarded application, for a page of its own or a frame in another page."""
+        get, post = self.thread.get, self.thread.post
         routes = [
             *self.pages.routes(),
             Route("/openapi.json", self.described),
             Route("/api/scene", self.scene),
             Route("/api/changes", self.changes),
-            Route("/api/variant/{variant}", self.variant),
+            Route("/api/variant/{variant}", get(lambda shown, of: shown.described_variant(of["variant"]))),
             Route("/api/splats/{chunk:int}", self.splats),
-            Route("/api/nodes/{variant}", self.nodes),
-            Route("/api/photo/{number:int}", self.photo),
-            Route("/api/thumb/{number:int}", self.thumb),
-            Route("/api/crop/{variant}/{node:int}", self.crop),
-            Route("/api/query", self.query, methods=["POST"]),
-            Route("/api/like", self.like, methods=["POST"]),
-            Route("/api/field", self.field, methods=["POST"]),
-            Route("/api/pick", self.pick, methods=["POST"]),
-            Route("/api/frame", self.frame, methods=["POST"]),
+            Route("/api/nodes/{variant}", get(nodes)),
+            Route("/api/photo/{number:int}", get(photo, behind=True)),
+            Route("/api/thumb/{number:int}", get(thumb, behind=True)),
+            Route("/api/crop/{variant}/{node:int}", get(crop, behind=True)),
+            Route("/api/query", post(wire.Query, query), methods=["POST"]),
+            Route("/api/like", post(wire.Like, like), methods=["POST"]),
+            Route("/api/field", post(wire.FieldRelevancy, field), methods=["POST"]),
+            Route("/api/pick", post(wire.Pick, picked), methods=["POST"]),
+            Route("/api/frame", post(wire.Frame, frame), methods=["POST"]),
             Route("/api/names", self.names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
-        return guarded(routes, token, {StaleNamesError: 412, StaleSceneError: 409}, embedded=embedded)
+        return guarded(routes, token, StaleNamesError, embedded=embedded)
 
     async def described(self, request: Request) -> Response:
         """Send the OpenAPI description."""
-        return answer_json(description())
-
-    # -- the scene --------------------------------------------------------------------------------
+        return answer(description())
 
     async def scene(self, request: Request) -> Response:
         """Send the views, counts, and the variants that can be queried now."""
-        return answer_json(await self.thread.opened_anew())
+        return answer(await self.thread.opened_anew())
 
     async def changes(self, request: Request) -> Response:
         """Send which parts of the scene changed on disk since they were opened."""
-        return answer_json(await self.thread.changes())
 
-    async def variant(self, request: Request) -> Response:
-        """Send the outline of a variant."""
-        variant = request.path_params["variant"]
-        return answer_json(await self.thread.do(request, lambda shown: shown.described_variant(variant)))
+        def find() -> dict[str, Any]:
+            shown = self.thread.shown
+            return {"of": shown.state, "changed": shown.changed(), "variants": shown.variants}
+
+        return answer(await self.thread.run(find))
 
     async def splats(self, request: Request) -> Response:
         """Send a chunk of the Gaussians as SPZ."""
@@ -95,117 +92,89 @@ class Viewer:
         data = await self.thread.do(request, lambda shown: shown.chunk(chunk))
         return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
 
-    async def nodes(self, request: Request) -> Response:
-        """Send the packed nodes of the Gaussians."""
-        variant = request.path_params["variant"]
-        data = await self.thread.do(
-            request, lambda shown: packed_nodes(shown.answering(variant).tree, shown.order)
-        )
-        return plain(data, BYTES)
-
-    async def photo(self, request: Request) -> Response:
-        """Send an undistorted photograph."""
-        return await self._photograph(request, photograph)
-
-    async def thumb(self, request: Request) -> Response:
-        """Send a thumbnail of a photograph."""
-        return await self._photograph(request, thumbnail)
-
-    async def _photograph(self, request: Request, send: Callable[[Scene, int], Response]) -> Response:
-        def find(shown: ViewerScene) -> Response:
-            with shown.unchanged():
-                return send(shown.scene, request.path_params["number"])
-
-        return await self.thread.do_behind(request, find)
-
-    async def crop(self, request: Request) -> Response:
-        """Send a crop of a node from the photograph that shows it largest."""
-
-        def draw(shown: ViewerScene) -> bytes:
-            scene = shown.answering(request.path_params["variant"])
-            node = node_of(scene, request.path_params["node"])
-            with shown.unchanged():
-                return encoded(exports.crop(scene, node, shown.threads))
-
-        return plain(await self.thread.do_behind(request, draw), "image/jpeg", cached=True)
-
-    # -- answers ----------------------------------------------------------------------------------
-
-    async def query(self, request: Request) -> Response:
-        """Send the answers to a text or a path."""
-        asked = await read(request, wire.Query)
-
-        def answer(shown: ViewerScene) -> answers.Answer:
-            return answers.answer(shown.answering(asked.variant), asked, asked.answerer)
-
-        return answer_json(await self.thread.do(request, answer))
-
-    async def like(self, request: Request) -> Response:
-        """Send the nodes that look like a node or a picture."""
-        asked = await read(request, wire.Like)
-
-        def answer(shown: ViewerScene) -> answers.Answer:
-            scene = shown.answering(asked.variant)
-            if asked.node is not None:
-                hits = scene.like_node(asked.node, limit=answers.LISTED)
-                what = scene.name_of(asked.node) or f"node {asked.node}"
-                return answers.alike(scene, hits, f"like {what}", [asked.node])
-            hits = scene.like_picture(_picture(asked.picture), limit=answers.LISTED)
-            return answers.alike(scene, hits, "like the picture")
-
-        return answer_json(await self.thread.do(request, answer))
-
-    async def field(self, request: Request) -> Response:
-        """Send the field's relevancy of each Gaussian, one byte each."""
-        asked = await read(request, wire.FieldRelevancy)
-
-        def answer(shown: ViewerScene) -> bytes:
-            found = shown.field_relevancy(asked.variant, asked.text, asked.level)
-            return (found[shown.order] if asked.order == "page" else found).tobytes()
-
-        return plain(await self.thread.do(request, answer), BYTES)
-
-    async def pick(self, request: Request) -> Response:
-        """Send the nodes and the 3D point that a pixel shows."""
-        asked = await read(request, wire.Pick)
-
-        def find(shown: ViewerScene) -> dict[str, Any]:
-            has = asked.variant in shown.variants
-            nodes = shown.answering(asked.variant).tree.node_of_gaussian if has else None
-            found = pick(shown.gaussians, nodes, asked.camera.camera(), asked.x, asked.y, shown.threads)
-            if found is None:
-                return {"nodes": [], "alpha": 0}
-            return {"nodes": found.nodes, "alpha": found.alpha, "point": found.point}
-
-        return answer_json(await self.thread.do(request, find))
-
-    async def frame(self, request: Request) -> Response:
-        """Send a rendered picture of the scene."""
-        asked = await read(request, wire.Frame)
-
-        def draw(shown: ViewerScene) -> bytes:
-            from hilsplat.viewer.frames import painted
-
-            paint = shown.paint(asked.variant, asked.style)
-            pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
-            return encoded(pixels, asked.image, asked.quality)
-
-        return plain(await self.thread.do(request, draw), f"image/{asked.image}")
-
     async def names(self, request: Request) -> Response:
         """Replace the names of a tree's nodes; `If-Match` is the version that was read."""
         asked = await read(request, wire.Names)
-        version = request.headers.get("if-match", "").strip('"')
 
         def write(shown: ViewerScene) -> dict[str, Any]:
-            found, scene = shown.found(asked.variant), shown.answering(asked.variant)
-            tree = found.parts.semantic_tree
+            scene = shown.answering(asked.variant)
+            tree, version = shown.parts(asked.variant).semantic_tree, version_sent(request)
             with shown.unchanged():  # otherwise the names could be assigned to nodes of a rebuilt tree
-                names = write_names(found.folder, tree, asked.names, len(scene.tree), version)
-            shown.renamed(asked.variant, names)
+                names = write_names(shown.folder, tree, asked.names, len(scene.tree), version)
+            shown.rename(tree, names)
             return {"version": names.version, "names": dict(names.of_node)}
 
-        return answer_json(await self.thread.do(request, write))
+        return answer(await self.thread.do(request, write))
+
+
+# -- the scene ------------------------------------------------------------------------------------
+
+
+def nodes(shown: ViewerScene, of: Mapping[str, Any]) -> bytes:
+    """Return the packed nodes of the Gaussians."""
+    return packed_nodes(shown.answering(of["variant"]).tree, shown.order)
+
+
+def photo(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
+    """Return an undistorted photograph."""
+    with shown.unchanged():
+        return photograph(shown.scene, of["number"])
+
+
+def thumb(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
+    """Return a thumbnail of a photograph."""
+    with shown.unchanged():
+        return thumbnail(shown.scene, of["number"])
+
+
+def crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
+    """Return a crop of a node from the photograph that shows it largest."""
+    scene = shown.answering(of["variant"])
+    node = node_of(scene, of["node"])
+    with shown.unchanged():
+        return plain(encoded(exports.crop(scene, node, shown.threads)), "image/jpeg", cached=True)
+
+
+# -- answers --------------------------------------------------------------------------------------
+
+
+def query(shown: ViewerScene, asked: wire.Query) -> answers.Answer:
+    """Return the answers to a text or a path."""
+    return answers.answer(shown.answering(asked.variant), asked, asked.answerer)
+
+
+def like(shown: ViewerScene, asked: wire.Like) -> answers.Answer:
+    """Return the nodes that look like a node or a picture."""
+    scene = shown.answering(asked.variant)
+    if asked.node is not None:
+        hits = scene.like_node(asked.node, limit=answers.LISTED)
+        what = scene.name_of(asked.node) or f"node {asked.node}"
+        return answers.alike(scene, hits, f"like {what}", [asked.node])
+    hits = scene.like_picture(_picture(asked.picture), limit=answers.LISTED)
+    return answers.alike(scene, hits, "like the picture")
+
+
+def field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
+    """Return the field's relevancy of each Gaussian, one byte each."""
+    found = shown.field_relevancy(asked.variant, asked.text, asked.level)
+    return (found[shown.order] if asked.order == "page" else found).tobytes()
+
+
+def picked(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
+    """Return the nodes and the 3D point that a pixel shows."""
+    has = asked.variant in shown.variants
+    of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has else None
+    found = pick(shown.gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
+    if found is None:
+        return {"nodes": [], "alpha": 0}
+    return {"nodes": found.nodes, "alpha": found.alpha, "point": found.point}
+
+
+def frame(shown: ViewerScene, asked: wire.Frame) -> Response:
+    """Return a rendered picture of the scene."""
+    paint = shown.paint(asked.variant, asked.style)
+    pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
+    return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")
 
 
 def _picture(text: str) -> np.ndarray:
@@ -226,13 +195,7 @@ def run_view(
 ) -> None:
     """Serve the page of a scene on this machine until Ctrl-C.
 
-    Args:
-        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
-        variant: the initially selected variant.
-        port: TCP port; 0 for any free port.
-        browser: whether to open the page in a browser.
-        threads: number of threads for rendering.
-        on_ready: called with the address once the page can be opened.
+    Arguments as in `ViewerScene` and `serve`.
 
     Raises:
         ArtifactError: the scene has no Gaussians yet.

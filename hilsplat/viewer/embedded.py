@@ -9,21 +9,12 @@ import uvicorn
 
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.server import listening_at
 from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.server import configured, listening_at
 
 
 class EmbeddedViewer:
-    """A notebook frame with the page of a scene; `close` stops its server.
-
-    Args:
-        found: the scene.
-        text: the first query; "" for none.
-        height: height of the frame, px.
-        proxy: address, containing `{port}`, under which a browser on another machine reaches a port of this
-            machine; "" if the browser runs on this machine.
-        threads: number of threads for rendering.
-    """
+    """A notebook frame with the page of a scene; `close` stops its server. Arguments as in `show`."""
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
         self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text
@@ -31,9 +22,7 @@ class EmbeddedViewer:
         listening = listening_at(0)
         self.port: int = listening.getsockname()[1]
         app = self.viewer.app(self.token, embedded=True)
-        self.server = uvicorn.Server(
-            uvicorn.Config(app, log_level="warning", access_log=False, server_header=False)
-        )
+        self.server = uvicorn.Server(configured(app))
         self.thread = threading.Thread(
             target=self.server.run, kwargs={"sockets": [listening]}, daemon=True, name="hilsplat viewer"
         )

@@ -17,12 +17,12 @@ from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.export import write_selection_ply
-from hilsplat.splat.films import write_film
-from hilsplat.splat.flyaround import closed_path, open_path
+from hilsplat.splat.flyaround import closed_path, open_path, write_film
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
 from hilsplat.viewer.wire import Film, Group
+from hilsplat.web.coco import coco_region
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
@@ -93,19 +93,9 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
                 mask = scene.node_masks(view, [node])
                 if not mask.any():
                     continue
-                archive.writestr(
-                    f"masks/{Path(view).stem}/{node}.png", _png(mask), compress_type=zipfile.ZIP_STORED
-                )
-                rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-                box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1)
-                described = {
-                    "image_id": number,
-                    "node": node,
-                    "iscrowd": 0,
-                    "area": int(mask.sum()),
-                    "bbox": [int(side) for side in box],
-                    "segmentation": {"size": [height, width], "counts": coco_counts(mask)},
-                }
+                png = f"masks/{Path(view).stem}/{node}.png"
+                archive.writestr(png, _png(mask), compress_type=zipfile.ZIP_STORED)
+                described = {"image_id": number, "node": node, **coco_region(mask)}
                 for category, group in enumerate(groups):
                     if node in group.nodes:
                         found = {"id": len(coco["annotations"]) + 1, "category_id": category + 1}
@@ -113,14 +103,6 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
             yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
     return held.getvalue()
-
-
-def coco_counts(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """Return COCO's uncompressed run lengths: column by column, starting with zeros."""
-    flat = mask.T.ravel()
-    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    runs = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
-    return [0, *runs] if flat[0] else runs
 
 
 def _png(mask: Bool[np.ndarray, "H W"]) -> bytes:
@@ -191,9 +173,8 @@ def flight(asked: Film, scene: Scene) -> list[Camera]:
     if len(asked.path) > 1:
         path = open_path([camera.camera() for camera in asked.path], asked.frames)
     else:
-        path = closed_path(
-            [scene.cameras[view] for view in scene.views("train") or scene.views()], asked.frames
-        )
+        views = scene.views("train") or scene.views()
+        path = closed_path([scene.cameras[view] for view in views], asked.frames)
     height, width = path[0].size_hw
     scale = asked.side_px / max(height, width)
     size_hw = (max(2, round(height * scale / 2) * 2), max(2, round(width * scale / 2) * 2))

@@ -38,19 +38,13 @@ class Paint:
     @staticmethod
     def of(
         style: Style,
-        node_of_gaussian: Int32[np.ndarray, "N 3"] | None,
+        node_of_gaussian: Int32[np.ndarray, "N 3"],
         num_nodes: int,
         relevancy: UInt8[np.ndarray, " N"] | None = None,
-        count: int = 0,
     ) -> "Paint":
         """Resolve a style: the finest used level whose node has an alpha above 0 sets a Gaussian's colour.
 
-        Args:
-            style: the style that the page sent.
-            node_of_gaussian: nodes in the tree; None if the scene has no tree yet.
-            num_nodes: number of nodes in the tree.
-            relevancy: relevancy of each Gaussian in steps of 1/255; required if the style has a ramp.
-            count: number of Gaussians, for a scene without a tree.
+        Relevancy is in steps of 1/255, and required if the style has a ramp.
 
         Raises:
             ValueError: the table has another number of rows.
@@ -59,8 +53,6 @@ class Paint:
             assert relevancy is not None
             share = np.full(len(relevancy), 0.8, np.float32)
             return Paint(style.colours()[relevancy].astype(np.float32) / 255, share, "plain")
-        if node_of_gaussian is None:
-            return Paint(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), "plain")
         table = style.rgba(num_nodes).astype(np.float32) / 255
         found = np.zeros((len(node_of_gaussian), 4), np.float32)
         for level in range(3):  # coarse to fine, so that finer levels override coarser ones

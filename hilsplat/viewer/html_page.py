@@ -6,16 +6,14 @@ The file is the page itself: its scripts are data URLs in an import map, with `o
 
 import base64
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hilsplat.base.images import resize_to_fit
 from hilsplat.viewer import answers, exports
 from hilsplat.viewer.payload import packed_nodes
-from hilsplat.viewer.server import as_json, encoded
-
-if TYPE_CHECKING:
-    from hilsplat.viewer.viewer_scene import ViewerScene
-    from hilsplat.viewer.wire import Page
+from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.viewer.wire import Page
+from hilsplat.web.server import as_json, encoded
 
 PHOTO_PX = 320
 MAX_CROPS = 400
@@ -27,13 +25,8 @@ POLICY = (
 )
 
 
-def html_page(shown: "ViewerScene", asked: "Page", static: dict[str, bytes]) -> exports.Steps:
+def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> exports.Steps:
     """Make the page of a scene, with one step per crop; 8 MB for 60,000 Gaussians.
-
-    Args:
-        shown: the scene.
-        asked: variant, queries of the page, and initial camera.
-        static: files of the page by name.
 
     Raises:
         SettingsError: a text is empty, or the variant cannot be queried.

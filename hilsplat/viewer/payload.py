@@ -4,7 +4,7 @@ import gzip
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.query.language_scene import LanguageScene
@@ -12,8 +12,7 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.boxes import OrientedBox
 from hilsplat.semantic_tree.tree import SemanticTree
-from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.order import morton_order
+from hilsplat.splat.gaussians import Gaussians, morton_order
 
 CHUNK = 65_536
 """Gaussians per chunk: 32 rows of the page's textures."""
@@ -123,8 +122,3 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
 def box_corners(rows: np.ndarray) -> list[list[float]]:
     """Return the eight corners of a stored oriented box."""
     return np.round(OrientedBox.from_array(rows).corners(), 5).tolist()
-
-
-def as_steps(relevancy: np.ndarray) -> UInt8[np.ndarray, " N"]:
-    """Convert relevancies in [0, 1] to bytes."""
-    return (np.clip(relevancy, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -18,12 +18,12 @@ from starlette.routing import Route
 
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.splat.order import morton_order
+from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.html_page import html_page
-from hilsplat.viewer.scene_thread import SceneThread
-from hilsplat.viewer.server import BYTES, answer_json, as_json, plain, read
 from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.scene_thread import SceneThread
+from hilsplat.web.server import as_json, read
 
 
 class SavedFiles:
@@ -35,57 +35,20 @@ class SavedFiles:
 
     def routes(self) -> list[Route]:
         """Return the routes of the files."""
+        post = self.thread.post
         return [
-            Route("/api/export/ply", self.ply, methods=["POST"]),
-            Route("/api/export/spz", self.spz, methods=["POST"]),
-            Route("/api/export/boxes", self.boxes, methods=["POST"]),
+            Route("/api/export/ply", post(wire.Selection, ply), methods=["POST"]),
+            Route("/api/export/spz", post(wire.Selection, spz), methods=["POST"]),
+            Route("/api/export/boxes", post(wire.Selection, boxes), methods=["POST"]),
             Route("/api/export/masks", self.masks, methods=["POST"]),
             Route("/api/export/film", self.film, methods=["POST"]),
             Route("/api/export/page", self.page, methods=["POST"]),
         ]
 
-    async def ply(self, request: Request) -> Response:
-        """Send the Gaussians of nodes as PLY."""
-        asked = await read(request, wire.Selection)
-
-        def make(shown: ViewerScene) -> bytes:
-            scene = shown.answering(asked.variant)
-            groups = exports.Groups(scene, checked(scene, asked.groups))
-            with shown.unchanged():
-                return exports.selection_ply(shown.folder / "gaussians.ply", groups)
-
-        return plain(await self.thread.do(request, make), BYTES)
-
-    async def spz(self, request: Request) -> Response:
-        """Send the Gaussians of nodes as SPZ."""
-        asked = await read(request, wire.Selection)
-
-        def make(shown: ViewerScene) -> bytes:
-            scene = shown.answering(asked.variant)
-            rows = exports.Groups(scene, checked(scene, asked.groups)).rows
-            return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
-
-        return plain(await self.thread.do(request, make), BYTES)
-
-    async def boxes(self, request: Request) -> Response:
-        """Send the boxes of nodes."""
-        asked = await read(request, wire.Selection)
-
-        def make(shown: ViewerScene) -> dict[str, Any]:
-            scene = shown.answering(asked.variant)
-            return answers.boxes(scene, checked(scene, asked.groups))
-
-        return answer_json(await self.thread.do(request, make))
-
     async def masks(self, request: Request) -> Response:
         """Send the masks of nodes in all views."""
         asked = await read(request, wire.Selection)
-
-        def begin(shown: ViewerScene) -> exports.Steps:
-            scene = shown.answering(asked.variant)
-            return exports.masks_zip(scene, checked(scene, asked.groups))
-
-        return await self._in_steps(request, begin)
+        return await self._in_steps(request, lambda shown: exports.masks_zip(*selected(shown, asked)))
 
     async def film(self, request: Request) -> Response:
         """Send a film in the colours of the page."""
@@ -154,6 +117,33 @@ class SavedFiles:
         yield found
 
 
+def ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
+    """Return the Gaussians of nodes as PLY."""
+    groups = exports.Groups(*selected(shown, asked))
+    with shown.unchanged():
+        return exports.selection_ply(shown.folder / "gaussians.ply", groups)
+
+
+def spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
+    """Return the Gaussians of nodes as SPZ."""
+    rows = exports.Groups(*selected(shown, asked)).rows
+    return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
+
+
+def boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
+    """Return the boxes of nodes."""
+    return answers.boxes(*selected(shown, asked))
+
+
+def selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
+    """Return the variant and the groups of nodes, or raise SettingsError if a node does not exist."""
+    scene = shown.answering(asked.variant)
+    for group in asked.groups:
+        for node in group.nodes:
+            node_of(scene, node)
+    return scene, asked.groups
+
+
 def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
     """Run the next step; return the progress, or the finished file."""
     try:
@@ -180,11 +170,3 @@ def node_of(scene: LanguageScene, node: int) -> int:
     if node >= len(scene.tree):
         raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
     return node
-
-
-def checked(scene: LanguageScene, groups: list[wire.Group]) -> list[wire.Group]:
-    """Return the groups, or raise SettingsError if a node does not exist."""
-    for group in groups:
-        for node in group.nodes:
-            node_of(scene, node)
-    return groups

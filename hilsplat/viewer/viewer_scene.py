@@ -2,8 +2,7 @@
 
 import logging
 import secrets
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -13,20 +12,23 @@ import numpy as np
 
 from hilsplat.base.artifacts import read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.query.caches import Opened, ViewStore
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.names import tree_digest
-from hilsplat.query.opening import Opened
-from hilsplat.query.view_store import ViewStore
-from hilsplat.scene.finished import FinishedScene, finished_variants
+from hilsplat.query.names import NodeNames, tree_digest
+from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
+from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
-from hilsplat.viewer.file_changes import FileChanges
-from hilsplat.viewer.frames import Paint
+from hilsplat.viewer.frames import Paint, painted
+from hilsplat.viewer.picking import pick
 from hilsplat.viewer.wire import Style
+from hilsplat.web.file_changes import FileChanges
 
 VIEWS_MIB = 256.0
 """Memory limit for cached results of views, such as their compositing weights."""
@@ -80,8 +82,6 @@ class ViewerScene:
                 fix="lower gaussians.max_gaussians",
             )
         self._variants: dict[str, LanguageScene] = {}
-        self._trees: dict[str, str] = {}
-        self._found: dict[str, FinishedScene] = {}
         self._relevancy: dict[tuple[str, str, str], np.ndarray] = {}
         self._painted: tuple[Any, Paint] | None = None
 
@@ -91,22 +91,12 @@ class ViewerScene:
         """Return opened parts that were rewritten or deleted; the page still shows what was opened."""
         return sorted({path.name for path in self.changes.changed()})
 
-    @contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """Guard disk reads: fail if files changed since the scene was opened.
-
-        Raises:
-            StaleSceneError: a part was rewritten before or during the read.
-        """
-        with self.changes.unchanged(self.scene.name):
-            yield
+    def unchanged(self) -> AbstractContextManager[None]:
+        """Guard disk reads: raise StaleSceneError if a part was rewritten before or during the read."""
+        return self.changes.unchanged(self.scene.name)
 
     def opened_again(self) -> "ViewerScene":
-        """Open the scene again, as it is on disk now.
-
-        Raises:
-            ArtifactError: as in the constructor.
-        """
+        """Open the scene as it is on disk now."""
         return ViewerScene(self.folder, self.first, self.threads)
 
     # -- variants ---------------------------------------------------------------------------------
@@ -136,28 +126,25 @@ class ViewerScene:
                 found = FinishedScene.locate(self.folder, variant)
                 self.changes.note(found.parts.as_inputs().values())
                 opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
-                self._trees[variant] = tree_digest(found.parts.semantic_tree)[:16]
             if len(opened.tree) > payload.MAX_NODES:
                 raise ArtifactError(f"the tree of {variant} has {len(opened.tree)} nodes, too many to show")
             self._variants[variant] = replace(opened, _views=ViewStore(VIEWS_MIB))
-            self._found[variant] = found
         return self._variants[variant]
 
     def _has_field(self, variant: str) -> bool:
         return (self.folder / variant / "field.safetensors").exists()
 
-    def found(self, variant: str) -> FinishedScene:
+    def parts(self, variant: str) -> SceneParts:
         """Return the paths of the parts of a variant."""
-        self.answering(variant)
-        return self._found[variant]
+        found = self.answering(variant).finished
+        assert found is not None
+        return found.parts
 
-    def renamed(self, variant: str, names: Any) -> LanguageScene:
-        """Use new names in every variant with the same tree."""
-        tree = self.found(variant).parts.semantic_tree.resolve()
-        for each, opened in list(self._variants.items()):
-            if self._found[each].parts.semantic_tree.resolve() == tree:
-                self._variants[each] = replace(opened, names=names)
-        return self._variants[variant]
+    def rename(self, semantic_tree: Path, names: NodeNames) -> None:
+        """Use new names in every variant with this tree."""
+        for variant, opened in list(self._variants.items()):
+            if self.parts(variant).semantic_tree.resolve() == semantic_tree.resolve():
+                self._variants[variant] = replace(opened, names=names)
 
     # -- descriptions -----------------------------------------------------------------------------
 
@@ -172,12 +159,13 @@ class ViewerScene:
 
     def described_variant(self, variant: str) -> dict[str, Any]:
         """Describe the outline of a variant, and the models of its masks and vectors."""
-        scene, parts = self.answering(variant), self.found(variant).parts
+        scene, parts = self.answering(variant), self.parts(variant)
         with self.unchanged():
             clip, masks = Path(read_index(parts.clip)["model"]).name, masks_label(parts.masks)
+            tree = tree_digest(parts.semantic_tree)[:16]
         return {
             "variant": variant,
-            "tree": self._trees[variant],
+            "tree": tree,
             **payload.described_nodes(scene),
             "clip": clip,
             "masks": masks,
@@ -228,10 +216,10 @@ class ViewerScene:
         """
         key = (variant, text, level)
         if key not in self._relevancy:
-            found = payload.as_steps(self.answering(variant).gaussian_relevancy(text, level))
+            found = self.answering(variant).gaussian_relevancy(text, level)
             for oldest in list(self._relevancy)[: 1 - KEPT_RELEVANCIES]:
                 del self._relevancy[oldest]
-            self._relevancy[key] = found
+            self._relevancy[key] = (np.clip(found, 0, 1) * 255 + 0.5).astype(np.uint8)
         return self._relevancy[key]
 
     def paint(self, variant: str, style: Style) -> Paint | None:
@@ -255,12 +243,6 @@ class ViewerScene:
 
     def warm_up(self) -> None:
         """Compile the loops of rendering, picking and masks before the page opens."""
-        from hilsplat.contributions.compositing import normalised_weights
-        from hilsplat.semantic_tree.view_nodes import ViewNodes
-        from hilsplat.splat.rasterise.api import pixel_weights
-        from hilsplat.viewer.frames import painted
-        from hilsplat.viewer.picking import pick
-
         camera = self.scene.cameras[self.scene.cameras.names[0]].scaled((8, 8))
         painted(self.gaussians, camera, None, self.threads)
         pick(self.gaussians, None, camera, 4.0, 4.0, self.threads)

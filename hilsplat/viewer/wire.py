@@ -6,23 +6,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from hilsplat.scene.cameras import Camera
+from hilsplat.web.messages import MAX_SIDE_PX, MAX_TEXT, Message, Text
 
-MAX_SIDE_PX = 4096
-MAX_TEXT = 200
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
-Text = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
 LevelName = Literal["auto", "whole", "part", "subpart"]
 Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
-
-
-class Message(BaseModel):
-    """Base of all request models; unknown keys, NaN and infinity are rejected."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class WireCamera(Message):
@@ -161,7 +153,7 @@ class Film(Asked):
     format: Literal["mp4", "gif"] = "mp4"
     side_px: Annotated[int, Field(ge=64, le=1920)] = 640
     frames: Annotated[int, Field(ge=2, le=480)] = 120
-    path: Annotated[list[WireCamera], Field(max_length=40)] = []
+    path: Annotated[tuple[WireCamera, ...], Field(max_length=40)] = ()
 
 
 class Group(Message):
@@ -186,7 +178,7 @@ class Names(Asked):
 class Page(Asked):
     """A scene as one HTML file with the answers to kept queries, each in its colour, and the last query."""
 
-    kept: Annotated[list[Question], Field(max_length=40)] = []
+    kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
     last: Question | None = None
     start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
     """Initial camera of the page, in the format of its address; empty for the first photograph's camera."""

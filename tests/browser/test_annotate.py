@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import Label, label_path, read_labels, version_of, write_labels
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
 from hilsplat.datasets.registry import open_labelled
+from hilsplat.query.names import version_of
 from tests.browser.conftest import serving
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import change_index
@@ -126,20 +126,6 @@ def test_changes_are_undone_and_redone_and_each_is_saved(page, root):
     assert (root / "annotated/photos/desk/000.json").read_bytes() == both
 
 
-def test_everything_can_be_drawn_by_keys(page, root):
-    name(page, "mug")
-    page.locator("#view").press("p")
-    for keys in (["Shift+ArrowLeft", "Space"], ["Shift+ArrowRight", "Space"], ["Shift+ArrowDown", "Space"]):
-        for key in keys:
-            page.keyboard.press(key)
-    page.keyboard.press("Enter")
-    saved(page)
-    (mug,) = kept(root)
-    (ring,) = mug.polygons  # traced, so it may begin at any corner
-    x, y = min(ring)
-    assert set(ring) == {(x, y), (x + 10, y), (x + 10, y + 10)}
-
-
 def test_a_node_is_proposed_stays_a_proposal_and_is_accepted(page, root):
     page.locator("#view").press("x")
     page.mouse.click(*place(page, 6, 6))
@@ -175,25 +161,6 @@ def test_the_next_thing_does_not_inherit_a_name(page, root):
     page.get_by_role("status").get_by_text("Accepted.").wait_for()
     page.locator("#view").press("Control+z")
     assert page.get_by_role("status").inner_text() == ""
-
-
-def test_a_scene_that_was_rewritten_is_reported(opened, desk, root, tmp_path_factory):
-    project = tmp_path_factory.mktemp("changing")
-    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
-    folder = project / desk.relative_to(desk.parents[2])
-    with serving(folder, "annotate", "--data-root", str(root)) as address:
-        page = opened(address)
-        assert not page.get_by_role("alert").is_visible()
-        with atomic_folder(folder / "default/semantic_tree") as new:
-            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
-        page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
-        name(page, "rim")  # the photographs are the same
-        polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))
-        assert [label.text for label in kept(root)] == ["rim"]
-        page.get_by_role("button", name="Reload").click()
-        page.get_by_role("alert").wait_for(state="hidden")
-        items(page).first.wait_for()
-        page.close()
 
 
 def test_things_are_carried_into_the_next_photograph(page, root):
@@ -294,19 +261,6 @@ def test_a_subpart_proposed_under_a_whole_says_that_it_is_part_of_nothing(page, 
     page.get_by_text("as part of nothing: a subpart needs a part above it, and mug is a whole").wait_for()
     saved(page)
     assert [label.parent for label in kept(root)] == [None, None]
-
-
-def test_a_telephone_has_everything_within_its_width(page):
-    page.set_viewport_size({"width": 390, "height": 780})
-    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
-    assert view["width"] == 390 and view["height"] > 150 and panel["y"] >= view["y"] + view["height"]
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-
-
-def test_every_control_has_a_name(page):
-    controls = "[...document.querySelectorAll('button, input:not([hidden]), select, a, [role=option]')]"
-    named = "each.getAttribute('aria-label') || each.textContent.trim() || each.labels?.length"
-    assert page.evaluate(f"{controls}.filter((each) => !({named})).map((each) => each.outerHTML)") == []
 
 
 def choosing(page) -> None:

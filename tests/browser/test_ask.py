@@ -7,9 +7,8 @@ import pytest
 from PIL import Image
 
 import hilsplat
-from hilsplat.base.artifacts import atomic_folder, read_json
+from hilsplat.base.artifacts import atomic_folder
 from hilsplat.base.images import write_png
-from hilsplat.splat.ply import load_ply
 from tests.browser.conftest import drawn, pixels, serving, wire_camera
 from tests.unit.artifact_changes import change_index
 
@@ -135,36 +134,6 @@ def test_the_outline_is_walked_by_keys(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
-def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, desk, scene):
-    page = opened(desk_address)
-    book = scene.query("book")[0].node
-    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
-    name = page.get_by_role("textbox", name="Name")
-    name.fill("Atlas <b")
-    name.press("Enter")
-    page.get_by_text("Named “Atlas <b”").wait_for()
-    ask(page, "atlas <B")
-    page.locator("#answers").get_by_text("Atlas <b").wait_for()
-    assert list(read_json(desk / "names.json")["trees"].values()) == [{str(book): "Atlas <b"}]
-    assert [hit.node for hit in hilsplat.open(desk).query("atlas <b")] == [book]
-    page.locator("#view").press("Escape")
-    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
-    name.fill("")
-    name.press("Enter")
-    page.get_by_text("The name is taken away.").wait_for()
-    (desk / "names.json").unlink()
-
-
-def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
-    page = opened(desk_address)
-    handle = scene.query("mug > handle")[0].node
-    page.locator(f"[role=treeitem][data-node='{handle}'] > .row .label").click()
-    page.get_by_role("button", name="More like this").click()
-    answers(page).first.wait_for()
-    expected = scene.like_node(handle)[0].node
-    assert page.locator("#answers li").first.get_attribute("data-node") == str(expected)
-
-
 def test_an_image_or_a_frame_drawn_over_the_view_is_requested(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
@@ -221,21 +190,6 @@ def test_an_address_opens_the_same_view(opened, desk_address, scene):
     found, expected = wire_camera(again), wire_camera(page)
     np.testing.assert_allclose(found["cam_from_world"], expected["cam_from_world"], atol=1e-3)
     np.testing.assert_allclose(found["K"], expected["K"], rtol=1e-3)
-
-
-def test_a_selection_is_saved_as_gaussians(opened, desk_address, scene, tmp_path):
-    page = opened(desk_address)
-    page.locator("#text").fill("mug > handle")
-    page.keyboard.press("Enter")
-    answers(page).first.wait_for()
-    page.locator("#save summary").click()
-    with page.expect_download() as started:
-        page.get_by_role("button", name="Gaussians, PLY").click()
-    started.value.save_as(tmp_path / "saved.ply")
-    (hit,) = scene.query("mug > handle")
-    np.testing.assert_array_equal(
-        load_ply(tmp_path / "saved.ply").means, scene.gaussians.means[hit.gaussians]
-    )
 
 
 RECORD_TEXTS = """() => {

@@ -1,6 +1,5 @@
 """Figures of the paper: queries by method, one query over four views, features at three levels."""
 
-import logging
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +18,12 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.tables.measured import row_name
-from hilsplat.query.language_scene import LanguageScene, Opened
+from hilsplat.query.caches import Opened
+from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.pictures import label_left, paint_answer, save_png_and_pdf, show
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
-
-logger = logging.getLogger(__name__)
 
 WIDTH_IN = 13.0
 MOST_COLUMNS = 8
@@ -87,13 +85,11 @@ def run_comparison(
             its tree and its field, others for their field.
         names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
-        settings: number of queries and views.
         evaluate: settings for true regions and for converting maps to masks.
         truth: truth folder of a synthetic scene.
         labels: labels of a published data set instead, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
         queries: texts to show if there is neither truth nor labels.
-        threads: threads for rendering.
 
     Raises:
         SettingsError: no variant is named.
@@ -218,11 +214,10 @@ def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
         show(axes[0], methods[0].scene.image(view), view)
         label_left(axes[0], method.title)
         for level in LEVELS:
-            picture = (
-                node_image(method.scene, view, level)
-                if method.method == "tree"
-                else method.scene.field_image(view, level)
-            )
+            if method.method == "tree":
+                picture = node_image(method.scene, view, level)
+            else:
+                picture = method.scene.field_image(view, level)
             show(axes[level.index + 1], picture, level.label)
     return figure
 

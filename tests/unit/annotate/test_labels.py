@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import (
-    NO_FILE,
     Label,
     StaleLabelsError,
     cut_to_parents,
     read_labels,
     traced,
-    version_of,
     write_labels,
 )
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
+from hilsplat.query.names import NO_FILE, version_of
 
 SIZE = (30, 40)
 

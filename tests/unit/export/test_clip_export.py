@@ -8,7 +8,6 @@ import pytest
 
 from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
-from hilsplat.embed.model_check import check_model
 from hilsplat.models.clip_split import split_clip
 from hilsplat.segment.masks import HierarchicalMasks
 
@@ -72,12 +71,6 @@ def test_a_mask_over_a_square_image_is_the_image_itself(ours, clip_parts):
         expected = unit(model.get_image_features(pixels))
     # stored as float16, whose steps below 1 are at most 2**-11
     np.testing.assert_allclose(ours.embed_masks(image, masks), expected, atol=TOLERANCE + 2**-11)
-
-
-def test_check_describes_the_cut_export(folder):
-    text = check_model(folder)
-    assert "kind       clip" in text
-    assert "vectors    12 numbers" in text
 
 
 def test_a_folder_without_an_export_cannot_be_cut(tmp_path):

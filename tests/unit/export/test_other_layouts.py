@@ -101,9 +101,3 @@ def test_open_clip_in_two_folders_gives_what_transformers_gives(open_clip_folder
     assert ours.width == 12
     names = {path.relative_to(open_clip_folder).as_posix() for path in ours.model.files}
     assert {"visual/model.onnx", "textual/model.onnx", "textual/tokenizer.json"} < names
-
-
-def test_sam_2_is_described(sam2_parts):
-    text = check_model(sam2_parts[1])
-    assert "kind       sam2" in text
-    assert "embedding  2 x 16 x 16, 4 x 8 x 8, 16 x 4 x 4" in text

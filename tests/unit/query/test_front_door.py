@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import hilsplat
-from hilsplat.annotate.labels import NO_FILE, Label, label_path, write_labels
+from hilsplat.annotate.labels import Label, label_path, write_labels
 from hilsplat.base.artifacts import provenance_path, read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.provenance import Inputs, write_provenance
@@ -24,7 +24,7 @@ from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
 from hilsplat.models.folder import open_model_folder
-from hilsplat.query.names import NodeNames
+from hilsplat.query.names import NO_FILE, NodeNames
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
@@ -89,20 +89,6 @@ def test_a_hit_knows_its_gaussians_and_its_pixels(desk):
     assert (shown & expected).sum() / (shown | expected).sum() > 0.7
     with pytest.raises(SettingsError, match=r"photos/desk has no view 'x\.png'"):
         hit.mask("x.png")
-
-
-def test_a_path_chooses_among_handles_and_a_flat_text_does_not(desk):
-    scene = hilsplat.open(desk / SCENE)
-    (flat,), (of_mug,), (of_book,) = map(scene.query, ("handle", "mug > handle", "book > handle"))
-    assert flat.node == of_book.node != of_mug.node
-    assert set(of_mug.gaussians) < set(scene.query("mug")[0].gaussians)
-
-
-def test_a_scene_opens_from_another_folder(desk, elsewhere):
-    hits = hilsplat.open(desk / SCENE).query("mug > handle")
-    shutil.copytree(desk, elsewhere / "copy")
-    copied = hilsplat.open(Path("copy") / SCENE).query("mug > handle")
-    assert copied == hits
 
 
 def test_a_moved_results_folder_finds_its_clip_by_digest(desk, elsewhere):
@@ -220,14 +206,6 @@ def test_query_takes_a_path_from_any_folder(desk, elsewhere, project):
         assert (elsewhere / "answer" / name).stat().st_size > 1000
 
 
-def test_query_takes_data_set_and_scene_with_the_results_folder(desk, elsewhere, project):
-    shutil.copytree(desk, elsewhere / "copy")
-    asked = run_command(project, "query", "photos/desk", "unicorn > handle", "--results", "copy/results")
-    assert asked.returncode == 0, asked.stderr
-    assert "doubtful: 'unicorn' may not be in the scene" in asked.stdout
-    assert (elsewhere / "copy" / SCENE / "queries/unicorn--handle/panel.png").is_file()
-
-
 def test_a_scene_is_found_by_its_name_alone(desk, tmp_path):
     results = desk / "results"
     assert scene_folder("desk", results) == scene_folder("photos/desk", results) == results / "photos/desk"
@@ -236,13 +214,6 @@ def test_a_scene_is_found_by_its_name_alone(desk, tmp_path):
         (tmp_path / dataset / "desk/scene").mkdir(parents=True)
     with pytest.raises(SettingsError, match=r"several scenes(.|\n)*photos/desk, synthetic/desk"):
         scene_folder("desk", tmp_path)
-
-
-def test_query_says_what_is_missing(elsewhere, project):
-    asked = run_command(project, "query", "photos/desk", "mug")
-    assert asked.returncode == 1
-    assert "scene folder results/photos/desk is missing" in asked.stderr
-    assert "Traceback" not in asked.stderr
 
 
 def test_export_writes_the_tree_from_any_folder(desk, elsewhere, project):

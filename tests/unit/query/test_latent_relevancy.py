@@ -6,9 +6,7 @@ import pytest
 from hilsplat.field.linear_code import LinearCode
 from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.field.network_training import train_autoencoder
-from hilsplat.query import projected_look_up
-from hilsplat.query.latent_relevancy import LatentRelevancy
-from hilsplat.query.projected_look_up import lost_for_error
+from hilsplat.query.relevancy import STEPS, LatentRelevancy, lost_for_error
 from hilsplat.settings import AutoencoderSettings
 
 
@@ -49,7 +47,7 @@ def pass_through(latent, channels):
 
 def distance_from_kept(code, latents, placed):
     """Of decoded vectors from what is kept of them: no unit text's cosine errs by more."""
-    kept = (placed.coordinates.T / projected_look_up.STEPS) @ placed.directions
+    kept = (placed.coordinates.T / STEPS) @ placed.directions
     return np.linalg.norm(code.decode_array(latents) - kept, axis=1)
 
 
@@ -107,7 +105,7 @@ def test_what_may_be_lost_gets_no_direction(height, directions):
 
 
 def test_objects_missed_again_are_found_and_directions_end_with_the_channels(monkeypatch):
-    monkeypatch.setattr(projected_look_up, "SAMPLE", 4)
+    monkeypatch.setattr("hilsplat.query.relevancy.SAMPLE", 4)
     latents = np.zeros((4000, 8), np.float32)  # the sample takes every 1000th
     latents[:, 0] = 1
     latents[101:201, 1] = 1  # the sample of these 100 takes every 25th

@@ -9,7 +9,6 @@ import pytest
 
 import hilsplat
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.query.answer import answer
 from hilsplat.query.names import FILE, NO_FILE, StaleNamesError, read_names, tree_digest, write_names
 from tests.unit.finished_desk import SCENE, build_finished_desk
 
@@ -78,13 +77,6 @@ def test_other_texts_and_evaluation_do_not_know_the_names(desk):
     np.testing.assert_array_equal(hilsplat.open(desk).node_margins(["mug"]), before.node_margins(["mug"]))
 
 
-def test_the_command_answers_by_names_too(desk, tmp_path):
-    book = nodes_by_text(hilsplat.open(desk))["book"]
-    name_nodes(desk, {book: "atlas"})
-    first = next(answer(desk, "atlas", out=tmp_path))
-    assert "1 answer to 'atlas'" in first and " atlas  0" in first and "doubtful" not in first
-
-
 def test_a_change_must_know_the_version_that_it_changes(desk):
     first = name_nodes(desk, {0: "mug"})
     second = name_nodes(desk, {0: "cup"}, first.version)
@@ -109,15 +101,18 @@ def test_names_of_another_tree_wait_until_it_is_back(desk, tmp_path):
     assert dict(read_names(desk, other).of_node) == {1: "cup"}
 
 
-@pytest.mark.parametrize("name", ["a > b", "x" * 81, "\x07"])
-def test_a_name_that_cannot_be_requested_is_refused(desk, name):
-    with pytest.raises(SettingsError, match="cannot be a name"):
-        name_nodes(desk, {0: name})
-
-
-def test_a_node_that_does_not_exist_cannot_be_named(desk):
-    with pytest.raises(SettingsError, match="no node 99"):
-        name_nodes(desk, {99: "mug"})
+@pytest.mark.parametrize(
+    ("node", "name", "message"),
+    [
+        (0, "a > b", "be a name"),
+        (0, "x" * 81, "be a name"),
+        (0, "\x07", "be a name"),
+        (99, "mug", "no node 99"),
+    ],
+)
+def test_a_name_that_cannot_be_requested_is_refused(desk, node, name, message):
+    with pytest.raises(SettingsError, match=message):
+        name_nodes(desk, {node: name})
 
 
 FORMAT = "hilsplat-names-1"

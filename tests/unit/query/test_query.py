@@ -11,13 +11,14 @@ from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import load_code
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
+from hilsplat.query.caches import ViewStore
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.look_up_kernels import fill_maps
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
-from hilsplat.query.view_store import ViewStore
+from hilsplat.query.relevancy_kernels import fill_maps
 from hilsplat.scene.finished import FinishedScene, require_same
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.tree import SemanticTree, run_semantic_tree
+from hilsplat.semantic_tree.build import run_semantic_tree
+from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.artifact_changes import write_record
@@ -76,15 +77,10 @@ def near(scene, node_select: float = 0.85) -> LanguageScene:
 @pytest.mark.parametrize("name", NODE)
 def test_every_region_is_found_at_its_level(scene, name):
     level = Level(int(scene.tree.level[NODE[name]]))
-    hits = near(scene).select((name,), level=level)
-    assert hits.ids.tolist() == [NODE[name]]
+    for asked in (level, None):
+        assert near(scene).select((name,), level=asked).ids.tolist() == [NODE[name]]
     assert scene.query(name, level.label)[0].score > 0.9
     assert scene.query(name, level.label)[0].node == NODE[name]
-
-
-@pytest.mark.parametrize("name", NODE)
-def test_automatic_level_is_the_region_s_own(scene, name):
-    assert near(scene).select((name,)).ids.tolist() == [NODE[name]]
 
 
 def test_a_threshold_keeps_the_answers_with_at_least_that_score(scene):
@@ -239,14 +235,23 @@ def test_a_missing_ancestor_counts_a_tenth_of_the_range(scene, three_wholes):
     assert hits.route == "fallback"
 
 
-def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
-    folder = tmp_path / "results" / "photos" / "bear"
-    variant = folder / "default"
-    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
-        (variant / part).mkdir(parents=True)
-    (folder / "scene").mkdir()
-    for name in ("gaussians.ply", "default/field.safetensors", "default/scores.csv"):
+FINISHED = ("default/semantic_tree", "default/autoencoder", "default/clip", "default/masks", "scene")
+
+
+def bear_with(root, folders=FINISHED, files=("gaussians.ply", "default/field.safetensors")):
+    """The folder of a scene in which empty folders and files stand for its parts."""
+    folder = root / "results" / "photos" / "bear"
+    for part in folders:
+        (folder / part).mkdir(parents=True)
+    for name in files:
         (folder / name).touch()
+    return folder
+
+
+def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
+    folder = bear_with(tmp_path)
+    variant = folder / "default"
+    (variant / "scores.csv").touch()
     assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
     settings = {"canonical": ["thing", "surface"], "node_select": 0.9, "a knob of old": 1}
     write_record(variant / "scores.csv", settings=settings)
@@ -256,16 +261,11 @@ def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
 
 
 def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_another(tmp_path):
-    folder = tmp_path / "results" / "synthetic" / "bear"
-    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
-        (folder / "default" / part).mkdir(parents=True)
-    (folder / "scene").mkdir()
-    for name in ("gaussians.ply", "default/field.safetensors"):
-        (folder / name).touch()
+    folder = bear_with(tmp_path)
     (folder / "lifted").mkdir()  # begun, and killed
     with pytest.raises(ArtifactError, match=r"lifted/field\.safetensors is missing"):
         FinishedScene.locate(folder, "lifted")
-    inputs = {"field": {"path": "results/synthetic/bear/default/field.safetensors"}}
+    inputs = {"field": {"path": "results/photos/bear/default/field.safetensors"}}
     (folder / "theta").mkdir()
     (folder / "theta/scores.csv").touch()
     write_record(folder / "theta/scores.csv", inputs=inputs)
@@ -277,10 +277,7 @@ def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_anot
 
 
 def test_a_tree_answers_before_there_is_a_field_and_no_tree_before_its_own(tmp_path):
-    folder = tmp_path / "results" / "photos" / "bear"
-    for part in ("scene", "default/clip", "default/masks", "omega"):
-        (folder / part).mkdir(parents=True)
-    (folder / "gaussians.ply").touch()
+    folder = bear_with(tmp_path, ("scene", "default/clip", "default/masks", "omega"), ("gaussians.ply",))
     with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
         FinishedScene.locate(folder)
     (folder / "default/semantic_tree").mkdir()
@@ -292,12 +289,8 @@ def test_a_tree_answers_before_there_is_a_field_and_no_tree_before_its_own(tmp_p
 
 
 def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
-    folder = tmp_path / "results" / "photos" / "bear"
+    folder = bear_with(tmp_path)
     panel = tmp_path / "results" / "figures" / "photos" / "bear" / "panel.png"
-    for part in ("default/semantic_tree", "default/autoencoder", "default/clip", "default/masks", "scene"):
-        (folder / part).mkdir(parents=True)
-    for name in ("gaussians.ply", "default/field.safetensors"):
-        (folder / name).touch()
     panel.parent.mkdir(parents=True)
     settings = {"figures": {}, "evaluate": {"template": "a photo of a {}"}}
     write_record(panel, settings=settings)
@@ -325,18 +318,6 @@ def test_hits_tell_gaussians_and_an_oriented_box(scene):
     assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
 
 
-def test_path_goes_from_child_to_child(scene):
-    hits = near(scene).select(("A", "A top", "A top left"))
-    assert hits.ids.tolist() == [NODE["A top left"]]
-    assert hits.route == "child"
-    assert hits.level == Level.SUBPART
-
-
-def test_path_restricts_a_part_to_its_object(scene):
-    # "A top" asked inside B can only be a part of B
-    assert near(scene).select(("B", "A top")).ids.tolist() == [NODE["B top"]]
-
-
 @pytest.mark.parametrize(
     ("path", "level", "found"),
     [
@@ -346,9 +327,12 @@ def test_path_restricts_a_part_to_its_object(scene):
         (("A", "A bottom"), None, "A bottom"),
         (("A top", "A top left"), None, "A top left"),  # the first text need be no whole
         (("B", "B corner"), None, "B corner"),
+        (("A", "A top", "A top left"), None, "A top left"),
+        (("B", "A top"), None, "B top"),  # inside B only a part of B
+        (("B", "B top", "B corner"), None, "B corner"),  # B top has no subpart, and B corner hangs under B
     ],
 )
-def test_a_short_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
+def test_a_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
     hits = near(scene).select(path, level=level)
     assert hits.ids.tolist() == [NODE[found]]
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
@@ -393,13 +377,6 @@ def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
     assert np.flatnonzero(~shown).tolist() == [NODE["B corner"]]
 
 
-def test_path_falls_back_to_any_descendant_of_the_object(scene):
-    # "B top" has no subpart; "B corner" hangs directly under B
-    hits = near(scene).select(("B", "B top", "B corner"))
-    assert hits.ids.tolist() == [NODE["B corner"]]
-    assert hits.route == "descendant"
-
-
 def test_path_falls_back_to_the_whole_level(scene):
     parent = np.where(scene.tree.level == Level.SUBPART, -1, scene.tree.parent).astype(np.int32)
     orphaned = replace(scene, tree=replace(scene.tree, parent=parent))
@@ -417,23 +394,19 @@ def test_query_parses_paths_and_describes_hits(scene):
 
 
 @pytest.mark.parametrize(
-    ("text", "level", "words"),
+    ("text", "options", "words"),
     [
-        ("a > b > c > d", "auto", "1 to 3 texts"),
-        ("a > b > c", "part", "cannot be searched at level part"),
-        (" ", "auto", "is empty"),
-        ("A", "hole", "unknown"),
-        ("A > A top", "hole", "unknown"),
+        ("a > b > c > d", {}, "1 to 3 texts"),
+        ("a > b > c", {"level": "part"}, "cannot be searched at level part"),
+        (" ", {}, "is empty"),
+        ("A", {"level": "hole"}, "unknown"),
+        ("A > A top", {"level": "hole"}, "unknown"),
+        ("A", {"answerer": "tre"}, "answerer 'tre' is unknown"),
     ],
 )
-def test_impossible_queries_say_why(scene, text, level, words):
+def test_impossible_queries_say_why(scene, text, options, words):
     with pytest.raises(SettingsError, match=words):
-        scene.query(text, level)
-
-
-def test_an_unknown_answerer_is_named(scene):
-    with pytest.raises(SettingsError, match="answerer 'tre' is unknown"):
-        scene.query("A", answerer="tre")
+        scene.query(text, **options)
 
 
 def test_node_masks_cover_their_region_in_an_unseen_view(scene):
@@ -443,22 +416,16 @@ def test_node_masks_cover_their_region_in_an_unseen_view(scene):
     assert np.array_equal(both, region_mask(3) | region_mask(5))
 
 
-def test_node_map_is_high_where_the_node_is(scene):
-    maps = scene.node_relevancy_map(["B", "A top"], "004.png")
+@pytest.mark.parametrize(("of", "ahead_by"), [("node_relevancy_map", 0), ("field_relevancy", 0.05)])
+def test_maps_are_high_where_the_region_is(scene, of, ahead_by):
+    maps = getattr(scene, of)(["B", "A top"], "004.png")
     assert maps.shape == (2, 3, HEIGHT, WIDTH)
-    inside = np.roll(region_mask(1), 4, axis=1)
-    assert maps[0, 0][inside].min() > maps[0, 0][~inside].max()
-    top = np.roll(region_mask(2), 4, axis=1)
-    assert maps[1, 1][top].min() > maps[1, 1][~top].max()
-
-
-def test_field_answers_where_the_region_is(scene):
-    maps = scene.field_relevancy(["B", "A top"], "004.png")
-    assert maps.shape == (2, 3, HEIGHT, WIDTH)
-    inside = np.roll(region_mask(1), 4, axis=1)
-    assert maps[0, 0][inside].mean() > maps[0, 0][~inside].mean() + 0.05
-    top = np.roll(region_mask(2), 4, axis=1)
-    assert maps[1, 1][top].mean() > maps[1, 1][~top].mean() + 0.05
+    for text, region in enumerate((1, 2)):
+        own = maps[text, text]
+        inside = np.roll(region_mask(region), 4, axis=1)
+        assert own[inside].mean() > own[~inside].mean() + ahead_by
+        if of == "node_relevancy_map":
+            assert own[inside].min() > own[~inside].max()
 
 
 def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(scene):

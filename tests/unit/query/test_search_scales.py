@@ -13,7 +13,6 @@ from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import margin_range, search
-from hilsplat.query.relevancy import margins, relevancy
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -132,13 +131,6 @@ def test_the_scale_of_relevancies_changes_no_answer(three_mugs):
     for share in (0.0, 0.3, 0.95):
         found = near(three_mugs, share).select(["mug"])
         assert near(small, share).select(["mug"]).ids.tolist() == found.ids.tolist()
-
-
-def test_margins_are_cosines_and_relevancies_their_logistic():
-    embeddings, text, generic = np.eye(5)[:1] * 0, np.eye(5)[:1], np.eye(5)[1:]
-    embeddings[0] = 0.30, 0.25, 0.28, 0.20, 0.22
-    assert margins(embeddings, text, generic) == pytest.approx(np.array([[0.02]]), abs=1e-6)
-    assert relevancy(embeddings, text, generic, 10.0) == pytest.approx(np.array([[0.549834]]), abs=1e-6)
 
 
 def test_a_text_that_nothing_answers_is_doubtful(three_mugs):

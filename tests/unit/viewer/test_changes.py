@@ -13,8 +13,8 @@ from hilsplat.base.artifacts import atomic_folder
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.file_changes import FileChanges
 from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.file_changes import FileChanges
 from tests.unit.artifact_changes import change_index
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import ADDRESS, TOKEN

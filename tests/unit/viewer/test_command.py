@@ -14,7 +14,7 @@ from urllib.request import urlopen
 import pytest
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.viewer.server import listening_at
+from hilsplat.web.server import listening_at
 from tests.conftest import PROJECT
 
 

@@ -4,7 +4,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from hilsplat.viewer.app import Viewer
-from hilsplat.viewer.server import static_files
+from hilsplat.web.server import Pages
 from tests.unit.viewer.conftest import ADDRESS, TOKEN
 
 QUERY = {"text": "mug"}
@@ -96,6 +96,17 @@ def test_a_variant_is_a_name_that_the_folder_lists(client, variant):
     assert client.post("/api/query", json={**QUERY, "variant": variant}).status_code == 422
 
 
+@pytest.mark.parametrize(
+    ("page", "package"), [("index.html", "hilsplat.viewer"), ("annotate.html", "hilsplat.annotate")]
+)
+def test_a_page_is_small_and_asks_no_other_address(page, package):
+    texts = {name: data.decode() for name, data in Pages(page, package).static.items()}
+    assert sum(len(text) for name, text in texts.items() if name.endswith(".js")) < 200_000
+    for name, text in texts.items():
+        found = text.replace("http://www.w3.org/2000/svg", "")
+        assert "http://" not in found and "https://" not in found and "innerHTML" not in found, name
+
+
 def test_every_answer_carries_the_policy(client):
     for path in ("/", "/api/scene", "/static/style.css", "/nothing"):
         headers = client.get(path, headers={"origin": ADDRESS}).headers
@@ -104,12 +115,3 @@ def test_every_answer_carries_the_policy(client):
         assert headers["x-content-type-options"] == "nosniff"
         assert headers["cross-origin-resource-policy"] == "same-origin"
         assert "access-control-allow-origin" not in headers
-
-
-def test_the_page_is_small_and_asks_no_other_address():
-    files = static_files()
-    scripts = {name: text.decode() for name, text in files.items() if name.endswith(".js")}
-    assert sum(map(len, scripts.values())) < 200_000
-    for name, text in {**scripts, "index.html": files["index.html"].decode()}.items():
-        found = text.replace("http://www.w3.org/2000/svg", "")
-        assert "http://" not in found and "https://" not in found and "innerHTML" not in found, name

@@ -5,10 +5,11 @@ import csv
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import NO_FILE, Label, label_path, traced, write_labels
+from hilsplat.annotate.labels import Label, label_path, traced, write_labels
 from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.evaluate.diagnostics.label_fits import Fits, add_view, region_ious, run_label_fits
+from hilsplat.query.names import NO_FILE
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
 
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)

@@ -13,7 +13,6 @@ from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
 from hilsplat.models.store import meaningless
 from hilsplat.query.answer import file_name, report, views_of
-from hilsplat.query.hits import hits_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.query.query_panel import query_panel
 from hilsplat.scene.finished import FinishedScene
@@ -64,9 +63,11 @@ def test_panel_with_annotations_is_drawn(block_world, tmp_path):
         assert picture.info["Software"] == "hilsplat"
 
 
-def test_panel_without_annotations_takes_given_texts(block_world, tmp_path):
-    rows = free_rows(block_world.answers, ["bear", "bear > head"], FiguresSettings())
-    assert [(row.path, row.view) for row in rows] == [(("bear",), "000.png"), (("bear", "head"), "000.png")]
+@pytest.mark.parametrize("texts", [["bear", "bear > head"], []])
+def test_panel_without_annotations_shows_given_texts_below_the_overview(block_world, tmp_path, texts):
+    rows = free_rows(block_world.answers, texts, FiguresSettings())
+    paths = [(("bear",), "000.png"), (("bear", "head"), "000.png")]
+    assert [(row.path, row.view) for row in rows] == paths[: len(texts)]
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png", dpi=60)
     assert (tmp_path / "panel.png").stat().st_size > 10_000
@@ -88,7 +89,7 @@ def test_panel_without_queries_shows_the_overview(block_world, tmp_path):
 def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     answers, text = block_world.answers, "bear > head"
     found = answers.find(text)
-    assert views_of(answers, hits_of(answers, found, 10), 2) == ["000.png", "001.png"]
+    assert views_of(answers, answers.hits_of(found, 10), 2) == ["000.png", "001.png"]
     lines = report(answers, text, found).splitlines()
     assert lines[0] == "1 answer to 'bear > head' in synthetic/blocks; lengths in metres"
     assert lines[2].split()[:3] == ["2", "part", "1.00"]
@@ -97,28 +98,22 @@ def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
-def test_no_answer_is_said(block_world):
-    empty = replace(block_world.answers.find("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
-    words = report(block_world.answers, "unicorn", empty)
-    assert words.startswith(
+def test_reports_say_what_was_not_found(block_world):
+    answers = block_world.answers
+    empty = replace(answers.find("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
+    nothing = report(answers, "unicorn", empty)
+    assert nothing.startswith(
         "nothing in synthetic/blocks answers to 'unicorn' at level whole; try --level part"
     )
-    words = report(block_world.answers, "unicorn", empty, "000.png")
-    assert words.startswith("nothing in what 000.png shows of synthetic/blocks answers to 'unicorn'")
-
-
-def test_a_path_that_ended_outside_its_first_thing_says_so(block_world):
-    found = block_world.answers.find("bear > head")
-    assert "the whole scene was searched" not in report(block_world.answers, "bear > head", found)
-    outside = report(block_world.answers, "bear > head", replace(found, route="fallback"))
+    nothing = report(answers, "unicorn", empty, "000.png")
+    assert nothing.startswith("nothing in what 000.png shows of synthetic/blocks answers to 'unicorn'")
+    found = answers.find("bear > head")
+    assert "the whole scene was searched" not in report(answers, "bear > head", found)
+    outside = report(answers, "bear > head", replace(found, route="fallback"))
     assert "no answer is part of anything that answers to 'bear'" in outside
-
-
-def test_what_nothing_answers_is_reported_as_doubtful(block_world):
-    text = "unicorn > head"
-    found = block_world.answers.find(text)
+    found = answers.find("unicorn > head")
     assert found.route == "child"
-    last = report(block_world.answers, text, found).splitlines()[-1]
+    last = report(answers, "unicorn > head", found).splitlines()[-1]
     assert last.startswith("doubtful: nothing here answers to 'unicorn' better than to a generic word")
 
 
@@ -149,19 +144,12 @@ def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
     assert parts.semantic_tree == folder / "default" / "semantic_tree"
 
 
-def test_unfinished_scene_names_the_missing_part(tmp_path):
-    folder = finished_scene(tmp_path)
-    (folder / "gaussians.ply").unlink()
-    with pytest.raises(ArtifactError, match=r"hilsplat run .*gaussians\.ply"):
-        FinishedScene.locate(folder, "default")
-
-
-def test_unknown_variant_names_those_there_are(tmp_path):
+def test_what_is_missing_of_a_scene_is_named(tmp_path):
+    with pytest.raises(ArtifactError, match=r"scene folder .*photos/desk is missing"):
+        FinishedScene.locate(tmp_path / "photos/desk")
     folder = finished_scene(tmp_path)
     with pytest.raises(ArtifactError, match="one of default"):
         FinishedScene.locate(folder, "leftover")
-
-
-def test_a_missing_scene_folder_is_named(tmp_path):
-    with pytest.raises(ArtifactError, match=r"scene folder .*photos/desk is missing"):
-        FinishedScene.locate(tmp_path / "photos/desk")
+    (folder / "gaussians.ply").unlink()
+    with pytest.raises(ArtifactError, match=r"hilsplat run .*gaussians\.ply"):
+        FinishedScene.locate(folder, "default")

@@ -1,10 +1,25 @@
-"""Cache of results per view, in bounded memory."""
+"""Caches of a scene: artifacts, each opened once, and results per view, in bounded memory."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from pathlib import Path
 from typing import Any
 
 VIEW_CACHE_MIB = 1024.0
 """Memory limit of the cache, MiB."""
+
+
+class Opened:
+    """Artifacts by path, each opened and hashed once because the variants of a scene share most of them."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Hashable, ...], Any] = {}
+
+    def get(self, how: Callable[..., Any], path: Path, *more: Hashable) -> Any:
+        """Return `how(path, *more)`, computed on the first call."""
+        key = (how, Path(path).resolve(), *more)
+        if key not in self._kept:
+            self._kept[key] = how(path, *more)
+        return self._kept[key]
 
 
 class ViewStore:

@@ -102,7 +102,7 @@ class Guard:
             return "open the printed address, with its token"
         if method in ("GET", "HEAD"):
             return ""
-        if headers.get("origin") not in (f"http://{host}",):
+        if headers.get("origin") != f"http://{host}":
             return "only the page itself may send something"
         return self._sent_as_json(method, headers)
 

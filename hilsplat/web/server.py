@@ -4,12 +4,13 @@ import json
 import secrets
 import socket
 import webbrowser
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from importlib.resources import files
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
+import uvicorn
 from jaxtyping import UInt8
 from pydantic import BaseModel, ValidationError
 from starlette.applications import Starlette
@@ -20,7 +21,8 @@ from starlette.routing import Route
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.images import resize_to_fit
 from hilsplat.scene.scene import Scene
-from hilsplat.viewer.guard import MAX_BODY_BYTES, Guard
+from hilsplat.web.file_changes import StaleSceneError
+from hilsplat.web.guard import MAX_BODY_BYTES, Guard
 
 TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
 BYTES = "application/octet-stream"
@@ -28,17 +30,18 @@ THUMB_PX = 160
 Sent = TypeVar("Sent", bound=BaseModel)
 
 
-def static_files(package: str = "hilsplat.viewer") -> dict[str, bytes]:
-    """Return the files of a page by name; no other file can be requested."""
-    folder = files(package) / "static"
-    return {each.name: each.read_bytes() for each in folder.iterdir() if each.name.endswith(tuple(TYPES))}
-
-
 class Pages:
-    """A page and its static files, by a fixed list of names."""
+    """A page and its static files; no other file can be requested.
 
-    def __init__(self, page: str, static: dict[str, bytes]) -> None:
-        self.first, self.static = page, static
+    Args:
+        page: name of the page's file.
+        package: package with the page's own files; those of `hilsplat.web` belong to every page.
+    """
+
+    def __init__(self, page: str, package: str) -> None:
+        found = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
+        self.first = page
+        self.static = {each.name: each.read_bytes() for each in found if each.name.endswith(tuple(TYPES))}
 
     def routes(self) -> list[Route]:
         """Return the routes of the page and its files."""
@@ -59,14 +62,18 @@ class Pages:
 def guarded(
     routes: list[Route],
     token: str,
-    statuses: Mapping[type[Exception], int],
+    stale_version: type[HilsplatError],
     max_body: int = MAX_BODY_BYTES,
     *,
     embedded: bool = False,
 ) -> Guard:
-    """Return the guarded application, which sends errors as text; `statuses` sets some HTTP statuses."""
+    """Return the guarded application, which sends errors as text.
+
+    `stale_version` is the error that a file changed since the version that the page sent in `If-Match`.
+    """
     handlers: dict[Any, Any] = {
-        **{error: _told(status) for error, status in statuses.items()},
+        stale_version: _told(412),
+        StaleSceneError: _told(409),
         HilsplatError: _told(422),
         ValidationError: _told(400),
     }
@@ -86,9 +93,16 @@ async def read(request: Request, kind: type[Sent]) -> Sent:
     return kind.model_validate_json(await request.body())
 
 
-def answer_json(value: Any) -> Response:
-    """Return a JSON response."""
-    return plain(as_json(value), "application/json")
+def version_sent(request: Request) -> str:
+    """Return the version of a file that the page has read and wants to replace."""
+    return request.headers.get("if-match", "").strip('"')
+
+
+def answer(made: Any) -> Response:
+    """Return a response of bytes or JSON; a response is returned unchanged."""
+    if isinstance(made, Response):
+        return made
+    return plain(made, BYTES) if isinstance(made, bytes) else plain(as_json(made), "application/json")
 
 
 def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
@@ -163,11 +177,15 @@ def listening_at(port: int) -> socket.socket:
         made.bind(("127.0.0.1", port))
     except OSError as error:
         made.close()
-        raise SettingsError(
-            f"port {port} cannot be used: {error}", fix="choose another, or leave it out"
-        ) from error
+        fix = "choose another, or leave it out"
+        raise SettingsError(f"port {port} cannot be used: {error}", fix=fix) from error
     made.listen()  # before the address is printed, so that early connections wait and are not refused
     return made
+
+
+def configured(app: Guard) -> uvicorn.Config:
+    """Return the configuration of a server that prints warnings only."""
+    return uvicorn.Config(app, log_level="warning", access_log=False, server_header=False)
 
 
 def serve(
@@ -178,18 +196,16 @@ def serve(
     Args:
         app: creates the application from its access token.
         about: description of the page for the printed line.
-        port: TCP port; 0 for any free port.
+        port: 0 for any free port.
         browser: whether to open the page in a browser.
-        on_ready: called with the address once the page can be opened.
+        on_ready: called with a line that has the address, once the page can be opened.
 
     Raises:
         SettingsError: the port is taken.
     """
-    import uvicorn
-
     token, listening = secrets.token_urlsafe(24), listening_at(port)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
-    config = uvicorn.Config(app(token), log_level="warning", access_log=False, server_header=False)
+    config = configured(app(token))
     on_ready(f"{about} at {address}\nCtrl-C ends it")
     if browser:
         webbrowser.open(address)

@@ -1,0 +1,15 @@
+"""Base of the pages' request models, and limits that both pages use."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+MAX_SIDE_PX = 4096
+MAX_TEXT = 200
+Text = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
+
+
+class Message(BaseModel):
+    """Base of all request models; unknown keys, NaN and infinity are rejected."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
