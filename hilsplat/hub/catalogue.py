@@ -29,20 +29,13 @@ not run code in it (`weights_only`)."""
 SMALL_BYTES = 50_000_000
 """Text files of a PyTorch model above this size are not part of its tokenizer."""
 
-
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
 """Possible paths of a whole CLIP without `.onnx`."""
 
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """A model to download.
-
-    Attributes:
-        name: name of the folder.
-        repository: owner/name on the hub.
-        release: the released model, or None for any other repository.
-    """
+    """A model to download: folder name, owner/name on the hub, and release (None for other repositories)."""
 
     name: str
     repository: str
@@ -50,11 +43,7 @@ class ModelRequest:
 
     @staticmethod
     def named(name: str, variant: str) -> "ModelRequest":
-        """Find a model by its release name or as owner/name.
-
-        Raises:
-            DownloadError: the name is neither.
-        """
+        """Find a model by its release name or as owner/name, and refuse any other name."""
         ending = f"-{variant}" if variant else ""
         for release in RELEASES:
             if name in (release.name, release.repository):
@@ -74,38 +63,14 @@ class ModelRequest:
         return ModelRequest(f"{name.split('/')[1]}{ending}", name, None)
 
 
-@dataclass(frozen=True)
-class Parts:
-    """Files of a kind of model.
-
-    Attributes:
-        networks: possible paths of each network without `.onnx`, the usual one first.
-        described: files required in addition to the networks.
-        whole: possible paths of a single network that contains all of them and can be split.
-        beside: files that are downloaded if they exist.
-    """
-
-    networks: tuple[tuple[str, ...], ...]
-    described: tuple[str, ...]
-    whole: tuple[str, ...]
-    beside: tuple[str, ...]
-
-    @property
-    def usual(self) -> tuple[str, ...]:
-        """Usual paths of all required files."""
-        return (*self.described, *(f"{places[0]}.onnx" for places in self.networks))
+def networks_of(kind: str) -> list[tuple[str, ...]]:
+    """Return the possible paths of each network without `.onnx`, the usual one first."""
+    return [spec.places[::-1] for spec in LAYOUTS[kind].networks.values()]
 
 
-PARTS = {
-    name: Parts(
-        tuple(spec.places[::-1] for spec in layout.networks.values()),
-        layout.described,
-        WHOLES if name in ("clip", "siglip") else (),
-        layout.beside,
-    )
-    for name, layout in LAYOUTS.items()
-}
-"""Layout -> files of its models."""
+def usual_files(kind: str) -> list[str]:
+    """Return the usual paths of all files that a kind of model requires."""
+    return [*LAYOUTS[kind].described, *(f"{places[0]}.onnx" for places in networks_of(kind))]
 
 
 @dataclass(frozen=True)
@@ -113,8 +78,6 @@ class HubFile:
     """A file as listed by the hub.
 
     Attributes:
-        path: path in the repository.
-        size: size in bytes.
         digest: SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits).
         cached: the file in the hub's cache on this machine, if the listing is that of the cache.
     """
@@ -135,14 +98,7 @@ class HubFile:
 
 @dataclass(frozen=True)
 class Listing:
-    """A repository at one commit.
-
-    Attributes:
-        repository: owner/name.
-        revision: the commit.
-        licence: licence according to the hub; empty if not stated.
-        files: files by path.
-    """
+    """A repository at one commit; `licence` is the hub's, or empty if not stated."""
 
     repository: str
     revision: str
@@ -150,11 +106,7 @@ class Listing:
     files: Mapping[str, HubFile]
 
     def require(self, *paths: str) -> list[HubFile]:
-        """Return files by path.
-
-        Raises:
-            DownloadError: the repository lacks one or more of them.
-        """
+        """Return files by path, and refuse a repository that lacks one of them."""
         if missing := [path for path in paths if path not in self.files]:
             raise DownloadError(
                 f"{self.repository} lacks {', '.join(missing)}",
@@ -229,8 +181,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
     """Choose the files of a model: separate networks, else a whole CLIP, else PyTorch weights.
 
     Args:
-        listing: the repository.
-        config: its config.json.
+        config: the repository's config.json.
         variant: suffix of the networks, such as "quantized" or "fp16", which is removed from their names;
             empty for the plain networks.
 
@@ -243,20 +194,21 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         described = None
     kind = layout_of(described)
     if kind is None:
+        is_object = isinstance(described, dict)
         raise DownloadError(
             f"{listing.repository} does not hold a model that can be used here",
             expected="; ".join(SUPPORTED.values()),
-            found=f"model_type {described.get('model_type')!r}"
-            if isinstance(described, dict)
-            else "no object",
+            found=f"model_type {described.get('model_type')!r}" if is_object else "no object",
             fix="name a SAM or a CLIP (hilsplat models list)",
         )
-    parts, ending = PARTS[kind], f"_{variant}" if variant else ""
-    for networks, split in ((parts.networks, False), ((parts.whole,), True)):
-        places = [_first(listing, each, ending) for each in networks]
-        if None not in places:
-            listing.require(*parts.described)
-            plain = [*parts.described, *(path for path in parts.beside if path in listing.files)]
+    layout, ending = LAYOUTS[kind], f"_{variant}" if variant else ""
+    whole = [WHOLES if kind in ("clip", "siglip") else ()]
+    for networks, split in ((networks_of(kind), False), (whole, True)):
+        present = [[place for place in each if f"{place}{ending}.onnx" in listing.files] for each in networks]
+        if all(present):
+            places = [each[0] for each in present]
+            listing.require(*layout.described)
+            plain = [*layout.described, *(path for path in layout.beside if path in listing.files)]
             files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
             # a network looks for its weights under the names that it was saved with
             weights = [
@@ -267,19 +219,14 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)
     weights = [name for name in WEIGHTS if name in listing.files][:1]
     if variant or not weights:
-        listing.require(*(f"{places[0]}{ending}.onnx" for places in parts.networks))
+        listing.require(*(f"{places[0]}{ending}.onnx" for places in networks_of(kind)))
     texts = [
         path
         for path, file in listing.files.items()
         if path.endswith((".json", ".txt")) and "/" not in path and file.size < SMALL_BYTES
     ]
-    listing.require(*(name for name in parts.described if name != "tokenizer.json"))
+    listing.require(*(name for name in layout.described if name != "tokenizer.json"))
     return Choice({path: path for path in [*texts, *weights]}, exported=True)
-
-
-def _first(listing: Listing, places: tuple[str, ...], ending: str) -> str | None:
-    """The first place at which the repository has a network."""
-    return next((place for place in places if f"{place}{ending}.onnx" in listing.files), None)
 
 
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)

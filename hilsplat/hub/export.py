@@ -23,11 +23,7 @@ LAST_LINES = 15
 
 
 def require_exporter(what: str) -> None:
-    """Check that the exporter is installed, before anything is downloaded.
-
-    Raises:
-        ModelError: some of its packages are missing.
-    """
+    """Refuse to continue without the exporter's packages, before anything is downloaded."""
     if missing := [name for name in NEEDED if not _is_installed(name)]:
         raise ModelError(
             f"{what} has no ready networks, and what would make them is not installed",
@@ -45,17 +41,10 @@ def _is_installed(module: str) -> bool:
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
-    """Export the networks of a PyTorch SAM or CLIP in a supported layout.
+    """Export the networks of a PyTorch SAM or CLIP, and return the versions of the exporter's packages.
 
-    Args:
-        weights: folder in the format of transformers: config.json, weights, preprocessor, tokenizer.
-        out: folder to write.
-
-    Returns:
-        versions of the exporter's packages by name.
-
-    Raises:
-        ModelError: the exporter fails; its last lines are shown.
+    `weights` is in the format of transformers: config.json, weights, preprocessor, tokenizer. If the exporter
+    fails, its last lines are in the error.
     """
     logger.info("exporting to ONNX; this takes a few minutes and about three times the weights in memory")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))

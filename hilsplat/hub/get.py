@@ -55,11 +55,7 @@ class Prepared:
     """A model whose required files are known.
 
     Attributes:
-        requested: name and repository.
-        listing: the repository at a commit.
-        choice: the required files.
         staging: folder of the download; kept after a failure, and resumed.
-        target: the model folder.
     """
 
     requested: ModelRequest
@@ -86,7 +82,7 @@ def get_models(
     """Download models, check each, and install them.
 
     Args:
-        names: names of released models, or owner/name; empty for the recommended pair.
+        names: released models, or owner/name; empty for the recommended pair.
         models: parent folder of the models; None for the user's.
         revision: branch, tag or commit of a single model; None for the hub's default.
         variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
@@ -188,11 +184,7 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
 
 
 def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
-    """Log the size of the download and the free space, and check that it fits.
-
-    Raises:
-        DiskSpaceError: there is too little free space.
-    """
+    """Log the size of the download and the free space, and refuse a download that does not fit."""
     fetched = sum(each.missing_bytes for each in prepared)
     made = sum(each.num_bytes * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
     free = shutil.disk_usage(models).free
@@ -231,12 +223,7 @@ def _install(found: Prepared) -> str:
 
 
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
-    """Fetch one file, continue it if a part is there, and compare its digest.
-
-    Raises:
-        DownloadError: the file is not the one that the hub states; it is deleted.
-        DiskSpaceError: the disk is full.
-    """
+    """Fetch one file, continue it if a part is there, and delete and refuse it if its digest is wrong."""
     target = staging / file.path
     with explain_full_disk(target):
         if file.cached is None:
@@ -279,18 +266,15 @@ def _place(found: Prepared, made: Path, **more: Any) -> str:
     """Check a finished folder, write `origin.json` into it, and rename it to the target."""
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
+    fetched = []
+    for path in sorted(found.choice.files):
+        file = found.listing.files[path]
+        kind = "sha256" if len(file.digest) == 64 else "git_sha1"
+        fetched.append({"path": path, "bytes": file.size, kind: file.digest})
     origin = {
         "repository": found.listing.repository,
         "revision": found.listing.revision,
-        "files": [
-            {
-                "path": path,
-                "bytes": file.size,
-                "sha256" if len(file.digest) == 64 else "git_sha1": file.digest,
-            }
-            for path, file in sorted(found.listing.files.items())
-            if path in found.choice.files
-        ],
+        "files": fetched,
         **more,
         "holds": {path.relative_to(made).as_posix(): path.stat().st_size for path in files},
     }

@@ -29,11 +29,8 @@ def models_table() -> str:
         kind, use = release.family.upper(), release.use
         if release.name in RECOMMENDED:
             use += " (recommended)"
-        lines.append(
-            COLUMNS.format(
-                release.name, kind, release.megabytes, release.licence, state(release.name), use
-            ).rstrip()
-        )
+        cells = (release.name, kind, release.megabytes, release.licence, state(release.name), use)
+        lines.append(COLUMNS.format(*cells).rstrip())
     for name, model in here.items():
         if name in {release.name for release in RELEASES}:
             continue
@@ -50,11 +47,7 @@ def models_table() -> str:
 
 
 def check_models() -> tuple[str, int]:
-    """Check every installed model folder.
-
-    Returns:
-        the report of `check_model` on each, and the number of models that do not work.
-    """
+    """Return the report of `check_model` on every installed model, and the number that do not work."""
     texts, num_failed = [], 0
     for folder in [*(model.folder for model in present_models()), *broken_models()]:
         try:

@@ -9,18 +9,14 @@ from huggingface_hub import constants
 from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 
 from hilsplat.base.errors import DownloadError, HilsplatError
-from hilsplat.hub.catalogue import OUT_OF_REACH, PARTS, ModelRequest
+from hilsplat.hub.catalogue import OUT_OF_REACH, ModelRequest, usual_files
 
 KEPT = "what was transferred is kept, and continued"
 
 
 @contextmanager
 def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
-    """Convert errors from the network and the hub into errors with a fix.
-
-    Raises:
-        DownloadError: the network or the hub raised an error.
-    """
+    """Convert errors from the network and the hub into a `DownloadError` with a fix."""
     place = f"{constants.ENDPOINT}/{requested.repository}"
     try:
         yield
@@ -41,12 +37,13 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
             raise _refused(answered, requested, place) from error
+        families = [requested.release.family] if requested.release else ["sam", "clip"]
         raise DownloadError(
             f"{requested.repository} cannot be fetched: {type(error).__name__}, no way to {place}",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again where the hub can be reached ({KEPT}; HF_ENDPOINT names a mirror, "
             f"HTTPS_PROXY a proxy), or put these files into {models / requested.name} by hand, from {place}: "
-            f"{', '.join(_files_by_hand(requested))}",
+            f"{', '.join(file for family in families for file in usual_files(family))}",
         ) from error
     except OSError as error:
         if error.filename is None:
@@ -94,9 +91,3 @@ def _innermost(error: BaseException) -> str:
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return str(error) or type(error).__name__
-
-
-def _files_by_hand(requested: ModelRequest) -> list[str]:
-    """Return the files of the model, for a user who must copy them by hand."""
-    families = [requested.release.family] if requested.release else ["sam", "clip"]
-    return [name for family in families for name in PARTS[family].usual]
