@@ -18,16 +18,10 @@ from hilsplat.world.mask_faults import (
     longest_border,
     sibling_borders,
 )
+from hilsplat.world.truth_masks import FAULTS
 
 EXACT = PerturbSettings(
-    boundary_px=0,
-    merge=0,
-    split=0,
-    missing=(0, 0, 0),
-    wrong_level=0,
-    systematic_merge=0,
-    systematic_missing=0,
-    score_noise=0,
+    **{fault: (0, 0, 0) if fault.startswith("missing") else 0 for fault in FAULTS}, score_noise=0
 )
 OBJECTS = 25
 WIDTH, HEIGHT = 9, 6
@@ -79,10 +73,6 @@ def within_binomial_bounds(successes: int, trials: int, probability: float) -> b
     return abs(successes - trials * probability) <= 4 * sigma
 
 
-def total(fault: str, views: int = 12, **faults) -> int:
-    return sum(with_faults(f"{view:03d}.png", **faults)[1][fault] for view in range(views))
-
-
 def test_without_faults_the_masks_are_the_truth():
     masks, counts = with_faults()
     for level in LEVELS:
@@ -113,9 +103,25 @@ def test_siblings_touch_and_strangers_and_the_floor_do_not():
     assert longest_border({7: 3, 5: 9, 4: 9}) == 4
 
 
-def test_merges_come_at_their_rate_and_unite_both_parts():
-    # either part may start the merge: 1 - 0.8^2 = 0.36 of the pairs
-    assert within_binomial_bounds(total("merged", merge=0.2), 12 * OBJECTS, 0.36)
+@pytest.mark.parametrize(
+    ("fault", "settings", "trials", "probability"),
+    [
+        ("merged", {"merge": 0.2}, OBJECTS, 0.36),  # either part may start it: 1 - 0.8^2 of the pairs
+        ("missing", {"missing": (0.1, 0.0, 0.0)}, OBJECTS + 1, 0.1),
+        ("missing", {"missing": (0.0, 0.5, 0.0)}, 2 * OBJECTS, 0.5),
+        ("split", {"split": 0.3}, 3 * OBJECTS + 1, 0.3),
+        ("wrong_level", {"wrong_level": 0.2}, 3 * OBJECTS + 1, 0.2),
+    ],
+)
+def test_faults_come_at_their_rates(fault, settings, trials, probability):
+    views = [with_faults(f"{view:03d}.png", **settings) for view in range(12)]
+    counts = sum(counts[fault] for _, counts in views)
+    assert within_binomial_bounds(counts, 12 * trials, probability)
+    if fault == "missing":
+        assert sum(3 * OBJECTS + 1 - len(masks) for masks, _ in views) == counts
+
+
+def test_a_merge_unites_both_parts():
     masks, counts = with_faults(merge=1)
     assert counts["merged"] == OBJECTS
     assert regions(masks, Level.PART) == true_regions(Level.WHOLE, skip=TRUTH.background)
@@ -125,19 +131,7 @@ def test_merges_come_at_their_rate_and_unite_both_parts():
     assert masks.stability[masks.rows_of(Level.PART)] == pytest.approx(0.75)
 
 
-def test_masks_are_missing_at_the_rate_of_their_level():
-    missing = {"missing": (0.1, 0.5, 0.0)}
-    wholes, parts = 0, 0
-    for view in range(12):
-        masks, _ = with_faults(f"{view:03d}.png", **missing)
-        wholes += OBJECTS + 1 - len(masks.rows_of(Level.WHOLE))
-        parts += 2 * OBJECTS - len(masks.rows_of(Level.PART))
-    assert within_binomial_bounds(wholes, 12 * (OBJECTS + 1), 0.1)
-    assert within_binomial_bounds(parts, 24 * OBJECTS, 0.5)
-
-
-def test_splits_come_at_their_rate_and_cover_what_they_cut():
-    assert within_binomial_bounds(total("split", split=0.3), 12 * (3 * OBJECTS + 1), 0.3)
+def test_splits_cover_what_they_cut():
     masks, counts = with_faults(split=1)
     assert counts["split"] == 3 * OBJECTS + 1
     for level in (Level.WHOLE, Level.PART):
@@ -157,14 +151,13 @@ def test_a_cut_leaves_between_30_and_70_percent_on_either_side():
     assert len(cut_in_two(single, np.random.default_rng(0))) == 1
 
 
-def test_wrong_levels_come_at_their_rate_one_step_away():
-    assert within_binomial_bounds(total("wrong_level", wrong_level=0.2), 12 * (3 * OBJECTS + 1), 0.2)
+def test_a_wrong_level_is_one_step_away():
     masks, _ = with_faults(wrong_level=1)
     # every whole stands at part; of the parts about half go up and half go down
     assert len(masks.rows_of(Level.PART)) == OBJECTS + 1
     assert within_binomial_bounds(len(masks.rows_of(Level.WHOLE)), 2 * OBJECTS, 0.5)
-    assert [beside(level, up=True) for level in LEVELS] == [Level.PART, Level.WHOLE, Level.PART]
-    assert [beside(level, up=False) for level in LEVELS] == [Level.PART, Level.SUBPART, Level.PART]
+    assert len(masks.rows_of(Level.WHOLE)) + len(masks.rows_of(Level.SUBPART)) == 2 * OBJECTS
+    assert [beside(Level.SUBPART, up) for up in (True, False)] == [Level.PART, Level.PART]
 
 
 def test_views_and_levels_are_dropped_at_their_rates():
@@ -182,14 +175,15 @@ def test_views_and_levels_are_dropped_at_their_rates():
     assert within_binomial_bounds(without_parts, 150, 0.75 * 0.4)
 
 
+def times_found(views: int, parts: list[np.ndarray], **faults) -> np.ndarray:
+    """Number of views in which each region is the mask of a part."""
+    found = [regions(with_faults(f"{view:03d}.png", **faults)[0], Level.PART) for view in range(views)]
+    return np.array([sum(part.tobytes() in masks for masks in found) for part in parts])
+
+
 def test_a_systematic_merge_repeats_in_its_share_of_the_views():
-    faults = {"systematic_merge": 0.2, "systematic_share": 0.9}
     views = 25
-    merged = np.zeros(OBJECTS, int)
-    for view in range(views):
-        masks, _ = with_faults(f"{view:03d}.png", **faults)
-        found = regions(masks, Level.PART)
-        merged += [(LABELS[0] == 3 * k).tobytes() in found for k in range(OBJECTS)]
+    merged = times_found(views, [LABELS[0] == 3 * k for k in range(OBJECTS)], systematic_merge=0.2)
     assert 0 < (merged > 0).sum() < OBJECTS
     # drawn once for each of the two parts: 1 - 0.8^2
     assert within_binomial_bounds(int((merged > 0).sum()), OBJECTS, 0.36)
@@ -199,11 +193,8 @@ def test_a_systematic_merge_repeats_in_its_share_of_the_views():
 
 def test_a_systematic_gap_is_the_same_node_in_its_share_of_the_views():
     views = 25
-    seen = np.zeros(2 * OBJECTS, int)
-    nodes = [node for node in range(3 * OBJECTS) if node % 3]
-    for view in range(views):
-        found = regions(with_faults(f"{view:03d}.png", systematic_missing=0.2)[0], Level.PART)
-        seen += [(LABELS[1] == node).tobytes() in found for node in nodes]
+    parts = [LABELS[1] == node for node in range(3 * OBJECTS) if node % 3]
+    seen = times_found(views, parts, systematic_missing=0.2)
     faulty = seen < views
     assert within_binomial_bounds(int(faulty.sum()), 2 * OBJECTS, 0.2)
     assert (seen[faulty] <= 0.1 * views + 4 * np.sqrt(views * 0.09)).all()
@@ -217,16 +208,16 @@ def test_a_higher_probability_only_adds_faults():
 
 def test_faults_follow_the_seed_the_scene_and_the_view_alone():
     settings = PerturbSettings()
-    arrays = {}
-    for order in (("a.png", "b.png"), ("b.png", "a.png")):
-        draws = Draws(3, "set/scene")
-        for view in order:
-            masks, _ = faulty_masks(LABELS, TRUTH, view, draws, settings, 1)
-            arrays.setdefault(view, []).append(b"".join(a.tobytes() for a in masks.arrays().values()))
-    assert arrays["a.png"][0] == arrays["a.png"][1] != arrays["b.png"][0] == arrays["b.png"][1]
+
+    def content(view, draws):
+        masks, _ = faulty_masks(LABELS, TRUTH, view, draws, settings, 1)
+        return b"".join(array.tobytes() for array in masks.arrays().values())
+
+    forth, back = Draws(3, "set/scene"), Draws(3, "set/scene")
+    first, second = content("a.png", forth), content("b.png", forth)
+    assert content("b.png", back) == second != first == content("a.png", back)
     for other in (Draws(4, "set/scene"), Draws(3, "set/other")):
-        masks, _ = faulty_masks(LABELS, TRUTH, "a.png", other, settings, 1)
-        assert b"".join(a.tobytes() for a in masks.arrays().values()) != arrays["a.png"][0]
+        assert content("a.png", other) != first
 
 
 def test_chances_are_even():

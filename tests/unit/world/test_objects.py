@@ -9,11 +9,14 @@ from hilsplat.base.errors import SceneError
 from hilsplat.world.objects.builder import NEIGHBOUR_CONTRAST, PARENT_CONTRAST, Builder
 from hilsplat.world.objects.catalogue import (
     FURNITURE,
+    STREET,
     TABLETOP,
     build_furniture,
     build_object,
+    build_street_object,
 )
 from hilsplat.world.paints import COLOURS, KINDS, TEXTURES, Paint, PaintBox, colour_word, lab_from_srgb
+from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.shapes import Mesh, box, cylinder, disc, extrude, loft, ring, sphere, sweep
 from hilsplat.world.textures import pattern
 
@@ -72,21 +75,23 @@ def test_primitives_are_closed_and_wound_outwards(mesh, expected):
     assert ((facet[:, None] * mesh.normals).sum(axis=-1) > 0).all()
 
 
-def test_there_are_twenty_four_classes_or_more():
-    assert len(TABLETOP) >= 24
+CLASSES = [
+    *((build_object, name, (0.0, np.inf)) for name in TABLETOP),
+    *((build_furniture, name, (0.3, 2.7)) for name in FURNITURE),  # full size, metres
+    *((build_street_object, name, (0.5, 16)) for name in STREET),  # no larger than a house
+]
 
 
-@pytest.mark.parametrize("name", TABLETOP)
-def test_every_class_has_two_parts_and_two_subparts_and_true_nesting(name):
-    for model in (built(name), build_object(name, np.random.default_rng(1))):
+@pytest.mark.parametrize(("build", "name", "sizes"), CLASSES)
+def test_every_class_has_two_parts_and_two_subparts_and_true_nesting(build, name, sizes):
+    for model in (built(name, build), build(name, np.random.default_rng(1))):
         texts = {level: {node.text for node in model.nodes if node.level == level} for level in (1, 2, 3)}
         assert texts[1] == {name}
         assert len(texts[2]) >= 2 and len(texts[3]) >= 2
+        assert all(text.startswith(f"{name} ") for text in texts[2] | texts[3])
         whole, part, subpart = model.node_ids.T
         assert (whole == 0).all()
-        levels, parents = (
-            np.array([getattr(node, field) for node in model.nodes]) for field in ("level", "parent")
-        )
+        levels, parents = np.array([(node.level, node.parent) for node in model.nodes]).T
         assert (levels[part] == 2).all() and (parents[part] == 0).all()
         fine = subpart >= 0
         assert (levels[subpart[fine]] == 3).all()
@@ -95,30 +100,18 @@ def test_every_class_has_two_parts_and_two_subparts_and_true_nesting(name):
         assert set(np.unique(model.node_ids)) - {-1} == set(range(len(model.nodes)))
         assert model.triangles[..., 2].min() == pytest.approx(0.0, abs=1e-9)
         assert np.linalg.norm(model.normals, axis=-1) == pytest.approx(1.0, abs=1e-6)
+        assert sizes[0] < np.ptp(model.triangles.reshape(-1, 3), axis=0).max() < sizes[1]
 
 
 def test_no_text_names_two_kinds_of_node():
-    makers = [(name, build_object) for name in TABLETOP] + [(name, build_furniture) for name in FURNITURE]
+    models = [built(name) for name in TABLETOP] + [built(name, build_furniture) for name in FURNITURE]
+    room = build_scene("room", 100, 1)
     named: dict[str, set[str]] = {}
-    for name, build in makers:
-        for node in built(name, build).nodes:
+    for nodes in (*(model.nodes for model in models), [room.nodes[node] for node in room.background]):
+        for node in nodes:
             for text in (node.text, *node.synonyms):
                 named.setdefault(text, set()).add(node.text)
     assert {text: nodes for text, nodes in named.items() if len(nodes) > 1} == {}
-
-
-def test_canonical_texts_of_parts_say_whose_they_are():
-    for name in TABLETOP:
-        for node in built(name).nodes[1:]:
-            assert node.text.startswith(f"{name} ") and len(node.text) > len(name) + 1
-
-
-def test_the_same_random_numbers_give_the_same_object():
-    for name in ("guitar", "boot"):
-        first, again, other = (build_object(name, np.random.default_rng(seed)) for seed in (3, 3, 4))
-        assert np.array_equal(first.triangles, again.triangles) and first.nodes == again.nodes
-        assert np.array_equal(first.materials, again.materials)
-        assert not np.array_equal(first.materials, other.materials)
 
 
 def seen_lab(materials, rows):
@@ -207,6 +200,14 @@ def test_texts_carry_aliases_attributes_and_relations():
     assert model.nodes[muzzle.parent].text == "bear head"
 
 
-def test_an_unknown_class_names_the_known_ones():
-    with pytest.raises(SceneError, match=r"unknown object class 'unicorn'\n  expected  one of bear, snowman"):
-        build_object("unicorn", np.random.default_rng(0))
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (build_object, "unknown object class 'unicorn'\n  expected  one of bear, snowman"),
+        (build_furniture, "unknown class of furniture 'unicorn'\n  expected  one of bed, sofa"),
+        (build_street_object, "unknown class of a street 'unicorn'\n  expected  one of car, truck"),
+    ],
+)
+def test_an_unknown_class_names_the_known_ones(build, message):
+    with pytest.raises(SceneError, match=message):
+        build("unicorn", np.random.default_rng(0))

@@ -1,13 +1,14 @@
 """Scenes follow from their seed, their objects do not touch, and seeds of different use are apart."""
 
 import itertools
+from functools import cache
 
 import numpy as np
 import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.world.scenes import tabletop
-from hilsplat.world.scenes.kinds import build_scene
+from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.tabletop import TABLE_RADIUS
 from hilsplat.world.seeds import SPLITS, require_split, split_of_seed
 
@@ -31,12 +32,23 @@ def test_a_seed_of_another_split_is_refused():
         require_split(201, "test")
 
 
-def test_the_same_seed_gives_the_same_scene_and_another_seed_another():
-    first, again, other = (build_scene("tabletop", seed, 4) for seed in (100, 100, 101))
+KINDS = ("tabletop", "room", "street")
+
+
+@cache
+def built(kind, seed=100):
+    return build_scene(kind, seed, 4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another(kind):
+    first, again, other = built(kind), build_scene(kind, 100, 4), built(kind, 102)
     for name in ("triangles", "normals", "coords", "node_ids", "material_ids", "materials"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
     assert first.nodes == again.nodes and first.placed == again.placed and first.style == again.style
     assert first.nodes != other.nodes
+    poses, same = (scene_cameras(scene, 8, 64, 360).cam_from_world for scene in (first, again))
+    assert np.array_equal(poses, same)
 
 
 def test_placed_objects_do_not_intersect_and_stand_on_the_table():
@@ -56,8 +68,9 @@ def test_placed_objects_do_not_intersect_and_stand_on_the_table():
             assert np.linalg.norm(np.subtract(a.centre_xy, b.centre_xy)) > a.footprint + b.footprint
 
 
-def test_ids_of_a_triangle_nest_in_the_scene_too():
-    scene = build_scene("tabletop", 102, 5)
+@pytest.mark.parametrize("kind", KINDS)
+def test_ids_of_a_triangle_nest_in_the_scene_too(kind):
+    scene = built(kind)
     parents = np.array([node.parent for node in scene.nodes])
     whole, part, subpart = scene.node_ids.T
     assert (parents[whole] == -1).all()
@@ -66,11 +79,20 @@ def test_ids_of_a_triangle_nest_in_the_scene_too():
     assert [node.id for node in scene.nodes] == list(range(len(scene.nodes)))
 
 
-def test_the_room_is_labelled_as_background_wholes():
-    scene = build_scene("tabletop", 102, 3)
-    texts = {scene.nodes[node].text for node in scene.background}
-    assert {"table", "floor", "wall"} <= texts <= {"table", "floor", "wall", "tablecloth", "rug", "picture"}
-    assert {scene.nodes[node].level for node in scene.background} == {1}
+@pytest.mark.parametrize(
+    ("kind", "always", "sometimes"),
+    [
+        ("tabletop", {"table", "floor", "wall"}, {"tablecloth", "rug", "picture"}),
+        ("room", {"wall", "floor", "ceiling"}, set()),
+        ("street", {"road", "lane marker", "curb", "sidewalk", "ground", "sky"}, set()),
+    ],
+)
+def test_the_surroundings_are_background_wholes(kind, always, sometimes):
+    for seed in (100, 102):
+        scene = built(kind, seed)
+        texts = [scene.nodes[node].text for node in scene.background]
+        assert always <= set(texts) <= always | sometimes and len(texts) == len(set(texts))
+        assert {scene.nodes[node].level for node in scene.background} == {1}
 
 
 def test_objects_that_find_no_place_are_left_out_and_said(monkeypatch, caplog):

@@ -58,17 +58,8 @@ def world(tmp_path):
     for name in NAMES:
         write_png(tmp_path / "scene" / "images" / name, np.zeros((*SIZE, 3), np.uint8))
     split = dict.fromkeys(NAMES, "train") | {NAMES[-1]: "test"}
-    nothing = np.zeros((0, 3))
-    Scene(
-        tmp_path / "scene",
-        "synthetic/bear",
-        "metre",
-        cameras,
-        split,
-        nothing.astype(np.float32),
-        nothing.astype(np.uint8),
-        np.eye(4),
-    ).save()
+    points, colours = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    Scene(tmp_path / "scene", "synthetic/bear", "metre", cameras, split, points, colours, np.eye(4)).save()
     labels = {name: labels_of(view) for view, name in enumerate(NAMES)}
     write_hierarchy(tmp_path / "truth", NODES, labels, dict.fromkeys(NAMES, range(4)))
     write_json(tmp_path / "truth" / "scene.json", {"background": [4]})
@@ -127,9 +118,8 @@ def test_every_fault_is_known_to_the_label():
 
 
 def test_label_images_of_another_size_are_refused(world):
-    write_png(world / "truth" / "labels" / "001.png.whole.png", np.zeros((12, 20), np.uint16))
-    write_png(world / "truth" / "labels" / "001.png.part.png", np.zeros((12, 20), np.uint16))
-    write_png(world / "truth" / "labels" / "001.png.subpart.png", np.zeros((12, 20), np.uint16))
+    for level in LEVELS:
+        write_png(world / "truth" / "labels" / f"001.png.{level.label}.png", np.zeros((12, 20), np.uint16))
     with pytest.raises(MisalignedArtifactError, match=r"view 001\.png(.|\n)*24 x 40(.|\n)*12 x 20"):
         make(world)
     assert not (world / "masks").exists()
