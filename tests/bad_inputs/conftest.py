@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base.artifacts import visible_files
 from hilsplat.base.errors import HilsplatError
 from hilsplat.cli.main import main
 from tests.conftest import PROJECT
@@ -58,9 +59,5 @@ def told(capsys, caplog, monkeypatch) -> Callable[..., str]:
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of all files except hidden files and caches."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.name.startswith(".") and ".cache" not in path.parts
-    }
+    """Return the bytes of all files except hidden files and those in hidden folders, such as caches."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in visible_files(folder)}

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.bad_inputs.conftest import snapshot
-from tests.bad_inputs.test_bad_inputs import CODE, CONTRIBUTIONS, TREE
+from tests.bad_inputs.test_bad_inputs import SOLVE
 from tests.unit.artifact_changes import write_record
 from tests.unit.finished_desk import SCENE
 
@@ -52,35 +52,18 @@ def textured(folder: Path) -> None:
 
 
 SCENE_IN, CACHE = ("--scene", str(SCENE / "scene")), ("--cache", "disk/cache")
-SOLVE = (
-    "field",
-    "--contributions",
-    str(CONTRIBUTIONS),
-    "--coverage-tree",
-    str(TREE),
-    "--autoencoder",
-    str(CODE),
-)
+WORLD = ("world", "make", "--source", "world:tabletop:1", "--settings", '{"views": 3, "image_px": 64}')
+POSES = ("poses", "--images", "photos")
 FIT = ("gaussians", *SCENE_IN, "--settings", '{"iterations": 20}', *CACHE, "--report", "disk/gaussians")
 STAGES = {
     # output: command, KiB of free space
-    "field.safetensors": (SOLVE, 4),
+    "field.safetensors": (SOLVE[: SOLVE.index("--out")], 4),
     "masks": (("masks", *SCENE_IN, "--settings", '{"segmenter": "graph"}', *CACHE), 4),
     "gaussians.ply": (FIT, 16),
-    "world": (
-        (
-            "world",
-            "make",
-            "--source",
-            "world:tabletop:1",
-            "--settings",
-            '{"views": 3, "image_px": 64}',
-        ),
-        32,
-    ),
-    "scene": (("poses", "--images", "photos"), 100),
-    "scene, at the features": (("poses", "--images", "photos"), 400),
-    "scene, at the database": (("poses", "--images", "photos"), 200),
+    "world": (WORLD, 32),
+    "scene": (POSES, 100),
+    "scene, at the features": (POSES, 400),
+    "scene, at the database": (POSES, 200),
 }
 
 
@@ -93,9 +76,7 @@ def test_a_full_disk_is_reported_and_costs_nothing(case: str, disk: Path, told: 
     else:
         out.mkdir()
         (out / "index.json").write_text("the former output")
-    stage = {"field.safetensors": "field", "gaussians.ply": "gaussians", "scene": "poses"}.get(
-        out.name, out.name
-    )
+    stage = command[0].replace("-", "_")
     write_record(out, stage=stage, outputs={out.name: {"sha256": "", "bytes": {}}})
     textured(Path("photos"))
     leave(disk, kib)

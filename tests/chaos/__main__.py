@@ -38,15 +38,7 @@ SLACK_S = 3600
 
 @dataclass
 class Tally:
-    """Faults, costs and problems so far.
-
-    Attributes:
-        lost_s: wall seconds lost by each kill.
-        lost_cpu_s: processor seconds lost by each kill.
-        faults: number of times that each fault was injected.
-        finished: number of complete runs.
-        problems: problems that need manual intervention.
-    """
+    """Faults, costs of each kill, complete runs, and problems that need manual intervention so far."""
 
     lost_s: list[float] = field(default_factory=list)
     lost_cpu_s: list[float] = field(default_factory=list)
@@ -64,8 +56,7 @@ class Tally:
     def settle(self, again: tuple[float, float] | None) -> None:
         """Count the kills since the last start.
 
-        Args:
-            again: wall and processor seconds until the new start began a job, added to the last kill's cost.
+        `again` are the wall and processor seconds until the new start began a job, a cost of the last kill.
         """
         for victims in self.waiting:
             again_s, again_cpu_s = (again or (0.0, 0.0)) if victims is self.waiting[-1] else (0.0, 0.0)

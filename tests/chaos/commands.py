@@ -15,6 +15,7 @@ from pathlib import Path
 import httpx2
 
 from hilsplat.annotate.labels import label_path, read_labels
+from tests.bad_inputs.conftest import snapshot
 from tests.conftest import PROJECT
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk
 
@@ -51,13 +52,6 @@ def started(project: Path, *words: str) -> subprocess.Popen[str]:
     )
 
 
-def contents(project: Path) -> dict[str, bytes]:
-    """Return the content of every file that is not hidden."""
-    files = (path for path in sorted(project.rglob("*")) if path.is_file())
-    seen = ((str(path.relative_to(project)), path) for path in files)
-    return {name: path.read_bytes() for name, path in seen if not any(p[0] == "." for p in Path(name).parts)}
-
-
 def kill_command(
     project: Path, name: str, whole_s: float, expected: dict[str, bytes], chance: random.Random
 ) -> Iterator[str]:
@@ -66,14 +60,14 @@ def kill_command(
     Yields:
         Problems that need manual intervention.
     """
-    before = contents(project)
+    before = snapshot(project)
     running = started(project, *COMMANDS[name])
     try:
         running.wait(chance.uniform(0, whole_s))
     except subprocess.TimeoutExpired:
         os.killpg(running.pid, signal.SIGKILL)
         running.wait()
-    after = contents(project)
+    after = snapshot(project)
     for path, content in after.items():
         if content not in (before.get(path), expected.get(path)):
             yield f"{name}: {path} is neither as before nor whole after a kill"
@@ -85,8 +79,8 @@ def kill_command(
     said, _ = again.communicate(timeout=600)
     if again.returncode:
         yield f"{name}: the same command failed after a kill:\n{said}"
-    elif contents(project) != expected:
-        found = contents(project)
+    elif snapshot(project) != expected:
+        found = snapshot(project)
         wrong = [path for path in {*expected, *found} if expected.get(path) != found.get(path)]
         yield f"{name}: after a kill it wrote something else: {sorted(wrong)[:5]}"
 
@@ -103,7 +97,7 @@ def kill_commands(root: Path, kills: int, chance: random.Random) -> list[str]:
         shutil.copytree(project, copy)
         begin = time.monotonic()
         assert started(copy, *COMMANDS[name]).wait(600) == 0
-        whole_s, expected = time.monotonic() - begin, contents(copy)
+        whole_s, expected = time.monotonic() - begin, snapshot(copy)
         shutil.rmtree(copy)
         for number in range(kills):
             copy = root / f"{name}-{number}"

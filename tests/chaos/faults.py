@@ -28,16 +28,11 @@ class Victim:
     """A job, and the amount of its work that is not stored yet.
 
     Attributes:
-        pid: its process.
-        stage: its subcommand.
         cache: folder in which the stage stores finished views or a checkpoint.
         begun_s: monotonic time at which it was first observed.
-        kept_s: monotonic time of its last change of the cache.
-        kept_cpu_s: processor seconds used up to then.
+        kept_s: monotonic time of its last change of the cache; `kept_cpu_s` were used up to then.
         first_s: duration up to its first stored view, which a new start repeats (also `first_cpu_s`).
-        seen_s: monotonic time at which it was last observed.
-        cpu_s: processor seconds used so far.
-        entries: entries of the cache.
+        seen_s: monotonic time at which it was last observed; `cpu_s` were used up to then.
     """
 
     pid: int
@@ -110,14 +105,7 @@ def children(pid: int) -> list[int]:
 
 
 class Run:
-    """A run of Snakemake in a project, started as by a user.
-
-    Args:
-        project: project to run.
-
-    Attributes:
-        problems: problems that need manual intervention.
-    """
+    """A run of Snakemake in a project, started as by a user, and problems that need manual intervention."""
 
     def __init__(self, project: Project) -> None:
         self.project = project
@@ -251,38 +239,31 @@ class Run:
         """Clean up the shared folder as another machine of the same name, with other process numbers."""
         code = "import sys; from hilsplat.base import processes; processes.remove_leftovers(sys.argv[1])"
         command = ["unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results"]
-        environment = self.project.environment()
-        ended = subprocess.run(
-            command, cwd=self.project.root, env=environment, capture_output=True, text=True
-        )
+        ended = self._beside(command)
         if ended.returncode:
             self.problems.append(f"no clean-up in another process namespace: {ended.stderr}")
         return []
 
     def run_twice(self, chance: random.Random) -> list[Victim]:
         """Start a second run in the same project, which must refuse without disturbing the first."""
-        second = subprocess.run(
-            self.command,
-            cwd=self.project.root,
-            env=self.project.environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if self.is_running() and (
-            second.returncode == 0 or "another hilsplat run" not in second.stdout + second.stderr
-        ):
-            self.problems.append(f"a second run was not refused:\n{second.stdout}{second.stderr}")
+        second = self._beside(self.command)
+        said = second.stdout + second.stderr
+        if self.is_running() and (second.returncode == 0 or "another hilsplat run" not in said):
+            self.problems.append(f"a second run was not refused:\n{said}")
         return []
+
+    def _beside(self, command: list[str]) -> "subprocess.CompletedProcess[str]":
+        """Run a command in the project, and return it with its output."""
+        root, environment = self.project.root, self.project.environment()
+        return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
 
 
 def remounted(folder: Path, mode: str) -> bool:
     """Remount a disk read-only (`ro`) or writable (`rw`); return False if it is no mount or is in use."""
     if not folder.is_mount():
         return False
-    return (
-        subprocess.run(["mount", "-o", f"remount,{mode}", str(folder)], capture_output=True).returncode == 0
-    )
+    command = ["mount", "-o", f"remount,{mode}", str(folder)]
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def stage_of(pid: int) -> str | None:
@@ -300,8 +281,6 @@ class Fault:
     """A fault to inject into a run.
 
     Attributes:
-        name: description of the fault.
-        strike: injects the fault.
         kills: whether it counts as a kill.
         needs_disk: whether results must be on a separate disk.
         may_fail: whether the run may end with an error.

@@ -73,8 +73,7 @@ def damaged_value(draw, value: Any) -> Any:
     """Draw a JSON value in which a random element is replaced, dropped or repeated."""
     if isinstance(value, dict) and value and draw(st.integers(0, 3)):
         key = draw(st.sampled_from(sorted(value)))
-        what = draw(st.integers(0, 5))
-        if what == 0:
+        if draw(st.integers(0, 5)) == 0:
             return {name: each for name, each in value.items() if name != key}
         return {**value, key: damaged_value(draw, value[key])}
     if isinstance(value, list) and value and draw(st.integers(0, 3)):

@@ -2,9 +2,12 @@
 
 import errno
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,13 +26,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
         raise RuntimeError
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
-
-
-def test_a_failed_folder_is_absent(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), artifacts.atomic_folder(tmp_path / "out") as folder:
-        (folder / "view.npz").write_bytes(b"x")
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(params=[0o022, 0o077, 0o002, 0o027], ids=oct)
@@ -86,19 +82,74 @@ def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_on
     assert flushed[4:] == [str(new), str(tmp_path)]
 
 
-def test_a_full_disk_is_reported_with_the_file_and_the_way_out(tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
+@pytest.fixture
+def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """A function that sets the free space on a disk of 8 MiB."""
+
+    def set_free(mib: float) -> None:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=2**23, free=mib * 2**20))
+
+    return set_free
+
+
+@pytest.mark.parametrize(
+    ("error", "free", "is_full"),
+    [
+        (OSError(errno.ENOSPC, "full"), 5, True),
+        (OSError(errno.EDQUOT, "full"), 5, True),
+        (OSError(errno.EACCES, "locked"), 0.5, False),
+        (Exception("SQLite: database or disk is full"), 5, True),
+        (RuntimeError("a library failed"), 0.5, True),
+        (ChildProcessError("a library ended its process"), 0.5, True),
+        (RuntimeError("a library failed"), 1, False),
+        (ValueError("a fault of ours"), 0.5, False),
+        (ArtifactError("an input is damaged: disk is full"), 0.5, False),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("writer", [artifacts.atomic_path, artifacts.atomic_folder, artifacts.work_folder])
+def test_errors_of_a_full_disk_name_it_and_the_way_out(
+    tmp_path, free_mib, writer, error, free, is_full
+) -> None:
+    free_mib(free)
+    with pytest.raises(DiskSpaceError if is_full else type(error)) as raised, writer(tmp_path / "new/a.txt"):
+        raise error
+    if is_full:
+        place, found, fix = str(raised.value).splitlines()
+        assert place == f"no space left while writing a.txt in {tmp_path / 'new'}"
+        assert f"{free:.1f} MiB free of 8 MiB on that disk" in found
+        assert f"free space on the disk of {tmp_path / 'new'}" in fix
+    else:
+        assert raised.value is error
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_errors_inside_a_new_folder_name_places_that_stay(tmp_path: Path, free_mib) -> None:
+    free_mib(0.5)
+    message = rf"no space left while writing out in {tmp_path}\n"
+    with pytest.raises(DiskSpaceError, match=message), artifacts.atomic_folder(tmp_path / "out"):
+        raise RuntimeError("a library failed")
+    message = rf"no space left while writing view\.npz in {tmp_path}\n"
     with (
-        pytest.raises(DiskSpaceError, match=r"no space left while writing a\.txt in .*\n.*MiB free of"),
-        artifacts.atomic_path(path),
+        pytest.raises(DiskSpaceError, match=message),
+        artifacts.atomic_folder(tmp_path / "out") as folder,
+        artifacts.atomic_folder(folder / "inner") as inner,
+        artifacts.atomic_path(inner / "view.npz"),
     ):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert list(tmp_path.iterdir()) == []
+        raise RuntimeError("a library failed")
+    with (
+        pytest.raises(OSError, match="broken") as raised,
+        artifacts.atomic_path(tmp_path / "a.txt") as temporary,
+    ):
+        raise OSError(errno.EIO, "broken", str(temporary))
+    assert raised.value.filename == str(tmp_path / "a.txt")
 
 
-def test_too_little_space_is_refused_before_work_begins(tmp_path: Path) -> None:
-    with pytest.raises(DiskSpaceError, match="too little space"):
-        artifacts.require_free_space(tmp_path / "not" / "yet", 1e15)
+def test_too_little_space_is_refused_before_work_begins(tmp_path: Path, free_mib) -> None:
+    free_mib(2)
+    artifacts.require_free_space(tmp_path / "not" / "yet", 2.0)
+    with pytest.raises(DiskSpaceError, match=rf"disk of {tmp_path}\n.*at least 3 MiB free\n.*2 MiB free"):
+        artifacts.require_free_space(tmp_path / "not" / "yet", 3.0)
 
 
 def test_npz_of_the_same_arrays_has_the_same_bytes(tmp_path: Path) -> None:
@@ -111,17 +162,34 @@ def test_npz_of_the_same_arrays_has_the_same_bytes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back["b"], arrays["b"])
 
 
-def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "evil.npz", a=np.array([{"x": 1}], dtype=object))
-    with pytest.raises(ArtifactError, match=r"evil\.npz cannot be read"):
-        artifacts.read_npz(tmp_path / "evil.npz")
+class Touches:
+    """An object whose unpickling creates a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.path,)
 
 
-def test_objects_are_never_pickled(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("save", "read"), [(np.save, artifacts.read_npy), (np.savez, artifacts.read_npz)], ids=["npy", "npz"]
+)
+def test_objects_are_never_unpickled(tmp_path: Path, save, read) -> None:
+    path = tmp_path / "evil"
+    with path.open("wb") as stream:
+        save(stream, np.array([Touches(tmp_path / "touched")], dtype=object))
+    with pytest.raises(ArtifactError, match=r"evil.* cannot be read: .*allow_pickle=False"):
+        read(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "write", [artifacts.write_npy, lambda path, array: artifacts.write_npz(path, a=array)]
+)
+def test_objects_are_never_pickled(tmp_path: Path, write) -> None:
     with pytest.raises(ValueError, match="allow_pickle=False"):
-        artifacts.write_npy(tmp_path / "a.npy", np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
-        artifacts.write_npz(tmp_path / "a.npz", a=np.array([{}], dtype=object))
+        write(tmp_path / "a", np.array([{}], dtype=object))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -131,20 +199,13 @@ def test_a_folder_without_index_is_incomplete(tmp_path: Path) -> None:
 
 
 def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -> None:
-    calls = []
-
-    def compute() -> dict[str, np.ndarray]:
-        calls.append(1)
-        return {"x": np.array([1, 2])}
-
     cache = artifacts.ViewCache(tmp_path)
-    key = artifacts.sha256_of_json({"image": "abc"})
-    for _ in range(2):
-        np.testing.assert_array_equal(cache.get(key, compute)["x"], [1, 2])
-    assert len(calls) == 1
-    cache.path(key).write_bytes(b"broken")
-    cache.get(key, compute)
-    assert len(calls) == 2
+    for counts in ((0, 1), (1, 1)):
+        assert cache.get("key", lambda: {"x": np.array([1, 2])})["x"].tolist() == [1, 2]
+        assert (cache.hits, cache.misses) == counts
+    cache.path("key").write_bytes(b"broken")
+    assert cache.get("key", lambda: {"x": np.array([3])})["x"].tolist() == [3]
+    assert (cache.hits, cache.misses) == (1, 2)
 
 
 @pytest.mark.parametrize("compressed", [True, False])
@@ -165,9 +226,8 @@ def test_entries_that_a_power_failure_cut_or_filled_with_zeros_are_computed_agai
     for damaged in [whole[:start] + bytes(end - start) + whole[end:] for start, end in zeros] + cut:
         path.write_bytes(damaged)
         found = cache.get("key", lambda: arrays)
-        assert {name: found[name].tolist() for name in found} == {
-            name: arrays[name].tolist() for name in arrays
-        }
+        assert found.keys() == arrays.keys()
+        assert all(np.array_equal(found[name], arrays[name]) for name in arrays)
 
 
 def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, monkeypatch) -> None:
@@ -176,16 +236,14 @@ def test_two_nodes_that_compute_one_view_leave_one_whole_entry(tmp_path: Path, m
     key = artifacts.sha256_of_json({"image": "abc"})
     write = artifacts._write_zip
 
-    def write_beside_the_other(
-        path: Path, arrays: dict[str, np.ndarray], method: int, **options: bool
-    ) -> None:
+    def write_beside_the_other(path: Path, *arguments: Any, **options: bool) -> None:
         with artifacts.atomic_path(path) as temporary:
             temporary.write_bytes(b"half an ent")
             with monkeypatch.context() as node:
                 node.setattr(artifacts, "_write_zip", write)
                 node.setattr("hilsplat.base.processes.host_token", lambda: "0" * 8)
                 other.get(key, lambda: {"x": np.arange(3)})
-            write(temporary, arrays, method, **options)
+            write(temporary, *arguments, **options)
 
     monkeypatch.setattr(artifacts, "_write_zip", write_beside_the_other)
     mine = cache.get(key, lambda: {"x": np.arange(3)})

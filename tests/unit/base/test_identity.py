@@ -17,15 +17,14 @@ from hilsplat.workflow.stages import STAGES
 
 
 def package(folder: Path, **modules: str) -> Path:
-    """A package `hilsplat` with the given modules; `sub__b` is the module `hilsplat.sub.b`."""
+    """A package `hilsplat` with the given modules; `sub_b` is the module `hilsplat.sub.b`."""
     root = folder / "hilsplat"
-    for name, text in {"__init__": "", **modules}.items():
-        path = root.joinpath(*name.split("__")) if not name.endswith("__init__") else None
-        if path is None:
-            path = root / name.removesuffix("__init__").strip("_") / "__init__"
+    for name, text in modules.items():
+        path = root.joinpath(*name.split("_")).with_suffix(".py")
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.with_suffix(".py").write_text(text)
-        (path.parent / "__init__.py").touch()
+        path.write_text(text)
+        for parent in {root, path.parent}:
+            (parent / "__init__.py").touch()
     return root
 
 
@@ -112,13 +111,10 @@ def test_a_module_that_is_handed_around_counts_as_a_whole(tmp_path):
 
 def test_names_that_a_package_exports_lead_to_their_module(tmp_path):
     a = "from hilsplat.sub import f\n\ndef g():\n    return f()\n"
+    root = package(tmp_path, a=a, sub_b="def f():\n    return 1\n", sub_c="def h():\n    return 1\n")
     exports = "from hilsplat.sub.b import f\nfrom hilsplat.sub.c import h\n"
-    modules = {
-        "sub__init__": exports,
-        "sub__b": "def f():\n    return 1\n",
-        "sub__c": "def h():\n    return 1\n",
-    }
-    assert found(tmp_path, a=a, **modules) == {"a:g", "sub.b:f"}
+    (root / "sub/__init__.py").write_text(exports)
+    assert reached("hilsplat.a:g", root=root) == ["hilsplat.a:g", "hilsplat.sub.b:f"]
 
 
 def test_a_local_name_hides_the_module_s(tmp_path):
@@ -194,21 +190,17 @@ def test_what_does_not_exist_is_named(tmp_path, root, a, message):
 @pytest.fixture
 def copy(project: Path, tmp_path: Path) -> Path:
     """A copy of the package."""
-    return Path(
-        shutil.copytree(
-            project / "hilsplat", tmp_path / "hilsplat", ignore=shutil.ignore_patterns("__pycache__")
-        )
-    )
+    no_caches = shutil.ignore_patterns("__pycache__")
+    return Path(shutil.copytree(project / "hilsplat", tmp_path / "hilsplat", ignore=no_caches))
 
 
-def digests(root: Path) -> dict[str, str]:
-    return {stage: code_digest(place, root=root) for stage, place in STAGES.items()}
-
-
-def changed(root: Path, project: Path) -> set[str]:
-    """Stages whose digest is another than that of the project."""
-    before, after = digests(project / "hilsplat"), digests(root)
-    return {stage for stage in STAGES if before[stage] != after[stage]}
+def changed(copy: Path, project: Path, places: dict[str, str] = STAGES, *roots: str) -> set[str]:
+    """Names of the places whose digest is another than that of the project."""
+    digests = [
+        {name: code_digest(*roots, place, root=root) for name, place in places.items()}
+        for root in (copy, project / "hilsplat")
+    ]
+    return {name for name in places if digests[0][name] != digests[1][name]}
 
 
 def edit(root: Path, path: str, old: str, new: str) -> None:
@@ -273,10 +265,10 @@ def edit_function(root: Path, place: str) -> None:
     ("place", "expected"),
     [
         ("segment/coverage_stage.py:run_coverage_tree", {"coverage_tree"}),
-        ("field/losses/part.py:part_loss_literal", {"field", "feature_tree"}),
+        ("field/losses.py:part_loss_literal", {"field", "feature_tree"}),
         ("field/literal_trainer.py:train_literally", {"field"}),
         ("embed/langsplat_files.py:read_clip", {"langsplat"}),
-        ("evaluate/tables/html_page.py:as_html", {"table"}),
+        ("evaluate/tables/formats.py:as_html", {"table"}),
         ("query/field_answers.py:field_colours", {"evaluate", "figures", "comparison"}),
         ("segment/graph.py:segment_graph", {"masks", "key_masks", "guided_masks"}),
         ("cli/stage.py:stage", set()),
@@ -292,17 +284,9 @@ def test_a_reader_and_a_baseline_count_for_the_jobs_that_use_them_alone(copy, pr
     edit_function(copy, "methods/lifted.py:fit")
     assert changed(copy, project) == set()
 
-    def edited(stage: str, places: dict[str, str]) -> set[str]:
-        roots = (copy, project / "hilsplat")
-        return {
-            name
-            for name, place in places.items()
-            if len({code_digest(STAGES[stage], place, root=root) for root in roots}) == 2
-        }
-
     for stage in ("evaluate", "figures", "comparison"):
-        assert edited(stage, DATASETS.places) == {"lerf_ovs"}
-    assert edited("method", METHODS.places) == {"lifted"}
+        assert changed(copy, project, DATASETS.places, STAGES[stage]) == {"lerf_ovs"}
+    assert changed(copy, project, METHODS.places, STAGES["method"]) == {"lifted"}
 
 
 def test_every_stage_and_plugin_has_its_code_and_nothing_else_is_imported_by_string(project):

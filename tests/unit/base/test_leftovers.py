@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base import artifacts, processes
-from hilsplat.base.artifacts import atomic_folder, atomic_path, work_folder, write_text
+from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.processes import host_token, remove_leftovers
 
 KILL = """
@@ -170,14 +170,6 @@ def test_every_name_that_fits_a_folder_can_be_written(tmp_path):
     with atomic_folder(tmp_path / ("f" * 255)) as folder:
         write_text(folder / ("x" * 255), "text")
     assert (tmp_path / ("f" * 255) / ("x" * 255)).exists()
-
-
-@pytest.mark.parametrize("writer", [atomic_path, atomic_folder, work_folder])
-def test_nothing_is_left_after_an_error(tmp_path, writer):
-    with pytest.raises(ZeroDivisionError), writer(tmp_path / "out") as temporary:
-        assert temporary.exists()
-        raise ZeroDivisionError
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
