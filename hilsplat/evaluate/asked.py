@@ -11,15 +11,13 @@ from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import dataset_of, open_labels
 from hilsplat.evaluate.protocols.cards import ProtocolCard, card_named
 
-SCANNET = ("scannet/opengaussian-19", "scannet/opengaussian-15", "scannet/opengaussian-10")
-SCANNET200 = ("scannet200/opengaussian", "scannet200/benchmark", "scannet200/instances")
-REPLICA = ("replica/per-scene",)
-WAYMO = ("waymo/segmentation",)
-
 STAND_INS: Mapping[str, tuple[str, ...]] = {
     "tabletop": (*dataset_of("3d_ovs").protocols, "lerf-mask/gaussian-grouping"),
-    "room": (*SCANNET, *SCANNET200, *REPLICA),
-    "street": WAYMO,
+    "room": (
+        *("scannet/opengaussian-19", "scannet/opengaussian-15", "scannet/opengaussian-10"),
+        *("scannet200/opengaussian", "scannet200/benchmark", "scannet200/instances", "replica/per-scene"),
+    ),
+    "street": ("waymo/segmentation",),
 }
 """Kind of synthetic scene -> protocols that it substitutes for, besides LERF-OVS and the level protocols."""
 
@@ -51,7 +49,7 @@ class Asked:
                 expected=f"one of {', '.join(STAND_INS)}",
                 fix="correct the kind, or leave it out",
             )
-        return _asked(STAND_INS.get(kind, ()), Level.WHOLE)
+        return Asked.of(STAND_INS.get(kind, ()), Level.WHOLE)
 
     @staticmethod
     def of_dataset(name: str) -> "Asked":
@@ -61,7 +59,14 @@ class Asked:
             SceneError: the data set is unknown.
             ArtifactError: the entry lists an unknown protocol.
         """
-        return _asked(dataset_of(name).protocols, None)
+        return Asked.of(dataset_of(name).protocols, None)
+
+    @staticmethod
+    def of(names: tuple[str, ...], level: Level | None) -> "Asked":
+        """Sort named protocols into those for images and those for points."""
+        cards = [card_named(name) for name in names]
+        points = tuple(card for card in cards if card.classes)
+        return Asked(tuple(card for card in cards if not card.classes), points, level)
 
     @staticmethod
     def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Asked]":
@@ -72,9 +77,3 @@ class Asked:
         """
         dataset = name.partition("/")[0]
         return dataset, open_labels(name, data_root), Asked.of_dataset(dataset)
-
-
-def _asked(names: tuple[str, ...], level: Level | None) -> Asked:
-    cards = [card_named(name) for name in names]
-    points = tuple(card for card in cards if card.classes)
-    return Asked(tuple(card for card in cards if not card.classes), points, level)

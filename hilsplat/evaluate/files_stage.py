@@ -17,7 +17,6 @@ from hilsplat.datasets.labelled import LabelledScene, image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.asked import Asked
-from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.prediction_files import read_point_classes, read_point_instances, read_view_masks
 from hilsplat.evaluate.protocols.cards import (
@@ -25,19 +24,18 @@ from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_OPENGAUSSIAN,
     LEVEL_GIVEN,
+    MASK,
     OVS_ARGMAX,
     OVS_NODES,
     ProtocolCard,
 )
 from hilsplat.evaluate.protocols.flat_views import eighth_truth
-from hilsplat.evaluate.protocols.masks import MASK_METRICS, measure_class_maps, measure_masks
-from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.points import measure_points
+from hilsplat.evaluate.protocols.rows import class_map_rows, mask_rows
 from hilsplat.evaluate.protocols.scene_points import class_set, instance_scan
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, annotated_truths
 from hilsplat.evaluate.protocols.views import consistency_rows
-from hilsplat.evaluate.scores import Score, write_scores
-from hilsplat.evaluate.truths import annotated_truths
+from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings
 
@@ -48,6 +46,9 @@ METHOD = "files"
 
 WORDS = "masks of files"
 """Bracketed suffix of a protocol's name: masks were supplied, so its map rule was not applied."""
+
+MASK_METRICS = (*MASK, "acc_25", "acc_50")
+"""Metrics of masks; those of maps cannot be computed."""
 
 Masks = Mapping[tuple[str, str], Bool[np.ndarray, "h w"]]
 
@@ -73,7 +74,6 @@ def run_evaluate_files(
     a mask counts as 0, except under the protocol that omits it.
 
     Args:
-        predictions: folder of the predictions.
         out: `scores.csv`; `instances.npz` is written beside it if there are instances.
         method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
@@ -81,8 +81,7 @@ def run_evaluate_files(
         truth: alternatively, the truth folder of a synthetic scene.
         scene: posed scene of the truth, which defines the test views.
         kind: kind of synthetic scene, as in `run_evaluate`.
-        dataset: data set in a synthetic scene's rows.
-        name: scene name in a synthetic scene's rows.
+        dataset: data set in a synthetic scene's rows, as is the scene's `name`.
         min_region_px: smaller true regions of a synthetic scene are not scored; None for the default setting.
 
     Raises:
@@ -182,7 +181,7 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
                 found=text,
                 fix=f"rename it {near[0]!r}" if near else "remove it, or correct its name",
             )
-        shape = truth.categories[0].truth.shape if truth.categories else mask.shape
+        shape = next((query.truth.shape for query in (*truth.categories, *truth.absent)), mask.shape)
         if mask.shape != shape:
             raise MisalignedArtifactError(
                 f"{where}: the mask has another size than the labels",
@@ -213,15 +212,13 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
 def _text_rows(
     card: ProtocolCard, query: Query, mask: Bool[np.ndarray, "H W"] | None, words: list[str]
 ) -> Iterator[Measured]:
-    region = query.any_grey_region if card.truth == "any grey" else query.truth
-    if not region.any():
-        return  # not visible in the view
+    region = query.region(card.truth)
+    if not region.any() or (mask is None and card.missing == "left out"):
+        return  # not visible in the view, or not answered
     metrics = tuple(metric for metric in card.metrics if metric in MASK_METRICS)
-    for row in measure_masks(
-        replace(card, metrics=metrics), METHOD, {query.text: mask}, {query.text: region}
-    ):
-        level = query.level.label if query.level else ""
-        yield replace(row, level=level, protocol=card.labelled(words))
+    answer = np.zeros_like(region) if mask is None else mask
+    protocol = card.labelled(words)
+    yield from mask_rows(METHOD, replace(query, truth=region), protocol, answer, metrics=metrics)
 
 
 def _argmax_rows(
@@ -239,8 +236,8 @@ def _argmax_rows(
     words = [*(["labelled pixels"] if labelled else []), *words]
     texts = [query.text for query in ordered]
     if asked.any():
-        for row in measure_class_maps(METHOD, similarity[:, None, asked], truth[:, None, asked], texts):
-            yield replace(row, protocol=OVS_ARGMAX.labelled(words))
+        protocol = OVS_ARGMAX.labelled(words)
+        yield from class_map_rows(METHOD, protocol, similarity[:, None, asked], truth[:, None, asked], texts)
 
 
 def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:

@@ -1,7 +1,5 @@
 """Readers for predictions of other programs: masks per view and text, classes and instances of points."""
 
-import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +23,6 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
     with an array per text, "<text>" or "<level>/<text>". A view without predictions has an empty folder.
 
     Args:
-        folder: folder of all predictions.
         view: view name, such as "frame_00041.png"; folders and files are named without the suffix.
 
     Raises:
@@ -41,7 +38,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
             fix="remove the one that you don't mean",
         )
     if packed.is_file():
-        return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in _arrays(packed).items()}
+        return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in read_npz(packed).items()}
     if not place.is_dir():
         raise ArtifactError(
             f"view {stem} has no predictions",
@@ -61,19 +58,32 @@ def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
         ArtifactError: the file is missing or malformed.
         MisalignedArtifactError: the number of points differs.
     """
-    return _of_points(_numbers(path, np.int64), num_points, path)
+    words = _text(path).split()
+    try:
+        values = np.array(words, dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise ArtifactError(
+            f"{path} does not hold one whole number per line",
+            found=str(error),
+            fix="write class ids, 0 for none",
+        ) from error
+    if len(values) != num_points:
+        raise MisalignedArtifactError(
+            f"{path} does not belong to the labelled points",
+            expected=f"{num_points} lines, one per point in the order of the labels",
+            found=len(values),
+            fix="predict on the points of the ground truth",
+        )
+    return values
 
 
 def read_point_instances(
     path: Path, num_points: int
 ) -> tuple[Bool[np.ndarray, "M P"], Int64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
-    """Read instances in ScanNet's format: lines of mask file, class id and confidence.
+    """Read masks, class ids and confidences in ScanNet's format: lines of mask file, class id and confidence.
 
     A mask file has one integer per point; non-zero points belong to the instance. Its path is relative to the
     folder of `path`.
-
-    Returns:
-        Masks, class ids and confidences.
 
     Raises:
         ArtifactError: a file is missing or malformed.
@@ -95,8 +105,7 @@ def read_point_instances(
                 found=line,
                 fix="write one line per predicted instance, in ScanNet's format",
             ) from error
-        mask_path = path.parent / name
-        masks.append(_of_points(_numbers(mask_path, np.int64), num_points, mask_path) != 0)
+        masks.append(read_point_classes(path.parent / name, num_points) != 0)
     stacked = np.array(masks, dtype=bool).reshape(len(masks), num_points)
     return stacked, np.array(classes, dtype=np.int64), np.array(confidences, dtype=np.float64)
 
@@ -135,38 +144,8 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
     return mask
 
 
-def _arrays(path: Path) -> Mapping[str, np.ndarray]:
-    try:
-        return read_npz(path)
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix="write it with numpy.savez") from error
-
-
 def _text(path: Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as text") from error
-
-
-def _numbers(path: Path, kind: type) -> np.ndarray:
-    words = _text(path).split()
-    try:
-        return np.array(words, dtype=kind)
-    except (ValueError, OverflowError) as error:
-        raise ArtifactError(
-            f"{path} does not hold one whole number per line",
-            found=str(error),
-            fix="write class ids, 0 for none",
-        ) from error
-
-
-def _of_points(values: np.ndarray, num_points: int, path: Path) -> np.ndarray:
-    if len(values) != num_points:
-        raise MisalignedArtifactError(
-            f"{path} does not belong to the labelled points",
-            expected=f"{num_points} lines, one per point in the order of the labels",
-            found=len(values),
-            fix="predict on the points of the ground truth",
-        )
-    return values

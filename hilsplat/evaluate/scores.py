@@ -1,11 +1,15 @@
-"""Rows of `scores.csv`: one number each, in long form."""
+"""Rows of `scores.csv`, one number each, in long form; matches of predicted instances in `instances.npz`.
+
+The official average precision pools the matches of all scans before computing a curve; one number per scan is
+not enough.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.artifacts import remake
+from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import write_csv
 from hilsplat.evaluate.metrics.registry import METRICS
@@ -14,23 +18,35 @@ from hilsplat.evaluate.protocols.cards import card_of
 if TYPE_CHECKING:
     import pandas as pd
 
+    from hilsplat.evaluate.metrics.instances import InstanceMatches
+
+INSTANCES = "instances.npz"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One number, without the scene and variant that it belongs to (see `Score`)."""
+
+    method: str
+    query: str
+    level: str
+    metric: str
+    protocol: str
+    value: float
+    n: int = 1
+
 
 @dataclass(frozen=True)
 class Score:
     """One number.
 
     Attributes:
-        dataset: data set of the scene.
-        scene: scene name.
-        variant: named set of settings.
         masks: origin of the masks, such as `sam-tiny`; see `made_from_truth`.
         method: method that answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
-        view: view name.
         query: text; empty if the number describes a whole view.
         level: level label of the annotation; empty if the protocol has no levels.
         metric: a key of `METRICS`.
         protocol: full name of the protocol, with deviating settings (`protocols.cards`).
-        value: value within the metric's bounds.
         n: number of items that the value averages.
     """
 
@@ -92,11 +108,35 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
     return scores.assign(value=scores["value"].astype(float), n=scores["n"].astype(int))
 
 
+def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
+    """Write a scene's matches, possibly none, beside its score file.
+
+    Args:
+        matches: matches by (data set, scene, variant, masks, method).
+    """
+    arrays = {
+        "/".join([*key, name]): array for key, found in matches.items() for name, array in vars(found).items()
+    }
+    write_npz(Path(scores).with_name(INSTANCES), **arrays)
+
+
+def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMatches"]:
+    """Read the matches beside score files by (data set, scene, variant, masks, method)."""
+    from hilsplat.evaluate.metrics.instances import InstanceMatches
+
+    found: dict[tuple[str, ...], dict] = {}
+    for path in scores:
+        beside = Path(path).with_name(INSTANCES)
+        for name, array in read_npz(beside).items() if beside.is_file() else ():
+            *key, part = name.split("/")
+            found.setdefault(tuple(key), {})[part] = array
+    return {key: InstanceMatches(**arrays) for key, arrays in found.items()}
+
+
 def score_summary(scene: str, files: Mapping[str, Path]) -> list[str]:
     """Return a user-facing table of mean IoU and localization: a line per variant, method and protocol.
 
     Args:
-        scene: name of the scene.
         files: score files, by variant name.
 
     Raises:

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from hilsplat.base.progress import stage_log, track
@@ -12,18 +11,15 @@ from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.asked import Asked
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
 from hilsplat.evaluate.diagnostics.world_answers import measure_world_consistency
-from hilsplat.evaluate.instance_files import write_instances
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.scene_points import measure_scene_points
-from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, annotated_truths, labelled_truths
 from hilsplat.evaluate.protocols.views import measure_view, relevancy_departures, rule_of
-from hilsplat.evaluate.scores import Score, write_scores
+from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.evaluate.tables.costs import time_queries, write_times
-from hilsplat.evaluate.truths import annotated_truths, labelled_truths
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.finished import SceneParts
@@ -40,14 +36,8 @@ TIMED_TEXTS = 3
 """Number of queries timed, all in one view."""
 
 
-@dataclass(frozen=True)
-class TrueAnnotations:
-    """The truth folder of a synthetic scene."""
-
-    folder: Path
-
-
-Annotations = LabelledScene | PointScene | TrueAnnotations
+Annotations = LabelledScene | PointScene | Path
+"""Labels of a published data set, or the truth folder of a synthetic scene."""
 
 
 def run_evaluate(
@@ -75,8 +65,6 @@ def run_evaluate(
         out: `scores.csv`; without truth and labels it holds only the header.
         settings: queries and protocols.
         dataset: data set in every row, as are `scene` and `variant`.
-        scene: scene name.
-        variant: named set of settings.
         truth: truth folder of a synthetic scene.
         kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Asked.of_world`).
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
@@ -99,7 +87,7 @@ def run_evaluate(
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
         scored: list[tuple[str, Annotations, Asked]] = [Asked.open(name, data_root) for name in labels]
         if truth is not None:
-            scored.append((dataset, TrueAnnotations(truth), Asked.of_world(kind)))
+            scored.append((dataset, truth, Asked.of_world(kind)))
         if not scored:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
@@ -114,20 +102,18 @@ def run_evaluate(
                     words = relevancy_departures(settings)
                     also = FlatProtocols(protocols.flat, protocols.level, words) if protocols.flat else None
                     kept[view] = PackedMasks(size_hw)
-                    rows = measure_view(
+                    for row in measure_view(
                         answers, selections, of_view, view, size_hw, settings, also, kept[view]
-                    )
-                    for row in rows:
+                    ):
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = timed(answers, view, texts, settings)
                     answers.forget(view)  # reused memory need not be cleared again
-                if isinstance(known, TrueAnnotations) and truths and settings.view_consistency:
-                    found = measure_world_consistency(
-                        answers, selections, truths, kept, known.folder, settings
-                    )
-                    for view, row in found:
+                if isinstance(known, Path) and truths and settings.view_consistency:
+                    for view, row in measure_world_consistency(
+                        answers, selections, truths, kept, known, settings
+                    ):
                         keep(data, view, row)
                 for each in point_rows(answers, known, protocols, settings, threads):
                     if isinstance(each, Measured):
@@ -149,7 +135,7 @@ def known_truths(
     if isinstance(known, LabelledScene):
         truths = labelled_truths(known, posed)
     else:
-        truths = annotated_truths(known.folder, posed, settings.min_region_px)
+        truths = annotated_truths(known, posed, settings.min_region_px)
     if not truths:
         logger.warning("no view of %s is annotated: nothing to score", posed.name)
     return truths
@@ -171,8 +157,8 @@ def point_rows(
         points, transform = known.truth, answers.scene.scene_from_source
     else:
         kind = "street" if any(card.classes.startswith("waymo") for card in asked.points) else "room"
-        points = labelled_points(known.folder.parent, kind)
-        true, found = Cameras.load(known.folder / "cameras.npz"), answers.scene.cameras
+        points = labelled_points(known.parent, kind)
+        true, found = Cameras.load(known / "cameras.npz"), answers.scene.cameras
         transform = scene_from_true(true, found)
         error = camera_error(true, found, transform)
         if error > MAX_CAMERA_ERROR_M:
@@ -188,10 +174,7 @@ def point_rows(
 
 
 def timed(
-    answers: LanguageScene,
-    view: str,
-    texts: Sequence[str],
-    settings: EvaluateSettings,
+    answers: LanguageScene, view: str, texts: Sequence[str], settings: EvaluateSettings
 ) -> dict[str, float]:
     """Return the seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
     rule = rule_of(settings)

@@ -45,7 +45,6 @@ class Agreement:
 
     Attributes:
         pairs: number of ordered pairs of views (A, B) compared.
-        points: number of shared points over all pairs.
         masks: number of masks of A compared over all pairs.
         best_iou: highest IoU of a mask of A with any mask of B, counted in shared points (0 if B has no
             mask), averaged over the masks of A and then over pairs. 1 is perfect.
@@ -58,7 +57,6 @@ class Agreement:
     """
 
     pairs: int
-    points: int
     masks: int
     best_iou: float
     disagreement: float
@@ -80,10 +78,8 @@ def shared_points(
     points at occluding borders are dropped.
 
     Args:
-        camera_a: camera of view A.
         depth_a: depth along A's optical axis at the pixel centres, scene units; inf without a surface.
-        camera_b: camera of view B.
-        depth_b: depth along B's optical axis, as for A.
+        depth_b: the same for B.
         tolerance: maximum relative difference in depth.
     """
     pixel = np.flatnonzero(np.isfinite(depth_a))
@@ -124,13 +120,7 @@ def thinned(points: SharedPoints, most: int = MAX_POINTS) -> SharedPoints:
 def best_ious(
     inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
 ) -> Float[np.ndarray, " m"]:
-    """Return, for each mask of A with enough shared points, the highest IoU with a mask of B, in points.
-
-    Args:
-        inside_a: whether each shared point is in each mask of A.
-        inside_b: whether each shared point is in each mask of B.
-        min_points: masks of A with fewer points are ignored.
-    """
+    """Return, for each mask of A with enough shared points, the highest IoU with a mask of B, in points."""
     a = inside_a[inside_a.sum(axis=1) >= min_points].astype(np.float32)  # counts exactly up to 2**24
     b = inside_b.astype(np.float32)
     if not len(b):
@@ -189,25 +179,20 @@ def view_agreement(
     masks_a: Bool[np.ndarray, "Ma Ha Wa"],
     masks_b: Bool[np.ndarray, "Mb Hb Wb"],
     points: SharedPoints,
-    min_points: int = MIN_POINTS,
 ) -> Agreement:
     """Return the agreement of the masks of one level between two views.
 
-    Args:
-        masks_a: masks of view A, which may overlap. `best_iou` uses them as they are, the disagreements use
-            the smallest mask at each point (`painted`), like the language field.
-        masks_b: masks of view B.
-        points: points visible in both views.
-        min_points: masks of A with fewer shared points are not compared.
+    Masks of a view may overlap. `best_iou` uses them as they are, the disagreements use the smallest mask at
+    each point (`painted`), like the language field.
     """
     inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, points.pixel_a]
     inside_b = masks_b.reshape(len(masks_b), np.prod(masks_b.shape[1:], dtype=int))[:, points.pixel_b]
-    ious = best_ious(inside_a, inside_b, min_points)
+    ious = best_ious(inside_a, inside_b)
     all_pairs, joined = pair_disagreement(
         painted(inside_a, masks_a.sum(axis=(1, 2))), painted(inside_b, masks_b.sum(axis=(1, 2)))
     )
     best = float(ious.mean()) if len(ious) else float("nan")
-    return Agreement(1, len(points), len(ious), best, all_pairs, joined)
+    return Agreement(1, len(ious), best, all_pairs, joined)
 
 
 def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
@@ -220,7 +205,6 @@ def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
 
     return Agreement(
         sum(part.pairs for part in parts),
-        sum(part.points for part in parts),
         sum(part.masks for part in parts),
         mean("best_iou"),
         mean("disagreement"),
@@ -248,7 +232,6 @@ def measure_consistency(
     pairs: Iterable[tuple[str, str]],
     depth_of: Callable[[str], Float[np.ndarray, "H W"]],
     masks_of: Callable[[str, Level], Bool[np.ndarray, "M H W"]],
-    tolerance: float = DEPTH_TOLERANCE,
 ) -> dict[Level, Agreement]:
     """Return the agreement of the masks of each level over pairs of views.
 
@@ -257,11 +240,10 @@ def measure_consistency(
         pairs: ordered pairs of view names (see `neighbours`).
         depth_of: depth of a view at its pixel centres; inf without a surface.
         masks_of: masks of a view at a level.
-        tolerance: see `shared_points`.
     """
     found: dict[Level, list[Agreement]] = {level: [] for level in LEVELS}
     for a, b in pairs:
-        points = thinned(shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b), tolerance))
+        points = thinned(shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b)))
         for level in LEVELS:
             found[level].append(view_agreement(masks_of(a, level), masks_of(b, level), points))
     return {level: mean_agreement(parts) for level, parts in found.items()}

@@ -4,13 +4,13 @@ The best IoU of any mask or node with a region needs no text and no CLIP: it is 
 query.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float64
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
@@ -18,7 +18,7 @@ from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.evaluate.truths import labelled_truths
+from hilsplat.evaluate.protocols.view_truth import labelled_truths
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
@@ -28,16 +28,8 @@ from hilsplat.splat.rasterise.api import pixel_weights
 
 FIT_IOU = 0.5
 COLUMNS = (
-    "scene",
-    "what",
-    "views",
-    "level",
-    "regions",
-    "best_iou",
-    "recall",
-    "any_level_iou",
-    "any_level_recall",
-    "containment",
+    *("scene", "what", "views", "level", "regions", "best_iou", "recall"),
+    *("any_level_iou", "any_level_recall", "containment"),
 )
 
 
@@ -115,20 +107,10 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
         member = sp.csr_matrix(
             (np.ones(len(rows), np.float32), (rows, nodes[rows])), shape=(len(nodes), len(tree))
         )
-        shares = (weights @ member).tocsc()
-        chosen = [node for node in range(len(tree)) if (share_of(shares, node) > 0.5).any()]
-        masks = np.zeros((len(chosen), weights.shape[0]), bool)
-        for row, node in enumerate(chosen):
-            begin, end = shares.indptr[node : node + 2]
-            masks[row, shares.indices[begin:end][shares.data[begin:end] > 0.5]] = True
-        found[level] = masks
+        strong = ((weights @ member) > 0.5).tocsc()
+        chosen = np.flatnonzero(strong.getnnz(axis=0))
+        found[level] = strong[:, chosen].T.toarray()
     return found
-
-
-def share_of(shares: sp.csc_matrix, node: int) -> Float32[np.ndarray, " e"]:
-    """Return a node's shares in the pixels where it is visible."""
-    begin, end = shares.indptr[node : node + 2]
-    return shares.data[begin:end]
 
 
 def run_label_fits(
@@ -138,11 +120,9 @@ def run_label_fits(
 
     Args:
         folder: scene folder, with `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`.
-        variant: variant of the masks and the tree.
         labels: labels with levels, such as "annotated/photos/desk".
         data_root: folder of the data sets.
         out: output CSV.
-        threads: rendering threads.
 
     Raises:
         SceneError: the labels cannot be read, or do not fit the scene.
@@ -151,18 +131,22 @@ def run_label_fits(
     folder, scene = Path(folder), Scene.load(folder / "scene")
     labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
     labelled_truths(labelled, scene)  # raises if they don't fit
-    tree, gaussians = (
-        SemanticTree.load(folder / variant / "semantic_tree"),
-        load_ply(folder / "gaussians.ply"),
-    )
+    tree = SemanticTree.load(folder / variant / "semantic_tree")
+    gaussians = load_ply(folder / "gaussians.ply")
     fits: dict[tuple[str, str], dict[Level, Fits]] = {}
     with stage_log("label_fits", scene.name) as counts:
         for view in track(list(labelled.views), "views compared"):
             camera = scene.cameras[view]
             regions = [(region, region.mask(camera.size_hw)) for region in labelled.views[view]]
             split = "held out" if scene.split[view] == "test" else "training"
-            for what, found in _found(masks, view, tree, gaussians, camera, threads):
-                add_view(fits.setdefault((what, split), {level: Fits() for level in LEVELS}), regions, found)
+            raw = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
+            found = {"nodes": nodes_of_view(tree, normalised_weights(raw))}
+            if (masks / f"{view}.npz").is_file():
+                found[f"masks, {masks_label(masks)}"] = masks_of_view(masks, view)
+            for what, by_level in found.items():
+                add_view(
+                    fits.setdefault((what, split), {level: Fits() for level in LEVELS}), regions, by_level
+                )
         counts["views"] = len(labelled.views)
     rows = [
         [scene.name, what, split, level.label, *each[level].row()]
@@ -172,10 +156,3 @@ def run_label_fits(
     ]
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 4)
-
-
-def _found(masks, view, tree, gaussians, camera, threads) -> Iterator[tuple[str, dict[Level, np.ndarray]]]:
-    if (masks / f"{view}.npz").is_file():
-        yield f"masks, {masks_label(masks)}", masks_of_view(masks, view)
-    weights = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
-    yield "nodes", nodes_of_view(tree, normalised_weights(weights))

@@ -73,16 +73,11 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
 
 
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
-    """Write a table of all views, and a picture of a median view and the worst one.
+    """Write a table of all views and a picture of a median view and the worst one; return a Markdown table.
 
     Args:
-        scene_folder: scene artifact.
-        truth_folder: truth of the synthetic scene.
         masks_folder: masks artifact of any segmenter.
         out: PNG to write; a PDF and the table as CSV are written beside it.
-
-    Returns:
-        The rows as a Markdown table.
 
     Raises:
         ArtifactError: an artifact is missing, or the scene is not synthetic.
@@ -108,23 +103,13 @@ def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Leve
     own = [fit[level] for fit in fits.values()]
     best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
     number = sum(fit.masks for fit in own)
-    shares = (
-        best.mean() if len(best) else np.nan,
-        (best >= FIT_IOU).mean() if len(best) else np.nan,
-        number / max(1, len(own)),
-        sum(fit.fitting for fit in own) / number if number else np.nan,
-    )
-    iou, recall, masks_a_view, precision = shares
+    iou = best.mean() if len(best) else np.nan
+    recall = (best >= FIT_IOU).mean() if len(best) else np.nan
+    masks_a_view = number / max(1, len(own))
+    precision = sum(fit.fitting for fit in own) / number if number else np.nan
     return [
-        scene,
-        masks,
-        level.label,
-        str(len(own)),
-        str(len(best)),
-        f"{iou:.4f}",
-        f"{recall:.4f}",
-        f"{masks_a_view:.1f}",
-        f"{precision:.4f}",
+        *(scene, masks, level.label, str(len(own)), str(len(best))),
+        *(f"{iou:.4f}", f"{recall:.4f}", f"{masks_a_view:.1f}", f"{precision:.4f}"),
     ]
 
 

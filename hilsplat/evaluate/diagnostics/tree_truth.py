@@ -20,16 +20,8 @@ from hilsplat.splat.rasterise.api import pixel_weights
 
 MATCH_IOU = 0.5
 COLUMNS = (
-    "scene",
-    "level",
-    "nodes",
-    "true_nodes",
-    "precision",
-    "recall",
-    "mean_iou",
-    "purity",
-    "parent_accuracy",
-    "view_consistency",
+    *("scene", "level", "nodes", "true_nodes", "precision", "recall", "mean_iou", "purity"),
+    *("parent_accuracy", "view_consistency"),
 )
 
 
@@ -157,9 +149,10 @@ def run_tree_truth(
     tree = SemanticTree.load(semantic_tree)
     votes = true_votes(scene, gaussians_ply, annotations, scene.views("train"), tree.min_weight, threads)
     measured = measure_tree(tree, votes, annotations)
-    rows = [
-        [scene.name, level.label, *(str(v) if isinstance(v, int) else f"{v:.4f}" for v in vars(one).values())]
-        for level, one in measured.items()
-    ]
+    rows = []
+    for level, one in measured.items():
+        values = [getattr(one, name) for name in COLUMNS[2:]]
+        shown = [str(value) if isinstance(value, int) else f"{value:.4f}" for value in values]
+        rows.append([scene.name, level.label, *shown])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 2)

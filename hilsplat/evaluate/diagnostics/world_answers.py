@@ -12,9 +12,9 @@ from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import VIEW_CONSISTENCY
-from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.evaluate.protocols.views import given_key, label_of, rule_of
+from hilsplat.evaluate.scores import Measured
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import EvaluateSettings
@@ -40,12 +40,9 @@ def measure_world_consistency(
     Nothing is yielded without the true mesh (labels of a photographed scene).
 
     Args:
-        answers: the scene.
-        selections: cached selections of its nodes.
         truths: annotated views.
         answered: stored answers in them (`views.measure_view`).
         truth: truth folder of a synthetic scene.
-        settings: methods and map rule.
     """
     if not (Path(truth) / "mesh.ply").is_file():
         return
@@ -56,9 +53,8 @@ def measure_world_consistency(
     pairs = [(view, nearest[view]) for view in truths if view in nearest]
     for number, pair in enumerate(pairs):
         view = pair[0]
-        points = thinned(
-            shared_points(true[pair[0]], mesh.depth(true[pair[0]]), true[pair[1]], mesh.depth(true[pair[1]]))
-        )
+        here, there = (true[each] for each in pair)
+        points = thinned(shared_points(here, mesh.depth(here), there, mesh.depth(there)))
         queries = spread(truths[view]().queries, TEXTS_PER_LEVEL)
         mask_of = answers_of(answers, selections, answered, pair, queries, settings)
         for row in consistency_rows(pair, points, queries, mask_of, settings):

@@ -1,6 +1,5 @@
 """View consistency of masks on a synthetic scene, measured with its exact geometry."""
 
-import logging
 from functools import lru_cache
 from pathlib import Path
 
@@ -9,44 +8,32 @@ from jaxtyping import Bool
 
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import Level
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.diagnostics.consistency import Agreement, measure_consistency, neighbours
+from hilsplat.evaluate.diagnostics.consistency import measure_consistency, neighbours
 from hilsplat.scene.cameras import Cameras
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
 from hilsplat.world.mesh import TrueMesh
 
-logger = logging.getLogger(__name__)
-
 TRUTH = "true regions"
 """Row name of the labels, an upper limit for any masks: label borders are off by up to a pixel."""
 
 COLUMNS = (
-    "scene",
-    "masks",
-    "level",
-    "view_pairs",
-    "masks_compared",
-    "best_iou",
-    "disagreement",
-    "joined_disagreement",
+    *("scene", "masks", "level", "view_pairs", "masks_compared"),
+    *("best_iou", "disagreement", "joined_disagreement"),
 )
 
 
 def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
-    """Measure how consistently the masks of neighbouring views divide the same surface.
+    """Measure how consistently masks of neighbouring views divide the same surface; return a Markdown table.
 
     Args:
         truth: truth folder of the scene: true cameras, mesh and labels.
         masks_folder: masks artifact of any segmenter.
-        out: CSV to write, one row per level for the masks and for the true regions, which are the upper limit
-            of the measure (because of pixels at borders).
+        out: CSV to write, one row per level for the masks and for the true regions.
         count: number of neighbours of each view.
-
-    Returns:
-        The rows as a Markdown table.
 
     Raises:
         ArtifactError: a folder is missing or incomplete, or fewer than two views have masks.
@@ -87,8 +74,9 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         (masks_label(masks_folder), masks_of),
         (TRUTH, lambda view, level: true_masks(annotations, view, level)),
     ):
-        measured = measure_consistency(cameras, pairs, depth_of, source)
-        rows += [_row(index["scene"], name, level, measured[level]) for level in LEVELS]
+        for level, one in measure_consistency(cameras, pairs, depth_of, source).items():
+            shares = [f"{share:.4f}" for share in (one.best_iou, one.disagreement, one.joined_disagreement)]
+            rows.append([index["scene"], name, level.label, str(one.pairs), str(one.masks), *shares])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
 
@@ -98,9 +86,3 @@ def true_masks(annotations: HierarchyAnnotations, view: str, level: Level) -> Bo
     labels = annotations.label_image(view, level)
     ids = np.unique(labels[labels >= 0])
     return labels[None] == ids[:, None, None]
-
-
-def _row(scene: str, masks: str, level: Level, agreement: Agreement) -> list[str]:
-    shares = (agreement.best_iou, agreement.disagreement, agreement.joined_disagreement)
-    numbers = [str(agreement.pairs), str(agreement.masks), *(f"{share:.4f}" for share in shares)]
-    return [scene, masks, level.label, *numbers]

@@ -1,6 +1,5 @@
 """The panel of a scene: photograph, masks, field, and answers to queries."""
 
-import logging
 import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -18,9 +17,8 @@ from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.metrics.localization import peak_points
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, annotated_truths, labelled_truths
 from hilsplat.evaluate.protocols.views import rule_of
-from hilsplat.evaluate.truths import annotated_truths, labelled_truths
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.pictures import (
@@ -37,8 +35,6 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import label_of_index, made_from_truth
 from hilsplat.segment.pictures import paint_level
 from hilsplat.settings import EvaluateSettings, FiguresSettings
-
-logger = logging.getLogger(__name__)
 
 WIDTH_IN = 13.0
 RING = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "white", "markeredgewidth": 1.8}
@@ -92,32 +88,24 @@ def run_figures(
     """Draw the panel, and copy the pictures of poses and fit beside it.
 
     Args:
-        parts: the finished scene.
         out: PNG to write; `registration.png` and `fit.png` are copied into its folder.
-        settings: number of queries and views.
-        evaluate: settings of the answers.
         fit: report folder of the fit; None copies nothing.
         truth: annotations of a synthetic scene, which define the queries.
         labels: labels of a published data set instead, such as "lerf_ovs/figurines".
         data_root: folder of the data sets' folders.
         queries: texts to show if there is neither truth nor labels.
-        threads: threads for rendering.
     """
     if fit is not None:
-        copy_picture(parts.scene / "registration.png", out.with_name("registration.png"))
-        copy_picture(fit / "test_views.png", out.with_name("fit.png"))
+        copies = {"registration.png": parts.scene / "registration.png", "fit.png": fit / "test_views.png"}
+        for name, source in copies.items():
+            with atomic_path(out.with_name(name)) as temporary:
+                shutil.copyfile(source, temporary)
     answers = LanguageScene.from_parts(parts, evaluate, threads=threads)
     with stage_log("figures", answers.scene.name) as counts:
         truths = truths_of(answers.scene, truth, labels, data_root, evaluate)
         rows = annotated_rows(truths, settings) if truths else free_rows(answers, queries, settings)
         save_png_and_pdf(draw_panel(answers, parts.masks, rows, evaluate), out)
         counts["queries"] = len(rows)
-
-
-def copy_picture(source: Path, out: Path) -> None:
-    """Copy a file atomically."""
-    with atomic_path(out) as temporary:
-        shutil.copyfile(source, temporary)
 
 
 def truths_of(
@@ -197,14 +185,9 @@ def draw_panel(
     label_left(grid[1, 0], "language field")
     for level in LEVELS:
         count = len(masks.rows_of(level))
-        show(
-            grid[0, level.index + 1],
-            paint_level(image, masks, level),
-            f"{level.label}: {count} masks",
-        )
-        show(
-            grid[1, level.index + 1], answers.field_image(held_out, level), f"{level.label}: field as colours"
-        )
+        above, below = grid[:, level.index + 1]
+        show(above, paint_level(image, masks, level), f"{level.label}: {count} masks")
+        show(below, answers.field_image(held_out, level), f"{level.label}: field as colours")
     if rows:
         draw_queries(parts[1], answers, rows, evaluate, columns)
     return figure
@@ -239,7 +222,7 @@ def draw_queries(
         pictures.append(("field", field_mask))
         title = f"truth, {row.view}" if row.truth is not None else row.view
         show(axes[0], paint_answer(image, None, row.truth), title)
-        label_left(axes[0], _wrapped(row.text), level)
+        label_left(axes[0], "\n".join(textwrap.wrap(row.text, 20)), level)
         for place, (name, mask) in zip(axes[1:], pictures, strict=False):
             score = f": IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
             show(place, paint_answer(image, mask, row.truth), name + score)
@@ -248,13 +231,5 @@ def draw_queries(
         for each in LEVELS:
             top = float(relevancy[each.index].max())
             picture = paint_relevancy(image, relevancy[each.index], low, high)
-            show(
-                axes[columns - 3 + each.index],
-                picture,
-                f"relevancy, {each.label}: {top:.2f}",
-                bold=each is level,
-            )
-
-
-def _wrapped(text: str, width: int = 20) -> str:
-    return "\n".join(textwrap.wrap(text, width))
+            title = f"relevancy, {each.label}: {top:.2f}"
+            show(axes[columns - 3 + each.index], picture, title, bold=each is level)

@@ -30,8 +30,7 @@ def run_sweep_plot(name: str, table: Path, out: Path, default: float | None = No
     """Draw a sweep as PNG and PDF: the paper's curves and ours, each kind in its own panel.
 
     Args:
-        name: "theta" or "omega".
-        table: the finished CSV of that table.
+        table: the finished CSV of the table with this name.
         out: PNG; the PDF is written beside it.
         default: value for rows that don't state one; by default that of the default variant.
 

@@ -57,7 +57,6 @@ def hierarchical_consistency(
 
     Args:
         transitions: families per level of the parent: wholes first, then parts.
-        reading: see `children_consistency`.
         pooled: whether to average over all parents of all levels at once instead.
     """
     return mean_over_parents(consistency_of_families(transitions, reading), pooled)

@@ -25,24 +25,6 @@ MIN_POINTS = 100
 
 
 @dataclass(frozen=True)
-class InstanceScan:
-    """Truth and predictions of one scan.
-
-    Attributes:
-        truth: per point class * 1000 + instance; values below 1000 or of a class that is not evaluated are
-            void.
-        masks: predicted instances over the same points; they may overlap.
-        classes: class id of each prediction.
-        confidences: confidence of each prediction; a constant if the method has none.
-    """
-
-    truth: Int[np.ndarray, " P"]
-    masks: Bool[np.ndarray, "M Q"]  # Q = P, checked below
-    classes: Int[np.ndarray, " M"]
-    confidences: Float[np.ndarray, " M"]
-
-
-@dataclass(frozen=True)
 class InstanceMatches:
     """Contribution of one scan to the precision-recall curves of K classes at T thresholds.
 
@@ -66,9 +48,14 @@ class InstanceMatches:
 
 
 def match_instances(
-    scan: InstanceScan, class_ids: Sequence[int], min_points: int = MIN_POINTS
+    truth: Int[np.ndarray, " P"],
+    masks: Bool[np.ndarray, "M Q"],  # Q = P, checked below
+    classes: Int[np.ndarray, " M"],
+    confidences: Float[np.ndarray, " M"],
+    class_ids: Sequence[int],
+    min_points: int = MIN_POINTS,
 ) -> InstanceMatches:
-    """Match predictions to true instances, per class and threshold.
+    """Match the predictions of one scan to its true instances, per class and threshold.
 
     Instances are visited in order. Each unused prediction of the class that overlaps an instance by more
     than the threshold matches it. If there are several, the most confident remains the match and each other
@@ -76,23 +63,32 @@ def match_instances(
     prediction as used. A prediction without sufficient overlap with any true instance is a false positive,
     unless the share of its points in void or in instances that are too small exceeds the threshold.
 
+    Args:
+        truth: per point class * 1000 + instance; values below 1000 or of a class that is not evaluated are
+            void.
+        masks: predicted instances over the same points; they may overlap.
+        classes: class id of each prediction.
+        confidences: confidence of each prediction; a constant if the method has none.
+        class_ids: the evaluated classes.
+        min_points: smaller instances and predictions are ignored.
+
     Raises:
         MisalignedArtifactError: masks and truth have different numbers of points.
     """
-    if scan.masks.shape[1] != len(scan.truth):
+    if masks.shape[1] != len(truth):
         raise MisalignedArtifactError(
             "predicted instances do not belong to the scan's points",
-            expected=f"{len(scan.truth)} points",
-            found=scan.masks.shape[1],
+            expected=f"{len(truth)} points",
+            found=masks.shape[1],
             fix="predict on the vertices of the evaluated mesh",
         )
-    ids, instance_of_point = np.unique(scan.truth, return_inverse=True)
+    ids, instance_of_point = np.unique(truth, return_inverse=True)
     sizes = np.bincount(instance_of_point, minlength=len(ids))
-    points = scan.masks.sum(axis=1)
-    kept = np.flatnonzero((points >= min_points) & np.isin(scan.classes, class_ids))
+    points = masks.sum(axis=1)
+    kept = np.flatnonzero((points >= min_points) & np.isin(classes, class_ids))
     # [kept prediction, true instance]: points in common
     common = np.array(
-        [np.bincount(instance_of_point[scan.masks[row]], minlength=len(ids)) for row in kept], dtype=np.int64
+        [np.bincount(instance_of_point[masks[row]], minlength=len(ids)) for row in kept], dtype=np.int64
     ).reshape(len(kept), len(ids))
     of_class = np.where(ids >= CLASS_STRIDE, ids // CLASS_STRIDE, 0)
     void = ~np.isin(of_class, class_ids) | (ids < CLASS_STRIDE)
@@ -103,13 +99,13 @@ def match_instances(
     for class_index, class_id in enumerate(class_ids):
         own = np.flatnonzero((of_class == class_id) & ~void)
         large = sizes[own] >= min_points
-        predictions = np.flatnonzero(scan.classes[kept] == class_id)
+        predictions = np.flatnonzero(classes[kept] == class_id)
         has_truth[class_index] = large.any()
         shared = common[np.ix_(predictions, own)]
         area = points[kept[predictions]]
         overlap = shared / (area[:, None] + sizes[own][None, :] - shared)
         ignored = (common[predictions][:, void].sum(axis=1) + shared[:, ~large].sum(axis=1)) / area
-        confidence = scan.confidences[kept[predictions]].astype(float)
+        confidence = confidences[kept[predictions]].astype(float)
         for overlap_index, threshold in enumerate(OVERLAPS):
             scored, missed = _matches(overlap > threshold, large, ignored > threshold, confidence)
             misses[class_index, overlap_index] = missed

@@ -1,4 +1,4 @@
-"""Metrics that compare one predicted mask with one true region."""
+"""Metrics that compare predicted masks with true regions."""
 
 import math
 
@@ -15,9 +15,9 @@ def iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> 
     return np.count_nonzero(prediction & truth) / union if union else 0.0
 
 
-def boundary_width_px(size_hw: tuple[int, int], ratio: float = BOUNDARY_RATIO) -> int:
+def boundary_width_px(size_hw: tuple[int, int]) -> int:
     """Return the width of the boundary band: a share of the diagonal, rounded half to even, at least 1 px."""
-    return max(1, round(ratio * math.hypot(*size_hw)))
+    return max(1, round(BOUNDARY_RATIO * math.hypot(*size_hw)))
 
 
 def boundary(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
@@ -38,11 +38,9 @@ def boundary(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "
     return mask & (eroded == 0)
 
 
-def boundary_iou(
-    prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"], ratio: float = BOUNDARY_RATIO
-) -> float:
+def boundary_iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
     """Return the IoU of the two boundaries (Cheng et al. 2021, as in lkeab/gaussian-grouping)."""
-    width_px = boundary_width_px(truth.shape, ratio)
+    width_px = boundary_width_px(truth.shape)
     return iou(boundary(prediction, width_px), boundary(truth, width_px))
 
 
@@ -66,3 +64,27 @@ def exceeds(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"],
     Source: yanmin-wu/OpenGaussian `scripts/compute_lerf_iou.py`.
     """
     return float(iou(prediction, truth) > threshold)
+
+
+def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K H W"]:
+    """Return one mask per class, the pixels where its similarity is largest: 3D-OVS's original protocol.
+
+    The first class wins ties; a pixel whose similarities are all -inf has no class. The IoU of a class absent
+    from prediction and truth is 0 (the default of scikit-learn, used by that code).
+    Source: Kunhao-Liu/3D-OVS `renderer.py`.
+
+    Args:
+        similarity: cosine of each pixel's feature with each class text, without template or canonical
+            phrases. Classes are in the order of the sorted texts, which determines ties.
+    """
+    winner = similarity.argmax(axis=0)
+    answered = similarity.max(axis=0) > -np.inf
+    return (winner[None] == np.arange(len(similarity))[:, None, None]) & answered
+
+
+def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray, "K H W"]) -> float:
+    """Return the share of pixels whose classes are exactly the true ones.
+
+    A pixel with two true classes or none is never correct, because the prediction has one.
+    """
+    return float((prediction == truth).all(axis=0).mean())

@@ -7,7 +7,6 @@ which classes are averaged; the functions are named accordingly.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from functools import reduce
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -31,13 +30,7 @@ class ClassCounts:
     def of(
         truth: Int[np.ndarray, " P"], prediction: Int[np.ndarray, " P"], num_classes: int
     ) -> "ClassCounts":
-        """Count points; predictions at points with truth 0 are ignored.
-
-        Args:
-            truth: labels 0 .. K.
-            prediction: labels 0 .. K.
-            num_classes: K.
-        """
+        """Count points with labels 0 .. K; predictions at points with truth 0 are ignored."""
         known = truth > 0
         truth, prediction = truth[known], prediction[known]
 
@@ -48,11 +41,6 @@ class ClassCounts:
 
         return ClassCounts(per_class(truth[truth == prediction]), per_class(truth), per_class(prediction))
 
-    def __add__(self, other: "ClassCounts") -> "ClassCounts":
-        """Return the counts of both point sets together."""
-        sums = (getattr(self, each.name) + getattr(other, each.name) for each in fields(self))
-        return ClassCounts(*sums)
-
     @property
     def union(self) -> Int64[np.ndarray, " K"]:
         """Points of the class or predicted as such."""
@@ -61,7 +49,9 @@ class ClassCounts:
 
 def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
     """Sum the counts of all scenes; unlike in a mean over scenes, a large scene has more weight."""
-    return reduce(ClassCounts.__add__, counts)
+    scenes = list(counts)
+    sums = (sum(getattr(scene, each.name) for scene in scenes) for each in fields(ClassCounts))
+    return ClassCounts(*sums)
 
 
 def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:
@@ -95,7 +85,6 @@ def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | Non
     over all scans.
 
     Args:
-        counts: counts of all scans.
         among: classes to average, such as the head, common or tail of ScanNet200.
     """
     ious = class_iou(counts)

@@ -4,7 +4,7 @@ Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a fi
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
@@ -54,7 +54,7 @@ class RelevancyRule:
     empty_wins: bool = False
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
-        """Return brief descriptions of the differences from another rule, for protocol names."""
+        """Return the differences from another rule in few words, for protocol names."""
         words = {
             "filter_px": f"filter {self.filter_px}" if self.filter_px else "filter scaled",
             "mix": "mix" if self.mix else "no mix",
@@ -66,12 +66,7 @@ class RelevancyRule:
             "levels": "levels " + "+".join(level.label for level in self.levels),
             "empty_wins": "empty wins" if self.empty_wins else "empty last",
         }
-        differing = [
-            field.name
-            for field in fields(self)
-            if getattr(self, field.name) != getattr(reference, field.name)
-        ]
-        return tuple(words[name] for name in differing)
+        return tuple(text for name, text in words.items() if getattr(self, name) != getattr(reference, name))
 
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
@@ -177,9 +172,6 @@ def relevancy_mask(
     """Return the mask of a level, or of the level that the rule chooses if `level` is None.
 
     Args:
-        smoothed: relevancy of a text.
-        level: level of the answer.
-        rule: the rule.
         united: unfiltered relevancy of another text, whose mask is merged with this one's before the majority
             filter; the level is chosen by the first text alone.
     """

@@ -39,9 +39,7 @@ class QueryableScene(Protocol):
 class ViewMaps:
     """Functions that compute one method's maps of one view for any texts.
 
-    Attributes:
-        relevancy: texts -> relevancy, (T, 3, H, W).
-        cosine: texts and pixels (row * width + column) -> plain cosine, (T, 3, P); -inf if a level has none.
+    Pixels are row * width + column; the plain cosine is -inf at levels without one.
     """
 
     relevancy: Callable[[Sequence[str]], Float32[np.ndarray, "T 3 H W"]]

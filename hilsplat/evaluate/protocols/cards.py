@@ -57,11 +57,9 @@ class ProtocolCard:
         name: `benchmark/variant`.
         version: incremented when a change below affects the numbers.
         metrics: keys of `METRICS` for which it has rows.
-        averaging: see `Averaging`.
         selection: how a prediction is chosen, threshold and level, in words.
         source: origin and departures from it. Begins with "none" if there is no public code.
         rule: how relevancy maps become masks, if they do.
-        missing: see `Missing`.
         classes: name of the queried `ClassSet`, if it is fixed.
         truth: `labels`: the region that the data set defines; `any grey`: all non-black pixels of its mask
             file, if it has one.

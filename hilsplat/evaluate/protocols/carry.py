@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.rotations import rotation_matrices
+from hilsplat.splat.gaussians import Gaussians
 
 Mode = Literal["frozen", "nearest", "vote", "density"]
 
@@ -75,6 +76,20 @@ class CarriedPoints:
         return np.where(self.is_scored, labels, 0).astype(labels.dtype)
 
 
+def carried_to(
+    points: Float[np.ndarray, "P 3"], gaussians: Gaussians, mode: Mode, radius: float, threads: int = 1
+) -> CarriedPoints:
+    """Assign Gaussians to points; positions and the radius of a vote are in scene units."""
+    means, opacities = gaussians.means, gaussians.opacities
+    if mode == "frozen":
+        return frozen(opacities, len(points))
+    if mode == "nearest":
+        return nearest(points, means, opacities, threads)
+    if mode == "vote":
+        return vote(points, means, opacities, radius, threads=threads)
+    return density(points, means, opacities, gaussians.scales, gaussians.quats, threads=threads)
+
+
 def frozen(opacities: Float[np.ndarray, " N"], num_points: int) -> CarriedPoints:
     """Assign Gaussian i to point i; the fit must not have moved, split or dropped any Gaussian.
 
@@ -122,14 +137,6 @@ def vote(
 
     A point without such a Gaussian has no prediction, which counts as a miss.
 
-    Args:
-        points: labelled points, scene units.
-        means: Gaussian centres, scene units.
-        opacities: peak alphas.
-        radius: scene units; 0.1 is 10 cm if the unit is a metre.
-        k: number of neighbours.
-        threads: search threads.
-
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
     """
@@ -157,18 +164,17 @@ def density(
 
     Args:
         points: labelled points, scene units.
-        means: Gaussian centres, scene units.
+        means: centres, scene units.
         opacities: peak alphas; Gaussians below 0.1 are not candidates.
         scales: standard deviations along the axes, scene units.
         quats: world-from-Gaussian rotation, wxyz, any non-zero length.
-        k: number of neighbours.
-        threads: search threads.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.
     """
     index, distance = _neighbours(points, means, opacities, k, np.inf, threads)
-    whiten = _gaussian_from_world(scales, quats)
+    # Matrices (N, 3, 3) that map an offset from the centre to standard deviations.
+    whiten = rotation_matrices(quats).transpose(0, 2, 1) / scales.astype(float)[:, :, None]
     weight = np.empty(index.shape)
     for rows in _chunks(len(points)):
         offset = points[rows, None, :].astype(float) - means[index[rows]]
@@ -180,25 +186,22 @@ def density(
     return CarriedPoints(f"density of {k}", index, _normalised(weight), np.ones(len(points), dtype=bool))
 
 
-def argmax_labels(scores: Float[np.ndarray, "P K"]) -> Int32[np.ndarray, " P"]:
-    """Return the label 1 .. K of the largest score (cosine or relevancy) per row; the first class wins ties.
-
-    An all-zero row has no feature and gets 0, a miss. OpenGaussian's argmax assigns such points to its
-    first class, wall.
-    """
-    return np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0).astype(np.int32)
-
-
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:
     """Return labels 1 .. K by the largest cosine with the class texts: no canonical phrases, no "other".
 
+    The first class wins ties. Departs: OpenGaussian's argmax assigns points without a feature to its first
+    class, wall; here they get 0, a miss.
+
     Args:
-        features: features of points or Gaussians, any length; an all-zero feature gives 0.
+        features: features of points or Gaussians, any length; all zero for none.
         texts: unit vectors.
     """
-    # A feature's length does not change which cosine is largest.
-    parts = [argmax_labels(features[rows] @ texts.T) for rows in _chunks(len(features))]
-    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int32)
+    labels = np.zeros(len(features), dtype=np.int32)
+    for rows in _chunks(len(features)):
+        # A feature's length does not change which cosine is largest.
+        scores = features[rows] @ texts.T
+        labels[rows] = np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0)
+    return labels
 
 
 def _neighbours(
@@ -223,11 +226,6 @@ def _neighbours(
     )
     found = np.isfinite(distance)
     return opaque[np.where(found, place, 0)].astype(np.int64), distance
-
-
-def _gaussian_from_world(scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Return matrices (N, 3, 3) that map an offset from the centre to standard deviations."""
-    return rotation_matrices(quats).transpose(0, 2, 1) / scales.astype(float)[:, :, None]
 
 
 def _normalised(weight: np.ndarray) -> np.ndarray:

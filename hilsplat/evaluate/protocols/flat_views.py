@@ -22,19 +22,15 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
 )
 from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import (
-    LERF_LANGSPLAT,
     LERF_MASK,
     LERF_MASK_SKIPPING,
     OVS_ARGMAX,
     OVS_NODES,
     ProtocolCard,
 )
-from hilsplat.evaluate.protocols.masks import measure_class_maps, measure_masks
-from hilsplat.evaluate.protocols.measured import Measured
-from hilsplat.evaluate.protocols.view_rows import mask_rows
+from hilsplat.evaluate.protocols.rows import NO_POINTS, class_map_rows, mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
-
-MASKS = (LERF_MASK, LERF_MASK_SKIPPING)
+from hilsplat.evaluate.scores import Measured
 
 
 class FlatProtocols:
@@ -64,8 +60,6 @@ class FlatProtocols:
         """Yield the rows of one text and method.
 
         Args:
-            method: "field" or "tree".
-            relevancy: the text's relevancy maps.
             nodes_mask: the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`; if None, LERF-Mask uses the
                 mask from the relevancy maps.
             category: the text, merged over levels.
@@ -82,29 +76,23 @@ class FlatProtocols:
             """Smooth once for all rules with the same filter, because it takes most of the time."""
             return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
 
-        def smoothed_for(rule: RelevancyRule) -> SmoothedRelevancy:
-            return smoothed_by(rule.filter_px, rule.mix, rule.border)
-
         for card in self.cards:
-            label = card.labelled(self.words)
-            region = flat.any_grey_region if card.truth == "any grey" else flat.truth
-            if not region.any() or (card is OVS_NODES and nodes_mask is None):
-                continue  # not visible in the view, or a field, which has no nodes
-            if card in (*MASKS, OVS_NODES):
+            region = flat.region(card.truth)
+            if not region.any() or (card is OVS_NODES and nodes_mask is None) or card is OVS_ARGMAX:
+                continue  # not visible in the view; a field, which has no nodes; needs all texts
+            points = NO_POINTS
+            if nodes_mask is not None and card in (LERF_MASK, LERF_MASK_SKIPPING, OVS_NODES):
                 mask = nodes_mask
-                if mask is None:
-                    rule = LERF_LANGSPLAT.rule
-                    assert rule is not None
-                    mask, _ = relevancy_mask(smoothed_for(rule), None, rule)
-                for row in measure_masks(card, method, {flat.text: mask}, {flat.text: region}):
-                    yield replace(row, protocol=label)
-            elif card.rule is not None:
-                smoothed = smoothed_for(card.rule)
+            else:
+                rule = card.rule or RelevancyRule()
+                smoothed = smoothed_by(rule.filter_px, rule.mix, rule.border)
                 other = dict(card.united).get(flat.text)
                 united = None if other is None else maps.relevancy((other,))[0]
-                mask, _ = relevancy_mask(smoothed, None, card.rule, united)
-                points, _ = peak_points(smoothed.filtered, None)
-                yield from mask_rows(method, replace(flat, truth=region), label, mask, points, card.metrics)
+                mask, _ = relevancy_mask(smoothed, None, rule, united)
+                if "localization_box" in card.metrics:
+                    points, _ = peak_points(smoothed.filtered, None)
+            answered = replace(flat, truth=region)
+            yield from mask_rows(method, answered, card.labelled(self.words), mask, points, card.metrics)
         if OVS_ARGMAX in self.cards:
             self._maps[method] = maps
             self._queries[flat.text] = flat
@@ -126,8 +114,8 @@ class FlatProtocols:
             return
         for method, maps in self._maps.items():
             similarity = maps.cosine(texts, pixels).max(axis=1)
-            for row in measure_class_maps(method, similarity[:, None], truth[:, None, asked], texts):
-                yield replace(row, protocol=OVS_ARGMAX.labelled(words))
+            protocol = OVS_ARGMAX.labelled(words)
+            yield from class_map_rows(method, protocol, similarity[:, None], truth[:, None, asked], texts)
 
 
 def eighth_truth(

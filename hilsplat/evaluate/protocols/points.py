@@ -3,7 +3,8 @@
 Predictions may have any source; `carry` transfers those of Gaussians to points. Every row names the mode.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -26,7 +27,7 @@ from hilsplat.evaluate.metrics.point_classes import (
     pooled,
 )
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
-from hilsplat.evaluate.protocols.measured import Measured
+from hilsplat.evaluate.scores import Measured
 
 MEANS: dict[str, Callable[[ClassCounts], float]] = {
     "miou_present": miou_over_present,
@@ -49,7 +50,7 @@ def measure_points(
     card: ProtocolCard,
     method: str,
     truth: Int[np.ndarray, " P"],
-    prediction: Int[np.ndarray, " Q"] | None,  # Q = P, checked below
+    prediction: Int[np.ndarray, " Q"],  # Q = P, checked below
     classes: ClassSet,
     carried: str,
 ) -> Iterator[Measured]:
@@ -60,10 +61,8 @@ def measure_points(
 
     Args:
         card: a point protocol; its classes are `classes`.
-        method: name of the method.
         truth: labels 1 .. K in the order of `classes`; 0 is ignored.
-        prediction: labels as in `truth`, 0 for a miss; None if the scene has no prediction (all 0).
-        classes: the queried classes.
+        prediction: labels as in `truth`, 0 for a miss.
         carried: mode of `carry.CarriedPoints`, or another way by which predictions reached the points.
 
     Raises:
@@ -74,8 +73,6 @@ def measure_points(
         raise MisalignedArtifactError(
             f"{card.full_name} is not defined on these classes", expected=card.classes, found=classes.name
         )
-    if prediction is None:
-        prediction = np.zeros_like(truth)
     if len(prediction) != len(truth):
         raise MisalignedArtifactError(
             "predictions do not belong to the scene's points",
@@ -98,15 +95,11 @@ def measure_points(
             yield Measured(method, "", "", metric, protocol, MEANS[metric](counts), int(counts.truth.sum()))
 
 
-def pooled_points(
-    card: ProtocolCard, scenes: Iterable[Sequence[Measured]], classes: ClassSet
-) -> dict[str, float]:
-    """Return the means of a pooled protocol from the class rows of all scenes.
+def pooled_points(card: ProtocolCard, scenes: Iterable[Iterable[Any]], classes: ClassSet) -> dict[str, float]:
+    """Return the means of a pooled protocol.
 
     Args:
-        card: protocol whose metrics are computed.
-        scenes: rows of each scene, from one method.
-        classes: the queried classes.
+        scenes: the class rows of each scene, from one method: `Measured` or named tuples of a score file.
     """
     counts = pooled(_counts_of(rows, classes) for rows in scenes)
     means = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
@@ -116,7 +109,7 @@ def pooled_points(
     return means
 
 
-def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
+def _counts_of(rows: Iterable[Any], classes: ClassSet) -> ClassCounts:
     """Return counts from class rows, exact up to 10**6 points per class because files keep six decimals."""
     hits, truth, union = np.zeros((3, len(classes)), dtype=np.int64)
     place = {text: row for row, text in enumerate(classes.texts)}
@@ -129,9 +122,7 @@ def _counts_of(rows: Sequence[Measured], classes: ClassSet) -> ClassCounts:
     return ClassCounts(hits, truth, union - truth + hits)
 
 
-def measure_instances(
-    method: str, scans: Mapping[str, InstanceMatches], carried: str, card: ProtocolCard = INSTANCES
-) -> Iterator[Measured]:
+def measure_instances(method: str, scans: Mapping[str, InstanceMatches], carried: str) -> Iterator[Measured]:
     """Yield AP, AP50 and AP25 over all scans, and AP of each split; `n` is the number of scans.
 
     Scans without predictions must be included: their instances are misses. Nothing is yielded if no scan has
@@ -144,4 +135,4 @@ def measure_instances(
     for split, members in splits_of(SCANNET200_INSTANCES).items():
         values[f"ap_{split}"] = ap(precisions[np.array(members)])
     for metric, value in values.items():
-        yield Measured(method, "", "", metric, point_label(card, carried), value, len(scans))
+        yield Measured(method, "", "", metric, point_label(INSTANCES, carried), value, len(scans))

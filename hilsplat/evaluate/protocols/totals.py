@@ -22,7 +22,6 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
 
     Args:
         rows: rows of one table row, which share an averaging order.
-        metric: rows of other metrics are ignored.
         level: rows of other levels are ignored; None keeps all.
     """
     kept = rows[rows["metric"] == metric]

@@ -1,7 +1,10 @@
-"""The truth of one view: its scored queries and their regions."""
+"""The truth of one view: its scored queries and their regions, loaded on demand."""
 
-from collections.abc import Iterable, Mapping
+import logging
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int, Int64
@@ -9,12 +12,18 @@ from PIL import Image
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.datasets.labelled import LabelledRegion
+from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, check_label_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.metrics.localization import box_of
+from hilsplat.scene.scene import Scene
+
+logger = logging.getLogger(__name__)
 
 EIGHTH = 8
 """3D-OVS compares masks at an eighth of the image's size."""
+
+SHAPE_TOLERANCE = 0.01
+"""Tolerated relative difference in shape between labels and view: undistortion and shrinking round sides."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +48,9 @@ class Query:
     any_grey: Bool[np.ndarray, "H W"] | None = None
     eighth: Bool[np.ndarray, "h w"] | None = None
 
-    @property
-    def any_grey_region(self) -> Bool[np.ndarray, "H W"]:
-        """True region for protocols with truth `any grey`."""
-        return self.truth if self.any_grey is None else self.any_grey
+    def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
+        """Return the true region for protocols with this `truth`, `labels` or `any grey`."""
+        return self.any_grey if truth == "any grey" and self.any_grey is not None else self.truth
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,6 @@ class ViewTruth:
         parents is queried but belongs to no family.
 
         Args:
-            regions: the labels of the view.
             size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
             image_hw: size of the image, if different.
         """
@@ -151,23 +158,6 @@ class ViewTruth:
             by_path,
             tuple(query for query in united if not query.truth.any()),
         )
-
-    @staticmethod
-    def flat(
-        truths: Mapping[str, Bool[np.ndarray, "H W"]],
-        boxes_xyxy: Mapping[str, Int[np.ndarray, "B 4"]] | None = None,
-    ) -> "ViewTruth":
-        """Return the truth of a benchmark without levels: LERF-OVS, LERF-Mask, 3D-OVS.
-
-        Args:
-            truths: true region per text; objects with the same text are merged.
-            boxes_xyxy: annotated boxes per text, borders included; None uses the boxes of the regions.
-        """
-        categories = tuple(
-            Query(text, None, ((text,),), truth, boxes_xyxy[text] if boxes_xyxy else box_of(truth)[None])
-            for text, truth in truths.items()
-        )
-        return ViewTruth((), categories, {})
 
     def own_part(self, path: tuple[str, ...], answer: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
         """Return the answer to a part without the area of other annotated wholes that have the same part.
@@ -211,7 +201,7 @@ def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
             tuple(path for query in same for path in query.paths),
             np.any([query.truth for query in same], axis=0),
             np.concatenate([query.boxes_xyxy for query in same]),
-            np.any([query.any_grey_region for query in same], axis=0)
+            np.any([query.region("any grey") for query in same], axis=0)
             if any(query.any_grey is not None for query in same)
             else None,
             _union(query.eighth for query in same),
@@ -244,3 +234,32 @@ def kept_by_pillow(
         return np.asarray(line.resize((new, 1), Image.Resampling.NEAREST))[0].astype(np.int64)
 
     return kept(old_hw[0], new_hw[0]), kept(old_hw[1], new_hw[1])
+
+
+def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str, Callable[[], ViewTruth]]:
+    """Return the true regions in each annotated test view, loaded on demand."""
+    annotations = HierarchyAnnotations.load(truth)
+    return {
+        view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, min_region_px)
+        for view in posed.views("test")
+        if annotations.views.get(view)
+    }
+
+
+def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
+    """Return the true regions in each labelled view of a published data set, loaded on demand.
+
+    Raises:
+        SceneError: a labelled view has no pose, or its labels differ in shape.
+    """
+    for sentence in labels.warnings:
+        logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
+    truths: dict[str, Callable[[], ViewTruth]] = {}
+    labels.check_posed(posed.cameras.names)
+    for view, regions in labels.views.items():
+        size_hw = posed.cameras[view].size_hw
+        for label_hw in sorted({region.size_hw for region in regions}):
+            for sentence in check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE):
+                logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
+        truths[view] = partial(ViewTruth.of_regions, regions, size_hw)
+    return truths

@@ -55,13 +55,10 @@ from hilsplat.evaluate.protocols.cards import (
     ProtocolCard,
 )
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.measured import Measured
-from hilsplat.evaluate.protocols.view_rows import mask_rows
+from hilsplat.evaluate.protocols.rows import NO_POINTS, mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.scores import Measured
 from hilsplat.settings import EvaluateSettings
-
-NO_POINTS = np.zeros((0, 2), np.int64)
-"""Peaks of answers without localization."""
 
 RELEVANCY_CHUNK_MIB = 512
 """Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
@@ -126,10 +123,8 @@ def measure_view(
     """Yield all rows of one view, in no particular order.
 
     Args:
-        scene: the queried scene.
-        selections: cached selections of its nodes.
+        selections: cached selections of the scene's nodes.
         truth: queries to score, with their regions.
-        view: name of the view.
         size_hw: height and width of the view, px.
         settings: methods, map rule and relevancy settings.
         also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
@@ -153,45 +148,32 @@ def measure_view(
     field_maps = maps_of(scene.field_relevancy, scene.field_cosine)
     node_maps = maps_of(scene.node_relevancy_map, scene.node_cosine)
 
-    texts = [query.text for query in (*truth.categories, *(truth.absent if also else ()))]
+    categories = [*truth.categories, *(truth.absent if also else ())]
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
-    for start in range(0, len(texts), per_chunk):
-        chunk = texts[start : start + per_chunk]
-        fields = _relevancy(scene.field_relevancy, chunk, view) if "field" in settings.methods else None
+    for start in range(0, len(categories), per_chunk):
+        chunk = categories[start : start + per_chunk]
+        texts = [category.text for category in chunk]
+        fields = _relevancy(scene.field_relevancy, texts, view) if "field" in settings.methods else None
         asks_nodes = {"tree", "tree-path"} & set(settings.methods)
-        nodes = _relevancy(scene.node_relevancy_map, chunk, view) if asks_nodes else None
-        for row, text in enumerate(chunk):
-            category = (*truth.categories, *truth.absent)[start + row]
-            queries = [query for query in truth.queries if query.text == text]
-            if not category.truth.any():
-                assert also is not None
-                for method, found, maps in (("field", fields, field_maps), ("tree", nodes, node_maps)):
-                    if found is not None and method in settings.methods:
-                        yield from also.add(method, found[row], None, category, queries, maps)
-                continue
-            if fields is not None:
-                smoothed = SmoothedRelevancy.of(fields[row], rule)
-                yield from _answer_rows(
-                    "field",
-                    LERF_LANGSPLAT,
-                    smoothed,
-                    partial(by_map, smoothed),
-                    category,
-                    queries,
-                    settings,
-                    masks,
-                )
+        nodes = _relevancy(scene.node_relevancy_map, texts, view) if asks_nodes else None
+        for row, category in enumerate(chunk):
+            queries = [query for query in truth.queries if query.text == category.text]
+            for method, found, maps in (("field", fields, field_maps), ("tree", nodes, node_maps)):
+                if found is None or method not in settings.methods:
+                    continue
+                mask = None
+                if category.truth.any():
+                    smoothed = SmoothedRelevancy.of(found[row], rule)
+                    flat, answer = LERF_LANGSPLAT, partial(by_map, smoothed)
+                    if method == "tree":
+                        flat, answer = TREE_NODES, partial(by_nodes, category.text)
+                        yield from _scene_wide_rows(queries, settings, selections, view, masks)
+                        mask = by_nodes(category.text, None) if also is not None else None
+                    yield from _answer_rows(
+                        method, flat, smoothed, answer, category, queries, settings, masks
+                    )
                 if also is not None:
-                    yield from also.add("field", fields[row], None, category, queries, field_maps)
-            if nodes is not None and "tree" in settings.methods:
-                smoothed = SmoothedRelevancy.of(nodes[row], rule)
-                yield from _answer_rows(
-                    "tree", TREE_NODES, smoothed, partial(by_nodes, text), category, queries, settings, masks
-                )
-                yield from _scene_wide_rows(queries, settings, selections, view, masks)
-                if also is not None:
-                    mask = by_nodes(text, None)
-                    yield from also.add("tree", nodes[row], mask, category, queries, node_maps)
+                    yield from also.add(method, found[row], mask, category, queries, maps)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
     if also is not None:
@@ -210,13 +192,6 @@ def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
     return found
 
 
-def _best_row(method: str, query: Query, protocol: str, mixed: np.ndarray) -> Measured:
-    level = query.level
-    assert level is not None
-    value = best_threshold_iou(mixed[level.index], query.truth)
-    return Measured(method, query.text, level.label, "best_threshold_iou", protocol, value)
-
-
 def _answer_rows(
     method: str,
     flat: ProtocolCard,
@@ -230,13 +205,10 @@ def _answer_rows(
     """Yield the rows of one text by field or tree.
 
     Args:
-        method: "field" or "tree".
         flat: protocol of texts merged over levels.
-        smoothed: the text's relevancy.
         answer: level, or None if the method chooses it -> mask of the text.
         category: the text, merged over levels.
         queries: the text at each level.
-        settings: as in `measure_view`.
         masks: stores the answers.
     """
     united, given, auto = (label_of(card, method, settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO))
@@ -245,11 +217,13 @@ def _answer_rows(
     yield from mask_rows(method, category, united, auto_mask, auto_points)
     masks.put((method, auto, category.text), auto_mask)
     for query in queries:
+        assert query.level is not None
         given_mask = answer(query.level)
         given_points, _ = peak_points(smoothed.filtered, query.level)
         yield from mask_rows(method, query, given, given_mask, given_points)
         yield from mask_rows(method, query, auto, auto_mask, auto_points)
-        yield _best_row(method, query, given, smoothed.mixed)
+        best = best_threshold_iou(smoothed.mixed[query.level.index], query.truth)
+        yield Measured(method, query.text, query.level.label, "best_threshold_iou", given, best)
         masks.put(given_key(method, query, settings), given_mask)
 
 
@@ -300,26 +274,25 @@ def _path_rows(
 
 def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:
     """Yield the HC of every method and of the annotations; nothing for a view without parents."""
-    # (method, protocol) -> function that returns the rest of the key of a path's answer
-    rest_of: dict[tuple[str, str], Callable[[tuple[str, ...]], tuple]] = {
-        ("truth", label_of(ANNOTATIONS, "truth", settings)): lambda path: (path,)
+    cards = {
+        "truth": (ANNOTATIONS,),
+        "field": (LEVEL_AUTO, LEVEL_GIVEN),
+        "tree": (LEVEL_AUTO, LEVEL_GIVEN, SCENE_WIDE),
+        "tree-path": (PATH,),
     }
-    for method in ("field", "tree"):
-        if method in settings.methods:
-            rest_of[method, label_of(LEVEL_AUTO, method, settings)] = lambda path: path[-1:]
-            for card in (LEVEL_GIVEN, *([SCENE_WIDE] if method == "tree" else [])):
-                rest_of[method, label_of(card, method, settings)] = lambda path: (path[-1], Level(len(path)))
-    if "tree-path" in settings.methods:
-        rest_of["tree-path", label_of(PATH, "tree-path", settings)] = lambda path: (path,)
 
-    def mask_of(answer: tuple[str, str], path: tuple[str, ...]) -> np.ndarray:
-        if answer[0] == "truth":
+    def mask_of(method: str, card: ProtocolCard, protocol: str, path: tuple[str, ...]) -> np.ndarray:
+        if card is ANNOTATIONS:
             return truth.regions[path]
-        mask = masks.get((*answer, *rest_of[answer](path)))
-        return mask if answer[0] == "tree-path" else truth.own_part(path, mask)
+        if card is PATH:
+            return masks.get((method, protocol, path))
+        key = path[-1:] if card is LEVEL_AUTO else (path[-1], Level(len(path)))
+        return truth.own_part(path, masks.get((method, protocol, *key)))
 
-    for answer in rest_of:
-        yield from consistency_rows(*answer, truth, partial(mask_of, answer))
+    for method, of_method in cards.items():
+        for card in of_method if method in ("truth", *settings.methods) else ():
+            protocol = label_of(card, method, settings)
+            yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
 
 
 def consistency_rows(
@@ -328,9 +301,7 @@ def consistency_rows(
     """Yield the HC of one method in one view; nothing if the view has no parent.
 
     Args:
-        method: name of the method.
         protocol: full name, with deviating settings.
-        truth: the view's regions.
         mask_of: path of texts -> its answer.
     """
     transitions = truth.families()

@@ -9,7 +9,6 @@ from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH
 from hilsplat.evaluate.protocols.totals import level_averages_of_scenes, table_value
 from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, with_seeds
-from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Block, Cell, Table
 from hilsplat.evaluate.tables.sources import Sources
 
@@ -18,6 +17,9 @@ if TYPE_CHECKING:
 
 FLAT = ("lerf/langsplat@", "lerf/tree-nodes@")
 OVS = ("3d-ovs/langsplat@",)
+PAPER_DATA = "LERF, 3D-OVS, Hi-LERF"
+"""Data sets of the paper's ablations."""
+
 AGAINST = "against default field"
 COLUMNS = (
     "LERF localization",
@@ -49,7 +51,7 @@ def ablation_table(sources: Sources) -> Table:
         "Initial-2D: levels of the 2D masks by the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
         "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md says how each was read.",
     )
-    blocks = [reported(sources, "ablation"), *component_blocks(sources)]
+    blocks = [sources.reported(PAPER_DATA, "ablation", families=False), *component_blocks(sources)]
     return sources.finished("ablation", "Ablation", blocks, footnotes)
 
 
@@ -67,7 +69,10 @@ def theta_table(sources: Sources) -> Table:
         "from this tree (masks.levels: tree), so theta moves masks between levels. With levels by SAM's head "
         "it affects a field only through L_ins and L_part, and the linked semantic tree not at all.",
     )
-    blocks = [reported(sources, "coverage threshold"), *component_blocks(sources, ("field",))]
+    blocks = [
+        sources.reported(PAPER_DATA, "coverage threshold", families=False),
+        *component_blocks(sources, ("field",)),
+    ]
     return sources.finished("theta", "Influence of the coverage threshold theta", blocks, footnotes)
 
 
@@ -78,35 +83,27 @@ def omega_table(sources: Sources) -> Table:
         "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and "
         "lambda_2 = exp(-5): with 1e-6 and 1e-5 all rows are equal.",
     )
-    blocks = [reported(sources, "similarity degrees"), *component_blocks(sources, ("field",))]
+    blocks = [
+        sources.reported(PAPER_DATA, "similarity degrees", families=False),
+        *component_blocks(sources, ("field",)),
+    ]
     return sources.finished("omega", "Influence of the similarity degree Omega", blocks, footnotes)
-
-
-def reported(sources: Sources, what: str) -> Block:
-    """Return the rows that the paper reports for an ablation."""
-    return reported_block(
-        sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
-    )
 
 
 def component_blocks(
     sources: Sources, methods: tuple[str, ...] = ("field", "tree", "tree-path")
 ) -> list[Block]:
     """Return one row per variant and method, all protocols of the ablation side by side."""
-    if sources.scores.empty:
-        return []
     scores = with_seeds(sources.scores)
-
     blocks = measured_blocks(
-        sources.scores[sources.scores["method"].isin(methods)],
-        sources.labels,
+        replace(sources, scores=sources.scores[sources.scores["method"].isin(methods)]),
         (f"{LEVEL_GIVEN.name}@", f"{PATH.name}@"),
         lambda part: component_cells(scores, part),
         lambda _: COLUMNS,
         frozenset({"Avg, best threshold", AGAINST}),
         over_seeds=lambda part: {AGAINST: against_default(scores, part)},
     )
-    return [replace(block, columns=tuple(c for c in COLUMNS if filled(block, c))) for block in blocks]
+    return [replace(block, columns=tuple(block.filled_columns())) for block in blocks]
 
 
 def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
@@ -153,8 +150,3 @@ def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
         return Cell(f"{mean:+.1f}", mean)
     error = statistics.stdev(differences) / math.sqrt(len(differences))
     return Cell(f"{mean:+.1f} ± {error:.1f}", mean, spread=error)
-
-
-def filled(block: Block, column: str) -> bool:
-    """Return whether any row of a block has a value in a column."""
-    return any(row.cells.get(column, Cell()).text != "-" for row in block.rows)

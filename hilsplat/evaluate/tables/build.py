@@ -9,24 +9,18 @@ from pathlib import Path
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.files import project_path
-from hilsplat.evaluate.instance_files import read_instances
-from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.scores import read_instances, read_scores
 from hilsplat.evaluate.tables.ablation import ablation_table, component_table, omega_table, theta_table
 from hilsplat.evaluate.tables.cost_tables import SECONDS, cost_table, efficiency_table, pruning_table
 from hilsplat.evaluate.tables.costs import read_costs
-from hilsplat.evaluate.tables.frame_tables import hi_3dovs_frames, hi_lerf_frames
-from hilsplat.evaluate.tables.hierarchy import hierarchy_table
-from hilsplat.evaluate.tables.html_page import as_html
+from hilsplat.evaluate.tables.formats import as_csv, as_html, as_latex, as_markdown
+from hilsplat.evaluate.tables.hierarchy import frames_table, hierarchy_table
 from hilsplat.evaluate.tables.image_tables import lerf_table, ovs_table
-from hilsplat.evaluate.tables.latex import as_latex
 from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
-from hilsplat.evaluate.tables.reported import read_published
 from hilsplat.evaluate.tables.rows import Table
-from hilsplat.evaluate.tables.sources import Sources
-from hilsplat.evaluate.tables.text import as_csv, as_markdown
+from hilsplat.evaluate.tables.sources import Sources, read_published
 
 logger = logging.getLogger(__name__)
-
 
 LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
 """Data used for the ablations: the synthetic stand-in, and images with labels at levels."""
@@ -73,8 +67,12 @@ TABLES: dict[str, TableKind] = {
     "efficiency-seconds": TableKind(partial(efficiency_table, seconds=True), LEVELLED, shows_costs=True),
     "theta": TableKind(theta_table, LEVELLED, "theta_variants"),
     "omega": TableKind(omega_table, LEVELLED, "omega_variants"),
-    "frames-hi-lerf": TableKind(hi_lerf_frames, ("tabletop", "lerf_ovs")),
-    "frames-hi-3dovs": TableKind(hi_3dovs_frames, ("tabletop", "3d_ovs")),
+    "frames-hi-lerf": TableKind(
+        partial(frames_table, name="frames-hi-lerf", data="Hi-LERF"), ("tabletop", "lerf_ovs")
+    ),
+    "frames-hi-3dovs": TableKind(
+        partial(frames_table, name="frames-hi-3dovs", data="Hi-3DOVS"), ("tabletop", "3d_ovs")
+    ),
 }
 """Every table by name, in report order; a new table needs a function and an entry here."""
 
@@ -92,7 +90,7 @@ def run_table(
     out: Path,
     absent: Sequence[str] = (),
 ) -> None:
-    """Build one table and write it as CSV, Markdown, LaTeX and HTML.
+    """Build one table and write it as CSV, Markdown, LaTeX and HTML; equal tables give identical files.
 
     Args:
         name: a key of `TABLES`.
@@ -116,16 +114,10 @@ def run_table(
         read_instances(scores),
         absent,
     )
-    table = kind.build(sources)
-    write_table(table, out)
-    rows = sum(len(block.rows) for block in table.blocks)
-    logger.info("table %s: %d blocks, %d rows", name, len(table.blocks), rows)
-
-
-def write_table(table: Table, out: Path) -> None:
-    """Write all four formats; equal tables give identical files."""
-    out = Path(out)
+    table, out = kind.build(sources), Path(out)
     write_text(out.with_suffix(".md"), as_markdown(table))
     write_text(out.with_suffix(".tex"), as_latex(table))
     write_text(out.with_suffix(".html"), as_html(table))
     write_text(out, as_csv(table))
+    rows = sum(len(block.rows) for block in table.blocks)
+    logger.info("table %s: %d blocks, %d rows", name, len(table.blocks), rows)

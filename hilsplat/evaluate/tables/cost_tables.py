@@ -11,17 +11,15 @@ from typing import TYPE_CHECKING
 
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
-from hilsplat.evaluate.tables.ablation import component_cells
+from hilsplat.evaluate.tables.ablation import PAPER_DATA, component_cells
 from hilsplat.evaluate.tables.costs import Cost
 from hilsplat.evaluate.tables.measured import ANSWERS, kind_and_title, row_name, with_seeds
-from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
 from hilsplat.evaluate.tables.sources import Sources
 
 if TYPE_CHECKING:
     import pandas as pd
 
-LOWER = ("(min)", "(GB)", "(s)")
 SECONDS = "-seconds"
 """Suffix of the names of tables that are not reproducible byte for byte."""
 
@@ -44,7 +42,7 @@ def cost_table(sources: Sources, seconds: bool = False) -> Table:
         for variant, method, of_row in by_answer(sources, costs):
             cells = {
                 **time_cells(of_row),
-                **{f"{cost.scene} query (s)": Cell.number(cost.query_s[method], 2) for cost in of_row},
+                **{f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in of_row},
             }
             rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
         blocks.append(timed(data, rows, columns))
@@ -97,13 +95,15 @@ def without_costs(block: Block) -> Block:
     return replace(block, rows=tuple(rows), columns=columns)
 
 
-def reported(sources: Sources, what: str) -> Block:
+def reported(sources: Sources, title: str) -> Block:
     """Return the paper's rows, with the smallest times and memories ranked best."""
-    block = reported_block(
-        sources.published, "LERF, 3D-OVS, Hi-LERF", f"Reported in the paper: {what}", families=False
-    )
-    lower = frozenset(column for column in block.columns if column.endswith(LOWER))
-    return Block(block.kind, block.data, block.title, block.rows, block.columns, lower)
+    block = sources.reported(PAPER_DATA, title, families=False)
+    return replace(block, lower_is_better=costs_of(block.columns))
+
+
+def costs_of(columns: Iterable[str]) -> frozenset[str]:
+    """Return the columns of times and memory, in which the smallest value is best."""
+    return frozenset(column for column in columns if column.endswith(("(min)", "(GB)", "(s)")))
 
 
 def quality_blocks(
@@ -121,7 +121,7 @@ def quality_blocks(
             quality = component_cells(scores, part)
             cells = {name: quality[name] for name in ("Hi-LERF mIoU", "Hi-LERF HC")}
             query = statistics.fmean(cost.query_s[method] for cost in of_row)
-            cells |= {**time_cells(of_row), "Query (s)": Cell.number(query, 2)}
+            cells |= {**time_cells(of_row), "Query (s)": Cell.number(query)}
             rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
         blocks.append(timed(data, rows, ["Hi-LERF mIoU", "Hi-LERF HC", *time_columns]))
     return blocks
@@ -148,16 +148,15 @@ def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: s
 def time_cells(costs: list[Cost]) -> Mapping[str, Cell]:
     """Return mean times over scenes and the largest memory."""
     return {
-        "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60, 2),
-        "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60, 2),
-        "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024, 2),
+        "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
+        "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
+        "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
     }
 
 
 def timed(data: str, rows: list[Row], columns: list[str]) -> Block:
     """Return a block of measured times."""
-    lower = frozenset(column for column in columns if column.endswith(LOWER))
-    return Block(*kind_and_title(data), tuple(rows), tuple(columns), lower)
+    return Block(*kind_and_title(data), tuple(rows), tuple(columns), costs_of(columns))
 
 
 def by_dataset(costs: Iterable[Cost]) -> dict[str, list[Cost]]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 PREPARATION = ("masks", "coverage_tree", "clip")
 TRAINING = ("contributions", "semantic_tree", "autoencoder", "field")
+TIMES = "times.csv"
 TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
 
 
@@ -27,9 +28,6 @@ class Cost:
     """Cost of one scene under one variant; shared stages are counted in full.
 
     Attributes:
-        dataset: data set of the scene.
-        scene: scene name.
-        variant: named set of settings.
         prepare_s: wall-clock time of masks, trees of the views and CLIP, s; nan if a job has no record.
         train_s: wall-clock time of contributions, semantic tree, autoencoder and field, s; nan as above.
         peak_mib: largest resident memory of a training job, MiB; nan without a record.
@@ -45,11 +43,6 @@ class Cost:
     query_s: Mapping[str, float]
 
 
-def times_path(scores: Path) -> Path:
-    """Return the path of the seconds per query that belong to a score file."""
-    return Path(scores).with_name("times.csv")
-
-
 def time_queries(
     answers: "LanguageScene", asks: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
 ) -> dict[str, float]:
@@ -58,9 +51,7 @@ def time_queries(
     The view's weights and the text's vector are timed once and added, because later queries reuse them.
 
     Args:
-        answers: the scene.
         asks: per method, a function from a text to its mask in `view`, with weights and vectors cached.
-        view: view name.
         texts: texts whose vectors are cached; the result is the median over them.
     """
     start = time.perf_counter()
@@ -82,16 +73,7 @@ def time_queries(
 def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:
     """Write `times.csv` beside a score file."""
     rows = [[dataset, scene, variant, method, f"{value:.4f}"] for method, value in sorted(seconds.items())]
-    write_csv(times_path(scores), TIME_COLUMNS, rows)
-
-
-def read_times(scores: Path) -> list[dict[str, str]]:
-    """Read the rows of `times.csv`.
-
-    Raises:
-        ArtifactError: the file is missing or has different columns.
-    """
-    return read_csv(times_path(scores), TIME_COLUMNS, "run the evaluate stage again")
+    write_csv(Path(scores).with_name(TIMES), TIME_COLUMNS, rows)
 
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:
@@ -102,7 +84,7 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
     """
     found = []
     for path in scores:
-        rows = read_times(path)
+        rows = read_csv(Path(path).with_name(TIMES), TIME_COLUMNS, "run the evaluate stage again")
         if not rows:  # a scene without labels
             continue
         jobs = jobs_of(Path(path))

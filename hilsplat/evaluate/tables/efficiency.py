@@ -3,7 +3,6 @@
 Times differ from run to run, so this table is separate from those that must be reproducible.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +11,6 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import require_beginning
 from hilsplat.base.tables import write_csv
 from hilsplat.configuration import SECTIONS
-
-STAGE_ORDER = tuple(SECTIONS)
-"""Stages in the order of the settings, which is that of the data flow."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +37,9 @@ class Job:
 
 
 def run_efficiency(results: Path, out: Path) -> str:
-    """Collect every benchmark file below `results`; write a CSV of jobs and a Markdown table of stages.
+    """Collect every benchmark file below `results`; write a CSV of jobs.
 
-    Args:
-        results: the results folder.
-        out: the CSV; `.md` is written beside it.
-
-    Returns:
-        The Markdown table.
+    A Markdown table of stages is written beside it and returned.
 
     Raises:
         ArtifactError: there is no benchmark file, one is unreadable, or an output is an unrelated file.
@@ -92,23 +83,13 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
             raise ArtifactError(
                 f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
             ) from error
-        jobs.append(
-            Job(
-                path.stem,
-                dataset,
-                scene,
-                variant,
-                elapsed_s,
-                _number(record.get("cpu_time")),
-                _number(record.get("max_rss")),
-            )
-        )
+        cpu_s, peak_mib = _number(record.get("cpu_time")), _number(record.get("max_rss"))
+        jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, cpu_s, peak_mib))
     return jobs
 
 
-def stage_table(jobs: Iterable[Job]) -> str:
+def stage_table(jobs: list[Job]) -> str:
     """Return a Markdown table with number of jobs, times, CPU and peak memory per stage."""
-    jobs = list(jobs)
     of_stage: dict[str, list[Job]] = {}
     for job in jobs:
         of_stage.setdefault(job.stage, []).append(job)
@@ -137,8 +118,9 @@ def _line(name: str, jobs: list[Job]) -> str:
 
 
 def _order(stage: str) -> tuple[int, str]:
-    """Return the sort key of a stage: workflow order, then other stages by name."""
-    return (STAGE_ORDER.index(stage) if stage in STAGE_ORDER else len(STAGE_ORDER), stage)
+    """Return the sort key of a stage: in the order of the settings (the data flow), others after by name."""
+    stages = tuple(SECTIONS)
+    return (stages.index(stage) if stage in stages else len(stages), stage)
 
 
 def _number(value: object) -> float:

@@ -1,17 +1,18 @@
-"""Queries at three levels: Hi-LERF, Hi-3DOVS and their synthetic stand-ins."""
+"""Queries at three levels and the scored frames: Hi-LERF, Hi-3DOVS and their synthetic stand-ins."""
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, VIEW_CONSISTENCY
 from hilsplat.evaluate.protocols.totals import share_above, table_value
 from hilsplat.evaluate.tables.measured import (
+    kind_and_title,
     level_cells,
     measured_blocks,
     same_row,
     with_seeds,
 )
-from hilsplat.evaluate.tables.reported import reported_block
-from hilsplat.evaluate.tables.rows import Cell, Table
+from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
 from hilsplat.evaluate.tables.sources import Sources
 
 if TYPE_CHECKING:
@@ -34,15 +35,9 @@ COLUMNS = (
 
 def hierarchy_table(sources: Sources) -> Table:
     """Build the table of mIoU at three levels, hierarchical consistency and view consistency."""
-    blocks = []
-    for data in ("Hi-LERF", "Hi-3DOVS"):
-
-        def rename(column: str, data: str = data) -> str | None:
-            if not column.startswith(f"{data} "):
-                return None
-            return column.removeprefix(f"{data} ").replace("HC", "HC (reading not stated)")
-
-        blocks.append(reported_block(sources.published, data, f"Reported in the paper: {data}", rename))
+    blocks = [
+        sources.reported(data, rename=partial(column_of_data, data)) for data in ("Hi-LERF", "Hi-3DOVS")
+    ]
     scores = with_seeds(sources.scores)
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
@@ -57,12 +52,12 @@ def hierarchy_table(sources: Sources) -> Table:
             "Pairs": Cell(str(len(ious)), float(len(ious))) if len(ious) else Cell(),
         }
         if part["protocol"].iloc[0].startswith(LEVEL_GIVEN.full_name):
-            cells["View consistency"] = view_consistency(scores, part)
+            same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
+            cells["View consistency"] = level_cells(same, "view_consistency")["Avg"]
         return cells
 
     blocks += measured_blocks(
-        sources.scores,
-        sources.labels,
+        sources,
         ("hierarchy/",),
         cells_of,
         lambda _: COLUMNS,
@@ -87,7 +82,38 @@ def hierarchy_table(sources: Sources) -> Table:
     return sources.finished("hierarchy", "Queries at three levels", blocks, footnotes)
 
 
-def view_consistency(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """Return the view consistency of the same row's answers; a dash if it was not measured."""
-    same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
-    return level_cells(same, "view_consistency")["Avg"]
+def column_of_data(data: str, column: str) -> str | None:
+    """Return the name of a reported column in the block of a data set; None in the other block."""
+    if not column.startswith(f"{data} "):
+        return None
+    return column.removeprefix(f"{data} ").replace("HC", "HC (reading not stated)")
+
+
+def frames_table(sources: Sources, name: str, data: str) -> Table:
+    """Build a table of the paper's frames, and of the views queried at levels with their number of texts."""
+    blocks = [sources.reported(data, families=False)]
+    for dataset, views in asked_views(sources).items():
+        rows = [
+            Row(
+                {"Frame": str(number + 1)},
+                {scene: Cell(listed[number]) for scene, listed in views.items() if number < len(listed)},
+                None,
+            )
+            for number in range(max(map(len, views.values())))
+        ]
+        blocks.append(Block(*kind_and_title(dataset), tuple(rows), tuple(sorted(views))))
+    footnotes = ("Measured rows: views that were scored, with the number of texts asked at levels.",)
+    return sources.finished(name, f"{data}: frames", blocks, footnotes)
+
+
+def asked_views(sources: Sources) -> dict[str, dict[str, list[str]]]:
+    """Return the views queried at levels by data set and scene, each with its number of texts."""
+    asked: dict[tuple[str, str, str], set] = {}
+    for row in sources.scores.itertuples():
+        if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):
+            asked.setdefault((row.dataset, row.scene, row.view), set()).add((row.query, row.level))
+    found: dict[str, dict[str, list[str]]] = {}
+    for (dataset, scene, view), texts in sorted(asked.items()):
+        name = view.rpartition(".")[0] or view
+        found.setdefault(dataset, {}).setdefault(scene, []).append(f"{name} ({len(texts)} texts)")
+    return found

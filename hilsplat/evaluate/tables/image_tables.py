@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from hilsplat.evaluate.protocols.cards import LERF_MASK
 from hilsplat.evaluate.protocols.totals import table_value
 from hilsplat.evaluate.tables.measured import measured_blocks, scene_cells
-from hilsplat.evaluate.tables.reported import reported_block
 from hilsplat.evaluate.tables.rows import Cell, Table
 from hilsplat.evaluate.tables.sources import Sources
 
@@ -22,11 +21,10 @@ def lerf_table(sources: Sources) -> Table:
         segmentation = [f"{scene} {name}" for scene in scenes for name in ("mIoU", "mBIoU")]
         return segmentation + [f"{scene} localization" for scene in scenes]
 
-    blocks = [reported_block(sources.published, "LERF", "Reported in the paper: LERF")]
+    blocks = [sources.reported("LERF")]
     for prefix in ("lerf/", LERF_MASK.name):
         blocks += measured_blocks(
-            sources.scores,
-            sources.labels,
+            sources,
             (prefix,),
             lambda part: scene_cells(part, metrics),
             columns_of,
@@ -65,8 +63,8 @@ def ovs_table(sources: Sources) -> Table:
         overall, accuracy = (Cell.percent(table_value(part, name)) for name in ("iou", "pixel_accuracy"))
         return {**cells, "Overall mIoU": overall, "Overall accuracy": accuracy}
 
-    blocks = [reported_block(sources.published, "3D-OVS", "Reported in the paper: 3D-OVS")]
-    blocks += measured_blocks(sources.scores, sources.labels, ("3d-ovs/",), cells_of, columns_of)
+    blocks = [sources.reported("3D-OVS")]
+    blocks += measured_blocks(sources, ("3d-ovs/",), cells_of, columns_of)
     footnotes = (
         "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean of the scenes, on 3D-OVS of "
         f"the five that the paper has ({', '.join(OVS_SCENES)}).",

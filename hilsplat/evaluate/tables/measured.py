@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, SCENE_WIDE
 from hilsplat.evaluate.protocols.totals import level_values, mean_over_levels, scene_values, table_value
 from hilsplat.evaluate.tables.rows import Block, Cell, Row
+from hilsplat.evaluate.tables.sources import Sources
 from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
@@ -44,78 +45,66 @@ TRUE_MASKS = "diagnostic, true masks: "
 
 
 def measured_blocks(
-    scores: "pd.DataFrame",
-    labels: Mapping[str, str],
+    sources: Sources,
     protocols: tuple[str, ...],
     cells_of: Callable[["pd.DataFrame"], dict[str, Cell]],
     columns_of: Callable[["pd.DataFrame"], Sequence[str]],
     unranked: frozenset[str] = frozenset(),
     ranked_by_protocol: bool = True,
-    lower_is_better: frozenset[str] = frozenset(),
     over_seeds: Callable[["pd.DataFrame"], dict[str, Cell]] = lambda part: {},
+    label_of: Callable[[str], str] = lambda protocol: protocol,
 ) -> list[Block]:
     """Return one block per data set, with one row per variant, method, masks and protocol.
 
     Args:
-        scores: rows of `scores.csv`.
-        labels: variant -> its name in the table.
         protocols: prefixes of the protocols that have rows.
         cells_of: computes a row's values from the scores of one variant, method, masks, protocol and seed.
         columns_of: returns the value columns, from the scores of a data set.
-        unranked: columns without ranking.
         ranked_by_protocol: whether rows of different protocols are ranked separately.
-        lower_is_better: columns in which the smallest value is best.
         over_seeds: computes further values of a row from the scores of all its seeds.
+        label_of: maps protocols to labels; those with the same label share a row.
     """
-    if scores.empty:
+    if sources.scores.empty:
         return []
     blocks = []
-    scores = with_seeds(scores)
-    for data, of_data in scores.groupby("dataset", sort=True):
+    for data, of_data in with_seeds(sources.scores).groupby("dataset", sort=True):
         rows = []
         selected = of_data[of_data["protocol"].str.startswith(protocols)]
-        keys = ["variant", "masks", "method", "protocol"]
-        for (variant, masks, method, protocol), part in selected.groupby(keys, sort=True):
-            group = protocol if ranked_by_protocol else ""
-            place, row = placed_row(variant, masks, method, protocol, part, labels, cells_of, group)
+        selected = selected.assign(label=selected["protocol"].map(label_of))
+        for (*_, label), part in selected.groupby(["variant", "masks", "method", "label"], sort=True):
+            group = label if ranked_by_protocol else ""
+            place, row = placed_row(label, part, sources.labels, cells_of, group)
             rows.append((place, replace(row, cells={**row.cells, **over_seeds(part)})))
-        distinct = without_repeats(in_order(rows))
+        ordered = [row for _, row in sorted(rows, key=lambda placed: placed[0])]
+        distinct = without_repeats(ordered)
         if distinct:
             columns = tuple(columns_of(selected))
-            blocks.append(
-                Block(*kind_and_title(str(data)), distinct, columns, lower_is_better, unranked=unranked)
-            )
+            blocks.append(Block(*kind_and_title(str(data)), distinct, columns, unranked=unranked))
     return blocks
 
 
 def placed_row(
-    variant: str,
-    masks: str,
-    method: str,
-    protocol: str,
+    label: str,
     part: "pd.DataFrame",
     labels: Mapping[str, str],
     cells_of: Callable[["pd.DataFrame"], Mapping[str, Cell]],
     group: str,
 ) -> tuple[tuple, Row]:
-    """Return one row and its position among the rows of a block (`in_order`).
+    """Return one row and its position among the rows of a block.
 
     Args:
-        variant: named set of settings.
-        masks: origin of the masks.
-        method: name of the method.
-        protocol: full name of the protocol, or another label that distinguishes the row.
+        label: full name of the protocol, or another label that distinguishes the row.
         part: scores of the row under all its seeds.
-        labels: variant -> its name in the table.
         cells_of: computes the row's values from the scores of one seed.
         group: rows of a group are ranked together; annotations and true masks are not ranked.
     """
+    variant, masks, method = part.iloc[0][["variant", "masks", "method"]]
     is_diagnostic = method != "truth" and made_from_truth(masks)
     title = row_name(variant, method, labels)
     names = {
         "Method": TRUE_MASKS + title if is_diagnostic else title,
         "Masks": masks if method != "truth" else "-",
-        "Protocol": PROTOCOLS.get(protocol, protocol),
+        "Protocol": PROTOCOLS.get(label, label),
     }
     seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
     if method == "truth":
@@ -125,20 +114,15 @@ def placed_row(
     order = ["default", *labels]
     place = (
         made_from_truth(masks),
-        list(PROTOCOLS).index(protocol) if protocol in PROTOCOLS else -1,
+        list(PROTOCOLS).index(label) if label in PROTOCOLS else -1,
         order.index(variant) if variant in order else len(order),
         variant,
         list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
         masks,
-        protocol,
+        label,
     )
     ranked_with = None if method == "truth" or is_diagnostic else group
     return place, Row(names, mean_over_seeds(seeds), ranked_with)
-
-
-def in_order(rows: Sequence[tuple[tuple, Row]]) -> list[Row]:
-    """Return the rows sorted by position."""
-    return [row for _, row in sorted(rows, key=lambda placed: placed[0])]
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
@@ -197,12 +181,10 @@ def kind_and_title(dataset: str) -> tuple[str, str, str]:
 def scene_cells(
     part: "pd.DataFrame", metrics: Mapping[str, str], average: str = "Average"
 ) -> dict[str, Cell]:
-    """Return the columns `<scene> <name>` of every scene, and the mean over scenes.
+    """Return the columns `<scene> <name>` of every scene, and their mean as `<average> <name>`.
 
     Args:
-        part: scores of one row.
         metrics: name in the column -> metric.
-        average: prefix of the mean's column.
     """
     cells = {}
     for name, metric in metrics.items():
@@ -227,13 +209,11 @@ def same_row(
 
     Args:
         scores: scores with seeds (`with_seeds`).
-        part: scores of one row.
         protocols: prefixes of the protocols' names.
         dataset: data set of the scores; None for the row's own.
     """
     first = part.iloc[0]
-    keys = ("variant", "seed", "masks", "method")
     same = scores["protocol"].str.startswith(protocols) & (scores["dataset"] == (dataset or first["dataset"]))
-    for key in keys:
+    for key in ("variant", "seed", "masks", "method"):
         same &= scores[key] == first[key]
     return scores[same]

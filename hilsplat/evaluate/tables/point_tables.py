@@ -1,22 +1,18 @@
-"""Tables of labelled points: Replica, ScanNet with ScanNet200, Waymo."""
+"""Tables of labelled points, with bootstrap intervals over scenes and class names.
+
+A room has about twenty names, most entirely right or wrong: one node changes the mean by several points.
+"""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hilsplat.evaluate.protocols.cards import INSTANCES, card_named, card_of
-from hilsplat.evaluate.protocols.measured import Measured
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hilsplat.evaluate.protocols.cards import card_named, card_of
 from hilsplat.evaluate.protocols.totals import table_value
-from hilsplat.evaluate.tables.intervals import interval_cells
-from hilsplat.evaluate.tables.measured import (
-    in_order,
-    kind_and_title,
-    measured_blocks,
-    placed_row,
-    scene_cells,
-    with_seeds,
-)
-from hilsplat.evaluate.tables.reported import reported_block
-from hilsplat.evaluate.tables.rows import Block, Cell, Table
+from hilsplat.evaluate.tables.measured import measured_blocks, scene_cells
+from hilsplat.evaluate.tables.rows import Cell, Table
 from hilsplat.evaluate.tables.sources import Sources
 
 if TYPE_CHECKING:
@@ -38,6 +34,9 @@ AP_COLUMNS = {
     "ap50": "ScanNet200 AP@50",
     **{f"ap_{split}": f"ScanNet200 {split} AP" for split in ("head", "common", "tail")},
 }
+
+DRAWS = 1000
+PERCENTILES = (2.5, 97.5)
 
 MODE_NOTE = (
     "Points get their class from the Gaussians by the mode named after 'points:' (nearest: the nearest "
@@ -67,14 +66,8 @@ def replica_table(sources: Sources) -> Table:
         means = scene_cells(part, {"mIoU": "miou_present", "mAcc": "macc_present"}, "Mean")
         return {**means, **interval_cells(part, "Mean", pooled=False)}
 
-    blocks = [reported_block(sources.published, "Replica", "Reported in the paper: Replica")]
-    blocks += measured_blocks(
-        sources.scores,
-        sources.labels,
-        ("replica/per-scene",),
-        cells_of,
-        columns_of,
-    )
+    blocks = [sources.reported("Replica")]
+    blocks += measured_blocks(sources, ("replica/per-scene",), cells_of, columns_of)
     footnotes = (
         "All in %. Mean over the classes present in a scene, vertices of other classes ignored. The paper "
         "speaks of 48 classes and names no code: this is our reading.",
@@ -87,10 +80,7 @@ def replica_table(sources: Sources) -> Table:
 
 def scannet_table(sources: Sources) -> Table:
     """Build the ScanNet table: 19, 15, 10 and 200 classes and ScanNet200 instances, one row per method."""
-    blocks = [reported_block(sources.published, "ScanNet", "Reported in the paper: ScanNet, ScanNet200")]
-    scores = with_seeds(sources.scores)
-    names = (*SCANNET_COLUMNS, BENCHMARK)
-    selected = scores[scores["protocol"].str.startswith(names)] if len(scores) else scores
+    blocks = [sources.reported("ScanNet", "ScanNet, ScanNet200")]
     columns = [
         f"{name} {what}" for name in SCANNET_COLUMNS.values() for what in ("mIoU", "95 %", "names", "mAcc")
     ]
@@ -99,16 +89,13 @@ def scannet_table(sources: Sources) -> Table:
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         return {**semantic_cells(part), **split_cells(part), **instance_cells(sources, part)}
 
-    for data, of_data in selected.groupby("dataset", sort=True):
-        rows = []
-        for (variant, masks, method), part in of_data.groupby(["variant", "masks", "method"], sort=True):
-            modes = {label.partition("(")[2].rstrip(")") for label in part["protocol"]}
-            for mode in sorted(modes):
-                of_mode = part[part["protocol"].str.endswith(f"({mode})")]
-                rows.append(
-                    placed_row(variant, masks, method, mode, of_mode, sources.labels, cells_of, group=mode)
-                )
-        blocks.append(Block(*kind_and_title(str(data)), tuple(in_order(rows)), tuple(columns)))
+    blocks += measured_blocks(
+        sources,
+        (*SCANNET_COLUMNS, BENCHMARK),
+        cells_of,
+        lambda _: columns,
+        label_of=lambda protocol: protocol.partition("(")[2].rstrip(")"),  # how points got their class
+    )
     footnotes = (
         "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
         "present in a scene, then over scenes; vertices of other classes are ignored.",
@@ -143,7 +130,7 @@ def split_cells(part: "pd.DataFrame") -> dict[str, Cell]:
     from hilsplat.datasets.classes.scannet200 import SCANNET200
     from hilsplat.evaluate.protocols.points import pooled_points
 
-    means = pooled_points(card_named(BENCHMARK), measured_scenes(of_benchmark), SCANNET200)
+    means = pooled_points(card_named(BENCHMARK), rows_of_scenes(of_benchmark), SCANNET200)
     return {column: Cell.percent(means[metric]) for metric, column in SPLIT_COLUMNS.items()}
 
 
@@ -161,7 +148,7 @@ def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
         return {}
     from hilsplat.evaluate.protocols.points import measure_instances
 
-    rows = measure_instances(first["method"], scans, "nearest", INSTANCES)
+    rows = measure_instances(first["method"], scans, "nearest")
     return {AP_COLUMNS[row.metric]: Cell.percent(row.value) for row in rows}
 
 
@@ -172,7 +159,7 @@ def waymo_table(sources: Sources) -> Table:
         from hilsplat.datasets.classes.waymo import WAYMO_22
         from hilsplat.evaluate.protocols.points import pooled_points
 
-        means = pooled_points(card_of(part["protocol"].iloc[0]), measured_scenes(part), WAYMO_22)
+        means = pooled_points(card_of(part["protocol"].iloc[0]), rows_of_scenes(part), WAYMO_22)
         classes = part[part["metric"] == "class_iou"]["query"].nunique()
         return {
             "mIoU": Cell.percent(means["miou_absent_as_one"]),
@@ -181,18 +168,12 @@ def waymo_table(sources: Sources) -> Table:
             "Classes present": Cell(str(classes), float(classes)),
         }
 
-    blocks = [reported_block(sources.published, "Waymo", "Reported in the paper: Waymo")]
+    blocks = [sources.reported("Waymo")]
     blocks += measured_blocks(
-        sources.scores,
-        sources.labels,
+        sources,
         ("waymo/",),
         cells_of,
-        lambda _: (
-            "mIoU",
-            "mIoU, present classes",
-            "Present classes 95 %",
-            "Classes present",
-        ),
+        lambda _: ("mIoU", "mIoU, present classes", "Present classes 95 %", "Classes present"),
         unranked=frozenset({"Classes present"}),
     )
     footnotes = (
@@ -205,12 +186,69 @@ def waymo_table(sources: Sources) -> Table:
     return sources.finished("waymo", "Waymo: segmentation of lidar points", blocks, footnotes)
 
 
-def measured_scenes(part: "pd.DataFrame") -> list[list[Measured]]:
-    """Convert score rows to `Measured`, one list per scene."""
-    return [
-        [
-            Measured(row.method, row.query, row.level, row.metric, row.protocol, row.value, row.n)
-            for row in of_scene.itertuples()
-        ]
-        for _, of_scene in part.groupby("scene", sort=True)
-    ]
+def rows_of_scenes(part: "pd.DataFrame") -> list[list[Any]]:
+    """Return score rows as named tuples, one list per scene."""
+    return [list(of_scene.itertuples()) for _, of_scene in part.groupby("scene", sort=True)]
+
+
+def bootstrap_mean(
+    hits: Float[np.ndarray, "S K"],
+    union: Float[np.ndarray, "S K"],
+    present: Bool[np.ndarray, "S K"],
+    pooled: bool,
+) -> tuple[float, float]:
+    """Return the 95 % interval of a mean IoU when scenes, and names within them, are resampled.
+
+    Args:
+        hits: correctly predicted points of each class, per scene.
+        union: points of the class or predicted as it; 0 where it doesn't occur.
+        present: classes included in the mean.
+        pooled: whether counts of all scenes are summed first; otherwise scenes are averaged.
+    """
+    draws, found = np.random.default_rng(0), []
+
+    def mean_over_names(iou: np.ndarray) -> float:
+        return float(iou[draws.integers(len(iou), size=len(iou))].mean())
+
+    for _ in range(DRAWS):
+        scenes = draws.integers(len(hits), size=len(hits))
+        if pooled:
+            counts = present[scenes].any(axis=0)
+            found.append(
+                mean_over_names(hits[scenes].sum(axis=0)[counts] / union[scenes].sum(axis=0)[counts])
+            )
+        else:
+            each = [
+                mean_over_names(hits[s, present[s]] / union[s, present[s]])
+                for s in scenes
+                if present[s].any()
+            ]
+            found.append(float(np.mean(each)) if each else 0.0)
+    low, high = np.percentile(found, PERCENTILES)
+    return float(low), float(high)
+
+
+def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
+    """Return interval, scenes and names of one protocol, method and seed; nothing without class rows.
+
+    Args:
+        name: prefix of the columns.
+        pooled: as in `bootstrap_mean`.
+    """
+    ious = part[part["metric"] == "class_iou"]
+    true = part[part["metric"] == "class_accuracy"]
+    if ious.empty or true.empty:
+        return {}
+    values, points, present = (
+        frame.pivot(index="scene", columns="query", values=column).reindex(
+            index=sorted(set(ious["scene"])), columns=sorted(set(ious["query"]))
+        )
+        for frame, column in ((ious, "value"), (ious, "n"), (true, "n"))
+    )
+    union = points.fillna(0).to_numpy(float)
+    counts = present.fillna(0).to_numpy() > 0
+    low, high = bootstrap_mean(values.fillna(0).to_numpy() * union, union, counts, pooled)
+    return {
+        f"{name} 95 %": Cell(f"{100 * low:.0f} to {100 * high:.0f}"),
+        f"{name} names": Cell(f"{int(counts.sum())} in {len(counts)}"),
+    }

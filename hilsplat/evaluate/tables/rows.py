@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Cell:
         return Cell() if value != value else Cell(f"{100 * value:.1f}", 100 * value)
 
     @staticmethod
-    def number(value: float, digits: int = 1) -> "Cell":
-        """Format a number with the given decimals; nan as a dash."""
-        return Cell() if value != value else Cell(f"{value:.{digits}f}", value)
+    def number(value: float) -> "Cell":
+        """Format a number with two decimals; nan as a dash."""
+        return Cell() if value != value else Cell(f"{value:.2f}", value)
 
     @staticmethod
     def printed(text: str, note: str = "") -> "Cell":
@@ -45,6 +45,10 @@ class Row:
     names: Mapping[str, str]
     cells: Mapping[str, Cell]
     ranked_with: str | None = ""
+
+    def cell(self, column: str) -> Cell:
+        """Return the value of a column; a dash if the row has none."""
+        return self.cells.get(column, Cell())
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,14 @@ class Block:
     lower_is_better: frozenset[str] = frozenset()
     unranked: frozenset[str] = frozenset()
 
+    def names(self) -> list[str]:
+        """Return the name columns, in order of appearance."""
+        return list(dict.fromkeys(name for row in self.rows for name in row.names))
+
+    def filled_columns(self) -> list[str]:
+        """Return the value columns in which any row has a value."""
+        return [column for column in self.columns if any(row.cell(column).text != "-" for row in self.rows)]
+
     def ranks(self) -> dict[tuple[int, str], int]:
         """Map (row, column) to 1, 2 or 3 for the three best values within a ranking group.
 
@@ -80,7 +92,7 @@ class Block:
                 continue
             groups: dict[str, dict[int, float]] = {}
             for number, row in enumerate(self.rows):
-                cell = row.cells.get(column, Cell())
+                cell = row.cell(column)
                 if row.ranked_with is not None and cell.value is not None:
                     # Displayed values are compared, so that equal texts get equal marks.
                     shown = float(cell.text.partition(" ")[0])
@@ -102,7 +114,7 @@ class Table:
     name: str
     title: str
     blocks: tuple[Block, ...]
-    footnotes: tuple[str, ...] = field(default=())
+    footnotes: tuple[str, ...]
 
     def numbered_notes(self) -> dict[str, int]:
         """Return the cell notes, numbered in reading order."""
@@ -110,18 +122,7 @@ class Table:
         for block in self.blocks:
             for row in block.rows:
                 for column in block.columns:
-                    note = row.cells.get(column, Cell()).note
+                    note = row.cell(column).note
                     if note:
                         notes.setdefault(note, len(notes) + 1)
         return notes
-
-
-def shown_columns(block: Block) -> tuple[list[str], list[str]]:
-    """Return the name and value columns of a block; empty value columns are omitted."""
-    names = list(dict.fromkeys(name for row in block.rows for name in row.names))
-    values = [
-        column
-        for column in block.columns
-        if any(row.cells.get(column, Cell()).text != "-" for row in block.rows)
-    ]
-    return names, values

@@ -59,7 +59,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
     from hilsplat.field.language_field import LanguageField
     from hilsplat.field.network_code import Autoencoder
     from hilsplat.query.language_scene import LanguageScene
-    from hilsplat.semantic_tree.tree import SemanticTree
+    from tests.unit.evaluate.plain_tree import plain_tree
 
     class Uncoded(Autoencoder):
         """Latents are the CLIP vectors themselves."""
@@ -127,26 +127,17 @@ def block_world(tmp_path_factory) -> BlockWorld:
     colours = (image[middle[:, 0], middle[:, 1]] / 255 - 0.5) / 0.282
     plain = round_gaussians(means, log_scale=-4.0, opacity_logit=3.0)
     gaussians = replace(plain, sh=colours.astype(np.float32)[:, None])
-    tree = SemanticTree(
-        level=np.array([node[1] for node in NODES], np.uint8),
-        parent=np.array([node[2] for node in NODES], np.int32),
+    masks = np.arange(len(NODES), dtype=np.int32)
+    tree = plain_tree(
+        [node[1] for node in NODES],
+        [node[2] for node in NODES],
+        node_of_gaussian,
         clip=clip,
-        centroid=np.zeros((len(NODES), 3), np.float32),
-        box=np.zeros((len(NODES), 2, 3), np.float32),
-        oriented_box=np.zeros((len(NODES), 5, 3), np.float32),
-        quality=np.ones(len(NODES), np.float32),
-        views=np.ones(len(NODES), np.int32),
-        node_of_gaussian=node_of_gaussian.astype(np.int32),
-        membership=(node_of_gaussian >= 0).astype(np.float32),
-        node_of_mask=np.arange(len(NODES), dtype=np.int32),
-        linked_node=np.arange(len(NODES), dtype=np.int32),
+        node_of_mask=masks,
+        linked_node=masks,
         crop_score=np.ones(len(NODES), np.float32),
         crop_rank=np.zeros(len(NODES), np.int32),
         view_area_px=np.array([[region(row).sum()] for row in range(len(NODES))], np.float32),
-        view_names=("000.png",),
-        gaussians_sha256="0",
-        cameras_sha256="0",
-        min_weight=1 / 255,
     )
     answers = LanguageScene(
         scene,

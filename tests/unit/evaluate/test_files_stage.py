@@ -1,26 +1,27 @@
 """Predictions of any program, from files: the same numbers as the run that wrote them, and clear errors."""
 
+import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.asked import Asked
 from hilsplat.evaluate.files_stage import run_evaluate_files
-from hilsplat.evaluate.instance_files import read_instances
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import card_named
 from hilsplat.evaluate.protocols.points import measure_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import label_of, measure_view
-from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.scores import read_instances, read_scores
 from hilsplat.evaluate.tables.build import run_table
-from hilsplat.evaluate.tables.reported import PUBLISHED_COLUMNS
+from hilsplat.evaluate.tables.sources import PUBLISHED_COLUMNS
 from hilsplat.settings import EvaluateSettings
 
 VIEW = "001.png"
@@ -98,14 +99,6 @@ def test_files_of_our_own_run_score_what_the_run_scored(block_world, tmp_path, p
     assert "3d-ovs/argmax@3 (labelled pixels, wholes, masks of files)" in set(frame["protocol"])
 
 
-def test_a_text_without_a_mask_counts_zero_or_is_left_out(block_world, tmp_path):
-    write_answers(tmp_path / "theirs", block_world)
-    (tmp_path / "theirs" / "001" / "bear.png").unlink()
-    frame = score(block_world, tmp_path / "theirs", tmp_path / "scores.csv", kind="tabletop")
-    assert numbers(frame, "lerf/langsplat", {"iou"})["bear", "", "iou"] == 0
-    assert numbers(frame, "lerf/opengaussian", {"acc_25"})["bear", "", "acc_25"] == 0
-
-
 def test_the_rows_make_a_table(block_world, tmp_path):
     write_answers(tmp_path / "theirs", block_world)
     score(block_world, tmp_path / "theirs", tmp_path / "scores.csv")
@@ -139,30 +132,23 @@ def test_a_view_with_masks_in_two_places_is_refused(block_world, tmp_path):
     assert "view 001 has predictions twice" in refused(block_world, tmp_path, tmp_path)
 
 
-def test_a_mask_of_another_size_is_refused_with_its_view_and_text(block_world, tmp_path):
-    write_png(tmp_path / "001" / "whole" / "bear.png", np.full((32, 64), 255, np.uint8))
-    message = refused(block_world, tmp_path, tmp_path, MisalignedArtifactError)
-    assert "001.png: whole/bear: the mask has another size" in message
-    assert "64 x 64" in message
-    assert "32 x 64" in message
-
-
-def test_an_unknown_text_is_refused_with_the_nearest_name(block_world, tmp_path):
-    write_png(tmp_path / "001" / "baer.png", np.full((64, 64), 255, np.uint8))
-    message = refused(block_world, tmp_path, tmp_path, MisalignedArtifactError)
-    assert "the labels have no text 'baer'" in message
-    assert "rename it 'bear'" in message
-
-
-def test_a_text_at_another_level_is_refused(block_world, tmp_path):
-    write_png(tmp_path / "001" / "whole" / "nose.png", np.full((64, 64), 255, np.uint8))
-    message = refused(block_world, tmp_path, tmp_path, MisalignedArtifactError)
-    assert "the labels have no text 'nose' at level whole" in message
-
-
-def test_masks_of_zeros_and_ones_are_refused(block_world, tmp_path):
-    write_png(tmp_path / "001" / "bear.png", np.ones((64, 64), np.uint8))
-    assert "none is foreground" in refused(block_world, tmp_path, tmp_path)
+@pytest.mark.parametrize(
+    ("name", "mask", "message"),
+    [
+        (
+            "whole/bear",
+            np.full((32, 64), 255),
+            "001.png: whole/bear: the mask has another size than the labels\n"
+            "  expected  64 x 64 \\(height x width\\)\n  found     32 x 64",
+        ),
+        ("baer", np.full((64, 64), 255), "the labels have no text 'baer'\n(.|\n)*rename it 'bear'"),
+        ("whole/nose", np.full((64, 64), 255), "the labels have no text 'nose' at level whole"),
+        ("bear", np.ones((64, 64)), "none is foreground"),
+    ],
+)
+def test_masks_that_cannot_be_scored_are_refused(block_world, tmp_path, name, mask, message):
+    write_png(tmp_path / "001" / f"{name}.png", mask.astype(np.uint8))
+    assert re.search(message, refused(block_world, tmp_path, tmp_path, HilsplatError))
 
 
 def test_it_must_be_clear_what_to_score_against(tmp_path):
@@ -192,7 +178,7 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     label[:4], grey[:8] = True, True
     region = LabelledRegion("cup", (16, 16), lambda: label, path=("cup",), any_grey=lambda: grey)
     data_set(
-        LabelledScene("set", "s", {}, None, {"a.png": (region,)}, ("cup",)),
+        LabelledScene("set", "s", {}, None, {"a.png": (region,)}),
         ("3d-ovs/langsplat", "3d-ovs/langsplat-v2", "3d-ovs/argmax"),
     )
     write_png(tmp_path / "a" / "cup.png", grey.astype(np.uint8) * 255)
@@ -204,6 +190,29 @@ def test_labels_of_a_data_set_take_grey_where_the_protocol_does(data_set, tmp_pa
     # an eighth has rows 4 and 12: the label has neither, and row 4 is in the mask
     assert ious["3d-ovs/argmax@3 (masks of files)"] == 0
     assert set(frame["scene"]) == {"s"}
+
+
+def test_a_text_without_a_mask_counts_zero_or_is_left_out(data_set, tmp_path):
+    cup, mug = np.arange(16) < 4, np.arange(16) > 8
+    regions = [
+        LabelledRegion(text, (1, 16), partial(np.atleast_2d, row), path=(text,))
+        for text, row in (("cup", cup), ("mug", mug))
+    ]
+    cards = ("lerf-mask/gaussian-grouping", "lerf-mask/gaussian-grouping-skipping")
+    data_set(LabelledScene("set", "s", {}, None, {"a.png": tuple(regions)}), cards)
+    write_png(tmp_path / "a" / "cup.png", cup[None].astype(np.uint8) * 255)
+    run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", labels="set/s")
+    frame = read_scores([tmp_path / "scores.csv"])
+    ious = {(row.protocol, row.query): row.value for row in frame[frame["metric"] == "iou"].itertuples()}
+    zero, skipping, langsplat, opengaussian = (
+        f"{name} (masks of files)"
+        for name in (*(f"{card}@1" for card in cards), "lerf/langsplat@2", "lerf/opengaussian@1")
+    )
+    assert ious == {(skipping, "cup"): 1} | {
+        (name, text): value
+        for name in (zero, langsplat, opengaussian)
+        for text, value in (("cup", 1), ("mug", 0))
+    }
 
 
 def point_scene(num=400, seed=0):

@@ -8,6 +8,7 @@ from hilsplat.base.levels import Level
 from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_NODES, card_named
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
+from hilsplat.evaluate.protocols.rows import mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
 from hilsplat.query.relevancy import relevancy_of_margins
 
@@ -126,23 +127,23 @@ def test_parts_are_not_asked_on_a_stand_in():
     assert list(flat.finish()) == []
 
 
-def test_lerf_mask_takes_the_trees_own_answer_and_the_fields_mask():
+@pytest.mark.parametrize("card", [LERF_MASK, OVS_NODES])
+def test_a_tree_answers_with_its_own_nodes_and_a_field_with_its_mask_or_not_at_all(card):
     cup = query("cup", (0, 16))
-    flat = FlatProtocols([LERF_MASK], Level.WHOLE)
+    flat = FlatProtocols([card], Level.WHOLE)
     tree = list(flat.add("tree", maps((0, 16)), region((0, 8)), cup, [cup], NO_MORE))
     field = list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE))
     assert {row.metric: row.value for row in tree}["iou"] == 0.5
-    assert {row.metric: row.value for row in field}["iou"] > 0.9
-    assert {row.protocol for row in tree + field} == {"lerf-mask/gaussian-grouping@1 (wholes)"}
+    assert [row.value > 0.9 for row in field if row.metric == "iou"] == [True] * (card is LERF_MASK)
+    assert {row.protocol for row in tree + field} == {f"{card.full_name} (wholes)"}
 
 
-def test_nodes_of_a_tree_answer_3d_ovs_by_themselves():
-    cup = query("cup", (0, 16))
-    flat = FlatProtocols([OVS_NODES], Level.WHOLE)
-    tree = list(flat.add("tree", maps((0, 16)), region((0, 8)), cup, [cup], NO_MORE))
-    assert {row.metric: row.value for row in tree}["iou"] == 0.5
-    assert {row.protocol for row in tree} == {"3d-ovs/tree-nodes@1 (wholes)"}
-    assert not list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE))
+def test_rows_of_a_mask_have_the_metrics_of_the_protocol():
+    cup, metrics = query("cup", (0, 16)), ("iou", "acc_25", "acc_50")
+    rows = mask_rows("m", cup, "p", region((0, 8)), metrics=metrics)
+    assert [(row.level, row.metric, row.value) for row in rows] == [
+        ("whole", metric, value) for metric, value in zip(metrics, (0.5, 1, 0), strict=True)
+    ]
 
 
 def test_rules_of_3d_ovs_are_applied_to_the_maps_of_either_method():

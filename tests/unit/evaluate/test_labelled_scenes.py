@@ -34,8 +34,7 @@ def labelled(block_world, views=("001.png",), levels=True):
         )
         for node in annotations.nodes
     )
-    prompts = tuple(sorted(region.text for region in regions))
-    return LabelledScene("hi_lerf", "blocks", {}, None, dict.fromkeys(views, regions), prompts)
+    return LabelledScene("hi_lerf", "blocks", {}, None, dict.fromkeys(views, regions))
 
 
 @pytest.fixture
@@ -92,7 +91,7 @@ def test_labelled_views_without_pose_are_named(block_world, rows):
 
 def test_labels_of_another_shape_than_the_view_are_refused(rows):
     wide = region_of(np.ones((64, 80), bool), "bear")
-    scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)}, ("bear",))
+    scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)})
     with pytest.raises(SceneError, match=r"label of view 001.png does not fit"):
         rows(labels=scene)
 

@@ -8,11 +8,11 @@ from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.evaluate.asked import STAND_INS, Asked
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
-from hilsplat.evaluate.instance_files import read_instances, write_instances
 from hilsplat.evaluate.metrics.instances import average_precision
 from hilsplat.evaluate.protocols.cards import card_named
-from hilsplat.evaluate.protocols.measured import Measured
-from hilsplat.evaluate.protocols.scene_points import PointAnswers, measure_scene_points
+from hilsplat.evaluate.protocols.carry import carried_to
+from hilsplat.evaluate.protocols.scene_points import measure_scene_points, node_instances, point_classes
+from hilsplat.evaluate.scores import Measured, read_instances, write_instances
 from hilsplat.scene.cameras import Cameras
 
 CLASSES = ClassSet("blocks", "drawn", (7, 9), ("chest", "bear"))
@@ -30,21 +30,27 @@ def points_of(block_world, count=1):
 @pytest.mark.parametrize("mode", ["nearest", "vote", "density", "frozen"])
 def test_points_get_the_class_of_the_node_or_latent_of_their_gaussians(block_world, method, mode):
     points, ids = points_of(block_world)
-    answers = PointAnswers.at(block_world.answers, points.xyz, mode, scene_units_per_metre=0.01)
-    found = answers.classes(method, CLASSES.texts)
+    carried = carried_to(points.xyz, block_world.answers.gaussians, mode, radius=0.001)
+    found = point_classes(block_world.answers, carried, method, CLASSES.texts)
     labelled = ids > 0
     assert np.array_equal(found[labelled], CLASSES.labels(ids)[labelled])
     if mode in ("nearest", "frozen"):
         assert (found[~labelled] == 0).all()  # no node, no latent: no prediction
 
 
-def test_a_node_is_an_instance_of_its_best_class(block_world):
+def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, tmp_path):
     points, _ = points_of(block_world, count=2)  # both objects then have 100 points and more
-    answers = PointAnswers.at(block_world.answers, points.xyz, "nearest", 1.0)
-    matches = answers.instances(points, CLASSES)
+    carried = carried_to(points.xyz, block_world.answers.gaussians, "nearest", radius=0.1)
+    matches = node_instances(block_world.answers, carried, points, CLASSES)
     assert matches.has_truth.all()
     assert np.nanmean(average_precision([matches])) == 1.0
     assert matches.misses.sum() == 0
+    key = ("synthetic-rooms", "room-1", "default", "sam-tiny", "tree")
+    write_instances(tmp_path / "scores.csv", {key: matches})
+    found = read_instances([tmp_path / "scores.csv"])[key]
+    assert np.array_equal(average_precision([found]), average_precision([matches]), equal_nan=True)
+    write_instances(tmp_path / "scores.csv", {})
+    assert read_instances([tmp_path / "scores.csv"]) == {}
 
 
 def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_world, monkeypatch):
@@ -56,25 +62,11 @@ def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_worl
     moved = LabelledPoints(points.xyz / 2 - 1, points.class_id, points.instance_id, "drawn")
     transform = np.diag([2.0, 2, 2, 1])
     transform[:3, 3] = 2
-    rows = list(
-        measure_scene_points(
-            block_world.answers, {"drawn": moved}, transform, [card], ("tree", "field"), "nearest"
-        )
-    )
+    asked = ({"drawn": moved}, transform, [card], ("tree", "field"), "nearest")
+    rows = list(measure_scene_points(block_world.answers, *asked))
     assert all(isinstance(row, Measured) for row in rows)
     assert {row.protocol for row in rows} == {"drawn/points@1 (points: nearest)"}
     assert {row.method: row.value for row in rows if row.metric == "miou_present"} == {"tree": 1, "field": 1}
-
-
-def test_matches_are_read_back_as_they_were_written(block_world, tmp_path):
-    points, _ = points_of(block_world, count=2)
-    matches = PointAnswers.at(block_world.answers, points.xyz, "nearest", 1.0).instances(points, CLASSES)
-    key = ("synthetic-rooms", "room-1", "default", "sam-tiny", "tree")
-    write_instances(tmp_path / "scores.csv", {key: matches})
-    found = read_instances([tmp_path / "scores.csv"])[key]
-    assert np.array_equal(average_precision([found]), average_precision([matches]), equal_nan=True)
-    write_instances(tmp_path / "scores.csv", {})
-    assert read_instances([tmp_path / "scores.csv"]) == {}
 
 
 def turned(angle, axis_centres):

@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilsplat.base.levels import Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.evaluate.diagnostics import tree_truth
 from hilsplat.evaluate.diagnostics.tree_truth import measure_tree
 from hilsplat.query.names import NodeNames
 from hilsplat.query.tree_picture import CELL_PX, GAP_PX, LABEL_PX, tree_picture
-from hilsplat.semantic_tree.tree import SemanticTree
+from tests.unit.evaluate.plain_tree import plain_tree
 
 TRUTH = HierarchyAnnotations(
     Path(),
@@ -28,30 +30,8 @@ BEAR_HEAD, BEAR, CHEST_LID, CHEST = [1, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 1], [0
 VOTES = np.array([BEAR_HEAD] * 2 + [BEAR] * 2 + [CHEST_LID] * 2 + [CHEST] * 2, float)
 
 
-def tree_of(node_of_gaussian, level, parent) -> SemanticTree:
-    """A tree with only the measured parts set."""
-    num, nodes = len(level), np.array(node_of_gaussian, np.int32)
-    return SemanticTree(
-        level=np.array(level, np.uint8),
-        parent=np.array(parent, np.int32),
-        clip=np.ones((num, 2), np.float32),
-        centroid=np.zeros((num, 3), np.float32),
-        box=np.zeros((num, 2, 3), np.float32),
-        oriented_box=np.zeros((num, 5, 3), np.float32),
-        quality=np.full(num, 0.8, np.float32),
-        views=np.ones(num, np.int32),
-        node_of_gaussian=nodes,
-        membership=np.ones(nodes.shape, np.float32),
-        node_of_mask=np.zeros(0, np.int32),
-        linked_node=np.zeros(0, np.int32),
-        crop_score=np.zeros(0, np.float32),
-        crop_rank=np.zeros(0, np.int32),
-        view_area_px=np.ones((num, 1), np.float32),
-        view_names=("000.png",),
-        gaussians_sha256="",
-        cameras_sha256="",
-        min_weight=1 / 255,
-    )
+def tree_of(node_of_gaussian, level, parent):
+    return plain_tree(level, parent, node_of_gaussian, quality=np.full(len(level), 0.8, np.float32))
 
 
 PERFECT = [[0, 2, -1]] * 2 + [[0, -1, -1]] * 2 + [[1, 3, -1]] * 2 + [[1, -1, -1]] * 2
@@ -72,16 +52,7 @@ def test_the_true_tree_is_perfect():
 def test_faults_are_counted_one_by_one():
     # the chest falls into two nodes of 3 and 1; one Gaussian of the bear is in its larger one; the head
     # hangs under the chest
-    nodes = [
-        [0, 3, -1],
-        [0, 3, -1],
-        [0, -1, -1],
-        [1, -1, -1],
-        [1, -1, -1],
-        [1, -1, -1],
-        [1, -1, -1],
-        [2, -1, -1],
-    ]
+    nodes = [[0, 3, -1]] * 2 + [[0, -1, -1]] + [[1, -1, -1]] * 4 + [[2, -1, -1]]
     found = measure_tree(tree_of(nodes, [1, 1, 1, 2], [-1, -1, -1, 1]), VOTES, TRUTH)
     whole = found[Level.WHOLE]
     # bear: 3 of 4, IoU 3/4; chest: 3 shared of a union of 5
@@ -93,17 +64,28 @@ def test_faults_are_counted_one_by_one():
     assert (part.precision, part.recall, part.parent_accuracy) == (1, 0.5, 0)
 
 
-def test_the_picture_has_a_row_of_crops_per_level(block_world):
-    picture = tree_picture(block_world.answers)
-    assert picture.dtype == np.uint8
-    assert picture.shape[0] > 3 * CELL_PX
-    # the crops are there: more than the background and its lines
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 5
+def test_measures_are_written_as_a_table(tmp_path, monkeypatch):
+    loaded = {
+        "Scene": SimpleNamespace(name="s", views=lambda split: []),
+        "HierarchyAnnotations": TRUTH,
+        "SemanticTree": tree_of(PERFECT, [1, 1, 2, 2], [-1, -1, 0, 1]),
+    }
+    for name, value in loaded.items():
+        monkeypatch.setattr(tree_truth, name, SimpleNamespace(load=lambda _, value=value: value))
+    monkeypatch.setattr(tree_truth, "true_votes", lambda *_: VOTES)
+    text = tree_truth.run_tree_truth(Path(), Path(), Path(), Path(), tmp_path / "tree.csv", 1)
+    lines = (tmp_path / "tree.csv").read_text().splitlines()
+    assert lines[0] == ",".join(tree_truth.COLUMNS)
+    assert lines[1] == "s,whole,2,2,1.0000,1.0000,1.0000,1.0000,nan,0.8000"
+    assert "| s | part | 2 | 2 | 1.0000 |" in text
 
 
-def test_the_picture_has_the_names_of_nodes(block_world):
+def test_the_picture_has_a_row_of_crops_per_level_and_the_names_of_nodes(block_world):
     answers = block_world.answers
     without = tree_picture(answers)
+    assert without.shape[0] > 3 * CELL_PX
+    # the crops are there: more than the background and its lines
+    assert len(np.unique(without.reshape(-1, 3), axis=0)) > 5
     longer = "a name that is far too long for the width of one crop"
     named = tree_picture(replace(answers, names=NodeNames({0: longer})))
     changed = np.argwhere((named != without).any(axis=2))

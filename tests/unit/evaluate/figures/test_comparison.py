@@ -71,20 +71,23 @@ def test_equal_nodes_have_equal_colours_and_what_has_none_is_black(block_world):
     assert nothing.tolist() == [0, 0, 0]
 
 
-def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_path, monkeypatch):
+@pytest.fixture
+def compare(block_world, tmp_path, monkeypatch):
+    """Function that draws the figures of the block world into a folder."""
     monkeypatch.setattr(
         comparison, "open_variants", lambda _, variants, __: dict.fromkeys(variants, block_world.answers)
     )
+
+    def run(name, variants, names, **more):
+        out, settings = tmp_path / name / "comparison.png", FiguresSettings(queries_per_level=1)
+        run_comparison(block_world.folder, variants, names, out, settings, EVALUATE, **more)
+
+    return run
+
+
+def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_path, compare):
     for name in ("one", "two"):
-        run_comparison(
-            block_world.folder,
-            ["default", "paper"],
-            {"paper": "hilsplat (paper)"},
-            tmp_path / name / "comparison.png",
-            FiguresSettings(queries_per_level=1),
-            EVALUATE,
-            truth=block_world.folder / "truth",
-        )
+        compare(name, ["default", "paper"], {"paper": "hilsplat (paper)"}, truth=block_world.folder / "truth")
     for figure in ("comparison", "views", "features"):
         for suffix in (".png", ".pdf"):
             first, second = (tmp_path / name / f"{figure}{suffix}" for name in ("one", "two"))
@@ -94,23 +97,17 @@ def test_all_figures_are_written_as_png_and_pdf_twice_the_same(block_world, tmp_
             assert picture.width == 1430
 
 
-def test_scenes_without_labels_show_the_queries_of_the_configuration(block_world, tmp_path, monkeypatch):
+def test_scenes_without_labels_show_the_queries_of_the_configuration(compare, monkeypatch):
     drawn = []
-    monkeypatch.setattr(
-        comparison, "open_variants", lambda _, variants, __: dict.fromkeys(variants, block_world.answers)
-    )
     monkeypatch.setattr(comparison, "draw_methods", lambda methods, rows, _: drawn.append(rows) or None)
     monkeypatch.setattr(comparison, "save_png_and_pdf", lambda figure, out: None)
-    run_comparison(
-        block_world.folder, ["default"], {}, tmp_path / "c.png", FiguresSettings(), EVALUATE, queries=["bear"]
-    )
-    assert [row.text for row in drawn[0]] == ["bear"]
-    assert drawn[0][0].truth is None
+    compare("free", ["default"], {}, queries=["bear"])
+    assert [(row.text, row.truth) for row in drawn[0]] == [("bear", None)]
 
 
-def test_comparing_no_variants_is_refused(block_world, tmp_path):
+def test_comparing_no_variants_is_refused(compare):
     with pytest.raises(SettingsError, match="there are no variants to compare"):
-        run_comparison(block_world.folder, [], {}, tmp_path / "c.png", FiguresSettings(), EVALUATE)
+        compare("none", [], {})
 
 
 SWEEP = """kind,data,method,Hi-LERF mIoU,Hi-LERF HC,notes

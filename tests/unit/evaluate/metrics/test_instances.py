@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.evaluate.metrics.instances import (
     OVERLAPS,
-    InstanceScan,
     ap,
     ap25,
     ap50,
@@ -26,7 +25,7 @@ def scan_of(truth, predictions, classes=None):
     masks = np.zeros((len(predictions), len(points)), dtype=bool)
     for mask, (first, stop, _) in zip(masks, predictions, strict=True):
         mask[first:stop] = True
-    return InstanceScan(
+    return (
         points.astype(np.int64),
         masks,
         np.array(classes or [CLASS] * len(predictions), dtype=np.int64),
@@ -35,16 +34,11 @@ def scan_of(truth, predictions, classes=None):
 
 
 def precisions(*scans, class_ids=(CLASS,), min_points=1):
-    return average_precision([match_instances(scan, class_ids, min_points) for scan in scans])
+    return average_precision([match_instances(*scan, class_ids, min_points) for scan in scans])
 
 
 A, B, VOID = 4001, 4002, 0
 EXAMPLE = [(A, 4), (B, 3), (VOID, 3)]
-
-
-def test_thresholds_are_nine_and_a_quarter():
-    np.testing.assert_array_equal(OVERLAPS, np.append(np.arange(0.5, 0.95, 0.05), 0.25))
-    assert len(OVERLAPS) == 10
 
 
 def test_worked_example_of_ten_vertices():
@@ -64,11 +58,8 @@ def test_area_under_the_curves_of_the_worked_examples():
     assert curve_area(np.zeros(0), np.zeros(0, dtype=bool), 2) == 0
 
 
-def test_perfect_instances_score_one():
+def test_perfect_instances_score_one_missing_ones_zero_and_an_absent_class_nothing():
     assert precisions(scan_of(EXAMPLE, [(0, 4, 0.9), (4, 7, 0.8)])).tolist() == [[1.0] * 10]
-
-
-def test_missing_predictions_score_zero_and_an_absent_class_nothing():
     result = precisions(scan_of(EXAMPLE, []), class_ids=(CLASS, 9))
     assert result[0].tolist() == [0.0] * 10
     assert np.isnan(result[1]).all()
@@ -78,7 +69,7 @@ def test_missing_predictions_score_zero_and_an_absent_class_nothing():
 def test_second_match_of_an_instance_is_a_false_positive_of_the_lower_confidence():
     # both overlap A by more than 0.5: 3 of 4 and 4 of 4. The surer stays the match, whatever the order.
     for first, second in (((0, 3, 0.3), (0, 4, 0.9)), ((0, 4, 0.9), (0, 3, 0.3))):
-        matches = match_instances(scan_of([(A, 4), (VOID, 4)], [first, second]), (CLASS,), 1)
+        matches = match_instances(*scan_of([(A, 4), (VOID, 4)], [first, second]), (CLASS,), 1)
         at_half = matches.overlap_index == 0
         found = sorted(
             zip(matches.confidence[at_half].tolist(), matches.is_match[at_half].tolist(), strict=True)
@@ -89,7 +80,7 @@ def test_second_match_of_an_instance_is_a_false_positive_of_the_lower_confidence
 
 def test_only_a_first_match_uses_a_prediction_up():
     # one prediction over A and B overlaps each by 4 of 8 > 0.25: A takes it, B is missed
-    matches = match_instances(scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
+    matches = match_instances(*scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
     quarter = len(OVERLAPS) - 1
     assert matches.is_match[matches.overlap_index == quarter].tolist() == [True]
     assert matches.misses[0, quarter] == 1
@@ -97,7 +88,7 @@ def test_only_a_first_match_uses_a_prediction_up():
 
 def test_second_match_may_still_be_the_first_of_another_instance():
     # at 0.25: the second prediction spans A and B, is a false positive on A and the match of B
-    matches = match_instances(scan_of([(A, 4), (B, 4)], [(0, 4, 0.9), (0, 8, 0.8)]), (CLASS,), 1)
+    matches = match_instances(*scan_of([(A, 4), (B, 4)], [(0, 4, 0.9), (0, 8, 0.8)]), (CLASS,), 1)
     entries = matches.overlap_index == len(OVERLAPS) - 1
     found = sorted(zip(matches.confidence[entries].tolist(), matches.is_match[entries].tolist(), strict=True))
     assert found == [(0.8, False), (0.8, True), (0.9, True)]
@@ -113,13 +104,10 @@ def test_prediction_is_ignored_only_where_more_than_the_threshold_lies_in_void()
     assert ap50(precisions(scan_of(truth, [(0, 4, 0.9), (3, 7, 0.95)]))) == 1
 
 
-def test_small_instances_are_neither_matched_nor_missed():
+def test_small_instances_and_predictions_and_other_classes_do_not_count():
     # B has 3 points, fewer than 4. Its prediction lies in an instance left out: ignored.
     scan = scan_of(EXAMPLE, [(0, 4, 0.9), (4, 8, 0.8)])
     assert precisions(scan, min_points=4).tolist() == [[1.0] * 10]
-
-
-def test_small_predictions_and_other_classes_are_dropped():
     scan = scan_of(EXAMPLE, [(0, 3, 0.9), (0, 4, 0.8)], classes=[CLASS, 77])
     assert precisions(scan, min_points=4).tolist() == [[0.0] * 10]
 
@@ -141,9 +129,8 @@ def test_scans_share_one_curve():
 
 
 def test_masks_of_other_points_are_refused():
-    scan = InstanceScan(np.zeros(3, int), np.ones((1, 4), bool), np.array([CLASS]), np.ones(1))
     with pytest.raises(MisalignedArtifactError, match=r"expected  3 points\n  found     4"):
-        match_instances(scan, (CLASS,))
+        match_instances(np.zeros(3, int), np.ones((1, 4), bool), np.array([CLASS]), np.ones(1), (CLASS,))
 
 
 # --- a second implementation ----------------------------------------------------------------------

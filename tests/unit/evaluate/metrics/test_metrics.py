@@ -6,18 +6,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilsplat.base.levels import Level
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.metrics.hierarchy import Family, consistency_per_child, hierarchical_consistency
 from hilsplat.evaluate.metrics.localization import box_of, hits_a_box, hits_the_mask, peak_points
 from hilsplat.evaluate.metrics.masks import (
+    argmax_masks,
     best_threshold_iou,
     boundary,
     boundary_iou,
     boundary_width_px,
     exceeds,
     iou,
+    pixel_accuracy,
 )
-from hilsplat.evaluate.metrics.pixel_classes import argmax_masks, pixel_accuracy
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
@@ -37,55 +38,30 @@ def rectangle(rows, columns, size_hw=(10, 10)):
     return mask
 
 
-# --- relevancy ------------------------------------------------------------------------------------
-
-
-def test_relevancy_is_decided_by_the_nearest_canonical_phrase():
-    from hilsplat.query.relevancy import relevancy
-
-    def at_cosine(value):
-        return [value, (1 - value**2) ** 0.5]
-
-    embedding, text = np.array([[1.0, 0.0]]), np.array([at_cosine(0.30)])
-    canonical = np.array([at_cosine(value) for value in (0.25, 0.28, 0.20, 0.22)])
-    # 1 / (1 + exp(-10 (0.30 - 0.28)))
-    assert relevancy(embedding, text, canonical)[0, 0] == pytest.approx(0.549834, abs=1e-6)
-    assert relevancy(embedding, canonical[1:2], canonical)[0, 0] == 0.5
-
-
 # --- threshold and filter of LangSplat's LERF rule ------------------------------------------------
 
 RELEVANCY = np.array([[0.30, 0.50, 0.60], [0.44, 0.65, 0.70], [0.52, 0.57, 0.61]])
 
 
-def test_threshold_means_min_max_above_0_7():
-    # min-max: [[0, .5, .75], [.35, .875, 1], [.55, .675, .775]]
-    expected = np.array([[0, 0, 1], [0, 1, 1], [0, 0, 1]], dtype=bool)
-    np.testing.assert_array_equal(threshold_mask(RELEVANCY), expected)
-    truth = np.array([[0, 0, 0], [0, 1, 1], [0, 1, 1]], dtype=bool)
-    assert iou(expected, truth) == pytest.approx(3 / 5)
+@pytest.mark.parametrize(
+    ("values", "rule", "expected"),
+    [
+        # min-max: [[0, .5, .75], [.35, .875, 1], [.55, .675, .775]]
+        (RELEVANCY, (0.4, "normalised_pm1"), [[0, 0, 1], [0, 1, 1], [0, 0, 1]]),
+        (RELEVANCY, (0.4, "raw"), [[0, 1, 1], [1, 1, 1], [1, 1, 1]]),
+        (np.full((2, 2), 0.6), (0.4, "normalised_pm1"), [[0, 0], [0, 0]]),
+    ],
+)
+def test_threshold_means_min_max_above_0_7_or_the_raw_value(values, rule, expected):
+    np.testing.assert_array_equal(threshold_mask(values, *rule), np.array(expected, dtype=bool))
 
 
-def test_threshold_on_raw_relevancy():
-    # all values but 0.30 are above 0.4
-    np.testing.assert_array_equal(
-        threshold_mask(RELEVANCY, 0.4, "raw"), np.array([[0, 1, 1], [1, 1, 1], [1, 1, 1]], dtype=bool)
-    )
-
-
-def test_constant_map_has_an_empty_mask():
-    assert not threshold_mask(np.full((4, 4), 0.6)).any()
-
-
-def test_even_filter_is_anchored_right_of_its_middle():
+def test_even_filters_are_anchored_right_of_their_middle():
     impulse = np.zeros((6, 6))
     impulse[2, 3] = 1
     expected = np.zeros((6, 6))
     expected[2:4, 3:5] = 0.25
     np.testing.assert_allclose(mean_filter(impulse, 2), expected)
-
-
-def test_filter_of_30_averages_15_rows_above_and_14_below():
     impulse = np.zeros((80, 80))
     impulse[40, 40] = 900
     rows, columns = np.nonzero(mean_filter(impulse, 30) > 0.5)
@@ -93,10 +69,11 @@ def test_filter_of_30_averages_15_rows_above_and_14_below():
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (26, 55, 26, 55)
 
 
-def test_filter_reflects_at_the_border_without_repeating_the_edge():
+def test_filter_reflects_at_the_border_or_averages_what_is_inside():
     row = np.array([[1.0, 2.0, 4.0]])
-    # side 3 at column 0: values 2, 1, 2; the single row is its own reflection
+    # side 3 at column 0: values 2, 1, 2; the single row is its own reflection. Inside: values 1, 2
     np.testing.assert_allclose(mean_filter(row, 3), [[5 / 3, 7 / 3, 8 / 3]], rtol=1e-6)
+    np.testing.assert_allclose(mean_filter(row, 3, "inside"), [[1.5, 7 / 3, 3.0]], rtol=1e-6)
 
 
 def test_filter_scales_with_the_height_unless_it_is_set():
@@ -104,13 +81,6 @@ def test_filter_scales_with_the_height_unless_it_is_set():
     assert filter_side_px(0, 256) == 11  # 10.52
     assert filter_side_px(0, 10) == 1
     assert filter_side_px(20, 256) == 20
-
-
-def test_majority_filter_ignores_the_last_row_and_column():
-    smoothed = majority_smooth(rectangle((0, 4), (0, 4), (8, 8)))
-    expected = np.zeros((8, 8), dtype=bool)
-    expected[0, :4] = expected[1, :3] = expected[2, :2] = expected[3, 0] = True
-    np.testing.assert_array_equal(smoothed, expected)
 
 
 def test_majority_filter_equals_the_plain_loop_over_windows():
@@ -122,15 +92,6 @@ def test_majority_filter_equals_the_plain_loop_over_windows():
             window = mask[max(0, i - 3) : min(i + 4, height - 1), max(0, j - 3) : min(j + 4, width - 1)]
             expected[i, j] = window.sum() * 2 > window.size
     np.testing.assert_array_equal(majority_smooth(mask), expected)
-
-
-def test_level_of_an_automatic_mask_has_the_highest_mixed_value():
-    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
-    relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = 0.6, 0.9, 0.7
-    rule = RelevancyRule(filter_px=1, majority=False)
-    mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
-    assert level is Level.PART
-    assert np.argwhere(mask).tolist() == [[5, 5]]
 
 
 @pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
@@ -170,12 +131,6 @@ def test_rule_names_what_departs_from_langsplat():
     assert RelevancyRule().departures(RelevancyRule(filter_px=20)) == ("filter scaled",)
 
 
-def test_windows_inside_the_image_average_what_is_there():
-    row = np.array([[1.0, 2.0, 4.0]])
-    # side 3 at column 0: values 1, 2; LangSplat's reflection would see 2, 1, 2
-    np.testing.assert_allclose(mean_filter(row, 3, "inside"), [[1.5, 7 / 3, 3.0]], rtol=1e-6)
-
-
 def test_majority_inside_the_image_sees_the_last_row_and_column():
     mask = rectangle((4, 8), (4, 8), (8, 8))
     # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask
@@ -187,15 +142,15 @@ def test_majority_inside_the_image_sees_the_last_row_and_column():
     assert not majority_smooth(corner).any()
 
 
-def test_level_is_chosen_among_the_levels_of_the_rule():
+@pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
+def test_the_level_with_the_highest_value_is_chosen_among_those_of_the_rule(level_rule):
     relevancy = np.zeros((3, 8, 8), dtype=np.float32)
     relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = 0.6, 0.7, 0.9
-    two = (Level.WHOLE, Level.PART)
-    for level_rule in ("max", "mean_in_mask"):
-        rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=two)
+    for levels, chosen, place in ((LEVELS, Level.SUBPART, [1, 1]), (LEVELS[:2], Level.PART, [5, 5])):
+        rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=levels)
         mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
-        assert level is Level.PART
-        assert np.argwhere(mask).tolist() == [[5, 5]]
+        assert level is chosen
+        assert np.argwhere(mask).tolist() == [place]
 
 
 # --- masks ----------------------------------------------------------------------------------------
@@ -265,22 +220,12 @@ def test_argmax_protocol_of_3d_ovs_on_four_pixels():
     truth = np.array([[[1, 1, 0, 0]], [[0, 0, 1, 0]], [[0, 0, 0, 1]]], dtype=bool)  # classes 0, 0, 1, 2
     similarity = np.array([[[0.9, 0.1, 0.2, 0.2]], [[0.3, 0.5, 0.4, 0.2]], [[0.1, 0.4, 0.3, 0.3]]])
     prediction = argmax_masks(similarity)  # 0, 1, 1, 2
-    ious = [iou(prediction[row], truth[row]) for row in range(3)]
-    assert ious == [1 / 2, 1 / 2, 1]
-    assert np.mean(ious) == pytest.approx(0.666667, abs=1e-6)
+    assert [iou(prediction[row], truth[row]) for row in range(3)] == [1 / 2, 1 / 2, 1]
     assert pixel_accuracy(prediction, truth) == 0.75
-
-
-def test_equal_similarities_go_to_the_first_class_and_an_absent_class_has_no_iou():
-    prediction = argmax_masks(np.zeros((2, 1, 3)))
-    assert prediction[0].all()
-    assert not prediction[1].any()
-    assert iou(prediction[1], np.zeros((1, 3), dtype=bool)) == 0
-
-
-def test_pixel_with_two_true_classes_is_never_right():
-    truth = np.array([[[1, 1]], [[1, 0]]], dtype=bool)
-    assert pixel_accuracy(argmax_masks(np.array([[[1.0, 1.0]], [[0.0, 0.0]]])), truth) == 0.5
+    truth[1, 0, 0] = True  # a pixel with two true classes is never right
+    assert pixel_accuracy(prediction, truth) == 0.5
+    first, second = argmax_masks(np.zeros((2, 1, 3)))  # equal similarities go to the first class
+    assert first.all() and not second.any()
 
 
 # --- localization ---------------------------------------------------------------------------------
@@ -319,6 +264,10 @@ def test_consistency_of_the_worked_example():
     # wholes: literal (0.28 + 0.4) / 2, containment (0.75 + 1) / 2; parts: 4/20 and 1
     assert hierarchical_consistency(families(), "literal") == pytest.approx(0.27)
     assert hierarchical_consistency(families(), "containment") == pytest.approx(0.9375)
+    assert hierarchical_consistency(families(), "literal", pooled=True) == pytest.approx(0.293333, abs=1e-6)
+    assert hierarchical_consistency(families(), pooled=True) == pytest.approx(0.916667, abs=1e-6)
+    empty = np.zeros((10, 10), dtype=bool)  # an empty child scores 0
+    assert hierarchical_consistency(families(x=empty)) == pytest.approx(0.4375)
 
 
 def test_children_of_a_parent_share_its_weight_unless_counted_alone():
@@ -336,16 +285,6 @@ def test_perfect_nesting_in_a_view_without_subparts_scores_half():
     assert hierarchical_consistency(transitions) == consistency_per_child(transitions) == 0.5
 
 
-def test_pooled_consistency_weighs_parents_equally():
-    assert hierarchical_consistency(families(), "literal", pooled=True) == pytest.approx(0.293333, abs=1e-6)
-    assert hierarchical_consistency(families(), pooled=True) == pytest.approx(0.916667, abs=1e-6)
-
-
-def test_empty_child_scores_nothing():
-    empty = np.zeros((10, 10), dtype=bool)
-    assert hierarchical_consistency(families(x=empty)) == pytest.approx(0.4375)
-
-
 def test_whole_image_fools_all_readings_but_the_anchored_one():
     full = np.ones((10, 10), dtype=bool)
     fooled = families(full, full, full, full, full, full)
@@ -353,7 +292,3 @@ def test_whole_image_fools_all_readings_but_the_anchored_one():
     assert hierarchical_consistency(fooled, "literal") == 1
     # area of the true parents: A 50, B 25, a1 20 of 100 px
     assert hierarchical_consistency(fooled, "anchored") == pytest.approx((0.375 + 0.2) / 2)
-
-
-def test_transition_without_parents_contributes_nothing():
-    assert hierarchical_consistency([families()[0], []]) == pytest.approx(0.4375)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.evaluate.protocols.carry import argmax_labels, classify, density, frozen, nearest, vote
+from hilsplat.evaluate.protocols.carry import classify, density, frozen, nearest, vote
 
 MEANS = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
 OPAQUE = np.array([0.9, 0.5, 0.9])
@@ -111,13 +111,8 @@ def test_order_of_points_does_not_matter(points, random):
     np.testing.assert_array_equal(carried.labels(LABELS)[order], other.labels(LABELS))
 
 
-def test_argmax_takes_the_first_of_equal_scores_and_nothing_without_a_feature():
-    scores = np.array([[0.2, 0.9], [0.5, 0.5], [0.0, 0.0], [-0.3, -0.1]])
-    assert argmax_labels(scores).tolist() == [2, 1, 0, 2]
-
-
-def test_classes_follow_the_cosine_whatever_the_length():
+def test_classes_follow_the_cosine_whatever_the_length_and_the_first_wins_ties():
     texts = np.array([[1.0, 0], [0, 1]])
-    features = np.array([[0.1, 0.2], [30.0, 20.0], [0.0, 0.0]])
-    assert classify(features, texts).tolist() == [2, 1, 0]
+    features = np.array([[0.1, 0.2], [30.0, 20.0], [0.0, 0.0], [0.5, 0.5], [-0.3, -0.1]])
+    assert classify(features, texts).tolist() == [2, 1, 0, 1, 2]
     assert classify(np.zeros((0, 2)), texts).shape == (0,)

@@ -72,17 +72,6 @@ def test_masks_and_levels_are_those_of_the_released_rule(seed):
     assert level is expected_level
 
 
-def test_the_threshold_is_a_min_max_of_0_625_after_smoothing():
-    stripes = np.repeat(np.array([0.0, 0.64, 1.0], np.float32), 60)
-    maps = np.broadcast_to(stripes, (3, 60, 180)).copy()
-    mask, _ = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE)
-    # the middle of each stripe, which the filter leaves alone: 0, 0.64 and 1 of the range
-    assert mask[30, [30, 90, 150]].tolist() == [False, True, True]
-    maps[:, :, 60:120] = 0.61
-    mask, _ = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE)
-    assert mask[30, [30, 90, 150]].tolist() == [False, False, True]
-
-
 def test_an_empty_mask_wins_the_level():
     maps = np.full((3, 40, 40), 0.1, np.float32)
     maps[Level.WHOLE.index, :20] = 0.9
@@ -90,22 +79,6 @@ def test_an_empty_mask_wins_the_level():
     mask, level = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE)
     assert level is Level.PART
     assert not mask.any()
-
-
-def wall(tmp_path):
-    """Truth of a mask file whose upper half is 255 and whose third quarter is grey."""
-    grey = np.zeros((40, 40), np.uint8)
-    grey[:20], grey[20:30] = 255, 1
-    path = tmp_path / "wood wall.png"
-    write_png(path, grey)
-    region = LabelledRegion(
-        "wood wall",
-        grey.shape,
-        lambda: read_mask_file(path, FOREGROUND),
-        path=("wood wall",),
-        any_grey=lambda: read_mask_file(path, 1),
-    )
-    return ViewTruth.of_regions([region], grey.shape).categories[0]
 
 
 def halves(rows):
@@ -120,24 +93,28 @@ def ious(query: Query, maps, more):
     return {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
 
 
-def test_wood_wall_is_united_with_wood_table_and_any_grey_is_true(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "others", "score"), [("wood wall", ["wood table"], 1), ("rabbit", [], 2 / 3)]
+)
+def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path, text, others, score):
+    grey = np.zeros((40, 40), np.uint8)  # the upper half of the label is 255 and its third quarter grey
+    grey[:20], grey[20:30] = 255, 1
+    path = tmp_path / "label.png"
+    write_png(path, grey)
+    region = LabelledRegion(
+        text,
+        grey.shape,
+        lambda: read_mask_file(path, FOREGROUND),
+        path=(text,),
+        any_grey=lambda: read_mask_file(path, 1),
+    )
+    (query,) = ViewTruth.of_regions([region], grey.shape).categories
     asked = []
 
     def more(texts, *_):
         asked.extend(texts)
         return halves((20, 30))[None]
 
-    found = ious(wall(tmp_path), halves((0, 20)), more)
-    assert asked == ["wood table"]
-    assert found == {"3d-ovs/langsplat-v2": 1.0, "3d-ovs/langsplat": 1.0}
-
-
-def test_other_texts_are_answered_alone(tmp_path):
-    mask = np.zeros((40, 40), bool)
-    mask[:20] = True
-    rabbit = ViewTruth.flat({"rabbit": mask}).categories[0]
-
-    def more(texts, *_):
-        raise AssertionError(texts)
-
-    assert ious(rabbit, halves((0, 20)), more)["3d-ovs/langsplat-v2"] == 1.0
+    found = ious(query, halves((0, 20)), more)
+    assert asked == others
+    assert found == {"3d-ovs/langsplat-v2": pytest.approx(score), "3d-ovs/langsplat": 1.0}

@@ -1,7 +1,5 @@
 """Rows of points, pooled and per scene, and how predictions of Gaussians reach points."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
@@ -10,9 +8,8 @@ from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES, splits_of
 from hilsplat.datasets.classes.waymo import WAYMO_22
-from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
+from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.protocols.cards import PROTOCOLS
-from hilsplat.evaluate.protocols.measured import Measured
 from hilsplat.evaluate.protocols.points import measure_instances, measure_points, pooled_points
 from hilsplat.evaluate.scores import Score, read_scores, write_scores
 
@@ -42,20 +39,12 @@ def test_rows_of_the_worked_example():
     }
 
 
-def test_scene_without_predictions_counts_zero():
-    rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, None, SCANNET_19, "frozen"))
+def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
+    nothing = np.zeros(10, dtype=int)
+    rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, nothing, SCANNET_19, "frozen"))
     assert {row.value for row in rows} == {0.0}
     assert {row.query for row in rows} == {"", "wall", "floor", "cabinet"}
-
-
-def test_scene_without_truth_has_no_rows():
-    nothing = np.zeros(10, dtype=int)
     assert list(measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, SCANNET_19, "frozen")) == []
-
-
-def test_pooled_protocols_have_no_number_per_scene():
-    rows = list(measure_points(WAYMO, "tree", TRUTH, PREDICTION, WAYMO_22, "nearest"))
-    assert all(row.query for row in rows)
 
 
 def scored(rows):
@@ -69,16 +58,13 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
     rng = np.random.default_rng(0)
     scenes = [(rng.integers(0, 6, 997), rng.integers(0, 6, 997)) for _ in range(3)]
     rows = [list(measure_points(WAYMO, "tree", *scene, WAYMO_22, "nearest")) for scene in scenes]
+    assert all(row.query for each in rows for row in each)  # no number per scene
     together = np.concatenate(scenes, axis=1)
-    (expected,) = [
-        pooled_points(WAYMO, [list(measure_points(WAYMO, "t", *together, WAYMO_22, "x"))], WAYMO_22)
-    ]
+    expected = pooled_points(WAYMO, [measure_points(WAYMO, "t", *together, WAYMO_22, "x")], WAYMO_22)
     assert pooled_points(WAYMO, rows, WAYMO_22) == expected
     for number, each in enumerate(rows):
         write_scores(tmp_path / f"{number}.csv", scored(each))
-    names = [field.name for field in fields(Measured)]
-    frames = [read_scores([tmp_path / f"{number}.csv"])[names] for number in range(3)]
-    read = [[Measured(**row) for row in frame.to_dict("records")] for frame in frames]
+    read = [read_scores([tmp_path / f"{number}.csv"]).itertuples() for number in range(3)]
     assert pooled_points(WAYMO, read, WAYMO_22) == expected
     # five of 22 classes occur; the other 17 count 1 under Waymo's own mean
     assert expected["miou_absent_as_one"] == pytest.approx((5 * expected["miou_present"] + 17) / 22)
@@ -114,24 +100,16 @@ def test_class_sets_turn_file_labels_into_rows():
 def test_instance_rows_are_of_all_scans_together():
     truth = np.repeat([4001, 0], 4)
     mask = np.repeat([[True, False]], 4, axis=1)
-    found = InstanceScan(truth, mask, np.array([4]), np.ones(1))
-    missed = InstanceScan(truth, mask[:0], np.zeros(0, int), np.zeros(0))
-    scans = {
-        name: match_instances(scan, SCANNET200_INSTANCES.ids, 1)
-        for name, scan in (("a", found), ("b", missed))
-    }
+    found = (truth, mask, np.array([4]), np.ones(1))
+    missed = (truth, mask[:0], np.zeros(0, int), np.zeros(0))
+    ids = SCANNET200_INSTANCES.ids
+    scans = {"a": match_instances(*found, ids, 1), "b": match_instances(*missed, ids, 1)}
     rows = list(measure_instances("tree", scans, "nearest"))
     assert {row.n for row in rows} == {2}
     values = {row.metric: row.value for row in rows}
-    half, none = pytest.approx(0.5), pytest.approx(np.nan, nan_ok=True)  # 4 is a class of the head
-    assert values == {
-        "ap": half,
-        "ap50": half,
-        "ap25": half,
-        "ap_head": half,
-        "ap_common": none,
-        "ap_tail": none,
-    }
+    none = pytest.approx(np.nan, nan_ok=True)  # 4 is a class of the head
+    half = dict.fromkeys(("ap", "ap50", "ap25", "ap_head"), pytest.approx(0.5))
+    assert values == {**half, "ap_common": none, "ap_tail": none}
     assert rows[0].protocol == "scannet200/instances@1 (points: nearest)"
-    nothing = {"a": match_instances(found, SCANNET200_INSTANCES.ids[5:], 1)}
+    nothing = {"a": match_instances(*found, ids[5:], 1)}
     assert list(measure_instances("tree", nothing, "nearest")) == []

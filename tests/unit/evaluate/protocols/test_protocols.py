@@ -13,9 +13,10 @@ from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
-from hilsplat.evaluate.scores import COLUMNS, Score, read_scores, write_scores
-from hilsplat.segment.origin import masks_label
+from hilsplat.evaluate.scores import COLUMNS, read_scores, write_scores
 from hilsplat.settings import EvaluateSettings
+from tests.unit.evaluate.tables.test_tables import score
+from tests.unit.evaluate.test_labelled_scenes import region_of
 
 SIZE = (10, 10)
 
@@ -140,9 +141,10 @@ def test_consistency_rows_match_the_worked_example(tmp_path):
 def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
     scene, truth = worked_example(tmp_path, without=("x",))
     values = measured(scene, truth, methods=("tree",))
-    assert values["tree", "hierarchy/level-given@5", "x", "subpart", "iou"] == 0
-    assert values["tree", "hierarchy/level-given@5", "A", "whole", "iou"] == 1
-    assert values["tree", "hierarchy/level-given@5", "", "", "hc_containment"] == pytest.approx(0.4375)
+    given = ("tree", "hierarchy/level-given@5")
+    assert values[*given, "x", "subpart", "iou"] == 0
+    assert values[*given, "A", "whole", "iou"] == 1
+    assert values[*given, "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
 def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
@@ -170,6 +172,7 @@ def test_regions_with_the_same_text_are_united(tmp_path):
     scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
     assert values["tree", "hierarchy/level-given@5", "cup", "whole", "iou"] == pytest.approx(0.5)
+    assert not [key for key in values if key[4].startswith("hc_")]  # a view without parents
 
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
@@ -193,13 +196,6 @@ def test_small_regions_are_not_scored(tmp_path):
         [(("A",), [("A", "a1")]), (("B",), [("B", "b1")])],
         [],
     ]
-
-
-def test_view_without_parents_gives_no_consistency_row(tmp_path):
-    annotations = annotations_of(tmp_path, NODES[:2], REGIONS[:2])
-    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
-    values = measured(HandMade([], {}), truth, methods=("tree",))
-    assert not [key for key in values if key[4].startswith("hc_")]
 
 
 def test_labels_of_another_size_are_refused(tmp_path):
@@ -234,7 +230,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[0, 2:6, 2:6] = 0.8
     relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
-    truth = ViewTruth.flat({"cup": mask_of((2, 6), (2, 6))})
+    truth = ViewTruth.of_regions([region_of(mask_of((2, 6), (2, 6)), "cup")], SIZE)
     scene = HandMade([], {}, {"cup": relevancy})
     cards = [PROTOCOLS["3d-ovs/langsplat@2"], PROTOCOLS["3d-ovs/langsplat-raw@2"]]
     rows = list(
@@ -261,7 +257,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
 def test_a_relevancy_that_is_not_a_number_is_an_error():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[1, 2, 3] = np.nan
-    truth = ViewTruth.flat({"cup": mask_of((2, 6), (2, 6))})
+    truth = ViewTruth.of_regions([region_of(mask_of((2, 6), (2, 6)), "cup")], SIZE)
     with pytest.raises(ArtifactError, match=r"relevancy of view v\.png is not a number at 1 pixels"):
         measured(HandMade([], {}, {"cup": relevancy}), truth, methods=("field",))
 
@@ -312,26 +308,12 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     assert field["bear"] > 0.9  # exact features; the filter rounds the corners
 
 
-def score(**changes):
-    fields = {
-        "dataset": "synthetic",
-        "scene": "s",
-        "variant": "default",
-        "masks": "sam-tiny",
-        "method": "tree",
-        "view": "v.png",
-        "query": "cup",
-        "level": "whole",
-        "metric": "iou",
-        "protocol": "hierarchy/level-given@5",
-        "value": 0.5,
-        "n": 1,
-    }
-    return Score(**{**fields, **changes})
-
-
 def test_score_files_are_sorted_and_stable(tmp_path):
-    rows = [score(query="b", value=1 / 3), score(query="a, or b"), score(query="a", metric="boundary_iou")]
+    rows = [
+        score("iou", 1 / 3, query="b"),
+        score("iou", 0.5, query="a, or b"),
+        score("boundary_iou", 0.5, query="a"),
+    ]
     write_scores(tmp_path / "one.csv", rows)
     write_scores(tmp_path / "two.csv", rows[::-1])
     text = (tmp_path / "one.csv").read_bytes()
@@ -342,20 +324,7 @@ def test_score_files_are_sorted_and_stable(tmp_path):
     assert frame["value"].tolist() == [0.5, 0.5, 0.333333]
 
 
-def test_header_only_score_file_reads_as_no_rows(tmp_path):
-    write_scores(tmp_path / "scores.csv", [])
-    assert len(read_scores([tmp_path / "scores.csv"])) == 0
-
-
 def test_other_columns_are_refused_by_name(tmp_path):
     (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ArtifactError, match=r"found     a, b"):
         read_scores([tmp_path / "scores.csv"])
-
-
-def test_masks_are_named_after_the_model_or_the_segmenter(block_world, tmp_path):
-    from hilsplat.base.artifacts import write_index
-
-    assert masks_label(block_world.folder / "masks") == "sam-tiny"
-    write_index(tmp_path, {}, segmenter="graph", model=None)
-    assert masks_label(tmp_path) == "graph"

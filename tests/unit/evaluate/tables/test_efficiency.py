@@ -14,16 +14,8 @@ def write(folder, stage, text):
 
 def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):
     results = tmp_path / "results"
-    write(
-        results / "synthetic" / "one" / "default",
-        "field",
-        '{"s": 2.5, "cpu_time": 2.0, "max_rss": 400.0}\n',
-    )
-    write(
-        results / "synthetic" / "two" / "default",
-        "field",
-        '{"s": 1.5, "cpu_time": 1.0, "max_rss": 600.0}\n',
-    )
+    write(results / "synthetic/one/default", "field", '{"s": 2.5, "cpu_time": 2.0, "max_rss": 400.0}\n')
+    write(results / "synthetic/two/default", "field", '{"s": 1.5, "cpu_time": 1.0, "max_rss": 600.0}\n')
     write(results / "synthetic" / "one", "poses", '{"s": 10.0, "cpu_time": "-", "max_rss": null}\n')
     write(results, "table-lerf", '{"s": 1.0, "cpu_time": 0.5, "max_rss": 90.0}\n')
     text = run_efficiency(results, tmp_path / "efficiency.csv")
@@ -39,12 +31,9 @@ def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):
     assert (tmp_path / "efficiency.md").read_text() == text
 
 
-def test_no_benchmarks_says_to_run_first(tmp_path):
+def test_missing_and_damaged_benchmarks_are_named(tmp_path):
     with pytest.raises(ArtifactError, match="run the workflow first"):
         run_efficiency(tmp_path, tmp_path / "x.csv")
-
-
-def test_damaged_benchmark_is_named(tmp_path):
     write(tmp_path, "masks", "no json\n")
     with pytest.raises(ArtifactError, match=r"masks\.jsonl is not a valid benchmark file"):
         run_efficiency(tmp_path, tmp_path / "x.csv")

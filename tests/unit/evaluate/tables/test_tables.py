@@ -7,13 +7,11 @@ import sys
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.scores import Score, read_scores, write_scores
+from hilsplat.evaluate.scores import Score, write_scores
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
-from hilsplat.evaluate.tables.latex import as_latex, latex_text
-from hilsplat.evaluate.tables.reported import read_published
+from hilsplat.evaluate.tables.formats import latex_text
 from hilsplat.evaluate.tables.rows import Block, Cell, Row
-from hilsplat.evaluate.tables.sources import Sources
-from hilsplat.evaluate.tables.text import as_markdown
+from hilsplat.evaluate.tables.sources import read_published
 from tests.conftest import PROJECT
 
 PUBLISHED = PROJECT / "config" / "published"
@@ -92,18 +90,8 @@ def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
     assert row["Acc@0.25"] == "75.00"
     assert row["Pairs"] == "7"
     assert (row["kind"], row["data"], row["masks"]) == ("synthetic stand-in", "synthetic", "sam-tiny")
-
-
-def test_levels_without_pairs_stay_out_of_the_average(tmp_path):
-    rows, _ = built(tmp_path, "hierarchy")
-    row = measured(rows, method="hilsplat (field)")
+    row = measured(rows, method="hilsplat (field)")  # levels without pairs stay out of the average
     assert (row["L1"], row["L2"], row["L3"], row["Avg"]) == ("40.00", "", "", "40.00")
-
-
-def test_annotations_row_is_shown_once_and_not_ranked(tmp_path):
-    rows, forms = built(tmp_path, "hierarchy")
-    assert measured(rows, method="annotations")["HC containment"] == "100.00"
-    assert "| annotations | - | reference | - | - | - | - | - | 100.0 | - |" in forms[".md"]
 
 
 def test_kinds_are_never_mixed_in_a_block(tmp_path):
@@ -169,11 +157,6 @@ def test_tables_are_the_same_bytes_whatever_the_order_of_rows(tmp_path):
             assert first.read_bytes() == second.read_bytes()
 
 
-def test_scenes_without_labels_leave_the_reported_rows(tmp_path):
-    rows, _ = built(tmp_path, "hierarchy", scores=[])
-    assert {row["kind"] for row in rows} == {"reported"}
-
-
 def block(*values, **more):
     rows = tuple(Row({"Method": str(number)}, {"x": cell}) for number, cell in enumerate(values))
     return Block("reported", "d", "t", rows, ("x",), **more)
@@ -184,17 +167,10 @@ def test_best_three_share_ranks_when_equal():
     assert block(*cells).ranks() == {(1, "x"): 1, (2, "x"): 1, (3, "x"): 2, (0, "x"): 3}
     lower = block(*cells, lower_is_better=frozenset({"x"})).ranks()
     assert lower == {(6, "x"): 1, (0, "x"): 2, (3, "x"): 3}
+    assert block(Cell.printed("10.0")).ranks() == {}  # a single row is not ranked
 
 
-def test_a_single_row_is_not_ranked():
-    assert block(Cell.printed("10.0")).ranks() == {}
-
-
-def test_latex_escapes_what_would_be_a_command():
-    assert latex_text("50 % of a_b & c > d") == r"50 \% of a\_b \& c \textgreater{} d"
-
-
-def test_latex_and_html_hold_every_reported_value(tmp_path):
+def test_latex_and_html_hold_every_reported_value_and_the_notes_below(tmp_path):
     _, forms = built(tmp_path, "lerf")
     for entry in read_published(PUBLISHED / "lerf.csv"):
         if entry["value"] != "-":
@@ -202,12 +178,9 @@ def test_latex_and_html_hold_every_reported_value(tmp_path):
             assert entry["value"] in forms[".html"]
     assert forms[".tex"].count(r"\toprule") == forms[".tex"].count(r"\bottomrule") == 2
     assert forms[".html"].count("<table>") == forms[".html"].count("</table>") == 2
-
-
-def test_notes_are_listed_below_the_table(tmp_path):
-    _, forms = built(tmp_path, "lerf")
     assert "The printed scenes average to 70.7." in forms[".md"]
     assert "<sup>" in forms[".html"]
+    assert latex_text("50 % of a_b & c > d") == r"50 \% of a\_b \& c \textgreater{} d"
 
 
 def test_unknown_table_names_those_that_exist(tmp_path):
@@ -306,9 +279,3 @@ def test_swapped_ap_columns_carry_a_note():
     entries = read_published(PUBLISHED / "scannet.csv")
     notes = [e["note"] for e in entries if e["method"] == "Hi-LSplat" and "AP@" in e["column"]]
     assert all("exchanged" in note for note in notes)
-
-
-def test_markdown_and_latex_are_text_of_one_table(tmp_path):
-    table = TABLES["waymo"].build(Sources(read_published(PUBLISHED / "waymo.csv"), read_scores([]), {}))
-    assert "| 3DGS-based | LangSplat | 64.2 |" in as_markdown(table)
-    assert r"3DGS-based & LangSplat & 64.2 \\" in as_latex(table)

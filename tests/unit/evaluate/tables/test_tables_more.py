@@ -7,11 +7,10 @@ import pytest
 
 from hilsplat.configuration import RunSettings
 from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES
-from hilsplat.evaluate.instance_files import write_instances
-from hilsplat.evaluate.metrics.instances import InstanceScan, match_instances
-from hilsplat.evaluate.scores import write_scores
+from hilsplat.evaluate.metrics.instances import match_instances
+from hilsplat.evaluate.scores import write_instances, write_scores
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
-from hilsplat.evaluate.tables.intervals import bootstrap_mean
+from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from tests.conftest import PROJECT
 from tests.unit.evaluate.tables.test_tables import PUBLISHED, built, measured, score
 
@@ -36,16 +35,14 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
     # one scan finds its only instance, the other misses it: precision 1 up to recall 1/2
     truth = np.full(100, 2001)
     ids = SCANNET200_INSTANCES.ids
-    hit = match_instances(InstanceScan(truth, np.ones((1, 100), bool), np.array([2]), np.array([0.5])), ids)
-    missed = match_instances(
-        InstanceScan(truth, np.zeros((0, 100), bool), np.zeros(0, int), np.zeros(0)), ids
-    )
-    key = ("default", "sam-tiny", "tree")
+    found = np.ones((1, 100), bool)
     matches = {
-        ("synthetic-rooms", "room-1", *key): hit,
-        ("synthetic-rooms", "room-2", *key): missed,
+        "room-1": match_instances(truth, found, np.array([2]), np.array([0.5]), ids),
+        "room-2": match_instances(truth, found[:0], np.zeros(0, int), np.zeros(0), ids),
     }
-    write_instances(tmp_path / "scores.csv", matches)
+    key = ("default", "sam-tiny", "tree")
+    keyed = {("synthetic-rooms", scene, *key): each for scene, each in matches.items()}
+    write_instances(tmp_path / "scores.csv", keyed)
     rows, _ = built(tmp_path, "scannet", scores)
     row = measured(rows, method="hilsplat (tree)")
     assert (row["19 classes mIoU"], row["ScanNet200 mAcc"]) == ("30.00", "10.00")
@@ -68,9 +65,9 @@ def test_replica_shows_scenes_and_their_mean(tmp_path):
 def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
     scores = []
     for scene, hits, union in (("street-1", 1, 2), ("street-2", 8, 8)):
-        for metric, of in (("class_iou", union), ("class_accuracy", union)):
-            row = point_score("waymo/segmentation", metric, hits / of, scene=scene, query="car")
-            scores.append(type(row)(**{**vars(row), "n": of, "dataset": "synthetic-streets"}))
+        for metric in ("class_iou", "class_accuracy"):
+            row = point_score("waymo/segmentation", metric, hits / union, scene=scene, query="car")
+            scores.append(replace(row, n=union, dataset="synthetic-streets"))
     rows, _ = built(tmp_path, "waymo", scores)
     row = measured(rows, method="hilsplat (tree)")
     # (1 + 8) / (2 + 8) for cars, and 21 absent classes that count 1
@@ -91,13 +88,14 @@ def test_seeds_of_a_variant_are_one_row_with_mean_and_spread(tmp_path):
     assert "standard deviation over seeds" in forms[".md"]
 
 
-def test_annotations_are_one_row_whatever_the_seeds(tmp_path):
+def test_annotations_are_one_unranked_row_whatever_the_variants_and_seeds(tmp_path):
     scores = [
         score("hc_containment", 1.0, variant=variant, method="truth", protocol="hierarchy/annotations@1")
         for variant in ("default", "paper", "paper.seed1", "paper.seed2")
     ]
-    rows, _ = built(tmp_path, "hierarchy", scores)
-    assert len([row for row in rows if row["method"] == "annotations"]) == 1
+    _, forms = built(tmp_path, "hierarchy", [*scores, score("hc_containment", 0.5, query="", level="")])
+    lines = [line for line in forms[".md"].splitlines() if line.startswith("| annotations")]
+    assert lines == ["| annotations | - | reference | 100.0 |"]
 
 
 def test_view_consistency_is_shown_beside_the_level_given_rows(tmp_path):
@@ -129,18 +127,14 @@ def test_frames_are_the_views_that_were_asked_at_levels(tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))
-def test_every_table_lists_below_what_was_not_measured(tmp_path, name):
+def test_every_table_is_built_without_scores_and_lists_below_what_was_not_measured(tmp_path, name):
+    assert TABLES[name].variants in RunSettings.model_fields
     out = tmp_path / f"{name}.csv"
-    run_table(
-        name, [], PROJECT / published_values(name), {}, out, ["replica (room_0): data_root is not set."]
-    )
+    absent = ["replica (room_0): data_root is not set."]
+    run_table(name, [], PROJECT / published_values(name), {}, out, absent)
+    assert {line.partition(",")[0] for line in out.read_text().splitlines()[1:]} <= {"reported"}
     for suffix in (".md", ".tex", ".html"):
         assert "Not measured: replica (room" in out.with_suffix(suffix).read_text().replace(r"\_", "_")
-
-
-@pytest.mark.parametrize("name", sorted(TABLES))
-def test_variants_of_every_table_are_a_list_of_the_configuration(name):
-    assert TABLES[name].variants in RunSettings.model_fields
 
 
 def test_lerf_mask_means_go_over_texts_and_not_over_pairs(tmp_path):

@@ -1,0 +1,162 @@
+"""A table as CSV, Markdown, LaTeX and HTML.
+
+pandas' Styler is not used: it does not escape < and ± in LaTeX and has no footnotes, the code would be as
+long, and an id and three classes per cell would make HTML files 1.6 to 2.5 times as large.
+"""
+
+import csv
+import html
+import io
+from collections.abc import Iterator
+
+from hilsplat.base.tables import plain_markdown
+from hilsplat.evaluate.tables.rows import Block, Cell, Table
+
+LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    ">": r"\textgreater{}",
+    "<": r"\textless{}",
+    "±": r"$\pm$",
+}
+
+HTML_STYLE = """<style>
+.hilsplat-table { font: 14px/1.4 system-ui, sans-serif; color: #1b1b1b; background: #fff; padding: 1em; }
+.hilsplat-table table { border-collapse: collapse; margin: 0 0 1.2em; }
+.hilsplat-table caption { text-align: left; font-weight: 600; padding: .4em 0; }
+.hilsplat-table th, .hilsplat-table td { padding: .2em .6em; text-align: right; white-space: nowrap; }
+.hilsplat-table th { border-bottom: 1px solid #444; font-weight: 600; }
+.hilsplat-table .name { text-align: left; }
+.hilsplat-table tbody tr:nth-child(even) { background: #f6f6f6; }
+.hilsplat-table .rank1 { background: rgb(255,179,179); font-weight: 700; }
+.hilsplat-table .rank2 { background: rgb(255,217,179); }
+.hilsplat-table .rank3 { background: rgb(255,255,179); }
+.hilsplat-table .scroll { overflow-x: auto; }
+.hilsplat-table .notes { max-width: 60em; font-size: 13px; }
+</style>"""
+
+
+def as_csv(table: Table) -> str:
+    """Return all blocks in one sheet; measured values with two decimals, reported ones as printed."""
+    names = list(dict.fromkeys(name for block in table.blocks for name in block.names()))
+    values = list(dict.fromkeys(column for block in table.blocks for column in block.columns))
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["kind", "data", *(name.lower() for name in names), *values, "notes"])
+    for block in table.blocks:
+        for row in block.rows:
+            cells = [row.cell(column) for column in values]
+            notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
+            shown = [_csv_value(cell, block.kind) for cell in cells]
+            writer.writerow([block.kind, block.data, *(row.names.get(n, "") for n in names), *shown, notes])
+    return stream.getvalue()
+
+
+def _csv_value(cell: Cell, kind: str) -> str:
+    if cell.text == "-":
+        return ""
+    if kind == "reported" or cell.value is None or cell.text.isdigit():
+        return cell.text
+    spread = f" ± {cell.spread:.2f}" if cell.spread is not None else ""
+    return f"{cell.value:.2f}{spread}"
+
+
+def shown_rows(block: Block, notes: dict[str, int]) -> Iterator[tuple[list[str], list[tuple[str, int, str]]]]:
+    """Yield the names of each row, and the text, rank (0 for none) and footnote number of each value."""
+    names, columns, ranks = block.names(), block.filled_columns(), block.ranks()
+    for number, row in enumerate(block.rows):
+        values = []
+        for column in columns:
+            cell = row.cell(column)
+            values.append((cell.text, ranks.get((number, column), 0), str(notes.get(cell.note, ""))))
+        yield [row.names.get(name, "") for name in names], values
+
+
+def as_markdown(table: Table) -> str:
+    """Return the table as Markdown. Best bold, second underlined, third in italics."""
+    marks = {1: "**{}**", 2: "<u>{}</u>", 3: "*{}*", 0: "{}"}
+    notes = table.numbered_notes()
+    lines = [f"# {table.title}", ""]
+    for block in table.blocks:
+        names, values = block.names(), block.filled_columns()
+        lines += [f"## {block.title}", "", "| " + " | ".join([*names, *values]) + " |"]
+        lines.append("|" + "---|" * len(names) + "---:|" * len(values))
+        for texts, shown in shown_rows(block, notes):
+            cells = [plain_markdown(text) for text in texts]
+            for text, rank, note in shown:
+                cells.append(marks[rank].format(text) + (f"<sup>{note}</sup>" if note else ""))
+            lines.append("| " + " | ".join(cells) + " |")
+        lines.append("")
+    lines += ["Best three in a block and protocol: **best**, <u>second</u>, *third*.", ""]
+    lines += [f"- {_plain(note)}".replace("*:", "\\*:") for note in table.footnotes]
+    lines += [f"- <sup>{number}</sup> {_plain(note)}" for note, number in notes.items()]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _plain(note: str) -> str:
+    """Return a note without HTML or links; our own emphasis is kept."""
+    return " ".join(note.replace("<", "&lt;").replace("](", "]\\(").splitlines())
+
+
+def latex_text(text: str) -> str:
+    """Escape characters that LaTeX would interpret."""
+    return "".join(LATEX_SPECIAL.get(letter, letter) for letter in text)
+
+
+def as_latex(table: Table) -> str:
+    """Return a booktabs table with footnotes below. Best bold, second underlined, third italic."""
+    marks = {1: r"\textbf{%s}", 2: r"\underline{%s}", 3: r"\textit{%s}", 0: "%s"}
+    notes = table.numbered_notes()
+    lines = [r"% needs \usepackage{booktabs,graphicx}", r"\begin{table*}[t]", r"\centering"]
+    lines.append(rf"\caption{{{latex_text(table.title)}.}}\label{{tab:{table.name}}}")
+    for block in table.blocks:
+        names, values = block.names(), block.filled_columns()
+        lines += [rf"\par\smallskip\textit{{{latex_text(block.title)}}}\par\smallskip"]
+        lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"]
+        lines += [rf"\begin{{tabular}}{{{'l' * len(names)}{'r' * len(values)}}}", r"\toprule"]
+        lines += [" & ".join(map(latex_text, [*names, *values])) + r" \\", r"\midrule"]
+        for texts, shown in shown_rows(block, notes):
+            cells = [latex_text(text) for text in texts]
+            for text, rank, note in shown:
+                raised = rf"\textsuperscript{{{note}}}" if note else ""
+                cells.append(marks[rank] % latex_text(text) + raised)
+            lines.append(" & ".join(cells) + r" \\")
+        lines += [r"\bottomrule", r"\end{tabular}}"]
+    lines.append(r"\par\smallskip\raggedright\footnotesize")
+    lines += [latex_text(note) + r"\par" for note in table.footnotes]
+    lines += [rf"\textsuperscript{{{number}}} {latex_text(note)}\par" for note, number in notes.items()]
+    lines.append(r"\end{table*}")
+    return "\n".join(lines) + "\n"
+
+
+def as_html(table: Table) -> str:
+    """Return an HTML fragment for the report; best, second and third are coloured as in the paper."""
+    notes = table.numbered_notes()
+    lines = [HTML_STYLE, '<div class="hilsplat-table">', f"<h2>{html.escape(table.title)}</h2>"]
+    for block in table.blocks:
+        lines.append('<div class="scroll"><table>')
+        lines += [f"<caption>{html.escape(block.title)}</caption>", "<thead><tr>"]
+        lines += [f'<th class="name">{html.escape(name)}</th>' for name in block.names()]
+        lines += [f"<th>{html.escape(column)}</th>" for column in block.filled_columns()]
+        lines += ["</tr></thead>", "<tbody>"]
+        for texts, shown in shown_rows(block, notes):
+            cells = [f'<td class="name">{html.escape(text)}</td>' for text in texts]
+            for text, rank, note in shown:
+                mark = f' class="rank{rank}"' if rank else ""
+                raised = f"<sup>{note}</sup>" if note else ""
+                cells.append(f"<td{mark}>{html.escape(text)}{raised}</td>")
+            lines.append("<tr>" + "".join(cells) + "</tr>")
+        lines.append("</tbody></table></div>")
+    lines.append('<div class="notes">')
+    lines += [f"<p>{html.escape(note)}</p>" for note in table.footnotes]
+    lines += [f"<p><sup>{number}</sup> {html.escape(note)}</p>" for note, number in notes.items()]
+    lines += ["</div>", "</div>"]
+    return "\n".join(lines) + "\n"
