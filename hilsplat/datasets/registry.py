@@ -5,12 +5,15 @@ A reader's module describes its data set in a constant (see `dataset.Dataset`); 
 
 from collections.abc import Collection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.plugins import Plugins
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.labelled import LabelledScene
-from hilsplat.datasets.points.labelled_points import PointScene
+
+if TYPE_CHECKING:  # imports OpenCV and SciPy, which the start of the workflow and the tables don't need
+    from hilsplat.datasets.labelled import LabelledScene
+    from hilsplat.datasets.points.labelled_points import PointScene
 
 DATASETS: Plugins[Dataset] = Plugins(
     {
@@ -35,7 +38,7 @@ def readers_of(labels: Collection[str]) -> tuple[str, ...]:
     return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
 
 
-def open_labelled(name: str, data_root: Path) -> LabelledScene:
+def open_labelled(name: str, data_root: Path) -> "LabelledScene":
     """Open a scene with labels on images, by a name such as "lerf_ovs/figurines".
 
     Raises:
@@ -53,7 +56,7 @@ def open_labelled(name: str, data_root: Path) -> LabelledScene:
     return dataset.open(dataset.locate(data_root), scene)
 
 
-def open_labels(name: str, data_root: Path) -> LabelledScene | PointScene:
+def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
     """Open a scene with labels on images or points, by a name such as "scannet/scene0000_00".
 
     Raises:

@@ -1,6 +1,6 @@
 """Published data sets named in rows of the scene sheet: which parts are present, and which files are labels.
 
-The workflow uses this module at start-up, so it reads no data.
+The workflow uses this module at start-up, so it reads no data and imports nothing heavy at module level.
 """
 
 from collections.abc import Collection
@@ -8,9 +8,7 @@ from pathlib import Path
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
-from hilsplat.scene.posed_images import write_posed_images
 
 DATA_PREFIX = "data:"
 
@@ -138,6 +136,9 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     Raises:
         SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.
     """
+    from hilsplat.datasets.points.labelled_points import PointScene
+    from hilsplat.scene.posed_images import write_posed_images
+
     scene = open_labels(name, data_root)
     if not isinstance(scene, PointScene):
         raise SceneError(
