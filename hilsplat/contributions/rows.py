@@ -85,7 +85,8 @@ class Contributions:
             ArtifactError: if the folder contains neither.
         """
         if (self.folder / "G").is_dir():
-            return Gram(*(self._mapped(f"G/{name}") for name in ("indptr", "indices", "values")), threads)
+            indptr, indices, values = (self._mapped(f"G/{name}") for name in ("indptr", "indices", "values"))
+            return Gram(indptr, indices, values, threads)
         if (self.folder / "W").is_dir():
             names = ("indptr", "indices", "data", "columns", "valid")
             indptr, indices, data, columns, valid = (self._mapped(f"W/{name}") for name in names)

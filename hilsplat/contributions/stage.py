@@ -207,8 +207,9 @@ def run_contributions(
             if labelled is not None:
                 builder.add(labelled)
                 checkpoint.offer(builder, number + 1)
-        for stream in (mass, *matrices.values()):
-            stream.close()
+        mass.close()
+        for matrix in matrices.values():
+            matrix.close()
         num_masks = sum(len(part) for part in rows["view"])
         if not num_masks:
             raise ArtifactError(

@@ -11,9 +11,13 @@ from jaxtyping import Float32, Float64, Int64
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.losses.distances import common_ancestor_depth
-from hilsplat.field.losses.instance import instance_loss_literal, instance_loss_tree
-from hilsplat.field.losses.part import part_loss_disentangle, part_loss_literal
+from hilsplat.field.losses import (
+    common_ancestor_depth,
+    instance_loss_literal,
+    instance_loss_tree,
+    part_loss_disentangle,
+    part_loss_literal,
+)
 from hilsplat.settings import FieldSettings
 
 MAX_MASKS_PER_LEVEL = 96
@@ -48,7 +52,6 @@ def view_relations(
     """Select the masks of each view for the contrastive losses, largest first.
 
     Args:
-        contributions: contributions of the scene.
         parents: parent of each mask in the coverage tree, by view (row among the view's masks).
         settings: least size of a mask, and pruning.
         means: mean lifted feature of each mask, used to prune similar masks; None keeps all.
@@ -70,18 +73,14 @@ def view_relations(
                 ]
             chosen[level] = np.sort(order)
         every = np.sort(np.concatenate(list(chosen.values())))
-        visible_parent = np.where((parent != NONE) & (pixels[parent] > 0), parent, NONE)
-        part_parent = []
-        for level in LEVELS[1:]:
-            own = visible_parent[chosen[level]]
-            part_parent.append(np.where(own == NONE, NONE, rows[own]) if len(rows) else own)
+        visible_parent = np.where((parent != NONE) & (pixels[parent] > 0), rows[parent], NONE)
         relations.append(
             ViewRelations(
                 rows=rows[every],
                 depth=depth[np.ix_(every, every)],
                 level=contributions.level[rows[every]].astype(np.int64),
                 part_rows=tuple(rows[chosen[level]] for level in LEVELS[1:]),
-                part_parent=tuple(np.asarray(own, dtype=np.int64) for own in part_parent),
+                part_parent=tuple(visible_parent[chosen[level]] for level in LEVELS[1:]),
             )
         )
     return relations
@@ -122,13 +121,7 @@ def compared(relations: list[ViewRelations]) -> tuple[int, int]:
 def instance_term(
     means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Compute L_ins, averaged over the views with at least two masks, and its gradient.
-
-    Args:
-        means: mean feature of each mask.
-        relations: relations by view.
-        settings: variant of L_ins, and Omega.
-    """
+    """Compute L_ins of the masks' mean features, averaged over views with at least two, and its gradient."""
     losses, gradient = [], np.zeros(means.shape)
     for view in relations:
         if len(view.rows) < 2:
@@ -157,8 +150,6 @@ def part_term(
         means: mean feature of each mask.
         halves: mean feature over a random half of each mask's pixels.
         other_halves: mean feature over the other pixels.
-        relations: relations by view.
-        settings: variant of L_part, and tau.
 
     Returns:
         the loss, and its gradients with respect to means, halves and other halves.
@@ -194,8 +185,6 @@ class Contrast:
         half_masks: A over a random half of each mask's pixels.
         pixels: n.
         half_pixels: number of pixels in the halves.
-        relations: relations by view.
-        settings: variants and weights of the losses.
     """
 
     masks: MaskOperator

@@ -4,7 +4,6 @@ Geometry is frozen, so the contributions contain all inputs of the losses: see `
 part, `contrast` for the hierarchy losses and `solver` for their minimisation.
 """
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,11 @@ from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.code import autoencoder_file, load_latents
 from hilsplat.field.contrast import Contrast, view_relations
-from hilsplat.field.language_field import LanguageField, report_path
+from hilsplat.field.language_field import LanguageField
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.segment.digests import require_same_masks
 from hilsplat.settings import FieldSettings
-
-logger = logging.getLogger(__name__)
 
 
 def run_field(
@@ -65,13 +62,14 @@ def run_field(
     latents = load_latents(autoencoder_folder, contributions)
     parents = read_parents(tree_folder, contributions)
     with stage_log("field", scene) as counts:
-        masks = MaskOperator.of(contributions.matrix("A"), contributions.level, threads)
-        half_masks = MaskOperator.of(contributions.matrix("A_half"), contributions.level, threads)
-        quadratic = contributions.quadratic(threads)
+        masks, half_masks = (
+            MaskOperator.of(contributions.matrix(name), contributions.level, threads)
+            for name in ("A", "A_half")
+        )
         pixels = contributions.pixels.astype(np.float32)
         problem = QuadraticProblem.of(
             masks,
-            quadratic,
+            contributions.quadratic(threads),
             pixels,
             latents,
             (settings.weight_language, settings.weight_clustering, settings.ridge),
@@ -84,10 +82,10 @@ def run_field(
         if rendered is None:
             features, report = solve_field(problem, contrast, settings)
         else:
-            from hilsplat.field.literal_trainer import Rendered, train_literally
+            from hilsplat.field.literal_trainer import train_literally
 
             features, report = train_literally(
-                problem, contrast, contributions, Rendered(*rendered), settings, seed, threads
+                problem, contrast, contributions, rendered, settings, seed, threads
             )
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
@@ -97,7 +95,7 @@ def run_field(
         field.save(out)
         unseen = int((problem.mass.max(axis=1) == 0).sum())
         write_json(
-            report_path(out),
+            Path(out).with_suffix(".report.json"),
             {
                 "scene": scene,
                 "gaussians": len(features),

@@ -36,8 +36,3 @@ class LanguageField:
             ArtifactError: if the file is missing, damaged or not a language field.
         """
         return made(LanguageField, *read_tensors(path), path)
-
-
-def report_path(field: Path) -> Path:
-    """Return the path of a field's report: `field.report.json` for `field.safetensors`."""
-    return Path(field).with_suffix(".report.json")

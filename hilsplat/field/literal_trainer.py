@@ -40,15 +40,6 @@ CURVE_POINTS = 30
 
 
 @dataclass(frozen=True)
-class Rendered:
-    """Inputs of rendering: the scene's cameras, its frozen Gaussians, and the masks of its views."""
-
-    scene: Path
-    gaussians: Path
-    masks: Path
-
-
-@dataclass(frozen=True)
 class ViewTargets:
     """Masks of one view in its covered pixels.
 
@@ -88,9 +79,7 @@ def view_losses(
 
     Args:
         shown: rendered features divided by alpha, channels of each level.
-        view: masks of the view.
         latents: latent of every mask of the scene.
-        settings: weights and variants of the losses.
         shares: factors that make the mean over all views equal the solver's objective.
 
     Returns:
@@ -153,12 +142,15 @@ def train_literally(
     problem: QuadraticProblem,
     contrast: Contrast,
     contributions: Contributions,
-    rendered: Rendered,
+    rendered: tuple[Path, Path, Path],
     settings: FieldSettings,
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Run Adam from the field's start, one random view per step, each once before any is repeated.
+
+    Args:
+        rendered: scene, its frozen Gaussians, and masks.
 
     Returns:
         the features, and a report: every term of the objective before and after, and the loss curve.
@@ -166,9 +158,10 @@ def train_literally(
     Raises:
         MisalignedArtifactError: if the contributions belong to other Gaussians or other masks.
     """
-    scene = Scene.load(rendered.scene)
-    require_same("contributions", scene.name, rendered.gaussians, contributions.gaussians_sha256)
-    gaussians, device = load_ply(rendered.gaussians), choose_device("auto")
+    scene_folder, gaussians_ply, masks_folder = rendered
+    scene = Scene.load(scene_folder)
+    require_same("contributions", scene.name, gaussians_ply, contributions.gaussians_sha256)
+    gaussians, device = load_ply(gaussians_ply), choose_device("auto")
     features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
     channels = features.shape[1] // len(LEVELS)
     shares = Shares(len(contributions.views), problem.total_pixels, *compared(contrast.relations))
@@ -190,9 +183,8 @@ def train_literally(
         camera = scene.cameras[contributions.views[number]]
         seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
         if number not in targets:
-            targets[number] = _targets(
-                contributions, rendered, number, seen.alpha, contrast.relations[number]
-            )
+            relations = contrast.relations[number]
+            targets[number] = _targets(contributions, masks_folder, number, seen.alpha, relations)
         alpha = np.maximum(seen.alpha.reshape(-1, 1), 1e-6)
         shown = (seen.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
         maps = shown.reshape(len(alpha), len(LEVELS), channels)
@@ -201,9 +193,8 @@ def train_literally(
         by_image[..., 3:] = (by_maps.reshape(shown.shape) / alpha).reshape(*seen.alpha.shape, -1)
         gradient = seen.gradients(by_image, np.zeros_like(seen.alpha)).features
         if settings.ridge:
-            gradient = gradient + (ridge * (features.reshape(problem.lifted.shape) - problem.lifted)).reshape(
-                features.shape
-            )
+            pull = ridge * (features.reshape(problem.lifted.shape) - problem.lifted)
+            gradient = gradient + pull.reshape(features.shape)
         adam.step(gradient)
         recent.append(sum(weights[name] * value for name, value in losses.items()))
         if step % log_every == 0 or step == settings.iterations:
@@ -218,13 +209,13 @@ def train_literally(
 
 def _targets(
     contributions: Contributions,
-    rendered: Rendered,
+    masks_folder: Path,
     number: int,
     alpha: Float32[np.ndarray, "H W"],
     relations: ViewRelations,
 ) -> ViewTargets:
     view = contributions.views[number]
-    masks = load_masks(rendered.masks, view, digests_in(contributions.folder))
+    masks = load_masks(masks_folder, view, digests_in(contributions.folder))
     labels = label_maps(masks)
     covered: Bool[np.ndarray, " P"] = alpha.reshape(-1) >= MIN_ALPHA
     half = random_half(view, len(labels))

@@ -40,14 +40,12 @@ def train_autoencoder(
 ) -> Autoencoder:
     """Train on one scene's vectors: Adam with cosine decay, full batches drawn without replacement.
 
+    Equal inputs and seeds give equal bytes on any number of the stage's threads (the command line limits BLAS
+    to one thread).
+
     Args:
         vectors: unit CLIP vectors, at least one.
-        settings: latent size, steps and weights.
         seed: seed of the initial weights and the order of vectors.
-
-    Returns:
-        the trained model; equal inputs and seeds give equal bytes on any number of the stage's threads (the
-        command line limits BLAS to one thread).
     """
     twister = torch_generator(seed)
     channels, latent = vectors.shape[1], settings.latent
@@ -110,11 +108,8 @@ def loss_gradients(
     Departs: LangSplat computes the cosine along the batch axis, which compares channels, not vectors.
 
     Args:
-        parameters: parameters of the network by name.
         vectors: batch of unit vectors.
-        latent: size d of a latent.
-        cosine_weight: weight of the cosine loss.
-        gradients: output, with the same names.
+        gradients: output, with the names of the parameters.
     """
     channels = vectors.shape[1]
     encoder, decoder = layers_of(channels, latent)

@@ -37,7 +37,6 @@ class QuadraticProblem:
 
     Attributes:
         masks: A.
-        quadratic: G or W.
         mass: G 1, the visible mass of each Gaussian at each level, px.
         pixels: n.
         latents: h.
@@ -132,10 +131,8 @@ def conjugate_gradient(
 ) -> np.ndarray:
     """Minimise the quadratic part in a few steps, preconditioned by the visible mass.
 
-    `curved` is G times the start, if known.
-
-    Levels and channels do not interact, so each has its own step size. Dot products are summed in
-    float64 in a fixed order.
+    `curved` is G times the start, if known. Levels and channels do not interact, so each has its own step
+    size. Dot products are summed in float64 in a fixed order.
     """
     scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)

@@ -1,5 +1,7 @@
 """The sparse solver against dense algebra and autograd, and the stage."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -16,29 +18,27 @@ from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
 from hilsplat.field.literal_trainer import Shares, ViewTargets, view_losses
-from hilsplat.field.minimise import lbfgs
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.methods.method import MethodInputs
-from hilsplat.semantic_tree.tree import run_semantic_tree
+from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, SemanticTreeSettings
-from tests.unit.field.clustering import clustering_loss
-from tests.unit.field.latent_regression import latent_regression_loss
-from tests.unit.field.torch_losses import instance_term, part_term
+from tests.unit.field.torch_losses import clustering_loss, instance_term, latent_regression_loss, part_term
 from tests.unit.round_gaussians import round_gaussians
 from tests.unit.two_boxes_world import reverse_masks
 
 PIXELS, GAUSSIANS, CHANNELS = 60, 12, 2
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 class Toy:
     """One view with three masks a level on 60 pixels and 12 Gaussians, and its dense matrices."""
 
-    def __init__(self, weights: tuple[float, float, float]) -> None:
+    def __init__(self, weights: tuple[float, float, float], unseen: int | None = None) -> None:
         rng = np.random.default_rng(0)
         dense = rng.random((PIXELS, GAUSSIANS)) * (rng.random((PIXELS, GAUSSIANS)) < 0.4)
         dense[:, 0] += 0.01  # no empty row
+        if unseen is not None:
+            dense[:, unseen] = 0
         self.W = (dense / dense.sum(axis=1, keepdims=True)).astype(np.float32)
         self.labels = rng.integers(-1, 3, (PIXELS, 3)) + np.array([0, 3, 6])
         self.labels[rng.random((PIXELS, 3)) < 0.2] = -1
@@ -61,6 +61,11 @@ class Toy:
         )
         self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
 
+    def view(self, settings: FieldSettings) -> ViewTargets:
+        """The view as the literal trainer sees it."""
+        relations = self.contrast(settings).relations[0]
+        return ViewTargets(np.arange(9), self.level.astype(np.int64) - 1, self.painted, self.half, relations)
+
     def contrast(self, settings: FieldSettings) -> Contrast:
         parent = np.array([-1] * 3 + [0, 0, 1] + [3, 4, 4])
         relations = ViewRelations(
@@ -77,8 +82,8 @@ class Toy:
         """Language loss and L_h by rendering every pixel, as means over labelled pixels."""
         language, clustering = 0, 0
         for index in range(3):
-            labels = torch.from_numpy(self.labels[:, index])[None]
-            rendered = (torch.from_numpy(self.W).double() @ features[:, index])[None]
+            labels = torch.from_numpy(self.labels[:, index])
+            rendered = torch.from_numpy(self.W).double() @ features[:, index]
             count = (labels >= 0).sum() / self.pixels.sum()
             latents = torch.from_numpy(self.latents).double()
             language = language + count * latent_regression_loss(rendered, labels, latents)
@@ -114,16 +119,7 @@ def test_lifted_average_is_a_weighted_mean_of_latents():
 
 
 def test_unseen_gaussians_stay_zero():
-    toy = Toy((1.0, 0.3, 0.1))
-    toy.W[:, 5] = 0
-    toy.A[:, 5] = 0
-    problem = QuadraticProblem.of(
-        MaskOperator.of(sp.csr_matrix(toy.A), toy.level),
-        StackedWeights(sp.csr_matrix(toy.W), toy.labels >= 0),
-        toy.pixels,
-        toy.latents,
-        (1.0, 0.3, 0.1),
-    )
+    problem = Toy((1.0, 0.3, 0.1), unseen=5).problem
     solved = conjugate_gradient(problem, problem.lifted, 5)
     assert np.isfinite(solved).all()
     assert (solved[5] == 0).all()
@@ -149,20 +145,20 @@ def test_a_solved_problem_stays_solved():
     assert np.array_equal(conjugate_gradient(toy.problem, toy.problem.lifted, 3), toy.problem.lifted)
 
 
-def test_lbfgs_finds_the_minimum_of_a_bowl():
-    curvature = np.array([1.0, 4.0, 9.0], np.float32)
+READINGS = pytest.mark.parametrize(
+    "readings",
+    [
+        {"instance_mode": instance, "part_mode": part, "tau": 0.5}
+        for instance in ("literal", "coverage_tree")
+        for part in ("literal", "disentangle")
+    ],
+)
 
-    def bowl(x: np.ndarray) -> tuple[float, np.ndarray]:
-        return float((curvature * (x - 1) ** 2).sum()), 2 * curvature * (x - 1)
 
-    assert lbfgs(bowl, np.zeros(3, np.float32), 20, 0.1) == pytest.approx(np.ones(3), abs=1e-3)
-
-
-@pytest.mark.parametrize("instance", ["literal", "coverage_tree"])
-@pytest.mark.parametrize("part", ["literal", "disentangle"])
-def test_contrastive_gradients_equal_autograd_through_the_means(instance, part):
+@READINGS
+def test_contrastive_gradients_equal_autograd_through_the_means(readings):
     toy = Toy((1.0, 0.3, 0.1))
-    contrast = toy.contrast(FieldSettings(instance_mode=instance, part_mode=part, tau=0.5))
+    contrast = toy.contrast(FieldSettings(**readings))
     terms = contrast.values(toy.features)
     value, gradient = contrast.weighted(toy.features, (0.5, 0.25))
 
@@ -238,20 +234,16 @@ def test_pruning_drops_look_alikes_that_are_unrelated():
     assert distinct(means, depth, 1.0).tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("instance", ["literal", "coverage_tree"])
-@pytest.mark.parametrize("part", ["literal", "disentangle"])
-def test_the_literal_trainer_takes_the_solver_s_objective_on_rendered_maps(instance, part):
+@READINGS
+def test_the_literal_trainer_takes_the_solver_s_objective_on_rendered_maps(readings):
     weights = {"weight_language": 0.7, "weight_clustering": 0.4, "weight_instance": 0.5, "weight_part": 0.25}
-    settings = FieldSettings(instance_mode=instance, part_mode=part, tau=0.5, **weights)
+    settings = FieldSettings(**readings, **weights)
     toy = Toy((0.7, 0.4, 0.0))
     contrast = toy.contrast(settings)
     shares = Shares(1, toy.problem.total_pixels, *compared(contrast.relations))
-    view = ViewTargets(
-        np.arange(9), toy.level.astype(np.int64) - 1, toy.painted, toy.half, contrast.relations[0]
-    )
     W = toy.W.astype(np.float64)
     maps = np.einsum("pg,gld->pld", W, toy.features)
-    losses, by_maps = view_losses(maps, view, toy.latents, settings, shares)
+    losses, by_maps = view_losses(maps, toy.view(settings), toy.latents, settings, shares)
     expected = toy.problem.terms(toy.features) | contrast.values(toy.features)
     assert losses == pytest.approx({name: expected[name] for name in losses}, rel=1e-4)
     _, by_features = contrast.weighted(toy.features, (0.5, 0.25))
@@ -263,17 +255,10 @@ def test_the_literal_trainer_takes_the_solver_s_objective_on_rendered_maps(insta
 def test_langsplats_l1_is_a_mean_over_all_pixels():
     toy = Toy((1.0, 0.0, 0.0))
     settings = FieldSettings(language="l1", trainer="literal", weight_part=0.0)
-    relations = toy.contrast(settings).relations[0]
-    view = ViewTargets(np.arange(9), toy.level.astype(np.int64) - 1, toy.painted, toy.half, relations)
     maps = np.einsum("pg,gld->pld", toy.W.astype(np.float64), toy.features)
-    losses, gradient = view_losses(maps, view, toy.latents, settings, Shares(1, 1.0, 1, 1))
-    apart = [
-        np.abs(maps[p, i] - toy.latents[toy.labels[p, i]]).sum()
-        for p in range(PIXELS)
-        for i in range(3)
-        if toy.labels[p, i] >= 0
-    ]
-    assert losses["language"] == pytest.approx(sum(apart) / (PIXELS * CHANNELS))
+    losses, gradient = view_losses(maps, toy.view(settings), toy.latents, settings, Shares(1, 1.0, 1, 1))
+    apart = np.abs(maps - toy.latents[toy.labels])[toy.labels >= 0]
+    assert losses["language"] == pytest.approx(apart.sum() / (PIXELS * CHANNELS))
     assert not gradient[toy.labels < 0].any()
 
 
@@ -288,52 +273,49 @@ def boxes_with_latents(two_boxes_contributions):
 
 
 SMALL_MASKS = FieldSettings(min_mask_px=4, weight_part=0.003)
-
-
-def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
-    world, contributions, autoencoder = boxes_with_latents
-    out = world.folder / "field.safetensors"
-    run_field(contributions, world.coverage_tree, autoencoder, out, SMALL_MASKS, 1)
-    before = out.read_bytes()
-    run_field(contributions, world.coverage_tree, autoencoder, out, SMALL_MASKS, 2)
-    assert out.read_bytes() == before
-    field = LanguageField.load(out)
-    assert field.features.shape == (96, 3, 3)
-    report = read_json(world.folder / "field.report.json")
-    assert report["after_lbfgs"]["language"] >= 0
-    assert report["gaussians"] == 96
-
-
-def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latents):
-    world, contributions, autoencoder = boxes_with_latents
-    reports = {}
-    for name, more in (("plain", {}), ("median", {"start": "median"}), ("pruned", {"prune_cosine": 0.0})):
-        out = world.folder / name / "field.safetensors"
-        settings = SMALL_MASKS.model_copy(update=more)
-        run_field(contributions, world.coverage_tree, autoencoder, out, settings, 1)
-        reports[name] = read_json(out.with_suffix(".report.json"))
-    assert reports["median"]["lifted"] != reports["plain"]["lifted"]
-    assert reports["pruned"]["contrasted_masks"] < reports["plain"]["contrasted_masks"]
-
-
 LITERAL = SMALL_MASKS.model_copy(update={"trainer": "literal", "iterations": 60, "rate": 0.05})
 
 
-def literal_field(world, contributions, autoencoder, out, settings=LITERAL, ply=None, threads=1, **more):
-    rendered = world.scene, ply or world.ply, world.masks
-    parts = (contributions, world.coverage_tree, autoencoder)
-    run_field(*parts, out, settings, threads, rendered=rendered, **more)
+def solved_field(boxes, name: str, settings: FieldSettings = SMALL_MASKS, threads: int = 1, **more) -> Path:
+    """The field of a run of the stage."""
+    world, contributions, autoencoder = boxes
+    out = world.folder / name / "field.safetensors"
+    if settings.trainer == "literal":
+        more.setdefault("rendered", (world.scene, world.ply, world.masks))
+    run_field(contributions, world.coverage_tree, autoencoder, out, settings, threads, **more)
+    return out
 
 
-def test_the_literal_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents, monkeypatch):
-    world, contributions, autoencoder = boxes_with_latents
+def report_of(field: Path) -> dict:
+    return read_json(field.with_suffix(".report.json"))
+
+
+def test_stage_is_the_same_on_any_number_of_threads(boxes_with_latents):
+    one, two = (solved_field(boxes_with_latents, str(threads), threads=threads) for threads in (1, 2))
+    assert one.read_bytes() == two.read_bytes()
+    assert LanguageField.load(one).features.shape == (96, 3, 3)
+    assert report_of(one)["after_lbfgs"]["language"] >= 0
+    assert report_of(one)["gaussians"] == 96
+
+
+def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latents):
+    plain, median, pruned = (
+        report_of(solved_field(boxes_with_latents, name, SMALL_MASKS.model_copy(update=more)))
+        for name, more in (("plain", {}), ("median", {"start": "median"}), ("pruned", {"prune_cosine": 0.0}))
+    )
+    assert median["lifted"] != plain["lifted"]
+    assert pruned["contrasted_masks"] < plain["contrasted_masks"]
+
+
+def test_the_literal_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents):
+    world, *own = boxes_with_latents
     other = world.folder / "other.ply"
     other.write_bytes(b"other")
+    rendered = world.scene, other, world.masks
     with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
-        literal_field(world, contributions, autoencoder, world.folder / "l.safetensors", ply=other)
-    parts = (world.scene, other, world.masks, contributions, autoencoder)
+        solved_field(boxes_with_latents, "literal", LITERAL, rendered=rendered)
     with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
-        MethodInputs(*parts).view_weights(world.views[0])
+        MethodInputs(*rendered, *own).view_weights(world.views[0])
 
 
 @pytest.fixture
@@ -347,45 +329,33 @@ def flat_boxes(boxes_with_latents, monkeypatch):
 
 
 def test_the_literal_trainer_lowers_its_loss_and_is_the_same_on_any_number_of_threads(flat_boxes):
-    world, contributions, autoencoder = flat_boxes
-    out = world.folder / "literal" / "field.safetensors"
     settings = LITERAL.model_copy(update={"start": "random"})
-    literal_field(world, contributions, autoencoder, out, settings)
-    report = read_json(world.folder / "literal" / "field.report.json")
+    one, two = (solved_field(flat_boxes, str(threads), settings, threads) for threads in (1, 2))
+    report = report_of(one)
     assert [point["step"] for point in report["curve"]] == list(range(2, 61, 2))
     assert report["curve"][-1]["loss"] < 0.7 * report["curve"][0]["loss"]
     assert report["trained"]["language"] < 0.5 * report["start"]["language"]
-    before = out.read_bytes()
-    literal_field(world, contributions, autoencoder, out, settings, threads=2)
-    assert out.read_bytes() == before
-    assert LanguageField.load(out).features.shape == (96, 3, 3)
+    assert one.read_bytes() == two.read_bytes()
+    assert LanguageField.load(one).features.shape == (96, 3, 3)
 
 
 def test_a_field_resumes_from_another_one(flat_boxes):
-    world, contributions, autoencoder = flat_boxes
-    first, out = (world.folder / name / "field.safetensors" for name in ("first", "second"))
-    literal_field(
-        world, contributions, autoencoder, first, LITERAL.model_copy(update={"min_labelled_share": 0.0})
-    )
+    first = solved_field(flat_boxes, "first", LITERAL.model_copy(update={"min_labelled_share": 0.0}))
     onward = SMALL_MASKS.model_copy(update={"start": "langsplat"})
-    parts = (contributions, world.coverage_tree, autoencoder)
-    run_field(*parts, out, onward, 1, start=first)
-    begun = read_json(out.with_suffix(".report.json"))["lifted"]
-    trained = read_json(first.with_suffix(".report.json"))["trained"]
+    begun = report_of(solved_field(flat_boxes, "second", onward, start=first))["lifted"]
+    trained = report_of(first)["trained"]
     assert begun.pop("ridge") == 0  # which pulls towards the start
     assert begun == pytest.approx({name: trained[name] for name in begun}, rel=1e-4)
-    other = LanguageField(LanguageField.load(first).features, "other", "code")
-    other.save(first)
+    LanguageField(LanguageField.load(first).features, "other", "code").save(first)
     with pytest.raises(MisalignedArtifactError, match="other Gaussians, or to another code"):
-        run_field(*parts, out, onward, 1, start=first)
+        solved_field(flat_boxes, "second", onward, start=first)
 
 
-@pytest.mark.parametrize("more", [{"trainer": "literal"}, {"start": "langsplat"}])
-def test_settings_that_need_another_input_say_so(boxes_with_latents, more):
-    world, contributions, autoencoder = boxes_with_latents
-    settings = SMALL_MASKS.model_copy(update=more)
+@pytest.mark.parametrize("update", [{"trainer": "literal"}, {"start": "langsplat"}])
+def test_settings_that_need_another_input_say_so(boxes_with_latents, update):
+    settings = SMALL_MASKS.model_copy(update=update)
     with pytest.raises(SettingsError, match="don't fit together"):
-        run_field(contributions, world.coverage_tree, autoencoder, world.folder / "l", settings, 1)
+        solved_field(boxes_with_latents, "field", settings, rendered=None)
 
 
 @pytest.mark.parametrize("stale", ["coverage_tree", "autoencoder", "contributions"])
@@ -396,16 +366,14 @@ def test_parts_of_masks_in_another_order_are_refused(boxes_with_latents, stale):
     for folder in {world.coverage_tree, autoencoder, contributions} - {world.folder / stale}:
         index = read_index(folder)  # as if its stage had run again
         write_index(folder, reversed_entries, **{key: index[key] for key in index if key != "views"})
-    parts = (contributions, world.coverage_tree, autoencoder)
     with pytest.raises(MisalignedArtifactError, match=rf"{stale} .*different masks \(view 001\.png\)"):
-        run_field(*parts, world.folder / "l.safetensors", SMALL_MASKS, 1)
+        solved_field(boxes_with_latents, "field")
 
 
 def test_the_literal_trainer_and_baselines_refuse_masks_in_another_order(flat_boxes):
-    world, contributions, autoencoder = flat_boxes
+    world, *own = flat_boxes
     reverse_masks(world, "001.png")
     with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
-        literal_field(world, contributions, autoencoder, world.folder / "l.safetensors")
-    parts = (world.scene, world.ply, world.masks, contributions, autoencoder)
+        solved_field(flat_boxes, "literal", LITERAL)
     with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
-        MethodInputs(*parts).view_labels("001.png")
+        MethodInputs(world.scene, world.ply, world.masks, *own).view_labels("001.png")

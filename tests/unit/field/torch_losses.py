@@ -1,14 +1,32 @@
-"""L_ins and L_part in torch: the reference of `hilsplat.field.losses`, whose gradients are written out."""
+"""The losses in torch: the reference of `hilsplat.field`, whose gradients and products are written out."""
 
 import math
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from hilsplat.base.levels import NONE
 from hilsplat.field.contrast import ViewRelations
-from hilsplat.field.losses.distances import SHORTEST, SOFTENING
+from hilsplat.field.losses import SHORTEST, SOFTENING
 from hilsplat.settings import FieldSettings
+
+
+def latent_regression_loss(
+    features: Float[Tensor, "P D"], labels: Int[Tensor, " P"], latents: Float[Tensor, "M D"]
+) -> Float[Tensor, ""]:
+    """Mean squared distance of the rendered features of labelled pixels to the latents of their masks."""
+    inside = labels >= 0
+    return (features[inside] - latents[labels[inside]]).square().sum() / inside.sum()
+
+
+def clustering_loss(features: Float[Tensor, "P D"], labels: Int[Tensor, " P"]) -> Float[Tensor, ""]:
+    """L_h (Eq. 2): mean squared distance of the rendered features of labelled pixels to their mask's mean."""
+    inside = labels >= 0
+    values, rows = features[inside], labels[inside]
+    one_hot = torch.nn.functional.one_hot(rows).to(values.dtype)
+    means = one_hot.T @ values / one_hot.sum(0).clamp(min=1)[:, None]
+    return (values - means[rows]).square().sum() / inside.sum()
 
 
 def soft_distances(means: Tensor) -> Tensor:
@@ -74,8 +92,6 @@ def part_loss_disentangle(
     tau: float,
 ) -> Tensor:
     anchors = torch.nonzero(has_parent).squeeze(1)
-    if not len(anchors) or len(half) < 2:
-        return half.sum() * 0
     similarity = similarity_without_parent(half[anchors], other_half, parent_means[anchors]) / tau
     positive = similarity[torch.arange(len(anchors)), anchors]
     return (similarity.logsumexp(1) - positive).mean()
