@@ -19,13 +19,12 @@ from benchmarks.test_splat import HALF_WAY, SETTINGS
 from hilsplat.base.tables import markdown_table
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.densify import ScreenGradients
-from hilsplat.splat.fit import fit_step
+from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.device import Device
 from hilsplat.splat.rasterise.parity import disagreement
-from hilsplat.splat.state import FitState
 from hilsplat.splat.views import TrainingView
 
 SIZES_TIMED = {**SIZES, "1M 986x728": (1_000_000, (728, 986))}

@@ -41,8 +41,7 @@ from hilsplat.settings import (
     FieldSettings,
     SemanticTreeSettings,
 )
-from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.order import morton_order
+from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 

@@ -16,7 +16,7 @@ from benchmarks.memory import peaks_mib
 from benchmarks.scenes import SIZES, random_scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.densify import ScreenGradients
-from hilsplat.splat.fit import fit_step
+from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.photometric import photometric_loss
@@ -26,7 +26,6 @@ from hilsplat.splat.rasterise.cpu import (
     project_gaussians,
     sparse_weights,
 )
-from hilsplat.splat.state import FitState
 from hilsplat.splat.views import TrainingView
 
 LARGE = "100k 800x600"

@@ -1,5 +1,6 @@
-"""JSON file beside `gaussians.ply` that relates its coordinates to those of the scene's source."""
+"""Import and export of Gaussians in the coordinates of a scene's source, and the JSON file between both."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -8,17 +9,17 @@ from jaxtyping import Float64
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, write_json
 from hilsplat.base.errors import ArtifactError
+from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.splat.similarity import decompose, move_gaussians
 
+logger = logging.getLogger(__name__)
+
 AXES = "right-handed; cameras in OpenCV axes (x right, y down, z forward)"
 
-
-def coordinates_path(ply: Path) -> Path:
-    """Return the path of `gaussians.json` beside `gaussians.ply`."""
-    return Path(ply).with_suffix(".json")
+FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians of the scene sheet"
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
@@ -27,17 +28,15 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
     The source of the poses is an imported COLMAP model or transforms.json, or our own structure from motion,
     whose coordinates are not recorded elsewhere.
 
-    Args:
-        ply: the written file, whose digest is recorded: the JSON applies to no other file.
-        origin: origin of the Gaussians, as in the report.
+    The JSON is beside the PLY and applies to no other file, so it contains the PLY's digest.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
     write_json(
-        coordinates_path(ply),
+        ply.with_suffix(".json"),
         {
             "scene": scene.name,
-            "ply": Path(ply).name,
+            "ply": ply.name,
             "ply_sha256": sha256_of_file(ply),
             "gaussians": len(gaussians),
             "sh_degree": gaussians.sh_degree,
@@ -61,7 +60,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     Raises:
         ArtifactError: if the JSON belongs to another PLY, or its transform cannot be used.
     """
-    path = coordinates_path(ply)
+    path = ply.with_suffix(".json")
     if not path.is_file():
         return None
     content = read_json(path)
@@ -69,7 +68,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
         return None
     if content.get("ply_sha256") != (found := sha256_of_file(ply)):
         raise ArtifactError(
-            f"{path} belongs to another PLY than {Path(ply).name}",
+            f"{path} belongs to another PLY than {ply.name}",
             expected=f"sha256 {content.get('ply_sha256')}",
             found=f"sha256 {found}",
             fix="put it beside the PLY that it was written for, or remove it if the PLY is in the "
@@ -81,19 +80,64 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     return matrix
 
 
+def import_gaussians(
+    ply: Path, scene: Scene, dataparser: Path | None = None, transforms: Path | None = None
+) -> tuple[Gaussians, dict[str, Any]]:
+    """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.
+
+    A PLY of this package is in its scene's coordinates instead; it is first moved to the source's by the
+    transform in the JSON file beside it. A nerfstudio PLY is moved by the transform of its data parser.
+
+    Args:
+        dataparser: nerfstudio's `dataparser_transforms.json`, if the PLY is in its training coordinates.
+        transforms: `transforms.json` with the source's poses, required by `dataparser`.
+
+    Returns:
+        The Gaussians in the scene's coordinates, and their origin for the report.
+
+    Raises:
+        ArtifactError: if the file cannot be used.
+    """
+    gaussians = load_ply(ply, fix=FIX)
+    if len(gaussians) == 0:
+        raise ArtifactError(f"{ply} does not hold any Gaussians", fix=FIX)
+    lengths = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
+    if (zero := int((lengths < 1e-12).sum())) > 0:
+        raise ArtifactError(
+            f"{ply}: {zero} of {len(gaussians)} Gaussians have no rotation: rot_0..3 are all zero", fix=FIX
+        )
+    source_from_ply = read_source_from_scene(ply)
+    moved = "in the coordinates of the scene's source"
+    transform = scene.scene_from_source
+    if source_from_ply is not None:
+        transform = transform @ source_from_ply
+        moved = "in the coordinates that the JSON file beside it describes"
+    elif dataparser is not None:
+        transform = transform @ source_from_dataparser(dataparser, transforms)
+        moved = f"in nerfstudio's training coordinates, by {dataparser.name}"
+    logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
+    origin = {
+        "kind": "imported",
+        "file": ply.name,  # its folder is in the provenance record
+        "sha256": sha256_of_file(ply),
+        "taken_as": moved,
+        "scene_from_ply": np.asarray(transform).tolist(),
+    }
+    return move_gaussians(gaussians, transform), origin
+
+
 def write_source_ply(ply: Path, out: Path) -> int:
     """Write the Gaussians of a scene in the coordinates of its source, and return their number.
 
     Args:
         ply: `gaussians.ply` of a scene, with its JSON file beside it.
-        out: 3DGS PLY to write.
 
     Raises:
         ArtifactError: if the PLY or its JSON file is missing or damaged.
     """
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:
-        raise ArtifactError(f"{coordinates_path(ply)} is missing", fix=f"hilsplat run {ply}")
+        raise ArtifactError(f"{ply.with_suffix('.json')} is missing", fix=f"hilsplat run {ply}")
     gaussians = move_gaussians(load_ply(ply), source_from_scene)
     save_ply(out, gaussians)
     return len(gaussians)

@@ -40,12 +40,7 @@ def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
 
 @dataclass
 class ScreenGradients:
-    """Running average of each Gaussian's screen-space gradient.
-
-    Attributes:
-        total: sum of the gradient's lengths.
-        seen: steps in which the Gaussian was drawn.
-    """
+    """Sum of the lengths of each Gaussian's screen-space gradients, and the steps in which it was drawn."""
 
     total: Float64[np.ndarray, " N"]
     seen: Int32[np.ndarray, " N"]
@@ -82,20 +77,13 @@ def densify(
     clone, split = selected[~large], selected[large]
     copies = {name: p[name][clone].copy() for name in FIELDS}
     halves = {name: np.repeat(p[name][split], 2, axis=0) for name in FIELDS}
-    halves["means"] += _offsets(halves["log_scales"], halves["quats"], generator)
+    offsets = generator.normal(size=halves["means"].shape) * np.exp(halves["log_scales"].astype(np.float64))
+    halves["means"] += rotate(unit_quaternions(halves["quats"]), offsets).astype(np.float32)
     halves["log_scales"] -= np.float32(np.log(SPLIT_FACTOR))
     keep = np.ones(len(adam), dtype=bool)
     keep[split] = False
     adam.keep(keep)
     adam.append({name: np.concatenate([copies[name], halves[name]]) for name in FIELDS})
-
-
-def _offsets(
-    log_scales: Float32[np.ndarray, "N 3"], quats: Float32[np.ndarray, "N 4"], generator: np.random.Generator
-) -> Float32[np.ndarray, "N 3"]:
-    """Draw one random offset from each Gaussian."""
-    local = generator.normal(size=log_scales.shape) * np.exp(log_scales.astype(np.float64))
-    return rotate(unit_quaternions(quats), local).astype(np.float32)
 
 
 def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:

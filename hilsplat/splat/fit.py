@@ -1,32 +1,31 @@
 """Base 3D Gaussian Splatting fit (Kerbl et al. 2023) on the CPU, the geometry of all later stages."""
 
+import json
 import logging
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.artifacts import sha256_of_json, sha256_of_path
-from hilsplat.base.errors import SceneError
+from hilsplat.base.artifacts import read_npz, sha256_of_json, sha256_of_path, write_npz
+from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.identity import code_digest
 from hilsplat.base.images import to_float
 from hilsplat.base.progress import stage_log, track
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.coordinates import write_coordinates
+from hilsplat.splat.coordinates import import_gaussians, write_coordinates
 from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
 from hilsplat.splat.fit_report import write_report
-from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.import_gaussians import import_gaussians
+from hilsplat.splat.gaussians import FIELDS, Gaussians, morton_order
 from hilsplat.splat.initial import first_gaussians
 from hilsplat.splat.mcmc import add_noise, add_regularisers, relocate_and_grow
 from hilsplat.splat.optimise import Adam, means_rate
-from hilsplat.splat.order import morton_order
 from hilsplat.splat.photometric import photometric_loss
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import draw
 from hilsplat.splat.rasterise.device import choose_device
-from hilsplat.splat.state import FitState
 from hilsplat.splat.views import TrainingView, camera_extent, load_views
 
 logger = logging.getLogger(__name__)
@@ -35,6 +34,74 @@ CURVE_EVERY = 20
 """Steps between two points of the training curve."""
 MIN_SIDE_PX = 64
 """Images are not shrunk below this shorter side."""
+
+
+@dataclass
+class FitState:
+    """State from which a fit resumes exactly.
+
+    Attributes:
+        gradients: screen gradients since the last densification.
+        generator: source of view order, splits and random backgrounds.
+        order: indices of the remaining views of this round.
+        step: completed steps.
+        curve: rows of (step, loss, training PSNR in dB, number of Gaussians).
+    """
+
+    adam: Adam
+    gradients: ScreenGradients
+    generator: np.random.Generator
+    order: list[int] = field(default_factory=list)
+    step: int = 0
+    curve: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    def save(self, path: Path, key: str) -> None:
+        """Write a checkpoint."""
+        arrays = {
+            f"{table}_{name}": getattr(self.adam, table)[name]
+            for table in ("parameters", "first", "second")
+            for name in FIELDS
+        }
+        write_npz(
+            path,
+            key=np.array(key),
+            counts=np.array([self.step, self.adam.steps]),
+            order=np.array(self.order, dtype=np.int64),
+            generator=np.array(json.dumps(self.generator.bit_generator.state)),
+            gradient_total=self.gradients.total,
+            gradient_seen=self.gradients.seen,
+            curve=np.array(self.curve, dtype=np.float64).reshape(-1, 4),
+            **arrays,
+        )
+
+    @staticmethod
+    def load(path: Path, key: str) -> "FitState | None":
+        """Read the checkpoint of this fit; None if it is missing, damaged or of another fit."""
+        if not path.is_file():
+            return None
+        try:
+            arrays = read_npz(path)
+        except ArtifactError as error:
+            logger.warning("ignoring the checkpoint, the fit starts over: %s", error)
+            return None
+        if arrays["key"].item() != key:
+            logger.info("checkpoint %s belongs to other inputs; the fit starts over", path)
+            return None
+        parameters, first, second = (
+            {name: arrays[f"{table}_{name}"] for name in FIELDS}
+            for table in ("parameters", "first", "second")
+        )
+        generator = np.random.default_rng()
+        generator.bit_generator.state = json.loads(arrays["generator"].item())
+        step, adam_steps = (int(count) for count in arrays["counts"])
+        return FitState(
+            Adam(parameters, first, second, adam_steps),
+            ScreenGradients(arrays["gradient_total"], arrays["gradient_seen"]),
+            generator,
+            arrays["order"].tolist(),
+            step,
+            [tuple(row) for row in arrays["curve"].tolist()],
+        )
 
 
 def fit_step(
@@ -170,13 +237,10 @@ def fit_gaussians(
             state.save(checkpoint, key)
     if settings.initial != "frozen":
         prune(state.adam, settings, extent)
-    parameters = state.adam.parameters
-    if settings.initial != "frozen":
-        order = morton_order(parameters["means"])
-        parameters = {name: values[order] for name, values in parameters.items()}
+        state.adam.keep(morton_order(state.adam.parameters["means"]))
     if checkpoint:
         checkpoint.unlink(missing_ok=True)
-    return Gaussians(**parameters), np.array(state.curve, dtype=np.float64).reshape(-1, 4)
+    return state.adam.as_gaussians(), np.array(state.curve, dtype=np.float64).reshape(-1, 4)
 
 
 def run_gaussians(
@@ -212,14 +276,8 @@ def run_gaussians(
         else:
             # a resumed fit must stay on one device, because sums differ between CPU and CUDA
             settings = settings.model_copy(update={"device": choose_device(settings.device)})
-            key = sha256_of_json(
-                [
-                    settings.model_dump(mode="json"),
-                    seed,
-                    sha256_of_path(scene_folder),
-                    code_digest(fit_gaussians),
-                ]
-            )
+            inputs = [settings.model_dump(mode="json"), seed, sha256_of_path(scene_folder)]
+            key = sha256_of_json([*inputs, code_digest(fit_gaussians)])
             checkpoint = Path(cache) / "gaussians" / f"{key[:16]}.npz"
             gaussians, curve = fit_gaussians(
                 scene, settings, seed=seed, threads=threads, checkpoint=checkpoint, key=key

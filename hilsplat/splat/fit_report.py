@@ -13,8 +13,7 @@ from hilsplat.base.images import to_float, write_png
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.films import contact_sheet
-from hilsplat.splat.flyaround import write_flyaround
+from hilsplat.splat.flyaround import contact_sheet, write_flyaround
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.photometric import psnr, ssim
 from hilsplat.splat.rasterise.api import render
@@ -24,6 +23,8 @@ logger = logging.getLogger(__name__)
 
 MAX_SHOWN = 8
 """Maximum number of views on the sheet of test views."""
+SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
+"""Entries of the report that the index repeats."""
 ERROR_GAIN = 4
 """Factor by which displayed errors are magnified."""
 
@@ -42,10 +43,7 @@ def write_report(
     It contains `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.mp4`,
     `flyaround.png`, `curves.png` after a fit, and the index.
 
-    Args:
-        scene: scene whose held-out views are scored, or its training views if none are held out.
-        curve: rows of (step, loss, training PSNR in dB, number of Gaussians); None without a fit.
-        origin: origin of the Gaussians.
+    The training views are scored if the scene has no held-out views. `curve` is that of `fit_gaussians`.
     """
     background = {"white": (1.0, 1.0, 1.0)}.get(settings.background, (0.0, 0.0, 0.0))
 
@@ -85,20 +83,12 @@ def write_report(
         )
     with atomic_folder(folder) as temporary:
         write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
-        path = [view.camera for view in load_views(scene, "train", settings.image_scale)]
-        path = path or [view.camera for view in views]
+        path = [view.camera for view in load_views(scene, "train", settings.image_scale) or views]
         write_flyaround(temporary, path, partial(picture, threads=1), threads)
         if curve is not None:
             _draw_curves(temporary / "curves.png", curve)
         write_json(temporary / "report.json", report)
-        write_index(
-            temporary,
-            scores,
-            split=split,
-            psnr_db=report["psnr_db"],
-            ssim=report["ssim"],
-            gaussians=len(gaussians),
-        )
+        write_index(temporary, scores, **{name: report[name] for name in SUMMARY})
     for warning in report["warnings"]:
         logger.warning("%s: %s", scene.name, warning)
     return report
@@ -112,12 +102,8 @@ def _draw_curves(path: Path, curve: Float[np.ndarray, "S 4"]) -> None:
     figure = Figure(figsize=(10, 3), layout="constrained")
     FigureCanvasAgg(figure)
     steps = curve[:, 0]
-    for axes, values, title in zip(
-        figure.subplots(1, 3),
-        curve[:, 1:].T,
-        ("loss", "PSNR of the step's view, dB", "Gaussians"),
-        strict=True,
-    ):
+    titles = ("loss", "PSNR of the step's view, dB", "Gaussians")
+    for axes, values, title in zip(figure.subplots(1, 3), curve[:, 1:].T, titles, strict=True):
         axes.plot(steps, values, linewidth=0.8)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("step")

@@ -1,8 +1,10 @@
-"""Smooth camera paths around a scene or through given cameras, as a film and a contact sheet."""
+"""Smooth camera paths around a scene or through given cameras; films and contact sheets of renders."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
+import av
 import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.interpolate import PchipInterpolator
@@ -13,7 +15,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from hilsplat.base.images import write_png
 from hilsplat.base.processes import in_order
 from hilsplat.scene.cameras import Camera
-from hilsplat.splat.films import contact_sheet, write_film
 
 FRAMES = 120
 FRAMES_PER_S = 24
@@ -23,16 +24,20 @@ MAX_STOPS = 80
 SMOOTHING = 1 / 40
 """Width of the smoothing as a share of the tour: it removes the shake of hand-held photographs."""
 
+MAX_SIDE_PX = 320
+"""Longer side of a picture on a contact sheet."""
+GAP_PX = 4
+
+OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}
+"""Macroblock-tree rate control is off: its bytes differ between runs, even on one thread (PyAV 18.1)."""
+
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     """Return cameras along a closed tour of the given ones, evenly spaced and smoothed.
 
     The tour is short in position and viewing direction, and its speed is constant. Position, viewing
-    direction and up are smoothed along it. Lens and image size are those of the first camera.
-
-    Args:
-        cameras: at least one; a single one is repeated.
-        frames: number of cameras to return; after the last, the path returns to the first.
+    direction and up are smoothed along it. Lens and image size are those of the first camera. A single camera
+    is repeated.
     """
     stops = cameras[:: -(-len(cameras) // MAX_STOPS)]
     centres = np.stack([camera.centre for camera in stops])
@@ -56,11 +61,7 @@ def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
     """Return cameras along a smooth curve through the given ones, in their order.
 
     Position and lens follow a monotone cubic, so that the path does not overshoot; the direction rotates at
-    a constant rate between neighbours. Image size is that of the first camera.
-
-    Args:
-        cameras: at least two.
-        frames: number of cameras to return.
+    a constant rate between neighbours. Image size is that of the first camera. There are at least two.
     """
     centres = np.stack([camera.centre for camera in cameras])
     turns = Rotation.from_matrix([camera.cam_from_world[:3, :3] for camera in cameras])
@@ -122,20 +123,64 @@ def write_flyaround(
     """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 
     Args:
-        cameras: training cameras that the path visits.
-        picture: renders a camera.
         threads: frames rendered in parallel while others are encoded; the bytes do not depend on it.
     """
     shown: list[UInt8[np.ndarray, "H W 3"]] = []
     path = closed_path(cameras, FRAMES)
 
     def frames() -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        for number, frame in enumerate(
-            in_order(picture, path, threads) if threads > 1 else map(picture, path)
-        ):
+        rendered = in_order(picture, path, threads) if threads > 1 else map(picture, path)
+        for number, frame in enumerate(rendered):
             if number % (FRAMES // SHEET_FRAMES) == 0:
                 shown.append(frame)
             yield frame
 
     write_film(folder / "flyaround.mp4", frames(), FRAMES_PER_S)
     write_png(folder / "flyaround.png", contact_sheet(shown, columns=4))
+
+
+def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
+    """Encode frames of one size; equal frames give equal bytes with the same version of PyAV.
+
+    An odd last row or column is cropped: yuv420p needs even sides.
+
+    Args:
+        path: .mp4 file, in a temporary folder or file of an atomic writer.
+        frames: at least one; consumed one by one, so that a long film needs little memory.
+    """
+    frames = iter(frames)
+    first = next(frames)
+    height, width = (side // 2 * 2 for side in first.shape[:2])
+    with av.open(path, "w", format="mp4", options={"movflags": "faststart", "fflags": "bitexact"}) as film:
+        stream = film.add_stream("libx264", rate=per_second, options=OPTIONS)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.codec_context.flags |= av.codec.context.Flags.bitexact
+        for frame in chain([first], frames):
+            even = np.ascontiguousarray(frame[:height, :width])
+            # the encoder's own conversion occasionally gives other bytes
+            picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
+            film.mux(stream.encode(picture))
+        film.mux(stream.encode())
+
+
+def contact_sheet(
+    pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int, max_side_px: int = MAX_SIDE_PX
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Arrange pictures on a white sheet, row by row, shrunk by whole factors to at most `max_side_px`."""
+    cells = [_shrunk(picture, -(-max(picture.shape[:2]) // max_side_px)) for picture in pictures]
+    height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
+    rows = -(-len(cells) // columns)
+    sheet = np.full((rows * height, min(columns, len(cells)) * width, 3), 255, np.uint8)
+    for k, cell in enumerate(cells):
+        y, x = (k // columns) * height, (k % columns) * width
+        sheet[y : y + cell.shape[0], x : x + cell.shape[1]] = cell
+    return sheet
+
+
+def _shrunk(picture: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Average blocks of factor x factor pixels; incomplete blocks at the border are cropped."""
+    if factor <= 1:
+        return picture
+    height, width = (side // factor for side in picture.shape[:2])
+    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)

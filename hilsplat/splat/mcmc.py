@@ -8,7 +8,7 @@ regularisers make unneeded Gaussians transparent and small.
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from scipy.special import comb, expit, logit
 
 from hilsplat.base.compiled import compiled
@@ -141,13 +141,18 @@ def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.ran
     """
     dead = opacities(adam) <= settings.min_opacity
     if dead.any() and not dead.all():
-        _relocate(adam, dead, settings, generator)
+        targets = np.flatnonzero(dead)
+        source = _draw(np.where(dead, 0.0, opacities(adam)), len(targets), generator)
+        shared = _share(adam, source, settings)
+        for name in FIELDS:
+            adam.parameters[name][targets] = shared[name]
+            adam.first[name][targets] = 0
+            adam.second[name][targets] = 0
     n = len(adam)
     target = min(settings.max_gaussians, int(n * (1 + settings.mcmc_growth)))
     if target > n:
         source = _draw(opacities(adam), target - n, generator)
-        shared = _share(adam, source, settings)
-        adam.append({name: shared[name] for name in FIELDS})
+        adam.append(_share(adam, source, settings))
 
 
 def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
@@ -162,19 +167,6 @@ def least_alive_logit(min_opacity: float) -> np.float32:
     """
     exact = float(logit(min_opacity))
     return np.float32(exact + 1e-6 * max(abs(exact), 1.0))  # float32 rounding is at most 6e-8 of its size
-
-
-def _relocate(
-    adam: Adam, dead: Bool[np.ndarray, " N"], settings: GaussiansSettings, generator: np.random.Generator
-) -> None:
-    """Move each dead Gaussian onto a live one."""
-    targets = np.flatnonzero(dead)
-    source = _draw(np.where(dead, 0.0, opacities(adam)), len(targets), generator)
-    shared = _share(adam, source, settings)
-    for name in FIELDS:
-        adam.parameters[name][targets] = shared[name]
-        adam.first[name][targets] = 0
-        adam.second[name][targets] = 0
 
 
 def _draw(weights: Float[np.ndarray, " N"], number: int, generator: np.random.Generator) -> np.ndarray:

@@ -19,11 +19,7 @@ SH_REST_SHARE = 1 / 20
 
 
 def means_rate(settings: GaussiansSettings, progress: float) -> float:
-    """Return the step size of the means in units of the cameras' extent; it decreases exponentially.
-
-    Args:
-        progress: share of the iterations done, in [0, 1].
-    """
+    """Return the step size of the means in units of the extent; it falls exponentially with progress."""
     return settings.means_rate ** (1 - progress) * settings.means_rate_last**progress
 
 
@@ -67,7 +63,6 @@ class Adam:
 
     Attributes:
         parameters, first, second: arrays by field, with one row per Gaussian.
-        steps: completed steps.
     """
 
     parameters: dict[str, np.ndarray]
@@ -93,12 +88,7 @@ class Adam:
     def step(
         self, gradients: Gradients, settings: GaussiansSettings, rate_of_means: float, threads: int
     ) -> None:
-        """Take one step.
-
-        Args:
-            settings: step sizes of scales, quaternions and harmonics.
-            rate_of_means: step size of the means, scene units.
-        """
+        """Take one step; `rate_of_means` is in scene units."""
         self.steps += 1
         of_rest = SH_REST_SHARE * settings.sh_rate
         rates: dict[str, list[float]] = {  # per number of one Gaussian, cyclic

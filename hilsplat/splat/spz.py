@@ -47,7 +47,7 @@ def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) ->
     Args:
         gaussians: harmonics beyond degree 3 are omitted.
         rows: Gaussians to write, in this order; spatially sorted rows compress best.
-        bits: fractional bits of positions (`fractional_bits`).
+        bits: output of `fractional_bits`.
     """
     degree = min(gaussians.sh_degree, 3)
     sh = gaussians.sh[rows, : (degree + 1) ** 2]

@@ -37,7 +37,6 @@ class Tiles:
     touches it, front to back, in at most tile_start[t + 1] - tile_start[t] entries.
 
     Attributes:
-        tiles_x: tiles per row.
         order: rows of the drawn Gaussians, front to back; equal depths in row order.
         tile_start: number of entries of all preceding tiles.
     """
@@ -46,11 +45,11 @@ class Tiles:
     order: Int32[np.ndarray, " M"]
     tile_start: Int64[np.ndarray, " num_tiles_plus_1"]
 
-    def bands(self, max_entries: int = MAX_ENTRIES) -> list[tuple[int, int]]:
-        """Return ranges that cover all tiles, each with at most `max_entries` entries or a single tile."""
+    def bands(self) -> list[tuple[int, int]]:
+        """Return ranges that cover all tiles, each with at most `MAX_ENTRIES` entries or a single tile."""
         start, out, begin = self.tile_start, [], 0
         while begin < len(start) - 1:
-            end = int(np.searchsorted(start, start[begin] + max_entries, side="right")) - 1
+            end = int(np.searchsorted(start, start[begin] + MAX_ENTRIES, side="right")) - 1
             end = min(max(end, begin + 1), len(start) - 1)
             out.append((begin, end))
             begin = end
@@ -172,7 +171,6 @@ def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tu
     Args:
         box: first and last pixel column, first and last pixel row; last < first: not drawn.
         depths: positive float32 depths.
-        size_hw: image size, px.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
     # positive floats and their bits have the same order

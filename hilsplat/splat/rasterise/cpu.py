@@ -42,11 +42,7 @@ def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *argume
 def over_ranges(
     work: Callable[..., Any], count: int, threads: int, *arguments: Any, first: int = 0
 ) -> list[Any]:
-    """Call `work(begin, end, *arguments)` over ranges that cover `count` numbers from `first`, on threads.
-
-    Returns:
-        results in the order of the ranges.
-    """
+    """Call `over_edges` with ranges that cover `count` numbers from `first`."""
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
     edges = first + np.linspace(0, count, pieces + 1).astype(int)
     return over_edges(work, edges.tolist(), threads, *arguments)
@@ -58,7 +54,6 @@ class Projected:
 
     Attributes:
         camera: packed camera row.
-        size_hw: image size, px.
         degree: degree of spherical harmonics used.
         geometry: see `project.GEOMETRY`.
         box: pixel box of each Gaussian; last < first if it is not drawn.
@@ -202,11 +197,9 @@ def blend_gradients(
     grad_alpha: Float32[np.ndarray, "H W"],
     threads: int,
 ) -> Gradients:
-    """Compute the gradients of the parameters from those of the premultiplied image and alpha.
+    """Compute the gradients of the parameters from those of the output of `blend_forward`.
 
-    Args:
-        channels: blended channels: the view's colours in the first 3 columns, then features.
-        image, alpha: output of `blend_forward`.
+    `channels` are the view's colours, then features.
     """
     p, n = gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
@@ -241,11 +234,7 @@ def draw(
     features: Float32[np.ndarray, "N D"] | None,
     threads: int,
 ) -> Drawn:
-    """Draw image and alpha, and compute gradients on demand; see `api.draw`.
-
-    Raises:
-        HilsplatError: if parameters are not finite, or quaternions have zero length.
-    """
+    """Draw image and alpha, and compute gradients on demand; see `api.draw`."""
     view = project_gaussians(gaussians, camera, degree, threads)
     channels = view.colours
     if features is not None:

@@ -68,9 +68,8 @@ def _scene() -> tuple[Gaussians, Camera]:
         rng.normal(size=(number, 4, 3)) * 0.4,
     )
     K = np.array([[70.0, 0, 41], [0, 75, 29], [0, 0, 1]])
-    return Gaussians(*(values.astype(np.float32) for values in arrays)), Camera(
-        "test", np.eye(4), K, (60, 80)
-    )
+    camera = Camera("test", np.eye(4), K, (60, 80))
+    return Gaussians(*(values.astype(np.float32) for values in arrays)), camera
 
 
 def _relative(one: np.ndarray, other: np.ndarray) -> float:

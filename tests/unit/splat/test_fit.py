@@ -1,7 +1,6 @@
 """The fit on a scene of three Gaussians: it improves, it resumes, and threads do not matter."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +10,11 @@ from hilsplat.base.errors import SceneError
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit
 from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
+from hilsplat.splat.gaussians import morton_order
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
 from hilsplat.splat.optimise import Adam, means_rate
-from hilsplat.splat.order import morton_order
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.cpu import Gradients
-from hilsplat.splat.state import FitState
 from tests.unit.splat.three_gaussians_world import mean_psnr
 
 SETTINGS = GaussiansSettings(
@@ -35,10 +33,6 @@ def test_fit_improves_held_out_views(scene, strategy):
     assert np.array_equal(morton_order(last.means), np.arange(len(last)))
 
 
-def outputs(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_path, monkeypatch, strategy):
     settings = SETTINGS.model_copy(update={"strategy": strategy, "background": "random"})
@@ -48,7 +42,7 @@ def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_
         fit.run_gaussians(
             scene.folder, out / "g.ply", out / "report", tmp_path / "cache", settings, 3, threads
         )
-        return outputs(out)
+        return {path.name: path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
     undisturbed = stage("one", threads=1)
     assert undisturbed == stage("two", threads=2)
@@ -78,14 +72,19 @@ def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_
     assert index["split"] == "test"
     assert list(index["views"]) == ["003.png", "007.png"]
     assert len(load_ply(tmp_path / "resumed" / "g.ply")) == index["gaussians"]
+    coordinates = read_json(tmp_path / "resumed" / "g.json")
+    assert coordinates["source"] == "imported from sparse/0"
+    assert coordinates["unit"] == "arbitrary"
+    assert coordinates["scale"] == 1.0
+    assert coordinates["origin"] == {"kind": "fitted", "strategy": strategy, "iterations": 60, "seed": 3}
 
 
 def test_another_fits_checkpoint_is_not_used(scene, tmp_path):
     adam = Adam.start(first_gaussians(scene, [scene.cameras["000.png"]], SETTINGS, np.random.default_rng(0)))
-    state = FitState(adam, ScreenGradients.start(len(adam)), np.random.default_rng(0))
+    state = fit.FitState(adam, ScreenGradients.start(len(adam)), np.random.default_rng(0))
     state.save(tmp_path / "c.npz", "this")
-    assert FitState.load(tmp_path / "c.npz", "other") is None
-    assert len(FitState.load(tmp_path / "c.npz", "this").adam) == len(adam)
+    assert fit.FitState.load(tmp_path / "c.npz", "other") is None
+    assert len(fit.FitState.load(tmp_path / "c.npz", "this").adam) == len(adam)
 
 
 def test_a_fit_does_not_resume_on_another_device(scene, tmp_path, monkeypatch):
@@ -134,8 +133,8 @@ def test_random_start_holds_as_many_points_as_asked_in_sight_of_cameras(scene):
 def test_frozen_gaussians_stay_the_points(scene, strategy):
     points = np.random.default_rng(0).normal(0, 0.3, (150, 3)).astype(np.float32)
     bare = replace(scene, points_xyz=points, points_rgb=np.full((150, 3), 128, np.uint8))
-    few = {"initial": "frozen", "max_gaussians": 100, "iterations": 60, "strategy": strategy}
-    settings = SETTINGS.model_copy(update={**few, "densify_every": 10, "opacity_reset_every": 20})
+    few = {"initial": "frozen", "max_gaussians": 100, "strategy": strategy, "opacity_reset_every": 20}
+    settings = SETTINGS.model_copy(update=few)
     gaussians, curve = fit.fit_gaussians(bare, settings, seed=0)
     assert np.array_equal(gaussians.means, points)
     assert curve[-1, 2] > curve[0, 2]  # colours, sizes and opacities are fitted all the same
@@ -170,16 +169,6 @@ def test_rate_of_the_means_falls_exponentially():
     assert means_rate(settings, 1.0) == pytest.approx(1e-4)
 
 
-def test_coordinates_are_written_beside_the_ply(scene, tmp_path):
-    settings = SETTINGS.model_copy(update={"iterations": 2})
-    fit.run_gaussians(scene.folder, tmp_path / "g.ply", tmp_path / "report", tmp_path, settings, 3, 1)
-    content = read_json(tmp_path / "g.json")
-    assert content["source"] == "imported from sparse/0"
-    assert content["unit"] == "arbitrary"
-    assert content["scale"] == 1.0
-    assert content["origin"] == {"kind": "fitted", "strategy": "default", "iterations": 2, "seed": 3}
-
-
 def test_scene_without_training_views_is_refused(scene):
     held_out = replace(scene, split=dict.fromkeys(scene.cameras.names, "test"))
     with pytest.raises(SceneError, match="no training view"):
@@ -210,15 +199,12 @@ def test_small_is_cloned_and_large_is_split():
 
 def test_the_cap_takes_the_largest_gradient_first():
     adam = Adam.start(two_gaussians())
-    settings = GaussiansSettings(densify_gradient=0.5, max_gaussians=100).model_copy(
-        update={"max_gaussians": 3}
-    )
+    settings = GaussiansSettings(densify_gradient=0.5).model_copy(update={"max_gaussians": 3})
     gradients = ScreenGradients(np.array([1.0, 2.0]), np.ones(2, np.int32))
     densify(adam, gradients, settings, 1.0, np.random.default_rng(0))
     assert len(adam) == 3
-    np.testing.assert_allclose(
-        np.exp(adam.parameters["log_scales"][:, 0]), [0.001, 0.0625, 0.0625], rtol=1e-5
-    )
+    widths = np.exp(adam.parameters["log_scales"][:, 0])
+    np.testing.assert_allclose(widths, [0.001, 0.0625, 0.0625], rtol=1e-5)
 
 
 def test_transparent_and_huge_are_pruned_and_opacity_is_reset():
@@ -244,9 +230,8 @@ def test_first_adam_step_moves_by_the_rate_against_the_sign():
     adam = Adam.start(two_gaussians())
     before = {name: values.copy() for name, values in adam.parameters.items()}
     ones = {name: np.ones_like(values) for name, values in before.items()}
-    gradients = Gradients(
-        **ones, features=np.zeros((2, 0), np.float32), means_px=np.zeros((2, 2), np.float32)
-    )
+    features, means_px = np.zeros((2, 0), np.float32), np.zeros((2, 2), np.float32)
+    gradients = Gradients(**ones, features=features, means_px=means_px)
     adam.step(gradients, GaussiansSettings(scales_rate=0.01, sh_rate=2.5e-3), rate_of_means=3.2e-4, threads=1)
     np.testing.assert_allclose(before["means"] - adam.parameters["means"], 3.2e-4, rtol=1e-3)
     np.testing.assert_allclose(before["log_scales"] - adam.parameters["log_scales"], 0.01, rtol=1e-3)

@@ -14,14 +14,15 @@ from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.coordinates import write_source_ply
+from hilsplat.splat.coordinates import import_gaussians, write_source_ply
 from hilsplat.splat.fit import run_gaussians
-from hilsplat.splat.import_gaussians import import_gaussians
+from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.splat.similarity import move_gaussians
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians, three_gaussians_scene
 
-FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
+COMPARED = ("means", "log_scales", "opacity_logits", "sh")
+"""All fields but the quaternions: a quaternion and its negative are the same rotation."""
 
 
 @pytest.fixture(scope="module")
@@ -44,28 +45,28 @@ def source_ply(turned_scene, tmp_path) -> Path:
 def test_source_coordinates_become_the_scenes(turned_scene, source_ply):
     existing, origin = import_gaussians(source_ply, turned_scene)
     truth = three_gaussians()
-    for name in ("means", "log_scales", "opacity_logits", "sh"):
+    for name in COMPARED:
         np.testing.assert_allclose(getattr(existing, name), getattr(truth, name), atol=1e-5)
     assert mean_psnr(turned_scene, existing) > 45
     assert origin["kind"] == "imported"
     assert origin["taken_as"] == "in the coordinates of the scene's source"
 
 
-def test_the_stage_reports_on_brought_gaussians_without_a_fit(
-    turned_scene, source_ply, tmp_path, monkeypatch
-):
-    monkeypatch.setattr("hilsplat.splat.fit.fit_gaussians", None)
+def stage_output(scene: Scene, existing: Path, tmp_path: Path) -> Path:
+    """The folder with PLY, JSON and report of a run of the stage."""
     out = tmp_path / "out"
-    run_gaussians(
-        turned_scene.folder,
-        out / "g.ply",
-        out / "report",
-        tmp_path / "cache",
-        GaussiansSettings(),
-        0,
-        1,
-        existing=source_ply,
-    )
+    settings = GaussiansSettings()
+    run_gaussians(scene.folder, out / "g.ply", out / "report", tmp_path, settings, 0, 1, existing=existing)
+    return out
+
+
+@pytest.fixture
+def out(turned_scene, source_ply, tmp_path) -> Path:
+    """The folder with PLY, JSON and report of the imported Gaussians."""
+    return stage_output(turned_scene, source_ply, tmp_path)
+
+
+def test_the_stage_reports_on_imported_gaussians_without_a_fit(source_ply, out):
     report = read_json(out / "report" / "report.json")
     assert report["origin"]["kind"] == "imported"
     assert report["origin"]["file"] == "theirs.ply"
@@ -82,19 +83,11 @@ def test_the_stage_reports_on_brought_gaussians_without_a_fit(
 
 def test_gaussians_elsewhere_are_reported(turned_scene, tmp_path):
     save_ply(tmp_path / "elsewhere.ply", three_gaussians())
-    out = tmp_path / "out"
-    settings = GaussiansSettings()
-    existing = tmp_path / "elsewhere.ply"
-    run_gaussians(turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, existing=existing)
-    assert "other coordinates" in read_json(out / "r" / "report.json")["warnings"][0]
+    out = stage_output(turned_scene, tmp_path / "elsewhere.ply", tmp_path)
+    assert "other coordinates" in read_json(out / "report" / "report.json")["warnings"][0]
 
 
-def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, source_ply, tmp_path):
-    out = tmp_path / "1"
-    settings = GaussiansSettings()
-    run_gaussians(
-        turned_scene.folder, out / "g.ply", out / "r", tmp_path, settings, 0, 1, existing=source_ply
-    )
+def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, source_ply, out):
     again, origin = import_gaussians(out / "g.ply", turned_scene)
     np.testing.assert_allclose(again.means, three_gaussians().means, atol=1e-5)
     assert "JSON" in origin["taken_as"]
@@ -157,21 +150,10 @@ def test_a_damaged_record_of_nerfstudio_is_named(turned_scene, source_ply, tmp_p
         import_gaussians(source_ply, turned_scene, path)
 
 
-def test_exported_gaussians_are_in_the_sources_coordinates(turned_scene, source_ply, tmp_path):
-    out = tmp_path / "out"
-    run_gaussians(
-        turned_scene.folder,
-        out / "g.ply",
-        out / "r",
-        tmp_path,
-        GaussiansSettings(),
-        0,
-        1,
-        existing=source_ply,
-    )
+def test_exported_gaussians_are_in_the_sources_coordinates(source_ply, out, tmp_path):
     assert write_source_ply(out / "g.ply", tmp_path / "exported.ply") == len(three_gaussians())
     exported, theirs = load_ply(tmp_path / "exported.ply"), load_ply(source_ply)
-    for name in ("means", "log_scales", "opacity_logits", "sh"):
+    for name in COMPARED:
         np.testing.assert_allclose(getattr(exported, name), getattr(theirs, name), atol=1e-4)
     (out / "g.json").unlink()
     with pytest.raises(ArtifactError, match=r"g\.json is missing"):
@@ -182,7 +164,8 @@ def rewritten(source: Path, target: Path, change, *, text: bool = False) -> Path
     """A PLY with other columns: `change` gets a dict of columns and returns it."""
     vertex = PlyData.read(source)["vertex"]
     columns = change({prop.name: np.array(vertex[prop.name]) for prop in vertex.properties})
-    table = np.empty(vertex.count, [(name, values.dtype) for name, values in columns.items()])
+    rows = len(next(iter(columns.values())))
+    table = np.empty(rows, [(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         table[name] = values
     PlyData([PlyElement.describe(table, "vertex")], text=text).write(target)
@@ -215,8 +198,10 @@ def test_dialects_of_other_programs_are_read(tmp_path, dialect, bases, text):
         np.testing.assert_allclose(getattr(again, name), getattr(gaussians, name), rtol=1e-6)
 
 
-def zero(columns: dict, name: str, value: float) -> dict:
-    columns[name][1] = value
+def changed(columns: dict, value: float, *names: str) -> dict:
+    """The columns with another value in their second row."""
+    for name in names:
+        columns[name][1] = value
     return columns
 
 
@@ -227,20 +212,14 @@ def zero(columns: dict, name: str, value: float) -> dict:
         (lambda c: {k: v for k, v in c.items() if k != "rot_3"}, "without rot_3"),
         (lambda c: {**c, "f_rest_0": c["x"], "f_rest_1": c["x"]}, "2 f_rest columns"),
         (lambda c: {**c, **{f"f_rest_{k}": c["x"] for k in range(72)}}, "72 f_rest columns"),
-        (lambda c: zero(c, "scale_1", -np.inf), "1 of 3 Gaussians hold a number that is not finite"),
-        (lambda c: zero(zero(zero(zero(c, "rot_0", 0), "rot_1", 0), "rot_2", 0), "rot_3", 0), "no rotation"),
+        (lambda c: changed(c, -np.inf, "scale_1"), "1 of 3 Gaussians hold a number that is not finite"),
+        (lambda c: changed(c, 0, "rot_0", "rot_1", "rot_2", "rot_3"), "no rotation"),
         (lambda c: {"packed_position": c["x"].astype(np.uint32)}, "compressed"),
         (lambda c: {k: v[:0] for k, v in c.items()}, "does not hold any Gaussians"),
     ],
 )
 def test_what_cannot_be_used_is_named(turned_scene, source_ply, tmp_path, change, message):
-    vertex = PlyData.read(source_ply)["vertex"]
-    columns = change({prop.name: np.array(vertex[prop.name]) for prop in vertex.properties})
-    table = np.empty(len(next(iter(columns.values()))), [(name, v.dtype) for name, v in columns.items()])
-    for name, values in columns.items():
-        table[name] = values
-    path = tmp_path / "broken.ply"
-    PlyData([PlyElement.describe(table, "vertex")]).write(path)
+    path = rewritten(source_ply, tmp_path / "broken.ply", change)
     with pytest.raises(ArtifactError, match=message) as caught:
         import_gaussians(path, turned_scene)
     assert "broken.ply" in str(caught.value)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilsplat.splat.order import morton_order
+from hilsplat.splat.gaussians import morton_order
 
 
 def test_a_cube_is_walked_octant_by_octant():

@@ -15,13 +15,15 @@ def some_gaussians(n: int, bases: int) -> Gaussians:
     return Gaussians(*(generator.standard_normal(shape, np.float32) for shape in shapes))
 
 
-@pytest.mark.parametrize("bases", [1, 4, 9, 16])
-def test_what_is_written_is_read_back(tmp_path, bases):
-    gaussians = some_gaussians(5, bases)
+@pytest.mark.parametrize(("n", "bases"), [(0, 4), (5, 1), (5, 4), (5, 9), (5, 16)])
+def test_what_is_written_is_read_back(tmp_path, n, bases):
+    gaussians = some_gaussians(n, bases)
     save_ply(tmp_path / "g.ply", gaussians)
     again = load_ply(tmp_path / "g.ply")
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(gaussians, name), getattr(again, name))
+    save_ply(tmp_path / "again.ply", again)
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "g.ply").read_bytes()
 
 
 def test_rest_is_stored_channel_by_channel(tmp_path):
@@ -34,17 +36,6 @@ def test_rest_is_stored_channel_by_channel(tmp_path):
     assert [prop.name for prop in vertex.properties][:7] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0"]
 
 
-def test_same_gaussians_same_bytes(tmp_path):
-    for name in ("a.ply", "b.ply"):
-        save_ply(tmp_path / name, some_gaussians(7, 9))
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
-def test_no_gaussians_survive_too(tmp_path):
-    save_ply(tmp_path / "g.ply", some_gaussians(0, 4))
-    assert len(load_ply(tmp_path / "g.ply")) == 0
-
-
 def test_broken_files_are_refused(tmp_path):
     with pytest.raises(ArtifactError, match="is missing"):
         load_ply(tmp_path / "none.ply")
@@ -55,12 +46,4 @@ def test_broken_files_are_refused(tmp_path):
     whole = (tmp_path / "g.ply").read_bytes()
     (tmp_path / "g.ply").write_bytes(whole[:-9])
     with pytest.raises(ArtifactError, match="is not a readable PLY"):
-        load_ply(tmp_path / "g.ply")
-    (tmp_path / "g.ply").write_bytes(whole.replace(b"opacity", b"opaqity"))
-    with pytest.raises(ArtifactError, match="without opacity"):
-        load_ply(tmp_path / "g.ply")
-    gaussians = some_gaussians(3, 1)
-    gaussians.means[1, 2] = np.nan
-    save_ply(tmp_path / "g.ply", gaussians)
-    with pytest.raises(ArtifactError, match="1 of 3 Gaussians"):
         load_ply(tmp_path / "g.ply")

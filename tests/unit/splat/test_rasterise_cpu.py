@@ -37,17 +37,17 @@ def test_any_number_of_threads_gives_the_same_bytes(threads):
 @pytest.mark.parametrize("max_entries", [1, 50, 1000])
 def test_bands_of_tiles_give_the_same_bytes(monkeypatch, max_entries):
     whole = everything(1)
-    bands = binning.Tiles.bands
-    monkeypatch.setattr(binning.Tiles, "bands", lambda tiles: bands(tiles, max_entries))
+    monkeypatch.setattr(binning, "MAX_ENTRIES", max_entries)
     for one, in_bands in zip(whole, everything(2), strict=True):
         np.testing.assert_array_equal(one, in_bands)
 
 
-def test_bands_cover_all_tiles_and_hold_no_more_than_asked():
+def test_bands_cover_all_tiles_and_hold_no_more_than_the_limit(monkeypatch):
     tiles = binning.Tiles(2, np.empty(0, np.int32), np.array([0, 3, 3, 10, 12, 13]))
-    # tile 2 alone has 7 entries, more than asked for, and forms a band alone
-    assert tiles.bands(5) == [(0, 2), (2, 3), (3, 5)]
     assert tiles.bands() == [(0, 5)]
+    monkeypatch.setattr(binning, "MAX_ENTRIES", 5)
+    # tile 2 alone has 7 entries, more than the limit, and forms a band alone
+    assert tiles.bands() == [(0, 2), (2, 3), (3, 5)]
 
 
 def test_tiles_list_the_boxes_that_touch_them_front_to_back():
