@@ -30,13 +30,18 @@ from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.crops import crop_ranks
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.level_nodes import LevelNodes, level_nodes
-from hilsplat.semantic_tree.nodes import mask_fits, nest_nodes, node_parents, renumbered_without_empty
+from hilsplat.semantic_tree.nodes import (
+    MIN_VISIBLE_PX,
+    mask_fits,
+    nearest_gaussians,
+    nest_nodes,
+    node_parents,
+    renumbered_without_empty,
+    without_strays,
+)
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
-
-MIN_VISIBLE_PX = 0.3
-"""A Gaussian counts as visible in a view if its mass there exceeds this."""
 
 LEAST_IOU = 1e-3
 """Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
@@ -81,6 +86,7 @@ def build_tree(
     cluster_of_mask = np.full(len(contributions), NONE, np.int64)
     node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
+    nearest = nearest_gaussians(means, threads)
     for each in LEVELS:
         rows = contributions.rows_of(each)
         found = (
@@ -94,8 +100,9 @@ def build_tree(
             whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
             found = found.joined(whole)
         renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
-        node_of_gaussian[:, each.index] = renumber[found.of_gaussian]
-        membership[:, each.index] = found.membership
+        of_gaussian = without_strays(found.of_gaussian, nearest, total_mass)
+        node_of_gaussian[:, each.index] = renumber[of_gaussian]
+        membership[:, each.index] = np.where(of_gaussian == NONE, 0, found.membership)
         cluster_of_mask[rows] = renumber[found.of_mask]
         level += [int(each)] * len(found.quality)
         quality += found.quality.tolist()

@@ -15,7 +15,7 @@ from hilsplat.settings import SemanticTreeSettings
 MIN_COVISIBLE = 0.2
 """Pairs of masks whose views see less than this share of each other are no evidence."""
 
-MIN_MEMBER_SHARE = 0.15
+MIN_MEMBER_SHARE = 0.05
 """A Gaussian joins its best node if that node holds more than this share of its weight."""
 
 MIN_FIT = 0.25

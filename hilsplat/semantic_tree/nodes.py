@@ -6,6 +6,19 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.levels import LEVELS, NONE
 
+MIN_VISIBLE_PX = 0.3
+"""A Gaussian counts as visible in a view if its mass there exceeds this."""
+
+
+PRIOR_VIEWS = 3
+"""Views without the node that are added to those that show it, so that one view alone decides little."""
+
+NEIGHBOURS = 11
+"""Number of nearest Gaussians, itself included, that connect a node."""
+
+STRAY_SHARE = 0.02
+"""A piece of a node with less than this share of the mass of its largest piece leaves the node."""
+
 
 def gaussian_nodes(
     cluster: Int64[np.ndarray, " M"],
@@ -16,22 +29,23 @@ def gaussian_nodes(
     total_mass: Float64[np.ndarray, " N"],
     min_share: float,
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Assign each Gaussian to the node that holds the largest share of its visible weight.
+    """Assign each Gaussian to the node that holds most of its visible weight where masks show the node.
 
-    Masks of one view may overlap, and a node may have several there, so a Gaussian's weight in a view is
-    capped at its visible mass there.
+    Nodes are ranked by the geometric mean of two shares of the Gaussian's visible weight: that inside the
+    node's masks in all views, and the same in the views that have a mask of the node. The second lets a small
+    thing, segmented in few views, keep its Gaussians beside a large one whose masks sometimes cover it. Masks
+    of one view may overlap, and a node may have several there, so a Gaussian's weight in a view is capped at
+    its visible mass there.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
-        num_nodes: number of nodes.
         weights: S of the masks.
-        view: view of each mask.
         mass: visible mass of each Gaussian in each view, px.
         total_mass: visible mass of each Gaussian, summed over views, px.
-        min_share: a Gaussian gets no node unless one holds more than this share of it.
+        min_share: a Gaussian joins only nodes that hold more than this share of its weight in all views.
 
     Returns:
-        node of each Gaussian, -1 for none (on a tie, the lowest node), and its share there.
+        node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.
     """
     inside = np.flatnonzero(cluster >= 0)
     ones = np.ones(len(inside))
@@ -40,20 +54,60 @@ def gaussian_nodes(
     in_pair = sp.csr_matrix((ones, (of_pair, inside)), shape=(len(seen), len(cluster)))
     per_view = (in_pair @ weights.astype(np.float64)).tocoo()
     capped = np.minimum(per_view.data, mass[pair_view[per_view.row], per_view.col])
-    per_node = sp.csr_matrix(
-        (capped / np.maximum(total_mass[per_view.col], 1e-12), (pair_node[per_view.row], per_view.col)),
-        shape=(num_nodes, weights.shape[1]),
-    ).tocoo()
-    node = np.full(weights.shape[1], NONE, np.int32)
-    membership = np.zeros(weights.shape[1], np.float32)
-    order = np.lexsort((per_node.row, -per_node.data, per_node.col))
-    column = per_node.col[order]
-    first = np.flatnonzero(np.concatenate(([True], column[1:] != column[:-1]))[: len(column)])
-    chosen = order[first]
-    chosen = chosen[per_node.data[chosen] > min_share]
-    node[per_node.col[chosen]] = per_node.row[chosen]
-    membership[per_node.col[chosen]] = per_node.data[chosen]
-    return node, membership
+    shape = (num_nodes, weights.shape[1])
+    per_node = sp.csr_matrix((capped, (pair_node[per_view.row], per_view.col)), shape=shape)
+    per_node.sort_indices()
+    in_its_views = np.empty(per_node.nnz)
+    for node in range(num_nodes):
+        row = slice(per_node.indptr[node], per_node.indptr[node + 1])
+        in_its_views[row] = mass[np.ix_(pair_view[pair_node == node], per_node.indices[row])].sum(axis=0)
+    column = per_node.indices
+    share = per_node.data / np.maximum(total_mass[column], 1e-12)
+    one_view = total_mass / np.maximum(np.count_nonzero(mass > MIN_VISIBLE_PX, axis=0), 1)
+    share_there = per_node.data / np.maximum(in_its_views + PRIOR_VIEWS * one_view[column], 1e-12)
+    row_of = np.repeat(np.arange(num_nodes), np.diff(per_node.indptr))
+    ranked = np.lexsort((row_of, -share * share_there, column))
+    ranked = ranked[share[ranked] > min_share]
+    best = ranked[np.flatnonzero(np.diff(column[ranked], prepend=NONE))]
+    node_of_gaussian = np.full(shape[1], NONE, np.int32)
+    membership = np.zeros(shape[1], np.float32)
+    node_of_gaussian[column[best]] = row_of[best]
+    membership[column[best]] = share[best]
+    return node_of_gaussian, membership
+
+
+def nearest_gaussians(means: Float[np.ndarray, "N 3"], threads: int) -> Int64[np.ndarray, "N K"]:
+    """Return the `NEIGHBOURS` nearest Gaussians of each, itself included."""
+    from scipy.spatial import cKDTree  # lazy: takes 0.2 s, and opening any tree imports this module
+
+    near = np.arange(1, min(NEIGHBOURS, len(means)) + 1)
+    return cKDTree(means).query(means, k=near, workers=threads)[1]
+
+
+def without_strays(
+    node_of_gaussian: Int32[np.ndarray, " N"],
+    nearest: Int64[np.ndarray, "N K"],
+    total_mass: Float64[np.ndarray, " N"],
+) -> Int32[np.ndarray, " N"]:
+    """Return the nodes without their stray pieces: Gaussians behind or beside a thing that its masks cover.
+
+    Gaussians of one node are connected if one is among the nearest of the other (`nearest_gaussians`).
+
+    Args:
+        node_of_gaussian: node of each Gaussian at one level, -1 for none.
+        nearest: nearest Gaussians of each.
+        total_mass: visible mass of each Gaussian, summed over views, px.
+    """
+    num = len(node_of_gaussian)
+    row, other = np.repeat(np.arange(num), nearest.shape[1]), nearest.ravel()
+    joined = (node_of_gaussian[row] == node_of_gaussian[other]) & (node_of_gaussian[row] != NONE)
+    graph = sp.csr_matrix((np.ones(joined.sum()), (row[joined], other[joined])), shape=(num, num))
+    _, piece = sp.csgraph.connected_components(graph, directed=False)
+    piece_mass = np.bincount(piece, total_mass)
+    largest = np.zeros(int(node_of_gaussian.max(initial=NONE)) + 2)
+    np.maximum.at(largest, node_of_gaussian, piece_mass[piece])
+    stray = piece_mass[piece] < STRAY_SHARE * largest[node_of_gaussian]
+    return np.where(stray, NONE, node_of_gaussian).astype(np.int32)
 
 
 def node_parents(

@@ -11,7 +11,7 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.level_nodes import level_nodes
-from hilsplat.semantic_tree.nodes import gaussian_nodes, node_parents
+from hilsplat.semantic_tree.nodes import gaussian_nodes, nearest_gaussians, node_parents, without_strays
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import SemanticTreeSettings
 from tests.unit.artifact_changes import change_index
@@ -26,15 +26,37 @@ from tests.unit.two_boxes_world import (
 
 
 def test_gaussians_join_the_node_with_the_largest_share():
-    weights = sp.csr_matrix(np.array([[5, 1, 3], [4, 1, 0], [2, 0, 3]], np.float32))
-    mass = np.array([[5, 5, 5], [5, 5, 5]], np.float32)
-    # nodes: masks 0 and 1 are node 0, mask 2 is node 1
+    weights = sp.csr_matrix(np.array([[5, 1, 2], [4, 1, 2], [2, 0, 1]], np.float32))
+    mass = np.full((2, 3), 5, np.float32)
+    # nodes: masks 0 and 1 are node 0 in views 0 and 1, mask 2 is node 1 in view 1 alone
     node, membership = gaussian_nodes(
         np.array([0, 0, 1]), 2, weights, np.array([0, 1, 1], np.int32), mass, np.full(3, 10.0), 0.25
     )
-    # 0.9 against 0.2; 0.2 is too little; of a tie, the lower node
+    # Gaussian 0: 9 of 10 px in node 0, 2 in node 1; Gaussian 1: 2 of 10 is too little
     assert node.tolist() == [0, -1, 0]
-    assert membership == pytest.approx([0.9, 0, 0.3])
+    assert membership == pytest.approx([0.9, 0, 0.4])
+
+
+def test_a_small_node_keeps_its_gaussian_where_a_large_one_sometimes_covers_it():
+    # Ten views of one Gaussian of 1 px. Node 0 has masks in all views, five of which cover the Gaussian;
+    # node 1 has masks in four views, all of which cover it.
+    weights = sp.csr_matrix(np.array([[1]] * 5 + [[0]] * 5 + [[1]] * 4, np.float32))
+    view = np.array([*range(10), *range(5, 9)], np.int32)
+    cluster = np.array([0] * 10 + [1] * 4)
+    node, membership = gaussian_nodes(
+        cluster, 2, weights, view, np.ones((10, 1), np.float32), np.full(1, 10.0), 0.05
+    )
+    # 5/10 * 5/(10 + 3) against 4/10 * 4/(4 + 3)
+    assert (node[0], membership[0]) == (1, pytest.approx(0.4))
+
+
+def test_of_a_tie_the_lower_node():
+    weights = sp.csr_matrix(np.array([[3], [3]], np.float32))
+    mass = np.full((2, 1), 5, np.float32)
+    found = gaussian_nodes(
+        np.array([1, 0]), 2, weights, np.arange(2, dtype=np.int32), mass, np.full(1, 10.0), 0.0
+    )
+    assert found[0].tolist() == [0]
 
 
 def test_overlapping_masks_of_one_view_count_a_gaussian_once():
@@ -45,6 +67,21 @@ def test_overlapping_masks_of_one_view_count_a_gaussian_once():
     node, membership = gaussian_nodes(np.array([0, 0, -1, 1]), 2, weights, view, mass, np.full(2, 10.0), 0.1)
     assert node.tolist() == [1, 1]
     assert membership == pytest.approx([0.5, 0.3])
+
+
+def test_small_pieces_apart_from_their_node_leave_it():
+    # two nodes on a line: node 0 at 0 to 39 and, one unit of mass in 52, at 200; node 1 beside the latter
+    means = np.zeros((52, 3))
+    means[:, 0] = [*range(40), 200, *range(201, 212)]
+    nodes = np.array([0] * 41 + [1] * 11, np.int32)
+    nearest = nearest_gaussians(means, 1)
+    kept = without_strays(nodes, nearest, np.full(52, 2.0))
+    assert kept.tolist() == nodes.tolist()  # one of forty is more than 2 %
+    mass = np.full(52, 2.0)
+    mass[40] = 1.0
+    assert np.flatnonzero(without_strays(nodes, nearest, mass) != nodes).tolist() == [40]
+    nodes[:] = -1
+    assert (without_strays(nodes, nearest, mass) == -1).all()
 
 
 def test_a_double_that_shows_nothing_is_no_node():

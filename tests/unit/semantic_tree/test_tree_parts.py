@@ -12,6 +12,7 @@ from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
 from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.splat.ply import load_ply, save_ply
+from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.round_gaussians import round_gaussians
 
 
@@ -77,25 +78,23 @@ def ply(tmp_path):
     return path
 
 
-class SomeTree:
-    def __init__(self, ply):
-        self.gaussians_sha256 = sha256_of_file(ply)
-
-    node_of_gaussian = np.array([[0, -1, 5], [0, 3, -1], [1, -1, -1], [-1, -1, -1]], np.int32)
+def tree_of(ply):
+    nodes = np.array([[0, -1, 3], [0, 2, -1], [1, -1, -1], [-1, -1, -1]], np.int32)
+    return plain_tree([1, 1, 2, 3], [-1, -1, 0, 0], nodes, gaussians_sha256=sha256_of_file(ply))
 
 
 def test_the_exported_ply_is_still_one_of_gaussians(ply, tmp_path):
     out = tmp_path / "tree.ply"
-    write_tree_ply(ply, SomeTree(ply), out)
+    write_tree_ply(ply, tree_of(ply), out)
     vertex = PlyData.read(out)["vertex"]
     assert vertex["node_whole"].tolist() == [0, 0, 1, -1]
-    assert vertex["node_part"].tolist() == [-1, 3, -1, -1]
-    assert vertex["node_subpart"].tolist() == [5, -1, -1, -1]
+    assert vertex["node_part"].tolist() == [-1, 2, -1, -1]
+    assert vertex["node_subpart"].tolist() == [3, -1, -1, -1]
     np.testing.assert_array_equal(load_ply(out).means, load_ply(ply).means)
 
 
 def test_a_tree_of_other_gaussians_is_not_exported(ply, tmp_path):
-    other = SomeTree(ply)
+    other = tree_of(ply)
     save_ply(ply, round_gaussians(np.arange(12.0).reshape(4, 3) + 1))  # as many Gaussians
     with pytest.raises(MisalignedArtifactError, match=r"made for another .*\.ply"):
         write_tree_ply(ply, other, tmp_path / "tree.ply")
