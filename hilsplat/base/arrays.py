@@ -46,7 +46,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
             if not fits:
                 raise ArtifactError(
                     f"{path}: array {name} cannot be used",
-                    expected=f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]",
+                    expected=described(declared),
                     found=f"{array.dtype} of shape {array.shape}",
                     fix=remake(path),
                 )
@@ -61,6 +61,11 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
                     found=f"{least} to {most}",
                     fix=remake(path),
                 )
+
+
+def described(declared: type[AbstractArray]) -> str:
+    """Return a jaxtyping annotation in readable form: `Float32[N 3]`."""
+    return f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]"
 
 
 def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:
