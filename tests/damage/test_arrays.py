@@ -49,7 +49,8 @@ def damaged(arrays: dict[str, np.ndarray], damage: tuple[str, str, int, int]) ->
     if kind == "shape":
         array = array[..., None]
     elif kind == "dtype":
-        array = array.astype([np.float64 if array.dtype.kind in "iu" else np.int16, np.str_][place % 2])
+        other = {"i": np.float64, "u": np.float64, "U": np.bytes_}.get(array.dtype.kind, np.int16)
+        array = array.astype([other, np.str_][place % 2])
     elif kind == "cut":
         array = array[: place % max(len(array), 1)]
     elif array.dtype.kind in "iu":
