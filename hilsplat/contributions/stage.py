@@ -57,7 +57,11 @@ MAX_WEIGHTS_TOGETHER = 2**25
 
 
 class ArrayStream:
-    """A .npy file written row by row, so that the stage never holds all of its output."""
+    """A .npy file written row by row, so that the stage never holds all of its output.
+
+    Args:
+        row_shape: shape of one row; () for an array of numbers.
+    """
 
     def __init__(self, path: Path, dtype: type, row_shape: tuple[int, ...] = ()) -> None:
         self._dtype, self._row_shape, self._rows = np.dtype(dtype), row_shape, 0

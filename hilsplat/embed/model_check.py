@@ -123,7 +123,7 @@ def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
 
 
 def _second_call(call: Callable[..., Any], *given: object) -> tuple[Any, float]:
-    """Return the result and seconds of a second call; the first compiles, allocates memory, fills caches."""
+    """Return the result of a second call and its seconds. The first call compiles and fills caches."""
     call(*given)
     start = time.perf_counter()
     return call(*given), time.perf_counter() - start

@@ -24,7 +24,7 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         raise
     except GatedRepoError as error:
         raise DownloadError(
-            f"{requested.repository} requires consent before a download ({_status(error)})",
+            f"{requested.repository} requires you to accept its terms before downloading ({_status(error)})",
             fix=f"accept its terms at {place}, `hf auth login` or set HF_TOKEN, and run the command again",
         ) from error
     except RepositoryNotFoundError as error:

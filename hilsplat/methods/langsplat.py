@@ -14,8 +14,7 @@ Departs from the published code:
     - weights below `contributions.min_weight` are dropped.
 
 `hilsplat.field.literal_trainer` (loss `l1`) renders at every step, and averages over all pixels like
-LangSplat. It also differs in drawing views with replacement and training all levels in one run. It treats
-alpha and unit length like this module.
+LangSplat. It also trains all levels in one run. It treats alpha and unit length like this module.
 """
 
 import numpy as np

@@ -21,7 +21,7 @@ from hilsplat.settings import EvaluateSettings
 
 @dataclass(frozen=True)
 class FieldAnswers:
-    """Answers of a language field; `text_vectors` returns the unit CLIP vectors of texts."""
+    """Query results from a language field; `text_vectors` returns the unit CLIP vectors of texts."""
 
     language: LanguageField
     code: Code

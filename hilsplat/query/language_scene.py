@@ -96,6 +96,11 @@ class LanguageScene:
         Canonical phrases, template, scale and node selection are read from the provenance of the variant's
         evaluation, or of its panel if the scene has no labels.
 
+        Args:
+            folder: a finished scene.
+            variant: named set of settings whose files are queried.
+            threads: number of threads for rasterising and look-ups.
+
         Raises:
             ArtifactError: the scene is not finished.
             MisalignedArtifactError: its parts do not belong together.

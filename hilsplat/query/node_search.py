@@ -96,7 +96,7 @@ def search(
         tree: the nodes.
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
-        path: the texts.
+        path: the texts, coarse to fine.
         threshold: see `best_nodes`.
         ancestors: share of the mean margin of a node's ancestors that is added to its own; ignored for a path
             of several texts, which names the ancestors itself.

@@ -43,7 +43,8 @@ def write_report(
     It contains `report.json`, `test_views.png` (photograph, rendering, error), `flyaround.mp4`,
     `flyaround.png`, `curves.png` after a fit, and the index.
 
-    The training views are scored if the scene has no held-out views. `curve` is that of `fit_gaussians`.
+    The training views are scored if the scene has no held-out views. `curve` is that of `fit_gaussians`; None
+    for imported Gaussians.
     """
     background = {"white": (1.0, 1.0, 1.0)}.get(settings.background, (0.0, 0.0, 0.0))
 

@@ -35,7 +35,8 @@ OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     """Return cameras along a closed tour of the given ones, evenly spaced and smoothed.
 
-    The tour is short in position and viewing direction, and its speed is constant. Position, viewing
+    The tour is short in position and viewing direction, and its speed is constant; after the last camera it
+    returns to the first. Position, viewing
     direction and up are smoothed along it. Lens and image size are those of the first camera. A single camera
     is repeated.
     """

@@ -14,7 +14,13 @@ from hilsplat.web.server import configured, listening_at
 
 
 class EmbeddedViewer:
-    """A notebook frame with the page of a scene; `close` stops its server. Arguments as in `show`."""
+    """A notebook frame with the page of a scene; `close` stops its server.
+
+    Args:
+        found: the finished scene.
+        text, height, proxy: as in `LanguageScene.show`.
+        threads: number of threads for rasterising and look-ups.
+    """
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
         self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text

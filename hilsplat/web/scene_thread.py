@@ -1,7 +1,8 @@
 """The thread that accesses the scene, and the check that a page shows the current state of the scene.
 
-The caches of an opened scene are not thread-safe, so all code that reads it runs on one worker. Its loops
-release the GIL, so the server stays responsive.
+The caches of an opened scene are not thread-safe, so all code that uses them runs on one worker. Its loops
+release the GIL, so the server stays responsive. The annotator's proposals have a worker and caches of their
+own.
 """
 
 import asyncio
@@ -48,7 +49,7 @@ class SceneThread(Generic[Shown]):
         self.behind = asyncio.Lock()
 
     def get(self, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False) -> Handler:
-        """Return a request handler that sends what is made from the scene and the parameters in the path.
+        """Return a handler that sends the result of `work`, called with the scene and the path's parameters.
 
         With `behind`, it runs as `do_behind`.
         """
@@ -62,7 +63,10 @@ class SceneThread(Generic[Shown]):
     def post(
         self, kind: type[Sent], work: Callable[[Shown, Sent], Any], worker: ThreadPoolExecutor | None = None
     ) -> Handler:
-        """Return a request handler that sends what is made from the scene and the validated body."""
+        """Return a handler that sends the result of `work`, called with the scene and the validated body.
+
+        `worker` runs it instead of the scene thread, for work that has caches of its own.
+        """
 
         async def handle(request: Request) -> Response:
             asked = await read(request, kind)

@@ -198,7 +198,7 @@ def serve(
         about: description of the page for the printed line.
         port: 0 for any free port.
         browser: whether to open the page in a browser.
-        on_ready: called with a line that has the address, once the page can be opened.
+        on_ready: called with the text to print, which contains the address, once the page can be opened.
 
     Raises:
         SettingsError: the port is taken.

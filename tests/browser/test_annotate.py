@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
+from hilsplat.base.artifacts import atomic_folder
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.query.names import version_of
 from tests.browser.conftest import serving
@@ -335,3 +336,29 @@ def test_sam_outlines_what_is_clicked(opened, browser, desk, tmp_path):
 
 def test_without_a_sam_there_is_no_tool_for_it(page):
     assert not page.locator("#segment-label").is_visible()
+
+
+def test_a_telephone_has_everything_within_its_width(page):
+    page.set_viewport_size({"width": 390, "height": 780})
+    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
+    assert view["width"] == 390 and view["height"] > 150 and panel["y"] >= view["y"] + view["height"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_a_scene_that_was_rewritten_is_reported(opened, desk, root, tmp_path_factory):
+    project = tmp_path_factory.mktemp("changing")
+    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
+    folder = project / desk.relative_to(desk.parents[2])
+    with serving(folder, "annotate", "--data-root", str(root)) as address:
+        page = opened(address)
+        assert not page.get_by_role("alert").is_visible()
+        with atomic_folder(folder / "default/semantic_tree") as new:
+            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
+        page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
+        name(page, "rim")  # the photographs are the same
+        polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))
+        assert [label.text for label in kept(root)] == ["rim"]
+        page.get_by_role("button", name="Reload").click()
+        page.get_by_role("alert").wait_for(state="hidden")
+        items(page).first.wait_for()
+        page.close()

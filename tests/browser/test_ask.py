@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 import hilsplat
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.base.artifacts import atomic_folder, read_json
 from hilsplat.base.images import write_png
 from tests.browser.conftest import drawn, pixels, serving, wire_camera
 from tests.unit.artifact_changes import change_index
@@ -299,3 +299,33 @@ def test_a_scene_that_was_rewritten_is_reported_and_loaded_again_without_the_old
         assert page.locator("#text").input_value() == "mug > handle"
         assert not page.locator("#overlay path.chosen").count()
         page.close()  # before its server ends: it asks for changes
+
+
+def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, desk, scene):
+    page = opened(desk_address)
+    book = scene.query("book")[0].node
+    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
+    name = page.get_by_role("textbox", name="Name")
+    name.fill("Atlas <b")
+    name.press("Enter")
+    page.get_by_text("Named “Atlas <b”").wait_for()
+    ask(page, "atlas <B")
+    page.locator("#answers").get_by_text("Atlas <b").wait_for()
+    assert list(read_json(desk / "names.json")["trees"].values()) == [{str(book): "Atlas <b"}]
+    assert [hit.node for hit in hilsplat.open(desk).query("atlas <b")] == [book]
+    page.locator("#view").press("Escape")
+    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
+    name.fill("")
+    name.press("Enter")
+    page.get_by_text("The name is taken away.").wait_for()
+    (desk / "names.json").unlink()
+
+
+def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
+    page = opened(desk_address)
+    handle = scene.query("mug > handle")[0].node
+    page.locator(f"[role=treeitem][data-node='{handle}'] > .row .label").click()
+    page.get_by_role("button", name="More like this").click()
+    answers(page).first.wait_for()
+    expected = scene.like_node(handle)[0].node
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(expected)

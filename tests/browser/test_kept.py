@@ -9,7 +9,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import hilsplat
-from tests.browser.conftest import HEIGHT, drawn, pixels
+from tests.browser.conftest import HEIGHT, WIDTH, drawn, pixels
 from tests.browser.test_ask import answers
 
 
@@ -140,3 +140,43 @@ def test_a_picture_is_saved_at_the_chosen_size(opened, desk_address, tmp_path):
     page.locator("#save summary").click()
     picture = Image.open(save(page, "Picture, PNG", tmp_path))
     assert max(picture.size) == 1280 and min(picture.size) > HEIGHT
+
+
+def test_the_address_keeps_them(opened, desk_address):
+    page = opened(desk_address)
+    keep(page, "book")
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    page.wait_for_timeout(1000)
+    again = opened(f"{desk_address}", fragment="#" + page.url.partition("#")[2])
+    assert chips(again).all_inner_texts() == chips(page).all_inner_texts()
+    assert again.locator("#text").input_value() == "mug > handle"
+
+
+def test_an_exported_page_has_them_too(opened, browser, desk_address, tmp_path):
+    page = opened(desk_address)
+    keep(page, "book")
+    keep(page, "mug > handle")
+    saved = save(page, "Page with answers, HTML", tmp_path)
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    alone = context.new_page()
+    alone.goto(f"file://{saved.rename(tmp_path / 'page.html')}")
+    alone.locator("body[data-ready=yes]").wait_for()
+    alone.evaluate("hilsplat.begun")
+    assert [chip.inner_text().split("\n")[0] for chip in chips(alone).all()] == ["book", "mug > handle"]
+    assert alone.locator("#overlay path.kept").count() == 2
+    context.close()
+
+
+def test_a_kept_query_of_a_photograph_is_reopened_at_it(opened, desk_address):
+    page = opened(desk_address)
+    page.get_by_role("checkbox", name="only what this photograph shows").check()
+    view = page.evaluate("hilsplat.camera.view")
+    keep(page, "book")
+    page.get_by_role("checkbox", name="only what this photograph shows").uncheck()
+    page.locator("#view").focus()
+    drawn(page, lambda: page.keyboard.press("ArrowLeft"))
+    chips(page).first.get_by_title("Change it").click()
+    answers(page).first.wait_for()
+    assert page.get_by_role("checkbox", name="only what this photograph shows").is_checked()
+    assert page.evaluate("hilsplat.camera.view") == view

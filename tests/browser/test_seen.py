@@ -66,3 +66,43 @@ def test_of_what_is_alike_the_first_five_are_painted(opened, desk_address, scene
     shown = f"import('/static/styles.js').then((own) => own.shownHits({answer}))"
     assert page.evaluate(shown.replace("ROUTE", "'like'")) == [9, 8, 7, 6, 5]
     assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
+
+
+def test_names_and_likeness_get_no_caution_about_words(opened, desk_address):
+    page = opened(desk_address, "server")
+    shown = "own.showAnswers({ caution: 'no word means anything' }, ANSWER, {})"
+    said = "document.getElementById('caution').hidden || document.getElementById('caution').textContent"
+    code = f"import('/static/answers.js').then((own) => {{ {shown}; return {said}; }})"
+    answers_and_cautions = {
+        "null": "no word means anything",  # nothing is asked yet
+        "{ hits: [], caution: 'not this one' }": "not this one",
+        "{ hits: [], caution: '' }": True,  # by name or by likeness: the server gives it none
+    }
+    for answer, expected in answers_and_cautions.items():
+        assert page.evaluate(code.replace("ANSWER", answer)) == expected
+
+
+def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened, desk_address, scene):
+    page = opened(desk_address, "server", color_scheme="dark")
+    page.locator("#view").focus()
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    best = scene.views.index(scene.query("mug > handle")[0].best_views[0])
+    page.locator("#views button").nth(best).click()
+    button = page.locator("#views button[aria-selected=true].shows")
+    button.wait_for()
+    marks = "[getComputedStyle(each).borderTopColor, getComputedStyle(each, '::before').borderTopColor]"
+    assert button.evaluate(f"(each) => {marks}") == ["rgb(255, 138, 31)", "rgb(255, 255, 255)"]
+
+
+def test_masks_are_saved_step_by_step_and_the_size_is_reported(opened, desk_address):
+    page = opened(desk_address, "server")
+    page.locator("#view").focus()
+    ask(page, "mug > handle")
+    answers(page).first.wait_for()
+    page.locator("#save summary").click()
+    with page.expect_download() as started:
+        page.get_by_role("button", name=re.compile("Masks in all photographs")).click()
+    size = started.value.path().stat().st_size
+    page.get_by_role("status").get_by_text(f"Saved desk-masks.zip, {-(-size // 1000)} kB.").wait_for()
+    assert page.locator("#saving").is_hidden()

@@ -75,11 +75,11 @@ def read_label_table(path: Path) -> dict[str, int]:
     found = {}
     with path.open(encoding="utf-8", newline="") as stream:
         rows = csv.DictReader(stream, delimiter="\t")
-        needed = {"id", "raw_category", "nyu40id"}
+        needed = {"id", "raw_category"}
         if not needed <= set(rows.fieldnames or ()):
             raise SceneError(
                 f"{path} is not the table of ScanNet's labels",
-                expected="tab-separated columns id, raw_category, nyu40id",
+                expected="tab-separated columns id, raw_category",
                 found=", ".join(rows.fieldnames or ())[:120] or "an empty file",
                 fix="download the latest table of the release again",
             )

@@ -58,7 +58,7 @@ def read_component(
         )
     try:
         known = parquet.read_schema(path).names
-        lacking = [name for name in columns if name not in known]
+        lacking = [name for name in (*columns, *(only or {})) if name not in known]
         if lacking:
             raise SceneError(
                 f"{path} is not the component {tag} of release 2",

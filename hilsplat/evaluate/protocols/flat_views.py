@@ -22,6 +22,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
 )
 from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import (
+    LERF_LANGSPLAT,
     LERF_MASK,
     LERF_MASK_SKIPPING,
     OVS_ARGMAX,
@@ -76,20 +77,23 @@ class FlatProtocols:
             """Smooth once for all rules with the same filter, because it takes most of the time."""
             return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
 
+        masks_only = (LERF_MASK, LERF_MASK_SKIPPING)
         for card in self.cards:
+            rule = LERF_LANGSPLAT.rule if card in masks_only else card.rule
             region = flat.region(card.truth)
-            if not region.any() or (card is OVS_NODES and nodes_mask is None) or card is OVS_ARGMAX:
-                continue  # not visible in the view; a field, which has no nodes; needs all texts
+            if not region.any():
+                continue  # not visible in the view
             points = NO_POINTS
-            if nodes_mask is not None and card in (LERF_MASK, LERF_MASK_SKIPPING, OVS_NODES):
+            if nodes_mask is not None and card in (*masks_only, OVS_NODES):
                 mask = nodes_mask
+            elif rule is None:
+                continue  # needs nodes, or all texts (`finish`)
             else:
-                rule = card.rule or RelevancyRule()
                 smoothed = smoothed_by(rule.filter_px, rule.mix, rule.border)
                 other = dict(card.united).get(flat.text)
                 united = None if other is None else maps.relevancy((other,))[0]
                 mask, _ = relevancy_mask(smoothed, None, rule, united)
-                if "localization_box" in card.metrics:
+                if {"localization_box", "localization_mask"} & set(card.metrics):
                     points, _ = peak_points(smoothed.filtered, None)
             answered = replace(flat, truth=region)
             yield from mask_rows(method, answered, card.labelled(self.words), mask, points, card.metrics)

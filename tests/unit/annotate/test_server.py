@@ -271,3 +271,14 @@ def test_a_running_workflow_adds_proposals_after_a_reload(copied, labels):
     shutil.move(copied / "later", tree)
     assert client.get("/api/changes").json()["changed"] == ["semantic_tree"]
     assert client.get("/api/scene").json()["proposes"] == "nodes"
+
+
+def test_a_version_that_is_not_the_last_is_refused(client):
+    first = put(client, 0, [MUG], "none").json()["version"]
+    second = put(client, 0, [{**MUG, "text": "cup"}], first)
+    assert second.status_code == 200
+    for old in ("none", first, ""):
+        stale = put(client, 0, [], old)
+        assert stale.status_code == 412 and "reload" in stale.json()["error"]
+    assert client.put("/api/labels/0", json={"labels": []}).status_code == 412
+    assert client.get("/api/labels").json()[0]["labels"][0]["text"] == "cup"

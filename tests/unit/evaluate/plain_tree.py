@@ -1,4 +1,4 @@
-"""A semantic tree of which only the given parts matter."""
+"""A semantic tree for tests that use only some of its parts."""
 
 import numpy as np
 

@@ -138,6 +138,12 @@ def test_a_tree_answers_with_its_own_nodes_and_a_field_with_its_mask_or_not_at_a
     assert {row.protocol for row in tree + field} == {f"{card.full_name} (wholes)"}
 
 
+def test_protocols_without_a_rule_for_maps_are_not_scored_from_maps():
+    cup = query("cup", (0, 16))
+    flat = FlatProtocols([card_named("lerf/opengaussian"), card_named("lerf/tree-nodes")], Level.WHOLE)
+    assert list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE)) == []
+
+
 def test_rows_of_a_mask_have_the_metrics_of_the_protocol():
     cup, metrics = query("cup", (0, 16)), ("iou", "acc_25", "acc_50")
     rows = mask_rows("m", cup, "p", region((0, 8)), metrics=metrics)

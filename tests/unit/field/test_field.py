@@ -62,7 +62,7 @@ class Toy:
         self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
 
     def view(self, settings: FieldSettings) -> ViewTargets:
-        """The view as the literal trainer sees it."""
+        """The view in the form that the literal trainer reads."""
         relations = self.contrast(settings).relations[0]
         return ViewTargets(np.arange(9), self.level.astype(np.int64) - 1, self.painted, self.half, relations)
 

@@ -176,7 +176,10 @@ def test_a_busy_hub_is_named(hub, waits, where):
     ("refusal", "message"),
     [
         (Refusal(503), r"does not serve Xenova/sam-vit-base \(503"),
-        (Refusal(401, {"X-Error-Code": "GatedRepo"}), r"requires consent(.|\n)*accept its terms at http"),
+        (
+            Refusal(401, {"X-Error-Code": "GatedRepo"}),
+            r"requires you to accept(.|\n)*accept its terms at http",
+        ),
         (Refusal(403), r"refuses Xenova/sam-vit-base \(403"),
         (Refusal(401), r"refuses Xenova/sam-vit-base \(401"),
         (Refusal(404, {"X-Error-Code": "EntryNotFound"}), r"does not have this revision or file"),

@@ -32,7 +32,7 @@ from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, region_mask
 
 RNG = np.random.default_rng(0)
 EVERY, LARGE = tuple(range(len(REGIONS))), (0, 1, 2, 3, 5, 6)
-"""LARGE lacks part "B top", which covers its box too little to be told from the rest."""
+"""LARGE lacks part "B top", which covers too little of its box to be distinguished from the rest."""
 FITS = {
     # method: settings, regions that it finds, least share of a region's Gaussians with its code
     "opengaussian": ({"codebook": (2, 2)}, EVERY, 0.8),

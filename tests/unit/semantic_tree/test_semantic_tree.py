@@ -38,8 +38,8 @@ def test_gaussians_join_the_node_with_the_largest_share():
 
 
 def test_a_small_node_keeps_its_gaussian_where_a_large_one_sometimes_covers_it():
-    # Ten views of one Gaussian of 1 px. Node 0 has masks in all views, five of which cover the Gaussian;
-    # node 1 has masks in four views, all of which cover it.
+    # Ten views of one Gaussian of 1 px. Node 0 has masks in all views, and five cover the Gaussian;
+    # node 1 has masks in four views, and all cover it.
     weights = sp.csr_matrix(np.array([[1]] * 5 + [[0]] * 5 + [[1]] * 4, np.float32))
     view = np.array([*range(10), *range(5, 9)], np.int32)
     cluster = np.array([0] * 10 + [1] * 4)

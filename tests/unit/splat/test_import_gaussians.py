@@ -66,7 +66,11 @@ def out(turned_scene, source_ply, tmp_path) -> Path:
     return stage_output(turned_scene, source_ply, tmp_path)
 
 
-def test_the_stage_reports_on_imported_gaussians_without_a_fit(source_ply, out):
+def test_the_stage_reports_on_imported_gaussians_without_a_fit(
+    turned_scene, source_ply, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("hilsplat.splat.fit.fit_gaussians", None)
+    out = stage_output(turned_scene, source_ply, tmp_path)
     report = read_json(out / "report" / "report.json")
     assert report["origin"]["kind"] == "imported"
     assert report["origin"]["file"] == "theirs.ply"

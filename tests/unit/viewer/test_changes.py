@@ -122,6 +122,21 @@ def test_a_variant_that_comes_later_is_not_opened_beside_old_parts(page, desk):
     assert page.post("/api/query", json={"text": "mug", "variant": "second"}, params={"of": load(page)})
 
 
+def test_names_are_kept_while_another_variant_gets_a_field_that_cannot_be_read(page, desk):
+    shutil.copytree(desk / "default", desk / "second")
+    for part in (desk / "second").glob("field.safetensors*"):
+        part.unlink()
+    assert page.post("/api/query", json={"text": "mug", "variant": "second"}).status_code == 200
+    (desk / "second/field.safetensors").write_bytes(b"unreadable")
+    handle = ask(page).json()["hits"][0]["node"]
+    body = {"variant": "default", "names": {str(handle): "grip"}}
+    answer = page.put("/api/names", json=body, headers={"if-match": '"none"'})
+    assert answer.status_code == 200, answer.text
+    body["names"] = {}
+    version = answer.json()["version"]
+    assert page.put("/api/names", json=body, headers={"if-match": f'"{version}"'}).status_code == 200
+
+
 def test_a_page_of_before_gets_nothing_of_after(page, desk):
     made_again(desk / "default/semantic_tree")
     again = load(page)  # another tab

@@ -97,6 +97,12 @@ def test_images_train_as_a_copy_of_images_is_refused(root):
         open_scene(root, "teatime")
 
 
+def test_missing_parts_are_named(root):
+    (root / "teatime" / "images_train").rename(root / "teatime" / "train")
+    with pytest.raises(SceneError, match=r"also teatime/images_train\n"):
+        open_scene(root, "teatime")
+
+
 def test_a_distorted_model_is_refused(root, true_world):
     from hilsplat.scene.colmap import pycolmap
 

@@ -42,6 +42,8 @@ def test_polygons_are_filled_with_border_by_whole_vertices_and_even_odd():
     assert np.where(fill_polygons([triangle], (4, 4)), "#", ".").tolist() == [list(row) for row in filled]
     star = fill_polygons([50 + 45 * np.stack([np.sin(angle), -np.cos(angle)], axis=1)], (100, 100))
     assert not star[50, 50] and star[20, 50]
+    square = np.array([[1, 1], [5, 1], [5, 5], [1, 5]])
+    assert fill_polygons([square, square + 2], (9, 9)).sum() == 25 + 25 - 9  # their overlap is filled
 
 
 def test_a_written_world_is_read_back_equal(true_world, root):

@@ -145,9 +145,9 @@ def test_of_two_groups_that_claim_a_vertex_the_later_one_wins(root):
     assert open_scan(root, SCAN).truth["scannet200"].class_id.tolist() == [1, 1, 2, 2, 0]
 
 
-def test_nyu40_follows_from_the_category_and_ids_outside_the_200_are_none(root):
+def test_ids_outside_the_200_are_none(root):
     path = root / LABEL_TABLE
-    # real rows: id 107 occurs with two NYU40 ids; cells may be empty
+    # id 107 occurs twice in the real table; cells may be empty
     path.write_text("id\traw_category\tcount\tnyu40id\n107\tone\t\t38\n107\tother\t\t40\n5\tdoor\t\t\n")
     table = read_label_table(path)
     assert table == {"one": 107, "other": 107, "door": 5}

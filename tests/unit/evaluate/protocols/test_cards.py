@@ -17,6 +17,7 @@ from hilsplat.evaluate.protocols.cards import (
     TREE_NODES,
     card_of,
 )
+from hilsplat.evaluate.protocols.scene_points import class_set
 from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.settings import EvaluateSettings
 
@@ -110,6 +111,11 @@ def test_the_documentation_lists_every_protocol_with_its_public_function():
 def test_protocols_carry_known_metrics_and_every_metric_is_carried():
     carried = {metric for card in CARDS for metric in card.metrics}
     assert carried == set(METRICS)
+
+
+def test_classes_of_protocols_exist():
+    for card in CARDS:
+        assert not card.classes or class_set(card.classes)[1].name == card.classes
 
 
 def test_rows_name_what_settings_change():

@@ -126,6 +126,11 @@ def test_frames_are_the_views_that_were_asked_at_levels(tmp_path):
     ]
 
 
+def test_scenes_without_labels_leave_the_reported_rows(tmp_path):
+    rows, _ = built(tmp_path, "hierarchy", scores=[])
+    assert {row["kind"] for row in rows} == {"reported"}
+
+
 @pytest.mark.parametrize("name", sorted(TABLES))
 def test_every_table_is_built_without_scores_and_lists_below_what_was_not_measured(tmp_path, name):
     assert TABLES[name].variants in RunSettings.model_fields
