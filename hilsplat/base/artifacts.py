@@ -569,5 +569,7 @@ def lock_path(output: Path) -> Path:
 
 def was_interrupted(output: Path) -> bool:
     """Return whether the last writer of an output was killed or failed."""
-    lock = lock_path(output)
-    return lock.is_file() and lock.stat().st_size > 0
+    try:
+        return lock_path(output).stat().st_size > 0
+    except OSError:
+        return False

@@ -101,7 +101,7 @@ def _leading_only_to(graph: Any, outputs: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of an int8 network with its float32 original: measured values by name, and their minima."""
+    """Agreement of an int8 network with its float32 original: measured values, and the least accepted."""
 
     values: dict[str, float]
     least: dict[str, float]

@@ -47,7 +47,7 @@ def one_thread_session(network: bytes | str, providers: list[str]) -> onnxruntim
 class Network:
     """An ONNX network with checked names; inputs are cast to its types, and outputs are float32.
 
-    Several threads may call a network (`one_thread_session`).
+    Each call runs in one thread (`one_thread_session`), and several threads may call a network.
     """
 
     def __init__(

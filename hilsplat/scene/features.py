@@ -220,7 +220,7 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 @dataclass(frozen=True)
 class MatchCounts:
-    """Numbers of features of a view, of pairs with `MIN_INLIERS` matches, and of the best pair's matches."""
+    """Numbers of a view's features, pairs of at least `MIN_INLIERS` matches, and of its best pair."""
 
     features: int
     pairs: int

@@ -18,7 +18,7 @@ LONGEST_NAME = 200
 
 
 def require_usable_name(photo: Path) -> None:
-    """Refuse a photograph after which files of later stages cannot be named.
+    """Refuse a photograph whose name later stages cannot use in file names.
 
     Braces are wildcards in Snakemake.
     """

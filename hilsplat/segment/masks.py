@@ -196,9 +196,10 @@ class HierarchicalMasks:
         return np.flatnonzero(self.level == int(level))
 
     def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
-        """Paint the row numbers of a level's masks (None: all) on -1, large to small.
+        """Return the row of the mask of a level (None: all) that each pixel shows, -1 for none.
 
-        Small masks thus stay visible; of two equally large masks, the lower row is painted last.
+        Large masks are painted first, so small ones stay visible; of two equal ones, the lower row is painted
+        last.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
         rows = np.arange(len(self)) if level is None else self.rows_of(level)
@@ -223,7 +224,7 @@ class HierarchicalMasks:
 
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
-        """Read `<view>.npz`; raise an ArtifactError if it is missing or damaged, or its arrays contradict."""
+        """Read `<view>.npz`; raise an ArtifactError if it is missing or damaged, or its arrays disagree."""
         arrays = read_npz(path, *(field.name for field in fields(HierarchicalMasks)))
         size = arrays["size_hw"]
         is_size = size.shape == (2,) and size.dtype.kind in "iu"

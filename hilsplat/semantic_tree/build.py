@@ -1,9 +1,10 @@
 """The semantic tree stage: links the masks of all views by the Gaussians they share.
 
 Masks have no identity across views. Masks of one level in different views are linked by how well they agree
-on the Gaussians that both views see. Clusters of masks become nodes, and each Gaussian joins its best node. A
-coarser node that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores
-the crops that show each node. The clip stage embeds the best crops, and their average is the node's vector.
+on the Gaussians that both views see. Clusters of masks become nodes, each Gaussian joins its best node, and
+small stray pieces leave it. A coarser node that holds most of a finer one becomes its parent. None of this
+needs CLIP: the tree only scores the crops that show each node. The clip stage embeds the best crops, and
+their average is the node's vector.
 """
 
 import logging
@@ -86,7 +87,7 @@ def build_tree(
     cluster_of_mask = np.full(len(contributions), NONE, np.int64)
     node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
-    nearest = nearest_gaussians(means, threads)
+    nearest = None if nodes_of else nearest_gaussians(means, threads)
     for each in LEVELS:
         rows = contributions.rows_of(each)
         found = (
@@ -100,7 +101,9 @@ def build_tree(
             whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
             found = found.joined(whole)
         renumber = np.append(len(level) + np.arange(len(found.quality)), NONE)
-        of_gaussian = without_strays(found.of_gaussian, nearest, total_mass)
+        of_gaussian = found.of_gaussian
+        if nearest is not None:
+            of_gaussian = without_strays(of_gaussian, nearest, total_mass)
         node_of_gaussian[:, each.index] = renumber[of_gaussian]
         membership[:, each.index] = np.where(of_gaussian == NONE, 0, found.membership)
         cluster_of_mask[rows] = renumber[found.of_mask]

@@ -29,13 +29,13 @@ def gaussian_nodes(
     total_mass: Float64[np.ndarray, " N"],
     min_share: float,
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Assign each Gaussian to the node that holds most of its visible weight where masks show the node.
+    """Assign each Gaussian to the node with the largest product of two shares of its visible weight.
 
-    Nodes are ranked by the geometric mean of two shares of the Gaussian's visible weight: that inside the
-    node's masks in all views, and the same in the views that have a mask of the node. The second lets a small
-    thing, segmented in few views, keep its Gaussians beside a large one whose masks sometimes cover it. Masks
-    of one view may overlap, and a node may have several there, so a Gaussian's weight in a view is capped at
-    its visible mass there.
+    The first is the share inside the node's masks in all views. The second is the same in the views that have
+    a mask of the node, with `PRIOR_VIEWS` average views added to its denominator. It lets a small thing,
+    segmented in few views, keep its Gaussians beside a large one whose masks sometimes cover it. Masks of one
+    view may overlap, and a node may have several there, so a Gaussian's weight in a view is capped at its
+    visible mass there.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
@@ -56,18 +56,19 @@ def gaussian_nodes(
     capped = np.minimum(per_view.data, mass[pair_view[per_view.row], per_view.col])
     shape = (num_nodes, weights.shape[1])
     per_node = sp.csr_matrix((capped, (pair_node[per_view.row], per_view.col)), shape=shape)
-    per_node.sort_indices()
-    in_its_views = np.empty(per_node.nnz)
-    for node in range(num_nodes):
+    del per_view, capped
+    per_node.data /= np.maximum(total_mass[per_node.indices], 1e-12)
+    per_node.data[per_node.data <= min_share] = 0
+    per_node.eliminate_zeros()
+    column, share = per_node.indices, per_node.data
+    in_its_views = np.zeros(per_node.nnz)
+    for node, in_view in zip(pair_node, pair_view, strict=True):  # gathered view by view: mass is large
         row = slice(per_node.indptr[node], per_node.indptr[node + 1])
-        in_its_views[row] = mass[np.ix_(pair_view[pair_node == node], per_node.indices[row])].sum(axis=0)
-    column = per_node.indices
-    share = per_node.data / np.maximum(total_mass[column], 1e-12)
+        in_its_views[row] += mass[in_view].take(column[row])
     one_view = total_mass / np.maximum(np.count_nonzero(mass > MIN_VISIBLE_PX, axis=0), 1)
-    share_there = per_node.data / np.maximum(in_its_views + PRIOR_VIEWS * one_view[column], 1e-12)
+    share_there = share * total_mass[column] / (in_its_views + PRIOR_VIEWS * one_view[column])
     row_of = np.repeat(np.arange(num_nodes), np.diff(per_node.indptr))
     ranked = np.lexsort((row_of, -share * share_there, column))
-    ranked = ranked[share[ranked] > min_share]
     best = ranked[np.flatnonzero(np.diff(column[ranked], prepend=NONE))]
     node_of_gaussian = np.full(shape[1], NONE, np.int32)
     membership = np.zeros(shape[1], np.float32)
@@ -78,7 +79,7 @@ def gaussian_nodes(
 
 def nearest_gaussians(means: Float[np.ndarray, "N 3"], threads: int) -> Int64[np.ndarray, "N K"]:
     """Return the `NEIGHBOURS` nearest Gaussians of each, itself included."""
-    from scipy.spatial import cKDTree  # lazy: takes 0.2 s, and opening any tree imports this module
+    from scipy.spatial import cKDTree  # lazy: takes 0.2 s, and queries import this module
 
     near = np.arange(1, min(NEIGHBOURS, len(means)) + 1)
     return cKDTree(means).query(means, k=near, workers=threads)[1]

@@ -10,6 +10,7 @@ import heapq
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64
+from scipy.spatial import cKDTree
 
 from hilsplat.base.levels import NONE
 
@@ -58,8 +59,6 @@ def touching(
     region: Int32[np.ndarray, " n"], num_regions: int, means: Float32[np.ndarray, "n 3"]
 ) -> sp.csr_matrix:
     """Count the pairs (Gaussian, one of its `NEIGHBOURS` nearest) between each two regions; symmetric."""
-    from scipy.spatial import cKDTree  # lazy: takes 0.2 s, and opening any tree imports this module
-
     near = min(NEIGHBOURS, len(means))  # the nearest is the Gaussian itself
     nearest = cKDTree(means).query(means, k=np.arange(1, near + 1))[1] if near else np.zeros((0, 0), np.int64)
     first, second = np.repeat(region, near), region[nearest.ravel()]

@@ -171,7 +171,9 @@ class Records:
         self._digests: dict[Path, str | None] = {}
 
     def state(self, artifact: Path, expected: Expected | None = None) -> tuple[str, str]:
-        """Return an artifact's state, and why it is not whole; None compares code and inputs only."""
+        """Return an artifact's state, and why it is not whole.
+
+        Without `expected`, only code and inputs are compared."""
         try:
             record = read_provenance(artifact)
         except ArtifactError:

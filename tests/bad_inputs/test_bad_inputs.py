@@ -169,6 +169,9 @@ ROWS = {
     "masks that are a single array": row(
         write(MASKS / "000.png.npz", b"\x93NUMPY\x01\x00"), COVERAGE, "000.png.npz cannot be read"
     ),
+    "an index whose views are a list": row(
+        write(MASKS / "index.json", '{"views": []}'), COVERAGE, "index.json"
+    ),
     "an index that is a list": row(
         write(MASKS / "index.json", "[]"), COVERAGE, "index.json is not the index"
     ),
@@ -228,6 +231,11 @@ ROWS = {
     # ---- queries
     "a scene that does not exist": row(
         nothing, ("query", "photos/none", "mug"), "results/photos/none is missing"
+    ),
+    "a scene with no stage": row(
+        lambda: Path("results/photos/later").mkdir(parents=True),
+        ("query", "photos/later", "mug"),
+        "photos/later is not finished",
     ),
     "a scene that is not finished": row(
         lambda: Path("results/photos/later/default").mkdir(parents=True),

@@ -159,6 +159,8 @@ def test_views_are_named_after_files_and_collisions_are_refused(tmp_path):
     assert view_names(twice) == ["train_r_0.png", "test_r_0.png"]
     with pytest.raises(SceneError, match=r"same view 1\.png"):
         view_names([tmp_path / "1.jpg", tmp_path / "1.png"])
+    with pytest.raises(SceneError, match="brace"):
+        view_names([tmp_path / "a{1}.png"])
 
 
 def test_photographs_share_a_camera_when_size_and_focal_length_agree(tmp_path):
