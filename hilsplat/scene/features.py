@@ -220,7 +220,12 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 @dataclass(frozen=True)
 class MatchCounts:
-    """Numbers of a view's features, pairs of at least `MIN_INLIERS` matches, and of its best pair."""
+    """Counts of a view.
+
+    Attributes:
+        pairs: other views with at least `MIN_INLIERS` verified matches.
+        best_pair: verified matches with the best of them.
+    """
 
     features: int
     pairs: int

@@ -143,7 +143,7 @@ class ViewerScene:
     def rename(self, semantic_tree: Path, names: NodeNames) -> None:
         """Use new names in every variant with this tree."""
         for variant, opened in list(self._variants.items()):
-            # as opened: opening a part anew could fail after the names are written
+            # as opened: opening a part again could fail after the names are written
             if opened.finished and opened.finished.parts.semantic_tree.resolve() == semantic_tree.resolve():
                 self._variants[variant] = replace(opened, names=names)
 
