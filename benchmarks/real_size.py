@@ -157,7 +157,7 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
     from hilsplat.base.images import read_image, resize_to_fit
     from hilsplat.models.layouts import LAYOUTS
     from hilsplat.models.network import Network
-    from hilsplat.segment.candidates import decode_candidates
+    from hilsplat.segment.generate import decode_candidates
     from hilsplat.segment.graph import segment_graph
     from hilsplat.segment.sam import SamModel
     from hilsplat.settings import ClipSettings, MasksSettings

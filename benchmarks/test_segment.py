@@ -12,9 +12,8 @@ import pytest
 from benchmarks.canned_sam import CannedSam, NetworkClock, blob_masks
 from benchmarks.goals import Goal
 from hilsplat.base.artifacts import write_npz
-from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.suppression import suppress_masks
 from hilsplat.settings import MasksSettings

@@ -30,10 +30,10 @@ from hilsplat.models.folder import open_model_folder
 from hilsplat.models.int8 import (
     CHECKED_CROPS,
     WORDS,
-    Agreement,
     agreement_of_vectors,
     int8_network,
     may_be_int8,
+    use_int8,
 )
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.models.network import Network
@@ -188,7 +188,7 @@ def _choose_precision(
     def quantised() -> Network:
         return int8_network(model.model, "vision_model", cache)
 
-    def measure() -> Agreement:
+    def measure() -> dict[str, float]:
         network = quantised()  # computed once, before the threads start
 
         def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -200,7 +200,7 @@ def _choose_precision(
         return agreement_of_vectors(full, found, model.embed_texts(list(WORDS)))
 
     inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
-    if Agreement.remembered(cache, inputs, measure).decide(settings.precision, "CLIP"):
+    if use_int8(settings.precision, "CLIP", cache, inputs, measure):
         model.use_int8(quantised())
 
 

@@ -3,7 +3,6 @@
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +26,10 @@ WORDS = (
 )
 """Texts that each crop ranks: the canonical phrases of LERF and everyday words."""
 
-LEAST_COSINE, LEAST_RANK_CORRELATION = 0.99, 0.95
-"""Minimum mean cosine between the vectors of both precisions, and minimum rank correlation of `WORDS` by
-cosine with a crop. Two crops of one object from neighbouring views differ by more."""
-
-LEAST_IOU = 0.98
-"""Minimum mean IoU between the masks of both precisions for the same prompts."""
+LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
+"""Minimum agreement of both precisions: mean IoU of masks from the same prompts, mean cosine of vectors,
+and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views differ
+by more."""
 
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 """Number of crops for checking a CLIP; number of views, and of prompts per side, for checking a SAM."""
@@ -54,16 +51,13 @@ def int8_network(
         cache: folder to use instead if the model's parent folder is read-only.
         graph: a modified graph to use instead of the network's file.
         exact: outputs that stay in float32, such as sines of large arguments.
-
-    Raises:
-        ModelError: the network cannot be opened.
     """
     source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
     beside = model.folder.parent  # a new file in the model folder could change its digest
     folder = beside if os.access(beside, os.W_OK) else Path(cache)
     path = folder / ".int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
     if not path.is_file():
-        logger.info("quantising %s of %s, once: seconds; later runs read it", name, model.folder)
+        logger.info("quantising %s of %s, which takes seconds; the result is kept", name, model.folder)
         _quantise(model.networks[name] if graph is None else graph, path, exact)
     return model.network(name, graph=path.read_bytes())
 
@@ -99,46 +93,40 @@ def _leading_only_to(graph: Any, outputs: Sequence[str]) -> list[str]:
     )
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Agreement of an int8 network with its float32 original: measured values, and the least accepted."""
+def use_int8(
+    precision: str, what: str, cache: Path, inputs: object, measure: Callable[[], dict[str, float]]
+) -> bool:
+    """Return whether to use int8 (`precision` is "auto" or "int8"), and log the measured agreement.
 
-    values: dict[str, float]
-    least: dict[str, float]
-
-    def decide(self, precision: str, what: str) -> bool:
-        """Return whether to use int8 (`precision` is "auto" or "int8"), and log the decision."""
-        agrees = all(self.values[name] >= least for name, least in self.least.items())
-        use = agrees or precision == "int8"
-        said = ", ".join(f"{name} {self.values[name]:.4f} (least: {at})" for name, at in self.least.items())
-        logger.info("%s runs in %s. int8 and float32: %s", what, "int8" if use else "float32", said)
-        return use
-
-    @staticmethod
-    def remembered(cache: Path, inputs: object, measure: Callable[[], "Agreement"]) -> "Agreement":
-        """Return the cached agreement for the same inputs (digests of model and data), or measure it."""
-
-        def arrays() -> dict[str, np.ndarray]:
-            found = measure()
-            return {name: np.array([value, found.least[name]]) for name, value in found.values.items()}
-
-        kept = ViewCache(Path(cache) / "int8").get(sha256_of_json([RECIPE, inputs]), arrays)
-        return Agreement(*({name: float(pair[k]) for name, pair in kept.items()} for k in (0, 1)))
+    Args:
+        what: the network, for the log.
+        inputs: digests of the model and of the data that `measure` reads; results are cached under them.
+        measure: measures the agreement of both precisions, by keys of `LEAST`.
+    """
+    kept = ViewCache(Path(cache) / "int8").get(
+        sha256_of_json([RECIPE, inputs]),
+        lambda: {name: np.array([value]) for name, value in measure().items()},
+    )
+    found = {name: float(value[0]) for name, value in kept.items()}
+    use = precision == "int8" or all(value >= LEAST[name] for name, value in found.items())
+    measured = ", ".join(f"{name} {value:.4f} (least: {LEAST[name]})" for name, value in found.items())
+    logger.info("%s runs in %s. int8 and float32: %s", what, "int8" if use else "float32", measured)
+    return use
 
 
 def agreement_of_vectors(
     full: Float[np.ndarray, "B C"], quantised: Float[np.ndarray, "B C"], texts: Float[np.ndarray, "T C"]
-) -> Agreement:
+) -> dict[str, float]:
     """Compare the crops' unit vectors of both precisions, directly and by how they rank texts."""
     ranks = [np.argsort(np.argsort(vectors @ texts.T, axis=1), axis=1) for vectors in (full, quantised)]
     centred = [rank - rank.mean(axis=1, keepdims=True) for rank in ranks]
     order = (centred[0] * centred[1]).sum() / max(float(np.square(centred[0]).sum()), 1e-12)
-    values = {"cosine": float((full * quantised).sum(axis=1).mean()), "rank correlation": float(order)}
-    return Agreement(values, {"cosine": LEAST_COSINE, "rank correlation": LEAST_RANK_CORRELATION})
+    return {"cosine": float((full * quantised).sum(axis=1).mean()), "rank correlation": float(order)}
 
 
-def agreement_of_masks(full: Bool[np.ndarray, "K h w"], quantised: Bool[np.ndarray, "K h w"]) -> Agreement:
+def agreement_of_masks(
+    full: Bool[np.ndarray, "K h w"], quantised: Bool[np.ndarray, "K h w"]
+) -> dict[str, float]:
     """Compare the masks of both precisions for the same prompts; pairs of empty masks are ignored."""
     union, shared = (full | quantised).sum(axis=(1, 2)), (full & quantised).sum(axis=(1, 2))
-    iou = float((shared[union > 0] / union[union > 0]).mean()) if union.any() else 0.0
-    return Agreement({"mask IoU": iou}, {"mask IoU": LEAST_IOU})
+    return {"mask IoU": float((shared[union > 0] / union[union > 0]).mean()) if union.any() else 0.0}

@@ -65,7 +65,7 @@ _MASKS: dict[str, Axes] = {"iou_scores": (None, None, 3), "pred_masks": (None, N
 DECODER = "prompt_encoder_mask_decoder"
 PREVIEW = "prompt_encoder_mask_preview"
 """A decoder with the same predicted IoUs, but only every second row and column of the masks. It detects
-duplicate prompts in a fraction of the decoder's time (`segment.candidates`). sam-tiny has one."""
+duplicate prompts in a fraction of the decoder's time (`segment.generate`). sam-tiny has one."""
 
 
 def _places(name: str) -> tuple[str, ...]:

@@ -13,13 +13,6 @@ from hilsplat.base.lanes import WIDTH
 from hilsplat.models.onnx_graph import keep_only
 from hilsplat.segment import decoder_kernels as kernels
 
-LAYER = "mask_decoder/transformer/layers.0"
-TOKENS = f"{LAYER}/self_attn/q_proj"
-"""Module whose input is the prompt tokens."""
-
-IMAGE_SIDE = (f"{LAYER}/cross_attn_token_to_image/v_proj", f"{LAYER}/cross_attn_token_to_image/k_proj")
-"""Modules whose inputs are the image features, without and with positions."""
-
 EPS = 1e-6
 """Epsilon of layer norms that the export splits into basic operators; the default of transformers."""
 
@@ -144,8 +137,7 @@ class DecoderGraph:
         return matches[0] if len(matches) == 1 else None
 
     def _node(self, ending: str) -> Any:
-        node = self._find(ending)
-        if node is None:
+        if (node := self._find(ending)) is None:
             raise self._unusual(f"it has no node {ending}")
         return node
 

@@ -30,65 +30,42 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.lanes import WIDTH
 from hilsplat.models.network import one_thread_session
 from hilsplat.segment import decoder_kernels as kernels
-from hilsplat.segment.decoder_weights import IMAGE_SIDE, TOKENS, DecoderGraph, Linear
+from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 
-LOG2_E = np.float32(1 / np.log(2))
-"""Factor that converts scores to base 2."""
-
+LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
 BLOCK = 64
 """Maximum pixels per block. Its arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
 
 PROMPTS = 16
 """Prompts per call. They process each block one after the other while it is in the cache."""
 
-HEADS_PER_ATTENTION = 8
-"""Heads per attention if the model's configuration doesn't specify them."""
+HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
 
 
 class FirstLayer(NamedTuple):
-    """Image arrays that the kernels read at the first layer, block by block.
+    """Image arrays that the kernels read at the first layer, block by block."""
 
-    Attributes:
-        queries: queries of the attention of pixels to tokens.
-        before: products of the pixels' features with the output projection of the values.
-        square: squared length of each pixel's features.
-        cross: products of the pixels' features with the bias that is added to them.
-        scaled_keys, fixed_keys: keys of the attention of tokens to pixels; the layer norm scales the first.
-        values: values of that attention, before the layer norm's scale.
-    """
-
-    queries: np.ndarray
-    before: np.ndarray
-    square: np.ndarray
-    cross: np.ndarray
-    scaled_keys: np.ndarray
+    queries: np.ndarray  # of the attention of pixels to tokens
+    before: np.ndarray  # products of the pixels' features with the output projection of the values
+    square: np.ndarray  # squared length of each pixel's features
+    cross: np.ndarray  # products of the pixels' features with the bias that is added to them
+    scaled_keys: np.ndarray  # keys of the attention of tokens to pixels; the layer norm scales this part
     fixed_keys: np.ndarray
-    values: np.ndarray
+    values: np.ndarray  # of that attention, before the layer norm's scale
 
 
 class FirstPrompts(NamedTuple):
-    """Prompt arrays that the kernels read at the first layer.
+    """Prompt arrays that the kernels read at the first layer."""
 
-    Attributes:
-        update_keys: keys of the attention of pixels to tokens.
-        twice_changes: twice the difference between the values of its tokens and the last token's.
-        gram: products of these differences after the output projection (`doubled_below`).
-        last: values of the last token.
-        square: squared length of the constant that the last token and the bias add to every pixel.
-        linear: twice the products of that constant with the differences.
-        queries: queries of the attention of tokens to pixels.
-        low, offset: products of `queries` with the keys of the factors, and of that constant.
-    """
-
-    update_keys: np.ndarray
-    twice_changes: np.ndarray
-    gram: np.ndarray
-    last: np.ndarray
-    square: np.ndarray
-    linear: np.ndarray
-    queries: np.ndarray
-    low: np.ndarray
-    offset: np.ndarray
+    update_keys: np.ndarray  # keys of the attention of pixels to tokens
+    twice_changes: np.ndarray  # twice the difference between the values of its tokens and the last token's
+    gram: np.ndarray  # products of these differences after the output projection (`doubled_below`)
+    last: np.ndarray  # values of the last token
+    square: np.ndarray  # squared length of the constant that last token and bias add to every pixel
+    linear: np.ndarray  # twice the products of that constant with the differences
+    queries: np.ndarray  # of the attention of tokens to pixels
+    low: np.ndarray  # products of `queries` with the keys of the factors
+    offset: np.ndarray  # products of `queries` with the keys of that constant
 
 
 class SecondLayer(NamedTuple):
@@ -144,34 +121,21 @@ class MaskImage(NamedTuple):
 
 
 class MaskPrompts(NamedTuple):
-    """Prompt arrays for mask logits.
+    """Prompt arrays for mask logits."""
 
-    Attributes:
-        masks: masks per prompt.
-        factors: factors after the first upscaling.
-        both_scales, second_scale: constants of the first and second layer after the first upscaling.
-        combine: channel weights of each mask.
-    """
-
-    masks: int
-    factors: np.ndarray
-    both_scales: np.ndarray
-    second_scale: np.ndarray
-    combine: np.ndarray
+    masks: int  # per prompt
+    factors: np.ndarray  # after the first upscaling
+    both_scales: np.ndarray  # constants of the first layer after the first upscaling
+    second_scale: np.ndarray  # constants of the second layer after the first upscaling
+    combine: np.ndarray  # channel weights of each mask
 
 
 @dataclass(frozen=True)
 class ImageTerms:
-    """Arrays that the decoder computes once per image.
+    """Arrays that the decoder computes once per image."""
 
-    Attributes:
-        grid_hw: height and width of the image side.
-        keys, values: inputs of the first attention of tokens to pixels (see `decoder_kernels.read_image`).
-        first, second, masks: inputs of the later attentions and of the masks.
-    """
-
-    grid_hw: tuple[int, int]
-    keys: np.ndarray
+    grid_hw: tuple[int, int]  # size of the image side
+    keys: np.ndarray  # keys and values of the first attention of tokens to pixels (`kernels.read_image`)
     values: np.ndarray
     first: FirstLayer
     second: SecondLayer
@@ -183,15 +147,7 @@ Kept = Mapping[str, np.ndarray]
 
 
 class FactoredDecoder:
-    """Factored mask decoder of a SAM or SAM 2.
-
-    Args:
-        graph: the exported decoder.
-        heads: heads of every attention.
-
-    Raises:
-        ModelError: if the decoder has another architecture.
-    """
+    """Factored mask decoder of a SAM or SAM 2; raises a ModelError for any other architecture."""
 
     def __init__(self, graph: DecoderGraph, heads: int = HEADS_PER_ATTENTION) -> None:
         self.heads = heads
@@ -209,9 +165,13 @@ class FactoredDecoder:
         self._mask_heads = [
             graph.perceptron(f"mask_decoder/output_hypernetworks_mlps.{k}") for k in (1, 2, 3)
         ]
+        # inputs of these modules: the prompt tokens; the image features without and with positions
+        tokens, image_side = ["self_attn/q_proj"], [f"cross_attn_token_to_image/{part}_proj" for part in "vk"]
         self._tokens, self._image_side = (
-            one_thread_session(graph.until(*modules), ["CPUExecutionProvider"])
-            for modules in ((TOKENS,), IMAGE_SIDE)
+            one_thread_session(
+                graph.until(*(f"{layers[0]}/{each}" for each in ends)), ["CPUExecutionProvider"]
+            )
+            for ends in (tokens, image_side)
         )
         self.inner = len(self._reads[0].q.bias)
         # tokens depend only on the shapes of the features
@@ -264,8 +224,7 @@ class FactoredDecoder:
     def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
         """Compute the terms that all prompts share from an encoder's outputs by name, float32.
 
-        Raises:
-            ModelError: if the image side cannot be cut into blocks.
+        A ModelError is raised if the image side cannot be cut into blocks.
         """
         sides = _run(self._image_side, features, np.zeros((1, 2)))
         x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
@@ -289,7 +248,7 @@ class FactoredDecoder:
 
         def by_pixel(rows: np.ndarray) -> np.ndarray:
             found = single(rows).reshape(self.heads, self.dim, -1, pixels).transpose(2, 0, 3, 1)
-            return filled(found).reshape(-1)
+            return np.pad(found, [(0, 0)] * 3 + [(0, up(self.dim) - self.dim)]).reshape(-1)
 
         def projected(layer: Linear, rows: np.ndarray) -> np.ndarray:
             return wide(layer.weight) @ rows
@@ -337,11 +296,9 @@ class FactoredDecoder:
     def decode(
         self, image: ImageTerms, points_xy: Float[np.ndarray, "P 2"], *, fine: bool
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"], Kept]:
-        """Decode prompts.
+        """Decode one foreground point per prompt (px of the network's input).
 
-        Args:
-            points_xy: one foreground point per prompt, px of the network's input.
-            fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first of them.
+        With `fine`, all 4 x 4 logits of each pixel of the image side are computed, otherwise only the first.
 
         Returns:
             predicted IoUs, logits, and the arrays that `logits` needs.
@@ -516,9 +473,7 @@ class PixelSums:
     ) -> Float32[np.ndarray, "n H T D"]:
         """Return the weighted means of the pixels' values.
 
-        Args:
-            factor_values: values of the factors (n, H, F, D).
-            scale_values: values that the pixels' scales multiply (n, H, 1, D).
+        Factors have values (n, H, F, D); the pixels' scales multiply `scale_values` (n, H, 1, D).
         """
         number, _, heads, tokens, dim, _, depth = self.sizes
         sums = self.sums.reshape(number, heads, tokens, -1)
@@ -536,7 +491,7 @@ def _run(
     features: Mapping[str, np.ndarray],
     points: Float[np.ndarray, "P 2"],
 ) -> list[np.ndarray]:
-    """Run a subgraph of the decoder and return its outputs."""
+    """Run a subgraph of the decoder."""
     feeds = {
         "input_points": points[None, :, None].astype(np.float32),
         "input_labels": np.ones((1, len(points), 1), np.int64),
@@ -621,8 +576,3 @@ def flat(x: np.ndarray) -> Float32[np.ndarray, " n"]:
 def up(number: int) -> int:
     """Round up to a multiple of the SIMD width."""
     return -(-number // WIDTH) * WIDTH
-
-
-def filled(x: np.ndarray) -> np.ndarray:
-    """Append zeros to the last axis up to a multiple of the SIMD width."""
-    return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, up(x.shape[-1]) - x.shape[-1])])

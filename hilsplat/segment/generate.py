@@ -1,20 +1,38 @@
 """Automatic mask generation: from a grid of prompts to masks at three levels.
 
-`candidates.decode_candidates` runs the networks and depends on few settings; its result is cached.
+`decode_candidates` runs the networks and depends on few settings; its result is cached.
 `masks_from_candidates` filters, upscales and suppresses; changing its settings costs no network call. The
 steps are SAM's automatic generator, run separately for the three heads as in LangSplat, then LangSplat's mask
 suppression. With `generator: official`, each step is as published (docs/segment.md lists the differences).
 """
 
-import numpy as np
-from jaxtyping import Bool, Float64, Int32, Int64
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64, UInt8
+
+from hilsplat.base.artifacts import sha256_of_bytes, sha256_of_json
+from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import Level
-from hilsplat.segment.candidates import Candidates, crop_boxes
 from hilsplat.segment.kernels import cleaned_runs, upscaled_runs
-from hilsplat.segment.masks import HierarchicalMasks, take_runs
-from hilsplat.segment.sam import HEADS, Frame, SamModel, frame_taps
+from hilsplat.segment.logit_kernels import edge_windows
+from hilsplat.segment.masks import HierarchicalMasks, join_rows, take_runs
+from hilsplat.segment.sam import (
+    HEADS,
+    Encoded,
+    Frame,
+    Prompts,
+    SamModel,
+    Thresholds,
+    frame_taps,
+    full_stability,
+    point_grid,
+    read_logits,
+)
 from hilsplat.segment.suppression import (
+    distinct_boxes,
     last_inside,
     suppress_boxes,
     suppress_boxes_officially,
@@ -22,8 +40,231 @@ from hilsplat.segment.suppression import (
 )
 from hilsplat.settings import MasksSettings
 
+LOOSE = 0.1
+"""Masks below this predicted IoU or stability, or below a lower threshold of the settings, are not cached."""
+BAND_PX = 3
+"""Logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)."""
+REPEAT_IOU = 0.95
+"""A preview mask repeats a better one if the IoU of their boxes exceeds this (`distinct_prompts`)."""
+REPEAT_SLACK = 0.05
+"""Amount by which a repeated mask's preview stability, counted on few pixels, may exceed the better one's."""
+CROP_OVERLAP = 512 / 1500
+"""Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
 CROP_EDGE_PX = 20
-"""A crop cut a mask if its box is this close to an edge of the crop that isn't the image's (SAM)."""
+"""A mask counts as cut by its crop if its box is this close to an edge that isn't the image's (SAM)."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """K masks as decoded, before any threshold that a user may change.
+
+    A mask's logits are kept in a window around it, in steps of `sam.LOGIT_STEP` (unrounded for the official
+    generator). Logits with no edge within `BAND_PX` are set to +-127, so that windows compress well. This
+    changes no pixel of a mask: the two bilinear resizings up to the view read logits at most three pixels
+    apart. Outside the window logits are -127.
+    """
+
+    logits: Int8[np.ndarray, " R"] | Float32[np.ndarray, " R"]  # concatenated windows, each row by row
+    offsets: Int64[np.ndarray, " K_and_1"]  # start of each mask's window, and the end of the last one
+    window_xyxy: Int32[np.ndarray, "K 4"]  # low-resolution px, end exclusive
+    low_hw: Int32[np.ndarray, " 2"]  # size of the decoder's masks
+    head: UInt8[np.ndarray, " K"]  # row of `HEADS`
+    predicted_iou: Float32[np.ndarray, " K"]  # exceeds 1 for the most certain masks of a released SAM
+    stability: Float32[np.ndarray, " K"]  # `sam.read_logits` or `sam.full_stability`
+    crop: UInt8[np.ndarray, " K"]  # row of the view's crop boxes
+
+    def __len__(self) -> int:
+        return len(self.head)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all fields as plain arrays."""
+        return dict(vars(self))
+
+    @staticmethod
+    def concatenate(parts: "list[Candidates]") -> "Candidates":
+        """Concatenate the rows of all parts (at least one)."""
+        names = ("window_xyxy", "head", "predicted_iou", "stability", "crop")
+        return Candidates(low_hw=parts[0].low_hw, **join_rows(parts, "logits", names))
+
+
+def crop_boxes(
+    size_hw: tuple[int, int], layers: int
+) -> tuple[Int32[np.ndarray, "C 4"], UInt8[np.ndarray, " C"]]:
+    """Return the boxes (xyxy, px) of the whole image and of each layer's overlapping crops, and their layers.
+
+    Layer i has 2**i crops per side; crops of one layer overlap by 512/1500 of the shorter side,
+    divided by 2**(i - 1).
+    """
+    height, width = size_hw
+    boxes, layer_of = [(0, 0, width, height)], [0]
+    for layer in range(1, layers + 1):
+        per_side = 2**layer
+        overlap = int(CROP_OVERLAP * min(size_hw) * 2 / per_side)
+        crop_h = -(-(overlap * (per_side - 1) + height) // per_side)
+        crop_w = -(-(overlap * (per_side - 1) + width) // per_side)
+        for column in range(per_side):
+            for row in range(per_side):
+                left, top = column * (crop_w - overlap), row * (crop_h - overlap)
+                if left < width and top < height:  # images of a few pixels have fewer crops
+                    boxes.append((left, top, min(left + crop_w, width), min(top + crop_h, height)))
+                    layer_of.append(layer)
+    return np.array(boxes, dtype=np.int32), np.array(layer_of, dtype=np.uint8)
+
+
+def candidates_key(
+    image_sha256: str, model: SamModel, settings: MasksSettings, points: np.ndarray | None = None
+) -> str:
+    """Return the cache key of a view's candidates, a digest of all inputs of `decode_candidates`."""
+    thresholds = model.thresholds(settings)
+    batch = model.prompts_per_call(thresholds.points_per_batch, settings.points_per_side**2)
+    return sha256_of_json(
+        {
+            "image": image_sha256,
+            "model": model.digest,
+            "precision": model.precision,
+            "providers": model.encoder.providers,
+            "points_per_side": settings.points_per_side,
+            "points": None if points is None else sha256_of_bytes(points.tobytes()),
+            "points_per_batch": batch,
+            "crop_layers": settings.crop_layers,
+            "stability_offset": settings.stability_offset,
+            "full_size": needs_full_size(settings),
+            "official": settings.generator == "official",
+            "preview": uses_preview(model, settings),
+            "factored": model.factored is not None,
+            "floors": floors(thresholds),
+            "code": code_digest(decode_candidates),
+        }
+    )
+
+
+def floors(thresholds: Thresholds) -> tuple[float, float]:
+    """Return the predicted IoU and stability below which candidates are dropped; 0 drops none."""
+    lowest = (min(LOOSE, thresholds.predicted_iou_min), min(LOOSE, thresholds.stability_min))
+    return lowest[0] or -math.inf, lowest[1]
+
+
+def needs_full_size(settings: MasksSettings) -> bool:
+    """Return whether stability is counted at the view's size."""
+    return settings.stability == "full" or settings.generator == "official"
+
+
+def decode_candidates(
+    image: UInt8[np.ndarray, "H W 3"],
+    model: SamModel,
+    settings: MasksSettings,
+    points: Float[np.ndarray, "P 2"] | None = None,
+) -> Candidates:
+    """Decode masks at grid points of the image and its crops, skipping repeats (`distinct_prompts`).
+
+    `points` (x, y, px), at least one, replace the grid on the whole image; crops keep the grid.
+    """
+    boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
+    grid = point_grid(settings.points_per_side)
+    thresholds = model.thresholds(settings)
+    batch = model.prompts_per_call(thresholds.points_per_batch, len(grid))
+    parts = []
+    for crop, (left, top, right, bottom) in enumerate(boxes):
+        encoded = model.encode(np.ascontiguousarray(image[top:bottom, left:right]))
+        own = grid * (right - left, bottom - top) if points is None or crop else points
+        prompts: Prompts = {"points": own}
+        if uses_preview(model, settings):
+            prompts = distinct_prompts(encoded, prompts, model, settings, batch)
+        for called, number in calls(prompts, batch):
+            scores, logits = (found[:number] for found in model.finish(encoded, called))
+            parts.append(keep_candidates(scores, logits, encoded.frame, crop, settings, thresholds))
+    return Candidates.concatenate(parts)
+
+
+def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
+    """Yield the prompts of each decoder call, and how many of them count.
+
+    The last prompt is repeated to fill the last call: some networks have a fixed batch size, and with a
+    constant size the results don't depend on how the prompts are split into calls.
+    """
+    total = len(next(iter(prompts.values())))
+    for start in range(0, total, batch):
+        rows = np.minimum(np.arange(start, start + batch), total - 1)
+        yield {name: rows_of[rows] for name, rows_of in prompts.items()}, min(batch, total - start)
+
+
+def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
+    """Return whether to skip repeated prompts: the model has previews, and repeated masks are suppressed."""
+    may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
+    return model.previews and not may_repeat
+
+
+def distinct_prompts(
+    encoded: Encoded, prompts: Prompts, model: SamModel, settings: MasksSettings, batch: int
+) -> Prompts:
+    """Preview prompts and drop each one whose masks all repeat better masks of the same head.
+
+    Masks are compared by their boxes in the preview, which has every second or fourth row and column of the
+    decoder's masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of 1000
+    prompts, 200 to 300 remain; at least one is kept.
+    """
+    iou_floor, stability_floor = floors(model.thresholds(settings))
+    found, kept = [], []
+    for called, number in calls(prompts, batch):
+        scores, logits, rest = model.preview(encoded, called["points"])
+        flat = logits[:number].reshape(-1, *logits.shape[2:])
+        _, stability, boxes = read_logits(flat, settings.stability_offset, encoded.frame)
+        found.append((scores[:number], stability.reshape(number, -1), boxes.reshape(number, -1, 4)))
+        kept.append({name: rows[:number] for name, rows in rest.items()})
+    predicted_iou, stability, boxes = (np.concatenate(each) for each in zip(*found, strict=True))
+    likely = (predicted_iou >= iou_floor) & (stability >= stability_floor) & boxes.any(axis=2)
+    chosen = np.zeros(len(likely), bool)
+    for head in range(len(HEADS)):
+        rows = np.flatnonzero(likely[:, head])
+        at = rows, head
+        distinct = distinct_boxes(boxes[at], predicted_iou[at], stability[at], REPEAT_IOU, REPEAT_SLACK)
+        chosen[rows[distinct]] = True
+    chosen[0] |= not chosen.any()
+    return {name: np.concatenate([each.pop(name) for each in kept])[chosen] for name in list(kept[0])}
+
+
+def keep_candidates(
+    scores: Float32[np.ndarray, "P 3"],
+    logits: Float32[np.ndarray, "P 3 h w"],
+    frame: Frame,
+    crop: int,
+    settings: MasksSettings,
+    thresholds: Thresholds,
+) -> Candidates:
+    """Return the masks of one decoder call that pass `floors`."""
+    iou_floor, stability_floor = floors(thresholds)
+    predicted_iou = scores.reshape(-1)
+    flat = logits.reshape(-1, *logits.shape[2:])
+    steps: np.ndarray
+    steps, stability, boxes = read_logits(flat, settings.stability_offset, frame)
+    if settings.generator == "official":
+        steps, boxes = np.ascontiguousarray(flat), positive_boxes(flat)
+    likely = (predicted_iou >= iou_floor) & boxes.any(axis=1)
+    if needs_full_size(settings):
+        stability[likely] = full_stability(flat[likely], settings.stability_offset, frame)
+    rows = np.flatnonzero(likely & (stability >= stability_floor))
+    values, offsets, windows = edge_windows(steps, rows, boxes, BAND_PX)
+    return Candidates(
+        values,
+        offsets,
+        windows,
+        np.array(steps.shape[1:], np.int32),
+        np.tile(np.arange(len(HEADS), dtype=np.uint8), len(scores))[rows],
+        predicted_iou[rows],
+        stability[rows],
+        np.full(len(rows), crop, np.uint8),
+    )
+
+
+def positive_boxes(logits: Float32[np.ndarray, "K h w"]) -> Int32[np.ndarray, "K 4"]:
+    """Return the box (xyxy, end exclusive) of the positive logits of each mask, all 0 if there are none."""
+    above = np.greater(logits, 0)
+    boxes = np.zeros((len(logits), 4), np.int32)
+    for low, high, along in ((0, 2, above.any(axis=1)), (1, 3, above.any(axis=2))):
+        boxes[:, low] = along.argmax(axis=1)
+        boxes[:, high] = along.shape[1] - along[:, ::-1].argmax(axis=1)
+    boxes[~above.any(axis=(1, 2))] = 0
+    return boxes
 
 
 def masks_from_candidates(
@@ -33,8 +274,7 @@ def masks_from_candidates(
 
     Suppression compares boxes in a crop, boxes across crops, boxes of changed masks, and masks.
 
-    Returns:
-        masks in `content_order`; a level may be empty.
+    The result is in `content_order`; a level may be empty.
     """
     thresholds = model.thresholds(settings)
     official = settings.generator == "official"
@@ -112,10 +352,7 @@ def clean_masks(
     """Fill holes and drop islands below `min_area_px` (8-connected), and drop masks below it.
 
     The largest island of a mask is always kept. With `keep_small`, masks below `min_area_px` are kept and
-    count as changed (SAM).
-
-    Returns:
-        the remaining masks, and which of them were changed.
+    count as changed (SAM). Returns the remaining masks, and which of them were changed.
     """
     runs, offsets, changed = cleaned_runs(masks.runs, masks.offsets, masks.size_hw[1], min_area_px)
     cleaned = HierarchicalMasks.from_runs(

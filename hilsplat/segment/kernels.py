@@ -39,7 +39,7 @@ def upscaled_runs(
     sign. Only pixels near a change of sign are computed.
 
     Args:
-        logits, offsets, windows: all windows, as in `candidates.Candidates`.
+        logits, offsets, windows: all windows, as in `generate.Candidates`.
         rows: windows to upscale.
         first_y, weight_y: first low-resolution row and weights of each row of the crop.
         first_x, weight_x: the same along x.

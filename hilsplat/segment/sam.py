@@ -22,7 +22,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.processes import in_order
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
-from hilsplat.models.int8 import CHECKED_GRID, Agreement, agreement_of_masks, int8_network, may_be_int8
+from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, int8_network, may_be_int8, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network, execution_providers, require_three_heads
 from hilsplat.models.onnx_graph import with_rowwise_attention
@@ -45,33 +45,21 @@ typical for SAM."""
 
 @dataclass(frozen=True)
 class Frame:
-    """Position of an image in the network's square input.
-
-    Attributes:
-        original_hw: size of the image, px.
-        resized_hw: its size in the input, where it is at the top left, px.
-        padded_hw: size of the whole input, px.
-        stretched: whether the image fills the input, and masks are upscaled in one step (SAM 2).
-    """
+    """Position of an image in the network's square input; sizes in px."""
 
     original_hw: tuple[int, int]
-    resized_hw: tuple[int, int]
-    padded_hw: tuple[int, int]
-    stretched: bool = False
+    resized_hw: tuple[int, int]  # size of the image in the input, where it is at the top left
+    padded_hw: tuple[int, int]  # size of the whole input
+    stretched: bool = False  # the image fills the input, and masks are upscaled in one step (SAM 2)
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """Output of the vision encoder for one image.
+    """Output of the vision encoder for one image."""
 
-    Attributes:
-        features: inputs of the decoder by name, float32 (1, C, h, w).
-        terms: per-image arrays of the factored decoder, if the model has one.
-    """
-
-    features: Mapping[str, np.ndarray]
+    features: Mapping[str, np.ndarray]  # inputs of the decoder by name, float32 (1, C, h, w)
     frame: Frame
-    terms: ImageTerms | None = None
+    terms: ImageTerms | None = None  # arrays of the factored decoder, if the model has one
 
 
 Prompts = Mapping[str, np.ndarray]
@@ -117,23 +105,16 @@ def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
 
 
 class SamModel:
-    """A SAM model folder, opened for inference.
+    """A SAM model folder, opened for inference."""
 
-    Attributes:
-        stretches: whether images are stretched to a square (SAM 2) or padded (SAM).
-        previewer: the decoder at half the resolution (`layouts.PREVIEW`), if the model has one.
-        factored: the equivalent, much faster decoder, if the model's graph can be factored.
-        as_exported: whether the encoder or the decoder runs as exported, which takes more memory.
-        precision: "fp32" or "int8", of the encoder.
-    """
-
-    precision: str = "fp32"
-
+    precision: str = "fp32"  # or "int8", of the encoder
     own: Thresholds = REAL_SAM
-    stretches: bool = False
-    previewer: Network | None = None
-    factored: FactoredDecoder | None = None
-    as_exported: bool = True
+    stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
+    previewer: Network | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
+    factored: FactoredDecoder | None = (
+        None  # the equivalent, much faster decoder, if the graph can be factored
+    )
+    as_exported: bool = True  # encoder or decoder run as exported, which takes more memory
 
     def __init__(self, model: ModelFolder) -> None:
         self.model = model
@@ -178,7 +159,7 @@ class SamModel:
             logits = np.concatenate([self.decode(encoded, piece)[1] for piece in pieces])
             return logits.reshape(-1, *logits.shape[2:]) > 0
 
-        def measure() -> Agreement:
+        def measure() -> dict[str, float]:
             work = [(image, encoder) for encoder in (self.encoder, quantised) for image in images]
             found = list(in_order(masks, work, threads))
             halves = found[: len(images)], found[len(images) :]
@@ -186,7 +167,7 @@ class SamModel:
 
         digests = [sha256_of_bytes(image.tobytes()) for image in images]
         inputs = {"model": self.digest, "images": digests, "grid": CHECKED_GRID}
-        if Agreement.remembered(cache, inputs, measure).decide(precision, "SAM's encoder"):
+        if use_int8(precision, "SAM's encoder", cache, inputs, measure):
             self.encoder, self.precision = quantised, "int8"
 
     def int8_encoder(self, cache: Path) -> Network:
@@ -214,30 +195,23 @@ class SamModel:
         """Factor the decoder and check it against the network; None if that fails."""
         described = self.model.config.get("mask_decoder_config", {})
         heads = described.get("num_attention_heads", HEADS_PER_ATTENTION)
+        on_runtime = f"the decoder of {self.model.folder} runs in onnxruntime"
         try:
             factored = FactoredDecoder(DecoderGraph(self.model.networks[DECODER]), heads)
-            apart = largest_difference(factored, self.decoder, self.padded_hw[0])
+            difference = largest_difference(factored, self.decoder, self.padded_hw[0])
         except ModelError as error:
-            logger.info("the decoder of %s runs in onnxruntime: %s", self.model.folder, error)
+            logger.info("%s: %s", on_runtime, error)
             return None
-        if apart > AGREEMENT:
-            logger.warning(
-                "the decoder of %s runs in onnxruntime, slower: factored, it differs by %.2g",
-                self.model.folder,
-                apart,
-            )
+        if difference > AGREEMENT:
+            logger.warning("%s, slower: factored, it differs by %.2g", on_runtime, difference)
             return None
         return factored
 
     @staticmethod
     def load(folder: Path, variant: str = "") -> "SamModel":
-        """Open a model folder (`open_model_folder`).
-
-        Raises:
-            ModelError: if it is missing, incomplete or not a SAM.
-        """
-        way_out = "set masks.segmenter: graph, which needs no model"
-        return SamModel(open_model_folder(folder, "sam", variant=variant, fix=way_out))
+        """Open a model folder; errors as in `open_model_folder`."""
+        other = "set masks.segmenter: graph, which needs no model"
+        return SamModel(open_model_folder(folder, "sam", variant=variant, fix=other))
 
     def thresholds(self, settings: MasksSettings) -> Thresholds:
         """Return the settings' thresholds, with the model's own in place of `auto`."""
@@ -277,11 +251,7 @@ class SamModel:
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-        """Decode three masks for each foreground point of the original image (px).
-
-        Returns:
-            predicted IoUs and low-resolution logits, in the order of `HEADS`.
-        """
+        """Return predicted IoUs and low-resolution logits (as `HEADS`) for each point of the image, px."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, _ = self.factored.decode(encoded.terms, points, fine=True)
@@ -291,14 +261,14 @@ class SamModel:
     def decode_clicks(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "K 2"], inside: Bool[np.ndarray, " K"]
     ) -> tuple[Float32[np.ndarray, " 3"], Float32[np.ndarray, "3 h w"]]:
-        """Decode three masks for several points (px) inside or outside one object."""
+        """Decode three masks of one object for several points (px) inside or outside it."""
         points = in_input(points_xy, encoded.frame)[None]
         iou, logits = ask_network(self.decoder, encoded.features, points, inside[None].astype(np.float64))
         return iou[0], logits[0]
 
     @property
     def previews(self) -> bool:
-        """Whether the model can decode faster at a lower resolution."""
+        """Whether the model can decode at a lower resolution in less time."""
         return self.previewer is not None or self.factored is not None
 
     def preview(
@@ -334,9 +304,9 @@ def ask_network(
     points_xy: Float[np.ndarray, "P K 2"],
     labels: Float[np.ndarray, "P K"] | None = None,
 ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-    """Run a decoder on prompts of K points of its input, and return predicted IoUs and logits.
+    """Run a decoder on prompts of K points of its input; labels are 1 inside the object, 0 outside.
 
-    Labels are 1 for points inside the object (the default) and 0 for points outside.
+    By default all points are inside. Returns predicted IoUs and logits.
     """
     scores, logits = decoder(
         input_points=points_xy[None],
@@ -386,8 +356,7 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
 def own_thresholds(model: ModelFolder) -> Thresholds:
     """Return the thresholds in a model folder's `config.json`, or `REAL_SAM`.
 
-    Raises:
-        ModelError: if it has an unknown key or a value out of range.
+    A ModelError is raised for an unknown key or a value out of range.
     """
     own: Any = model.config.get(OWN, {})
     known = vars(REAL_SAM)
@@ -463,13 +432,10 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return the weights that blend low-resolution pixels to each pixel along one axis of the image.
+    """Return each pixel's first low-resolution pixel along one axis, and the weights of it and the next ones.
 
     They combine SamProcessor's steps: bilinear from `low` to the padded input, cropped to the resized image,
     bilinear to the original size.
-
-    Returns:
-        first low-resolution pixel of each pixel of the image, and the weights of that and the following ones.
     """
     weights = _bilinear(low, padded)[:resized]
     if resized != original:

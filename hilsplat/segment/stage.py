@@ -18,10 +18,9 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.models.int8 import CHECKED_VIEWS
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.candidates import Candidates, candidates_key, decode_candidates
 from hilsplat.segment.coverage import with_tree_levels
 from hilsplat.segment.digests import digests_in, index_entry, load_masks
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import Candidates, candidates_key, decode_candidates, masks_from_candidates
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel

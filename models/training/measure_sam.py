@@ -11,8 +11,7 @@ from hilsplat.base.artifacts import sha256_of_bytes
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
-from hilsplat.segment.candidates import decode_candidates
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.sam import SamModel

@@ -5,9 +5,9 @@ import onnx
 import pytest
 
 from hilsplat.base.errors import ModelError
-from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.decoder_weights import DecoderGraph
 from hilsplat.segment.factored_decoder import FactoredDecoder
+from hilsplat.segment.generate import decode_candidates
 from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
 from hilsplat.settings import MasksSettings
 

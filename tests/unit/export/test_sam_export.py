@@ -6,8 +6,7 @@ import pytest
 
 from hilsplat.embed.model_check import check_model
 from hilsplat.models.onnx_graph import with_rowwise_attention
-from hilsplat.segment.candidates import crop_boxes, decode_candidates
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import crop_boxes, decode_candidates, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel, point_grid
 from hilsplat.settings import MasksSettings

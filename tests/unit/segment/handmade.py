@@ -12,8 +12,7 @@ from hilsplat.base.images import write_png
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.candidates import decode_candidates
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings

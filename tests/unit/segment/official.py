@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from hilsplat.segment.candidates import crop_boxes
+from hilsplat.segment.generate import crop_boxes
 from hilsplat.segment.sam import SamModel, point_grid
 from hilsplat.settings import MasksSettings
 

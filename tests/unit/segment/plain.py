@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from hilsplat.segment.candidates import BAND_PX, Candidates
+from hilsplat.segment.generate import BAND_PX, Candidates
 from hilsplat.segment.sam import LOGIT_STEP, Frame
 
 

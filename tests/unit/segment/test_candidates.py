@@ -5,8 +5,7 @@ import zlib
 import numpy as np
 import pytest
 
-from hilsplat.segment.candidates import Candidates, distinct_prompts, keep_candidates
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import Candidates, distinct_prompts, keep_candidates, masks_from_candidates
 from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, resized_size
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.plain import flatten_far, quantise, restore, smooth_logits, unpacked

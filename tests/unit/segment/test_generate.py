@@ -8,9 +8,16 @@ from hypothesis.extra import numpy as hnp
 
 from hilsplat.base.levels import Level
 from hilsplat.models.folder import open_model_folder
-from hilsplat.segment.candidates import Candidates, candidates_key, crop_boxes, decode_candidates, floors
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.segment.generate import clean_masks, masks_from_candidates
+from hilsplat.segment.generate import (
+    Candidates,
+    candidates_key,
+    clean_masks,
+    crop_boxes,
+    decode_candidates,
+    floors,
+    masks_from_candidates,
+)
 from hilsplat.segment.sam import Encoded, SamModel, Thresholds
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.handmade import assert_equal_masks, generate, pack

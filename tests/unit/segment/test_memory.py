@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.canned_sam import CannedSam, NetworkClock
-from hilsplat.segment.candidates import decode_candidates
 from hilsplat.segment.coverage import coverage_tree
-from hilsplat.segment.generate import masks_from_candidates
+from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.settings import MasksSettings
 
 CLEAR = Path("/proc/self/clear_refs")

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.canned_sam import CannedSam, NetworkClock
-from hilsplat.segment.candidates import positive_boxes
-from hilsplat.segment.generate import clean_masks
+from hilsplat.segment.generate import clean_masks, positive_boxes
 from hilsplat.segment.sam import HEADS, Frame, SamModel, full_stability, read_logits
 from hilsplat.segment.suppression import suppress_boxes, suppress_boxes_officially
 from hilsplat.settings import MasksSettings
