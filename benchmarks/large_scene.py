@@ -30,7 +30,7 @@ from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.field import run_field
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.coverage_stage import run_coverage_tree
+from hilsplat.segment.coverage import run_coverage_tree
 from hilsplat.segment.digests import MASKS_SHA256, digest_of, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.semantic_tree.build import run_semantic_tree

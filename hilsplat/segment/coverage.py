@@ -1,13 +1,19 @@
-"""Coverage tree of a view: the parent of each mask (paper, Sec. III-B)."""
+"""Coverage tree of a view: the parent of each mask (paper, Sec. III-B), and the stage `coverage_tree`."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int32, Int64, UInt8
 
+from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_npz
 from hilsplat.base.errors import EmptyMaskError
-from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.progress import stage_log, track
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import CoverageTreeSettings
 
 
 def coverage_parents(
@@ -22,7 +28,7 @@ def coverage_parents(
     its child; the parent of a subpart may be a whole.
 
     Args:
-        overlap_px: pixels that each pair of masks shares; the diagonal holds their areas.
+        overlap_px: pixels that each pair of masks shares; the diagonal contains their areas.
         level: `Level` of each mask; None allows parents from any level, as printed in the paper.
         theta: coverage threshold, a share in (0, 1); the paper uses 0.9.
 
@@ -39,11 +45,8 @@ def coverage_parents(
     """
     area_px = np.diagonal(overlap_px)
     if not area_px.all():
-        empty = np.flatnonzero(area_px == 0).tolist()
-        raise EmptyMaskError(
-            f"masks {empty} of {len(area_px)} have no pixel",
-            fix="drop empty masks before building the coverage tree",
-        )
+        empty = f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} have no pixel"
+        raise EmptyMaskError(empty, fix="drop empty masks before building the coverage tree")
     if not len(area_px):
         return np.zeros(0, dtype=np.int32)
     share = overlap_px / area_px[:, None]  # [a, b]: share of a inside b
@@ -79,8 +82,38 @@ def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMask
     """Return the masks with levels set to their depths in the view's tree, in `content_order`.
 
     Roots become wholes, their children parts, and all other descendants subparts (a comment in the source of
-    the paper, Sec. III-B). The heads that made the masks don't count.
+    the paper, Sec. III-B), whichever head predicted them.
     """
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
     found = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))
     return found.take(found.content_order())
+
+
+def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSettings) -> None:
+    """Write `<view>.npz` of every view with `parent` i32 (M) and `depth` u8 (M), and `index.json`.
+
+    Rows are in the order of the masks. A MisalignedArtifactError is raised if a view's masks differ from
+    those recorded in their index.
+    """
+    scene, digests = read_index(masks_folder)["scene"], digests_in(masks_folder)
+    index: dict[str, Any] = {}
+    with stage_log("coverage_tree", scene) as counts, atomic_folder(out) as folder:
+        for view in track(list(digests), "coverage trees"):
+            masks = load_masks(masks_folder, view, digests)
+            parent, depth = coverage_tree(masks, settings.theta)
+            write_npz(folder / f"{view}.npz", parent=parent, depth=depth)
+            has_parent = parent != NONE
+            index[view] = {
+                MASKS_SHA256: digests[view],
+                "masks": len(masks),
+                "roots": int((~has_parent).sum()),
+                "part_with_parent": int(has_parent[masks.rows_of(Level.PART)].sum()),
+                "subpart_with_parent": int(has_parent[masks.rows_of(Level.SUBPART)].sum()),
+                "deepest": int(depth.max(initial=0)),
+            }
+        write_index(folder, index, scene=scene, theta=settings.theta)
+        counts.update(
+            views=len(index),
+            masks=sum(entry["masks"] for entry in index.values()),
+            roots=sum(entry["roots"] for entry in index.values()),
+        )

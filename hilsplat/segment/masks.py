@@ -1,14 +1,14 @@
 """Overlapping masks of one view at three levels, run-length encoded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64, UInt8, UInt32
 
-from hilsplat.base.arrays import require_types
+from hilsplat.base.arrays import made
 from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError, EmptyMaskError
 from hilsplat.base.levels import NONE, Level
@@ -28,8 +28,7 @@ def encode_runs(
         flat = mask.reshape(-1)
         edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
         lengths = np.diff(edges, prepend=0, append=flat.size)
-        starts_inside = flat.size and flat[0]
-        pieces.append(np.insert(lengths, 0, 0) if starts_inside else lengths)
+        pieces.append(np.insert(lengths, 0, 0) if flat.size and flat[0] else lengths)
     return _joined(pieces)
 
 
@@ -70,9 +69,7 @@ def runs_of_labels(
 def join_rows(parts: Sequence[Any], ragged: str, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Concatenate the rows of several tables (at least one), field by field.
 
-    Args:
-        ragged: field with a variable number of values per row, at `offsets`.
-        names: the other fields to join, with one entry per row.
+    The field `ragged` has a variable number of values per row, at `offsets`; those in `names` have one entry.
     """
     starts = np.cumsum([0, *(len(getattr(part, ragged)) for part in parts)])
     offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
@@ -86,26 +83,16 @@ PER_MASK = ("level", "predicted_iou", "stability", "area_px", "box_xyxy")
 
 @dataclass(frozen=True)
 class HierarchicalMasks:
-    """M masks of one view; they may overlap, across and within levels.
+    """M masks of one view; they may overlap, across and within levels."""
 
-    Attributes:
-        runs: run lengths of all masks (see `encode_runs`).
-        offsets: start of each mask's runs, and the end of the last ones.
-        level: `Level` of each mask as the segmenter gave it.
-        predicted_iou: quality of each mask as estimated by the segmenter; SAM's may slightly exceed 1.
-        stability: stability of each mask under a changed threshold, in [0, 1].
-        box_xyxy: box of each mask, px, end exclusive.
-        size_hw: height and width of the view, px.
-    """
-
-    runs: UInt32[np.ndarray, " R"]
-    offsets: Int64[np.ndarray, " M_and_1"]
-    level: UInt8[np.ndarray, " M"]
-    predicted_iou: Float32[np.ndarray, " M"]
-    stability: Float32[np.ndarray, " M"]
+    runs: UInt32[np.ndarray, " R"]  # run lengths of all masks (`encode_runs`)
+    offsets: Int64[np.ndarray, " M_and_1"]  # start of each mask's runs, and the end of the last ones
+    level: UInt8[np.ndarray, " M"]  # `Level` of each mask
+    predicted_iou: Float32[np.ndarray, " M"]  # as the segmenter predicts; SAM's may slightly exceed 1
+    stability: Float32[np.ndarray, " M"]  # stability under a changed threshold, in [0, 1]
     area_px: Int64[np.ndarray, " M"]
-    box_xyxy: Int32[np.ndarray, "M 4"]
-    size_hw: tuple[int, int]
+    box_xyxy: Int32[np.ndarray, "M 4"]  # px, end exclusive
+    size_hw: tuple[int, int]  # of the view, px
 
     def __len__(self) -> int:
         return len(self.level)
@@ -167,7 +154,7 @@ class HierarchicalMasks:
 
     @staticmethod
     def concatenate(parts: "list[HierarchicalMasks]", size_hw: tuple[int, int]) -> "HierarchicalMasks":
-        """Concatenate the rows of all parts; `size_hw` is the view's size, px."""
+        """Concatenate the rows of all parts."""
         none = np.zeros(0, np.float32)
         empty = HierarchicalMasks.from_dense(np.zeros((0, *size_hw), bool), none.astype(np.uint8), none, none)
         return HierarchicalMasks(size_hw=size_hw, **join_rows([empty, *parts], "runs", PER_MASK))
@@ -178,28 +165,22 @@ class HierarchicalMasks:
         The order does not depend on row numbers, so a segmenter that sorts by it writes the same file for any
         order of prompts.
         """
-        keys = [
-            (
-                int(self.level[row]),
-                -int(self.area_px[row]),
-                tuple(self.box_xyxy[row].tolist()),
-                -float(self.predicted_iou[row]),
-                -float(self.stability[row]),
-                self.runs[self.offsets[row] : self.offsets[row + 1]].tobytes(),
-            )
-            for row in range(len(self))
-        ]
-        return np.array(sorted(range(len(self)), key=keys.__getitem__), dtype=np.int64)
+
+        def key(row: int) -> tuple:
+            scores = -float(self.predicted_iou[row]), -float(self.stability[row])
+            runs = self.runs[self.offsets[row] : self.offsets[row + 1]].tobytes()
+            return int(self.level[row]), -int(self.area_px[row]), self.box_xyxy[row].tolist(), *scores, runs
+
+        return np.array(sorted(range(len(self)), key=key), dtype=np.int64)
 
     def rows_of(self, level: Level) -> Int64[np.ndarray, " m"]:
         """Return the rows of a level, in order."""
         return np.flatnonzero(self.level == int(level))
 
     def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
-        """Return the row of the mask of a level (None: all) that each pixel shows, -1 for none.
+        """Return the row of the mask that each pixel shows, -1 for none, of one level or of all (None).
 
-        Large masks are painted first, so small ones stay visible; of two equal ones, the lower row is painted
-        last.
+        Large masks are painted first, so small ones stay visible; of two equal ones, the lower row wins.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
         rows = np.arange(len(self)) if level is None else self.rows_of(level)
@@ -225,40 +206,51 @@ class HierarchicalMasks:
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
         """Read `<view>.npz`; raise an ArtifactError if it is missing or damaged, or its arrays disagree."""
-        arrays = read_npz(path, *(field.name for field in fields(HierarchicalMasks)))
-        size = arrays["size_hw"]
+        arrays = read_npz(path, "size_hw")
+        size = arrays.pop("size_hw")
         is_size = size.shape == (2,) and size.dtype.kind in "iu"
         if not is_size or size.min() < 1 or size.max() > MAX_SIDE_PX:
-            raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
-        require_types(HierarchicalMasks, arrays, path, LIMITS)
-        try:
-            found = HierarchicalMasks.from_arrays(arrays)
-        except TypeError as error:
-            raise _damaged(path, "names", "those of masks", str(error)) from error
-        found._require_whole(path)
-        return found
+            raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px")
+        masks = made(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
+        masks._require_whole(path)
+        return masks
 
     def _require_whole(self, path: Path) -> None:
-        lengths = np.diff(self.offsets)
-        if len(self.offsets) != len(self) + 1 or self.offsets[0] != 0 or self.offsets[-1] != len(self.runs):
-            ends = f"{len(self.offsets)} from {self.offsets[:1].tolist()} to {self.offsets[-1:].tolist()}"
-            raise _damaged(path, "offsets", f"{len(self) + 1} from 0 to {len(self.runs)}", ends)
-        if (lengths <= 0).any():
-            raise _damaged(path, "offsets", "ascending offsets", f"steps of {int(lengths.min())}")
+        """Check that offsets, runs, areas and boxes agree."""
+        lengths, ends = np.diff(self.offsets), self.offsets[[0, -1]].tolist() if len(self.offsets) else []
+        if len(self.offsets) != len(self) + 1 or ends != [0, len(self.runs)] or (lengths <= 0).any():
+            raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}")
         height, width = self.size_hw
         if len(self):
             pixels = np.add.reduceat(self.runs.astype(np.int64), self.offsets[:-1])
             if (pixels != height * width).any():
-                wrong = int(pixels[pixels != height * width][0])
-                raise _damaged(path, "runs", f"{height * width} pixels a mask", f"{wrong} in one")
+                raise _damaged(path, "runs", f"{height * width} pixels per mask")
         area_px, boxes = areas_and_boxes(self.runs, self.offsets, width)
         if not (area_px > 0).all() or not np.array_equal(area_px, self.area_px):
-            raise _damaged(path, "area_px", "the areas of the masks", "others")
+            raise _damaged(path, "area_px", "the areas of the masks")
         if not np.array_equal(boxes, self.box_xyxy):
-            raise _damaged(path, "box_xyxy", "the boxes of the masks", "others")
+            raise _damaged(path, "box_xyxy", "the boxes of the masks")
 
 
-def _damaged(path: Path, name: str, expected: str, found: str) -> ArtifactError:
-    return ArtifactError(
-        f"{path}: array {name} cannot be right", expected=expected, found=found, fix=remake(path)
-    )
+def _damaged(path: Path, name: str, expected: str) -> ArtifactError:
+    return ArtifactError(f"{path}: array {name} cannot be right", expected=expected, fix=remake(path))
+
+
+def region_ious(
+    labels: Int[np.ndarray, "H W"], masks: Bool[np.ndarray, "M H W"]
+) -> tuple[Int64[np.ndarray, " R"], Int64[np.ndarray, " R"], Float32[np.ndarray, "R M"]]:
+    """Return the ids of a label image's regions, their areas (px) and their IoUs with every mask.
+
+    Ids ascend. Labels are negative where there is no region; masks may overlap.
+    """
+    flat = labels.reshape(-1)
+    ids, index = np.unique(flat, return_inverse=True)
+    first = int(np.searchsorted(ids, 0))
+    areas = np.bincount(index, minlength=len(ids))
+    guesses = masks.reshape(len(masks), flat.size)
+    shared = np.zeros((len(ids), len(masks)))
+    for row, guess in enumerate(guesses):
+        shared[:, row] = np.bincount(index[guess], minlength=len(ids))
+    union = areas[:, None] + guesses.sum(axis=1)[None] - shared
+    found = (shared / np.maximum(union, 1)).astype(np.float32)
+    return ids[first:].astype(np.int64), areas[first:].astype(np.int64), found[first:]

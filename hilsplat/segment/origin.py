@@ -7,16 +7,15 @@ from hilsplat.base.artifacts import read_index
 
 
 def masks_label(masks_folder: Path) -> str:
-    """Return the label of the masks' source.
-
-    It is the name of the model folder, or of the segmenter if it uses no model. Masks made from true labels
-    have a label that also names their faults.
-    """
+    """Return the label of the masks' source (`label_of_index`)."""
     return label_of_index(read_index(masks_folder))
 
 
 def label_of_index(index: dict[str, Any]) -> str:
-    """Return the label from the index of a masks artifact."""
+    """Return the label in the index of masks, else the name of the model or, without one, the segmenter.
+
+    The label of masks made from true labels names their faults.
+    """
     if "label" in index:
         return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]

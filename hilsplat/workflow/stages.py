@@ -1,7 +1,11 @@
 """Registry of the function of each stage."""
 
+from collections.abc import Callable
+from typing import Any
+
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest
+from hilsplat.base.plugins import load
 
 STAGES: dict[str, str] = {
     "world": "hilsplat.world.stage:run_world",
@@ -12,7 +16,7 @@ STAGES: dict[str, str] = {
     "key_masks": "hilsplat.contributions.key_views:run_key_masks",
     "guided_masks": "hilsplat.semantic_tree.guided_masks:run_guided_masks",
     "truth_masks": "hilsplat.world.truth_masks:run_truth_masks",
-    "coverage_tree": "hilsplat.segment.coverage_stage:run_coverage_tree",
+    "coverage_tree": "hilsplat.segment.coverage:run_coverage_tree",
     "clip": "hilsplat.embed.stage:run_clip",
     "langsplat": "hilsplat.embed.langsplat_files",
     "names": "hilsplat.query.node_names:run_names",
@@ -21,11 +25,11 @@ STAGES: dict[str, str] = {
     "feature_tree": "hilsplat.methods.feature_tree:run_feature_tree",
     "autoencoder": "hilsplat.field.autoencoder:run_autoencoder",
     "field": "hilsplat.field.field:run_field",
-    "method": "hilsplat.methods.stage:run_method",
+    "method": "hilsplat.methods.method:run_method",
     "evaluate": "hilsplat.evaluate.stage:run_evaluate",
     "evaluate_files": "hilsplat.evaluate.files_stage:run_evaluate_files",
     "table": "hilsplat.evaluate.tables.build:run_table",
-    "efficiency": "hilsplat.evaluate.tables.efficiency:run_efficiency",
+    "efficiency": "hilsplat.evaluate.tables.costs:run_efficiency",
     "figures": "hilsplat.evaluate.figures.panel:run_figures",
     "comparison": "hilsplat.evaluate.figures.comparison:run_comparison",
     "sweep": "hilsplat.evaluate.figures.sweep_plot:run_sweep_plot",
@@ -49,3 +53,8 @@ def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
     if stage not in STAGES:
         raise HilsplatError(f"unknown stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
     return code_digest(STAGES[stage], *plugins)
+
+
+def stage_function(stage: str) -> Callable[..., Any]:
+    """Import the function of a stage, or the module if `STAGES` names one."""
+    return load(STAGES[stage])

@@ -12,8 +12,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.segment.generate import decode_candidates, masks_from_candidates
-from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.overlaps import region_ious
+from hilsplat.segment.masks import HierarchicalMasks, region_ious
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
 from models.training.data import HEAD_LEVELS, LabelledViews, normalised

@@ -18,9 +18,8 @@ from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.query.pictures import grey, save_png_and_pdf, show
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.segment.masks import HierarchicalMasks, region_ious
 from hilsplat.segment.origin import masks_label
-from hilsplat.segment.overlaps import region_ious
 from hilsplat.segment.pictures import paint_level
 
 LEAST_PX = 100
@@ -75,9 +74,7 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
     """Write a table of all views and a picture of a median view and the worst one; return a Markdown table.
 
-    Args:
-        masks_folder: masks artifact of any segmenter.
-        out: PNG to write; a PDF and the table as CSV are written beside it.
+    The PDF and the table as CSV are written beside the PNG.
 
     Raises:
         ArtifactError: an artifact is missing, or the scene is not synthetic.
@@ -91,26 +88,24 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
             for view in track(list(index["views"]), "views compared")
         }
         counts["views"] = len(fits)
-        rows = [table_row(scene.name, masks_label(masks_folder), level, fits) for level in LEVELS]
+        rows = []
+        for level in LEVELS:  # means are over regions, not over views
+            own = [fit[level] for fit in fits.values()]
+            best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
+            number = sum(fit.masks for fit in own)
+            shares = (best.mean(), (best >= FIT_IOU).mean()) if len(best) else (np.nan, np.nan)
+            precision = sum(fit.fitting for fit in own) / number if number else np.nan
+            rows.append(
+                [
+                    *(scene.name, masks_label(masks_folder), level.label, str(len(own)), str(len(best))),
+                    *(f"{share:.4f}" for share in shares),
+                    *(f"{number / max(1, len(own)):.1f}", f"{precision:.4f}"),
+                ]
+            )
         figure = draw_fits(scene, truth, Path(masks_folder), fits, median_and_worst(fits))
         save_png_and_pdf(figure, out)
         write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
-
-
-def table_row(scene: str, masks: str, level: Level, fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
-    """Return the row of one level over all views; means are over regions, not over views."""
-    own = [fit[level] for fit in fits.values()]
-    best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
-    number = sum(fit.masks for fit in own)
-    iou = best.mean() if len(best) else np.nan
-    recall = (best >= FIT_IOU).mean() if len(best) else np.nan
-    masks_a_view = number / max(1, len(own))
-    precision = sum(fit.fitting for fit in own) / number if number else np.nan
-    return [
-        *(scene, masks, level.label, str(len(own)), str(len(best))),
-        *(f"{iou:.4f}", f"{recall:.4f}", f"{masks_a_view:.1f}", f"{precision:.4f}"),
-    ]
 
 
 def median_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
@@ -132,11 +127,11 @@ def draw_fits(
     views: list[str],
 ) -> Figure:
     """Draw two rows per view: its masks by level, and below the true regions coloured by their best IoU."""
-    wide = 1 + len(LEVELS)
+    tall, wide = max(1, 2 * len(views)), 1 + len(LEVELS)
     example = scene.cameras[views[0]].size_hw if views else (1, 1)
     height_in = 3.1 * example[0] / example[1] + 0.3
-    figure = Figure(figsize=(3.1 * wide, max(1, 2 * len(views)) * height_in), layout="constrained")
-    axes = figure.subplots(max(1, 2 * len(views)), wide, squeeze=False)
+    figure = Figure(figsize=(3.1 * wide, tall * height_in), layout="constrained")
+    axes = figure.subplots(tall, wide, squeeze=False)
     for each in axes.flat:
         each.set_axis_off()
     for number, view in enumerate(views):

@@ -12,7 +12,7 @@ from hilsplat.base.images import read_image
 from hilsplat.models.folder import open_model_folder
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network
-from hilsplat.segment.coverage_stage import run_coverage_tree
+from hilsplat.segment.coverage import run_coverage_tree
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.pictures import THUMB_PX, masks_overview
 from hilsplat.segment.stage import run_masks

@@ -8,8 +8,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
-from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.overlaps import region_ious
+from hilsplat.segment.masks import HierarchicalMasks, region_ious
 
 VIEW = "001.png"
 
