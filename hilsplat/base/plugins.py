@@ -2,9 +2,16 @@
 
 import importlib
 from collections.abc import Iterator, Mapping
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Part = TypeVar("Part")
+
+
+def load(place: str) -> Any:
+    """Import what "module:name" or "module" names."""
+    module, _, name = place.partition(":")
+    found = importlib.import_module(module)
+    return getattr(found, name) if name else found
 
 
 class Plugins(Mapping[str, Part], Generic[Part]):
@@ -21,8 +28,7 @@ class Plugins(Mapping[str, Part], Generic[Part]):
         self.places = dict(places)
 
     def __getitem__(self, name: str) -> Part:
-        module, _, constant = self.places[name].partition(":")
-        return getattr(importlib.import_module(module), constant)
+        return load(self.places[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.places)

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from hilsplat.cli.apps import datasets_app
-from hilsplat.cli.stage import DataRoot, PathOut, Results, Threads, stage, start_logging
+from hilsplat.cli.stage import DataRoot, PathOut, Results, Threads, datasets_app, stage
 
 
 @datasets_app.command("list")
@@ -14,8 +13,7 @@ def datasets_list(
     data_root: Annotated[Path | None, typer.Option(help="folder that holds the data sets")] = None,
 ) -> None:
     """List the data sets: citation, licence, layout and, with --data-root, the scenes found."""
-    start_logging()
-    from hilsplat.datasets.overview import overview
+    from hilsplat.datasets.registry import overview
 
     typer.echo(overview(data_root))
 
@@ -27,9 +25,7 @@ def datasets_check(
     scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
     """Read all labels of a data set and report what was found and what is wrong, scene by scene."""
-    start_logging()
-    from hilsplat.datasets.overview import check
-    from hilsplat.datasets.registry import dataset_of
+    from hilsplat.datasets.registry import check, dataset_of
 
     report, num_failed = check(dataset_of(name), data_root, scene or ())
     typer.echo(report)
@@ -48,10 +44,8 @@ def datasets_export(
     from hilsplat.datasets.sources import DATA_PREFIX, image_files
 
     files = image_files(f"{DATA_PREFIX}{name}", str(data_root))
-    with stage("source", out, plugins=readers_of([name]), inputs={"files": files}):
-        from hilsplat.datasets.sources import export_images
-
-        export_images(name, data_root, out)
+    with stage("source", out, plugins=readers_of([name]), inputs={"files": files}) as run:
+        run(name, data_root, out)
 
 
 @datasets_app.command("fits")
@@ -81,8 +75,6 @@ def datasets_fits(
     }
     from hilsplat.datasets.registry import readers_of
 
-    with stage("label_fits", target, inputs=inputs, plugins=readers_of([name])):
-        from hilsplat.evaluate.diagnostics.label_fits import run_label_fits
-
-        table = run_label_fits(folder, variant, name, data_root, target, threads)
+    with stage("label_fits", target, inputs=inputs, plugins=readers_of([name])) as run:
+        table = run(folder, variant, name, data_root, target, threads)
     typer.echo(table)

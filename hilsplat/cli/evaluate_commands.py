@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from hilsplat.cli.apps import app
 from hilsplat.cli.stage import (
     DataRoot,
     PathIn,
@@ -14,10 +13,10 @@ from hilsplat.cli.stage import (
     Results,
     Settings,
     Threads,
+    app,
     json_option,
     section_of,
     stage,
-    start_logging,
 )
 
 Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
@@ -28,6 +27,18 @@ EvaluateSection = Annotated[
     str, typer.Option(help="section evaluate as JSON; missing keys take their defaults")
 ]
 Queries = Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")]
+
+
+def _truth_inputs(
+    truth: Path | None, labels: str | Sequence[str], data_root: Path
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the annotations and label files against which a stage scores, and the readers of the labels."""
+    from hilsplat.datasets.registry import readers_of
+    from hilsplat.datasets.sources import label_files
+
+    named = [labels] if isinstance(labels, str) else labels
+    files = {f"labels {name}": label_files(name, str(data_root)) for name in named if name}
+    return {"truth": truth, **files}, readers_of(named)
 
 
 @app.command()
@@ -62,31 +73,17 @@ def evaluate(
 
     section = section_of("evaluate", settings)
     parts = SceneParts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
-    inputs = {**parts.as_inputs(), **_truth_inputs(truth, labels or (), data_root)}
+    against: dict[str, Any] = {"truth": truth, "labels": labels or (), "data_root": data_root}
+    named = {"dataset": dataset, "scene": name, "variant": variant, "kind": kind}
+    read, readers = _truth_inputs(**against)
+    inputs, beside = (
+        {**parts.as_inputs(), **read},
+        (out.with_name("times.csv"), out.with_name("instances.npz")),
+    )
     with stage(
-        "evaluate",
-        out,
-        settings=section,
-        threads=threads,
-        inputs=inputs,
-        plugins=_readers(labels or ()),
-        beside=(out.with_name("times.csv"), out.with_name("instances.npz")),
-    ):
-        from hilsplat.evaluate.stage import run_evaluate
-
-        run_evaluate(
-            parts,
-            out,
-            section,
-            dataset=dataset,
-            scene=name,
-            variant=variant,
-            truth=truth,
-            kind=kind,
-            labels=labels or (),
-            data_root=data_root,
-            threads=threads,
-        )
+        "evaluate", out, settings=section, threads=threads, inputs=inputs, plugins=readers, beside=beside
+    ) as run:
+        run(parts, out, section, **named, **against, threads=threads)
 
 
 @app.command("evaluate-files")
@@ -98,7 +95,7 @@ def evaluate_files(
     data_root: DataRoot = Path(),
     truth: Truth = None,
     scene: Annotated[
-        Path | None, typer.Option(help="posed scene of a synthetic scene: says which views are tested")
+        Path | None, typer.Option(help="posed scene of a synthetic scene, which has the list of test views")
     ] = None,
     kind: Annotated[str, typer.Option(help="kind of a synthetic scene: tabletop, room or street")] = "",
     dataset: Annotated[str, typer.Option(help="data set of a synthetic scene in the scores")] = "synthetic",
@@ -111,40 +108,12 @@ def evaluate_files(
     ] = None,
 ) -> None:
     """Score masks or point labels written by any program, under the same protocols."""
-    inputs = {"predictions": predictions, **_truth_inputs(truth, [labels] if labels else [], data_root)}
-    inputs |= {"scene": scene} if scene else {}
-    with stage("evaluate_files", out, inputs=inputs, plugins=_readers([labels] if labels else [])):
-        from hilsplat.evaluate.files_stage import run_evaluate_files
-
-        run_evaluate_files(
-            predictions,
-            out,
-            method=method,
-            labels=labels,
-            data_root=data_root,
-            truth=truth,
-            scene=scene,
-            kind=kind,
-            dataset=dataset,
-            name=name,
-            min_region_px=min_region_px,
-        )
-
-
-def _readers(labels: Sequence[str]) -> tuple[str, ...]:
-    from hilsplat.datasets.registry import readers_of
-
-    return readers_of(labels)
-
-
-def _truth_inputs(
-    truth: Path | None, labels: Sequence[str], data_root: Path
-) -> dict[str, Path | Sequence[Path]]:
-    """Return the annotations and label files against which a stage scores."""
-    from hilsplat.datasets.sources import label_files
-
-    found: dict[str, Path | Sequence[Path]] = {"truth": truth} if truth else {}
-    return found | {f"labels {name}": label_files(name, str(data_root)) for name in labels}
+    against: dict[str, Any] = {"truth": truth, "labels": labels, "data_root": data_root}
+    named = {"method": method, "kind": kind, "dataset": dataset, "name": name}
+    read, readers = _truth_inputs(**against)
+    inputs = {"predictions": predictions, **read, "scene": scene}
+    with stage("evaluate_files", out, inputs=inputs, plugins=readers) as run:
+        run(predictions, out, **named, **against, scene=scene, min_region_px=min_region_px)
 
 
 @app.command()
@@ -164,10 +133,8 @@ def table(
     scores = scores or []
     inputs = {"published": published, **{f"scores {number}": path for number, path in enumerate(scores)}}
     beside = tuple(out.with_suffix(ending) for ending in (".md", ".tex", ".html"))
-    with stage("table", out, inputs=inputs, beside=beside):
-        from hilsplat.evaluate.tables.build import run_table
-
-        run_table(name, scores, published, json_option("--labels", labels, dict), out, absent or [])
+    with stage("table", out, inputs=inputs, beside=beside) as run:
+        run(name, scores, published, json_option("--labels", labels, dict), out, absent or [])
 
 
 @app.command()
@@ -194,31 +161,15 @@ def figures(
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     parts = SceneParts(scene, gaussians, semantic_tree, field, autoencoder, clip, masks)
-    inputs = {**parts.as_inputs(), "fit": fit, **_truth_inputs(truth, [labels] if labels else [], data_root)}
-    recorded = {"figures": section, "evaluate": protocol}
+    against: dict[str, Any] = {"truth": truth, "labels": labels, "data_root": data_root}
+    read, readers = _truth_inputs(**against)
+    inputs, both = {**parts.as_inputs(), "fit": fit, **read}, {"figures": section, "evaluate": protocol}
+    beside = (out.with_name("registration.png"), out.with_name("fit.png"))
+    texts = json_option("--queries", queries, list)
     with stage(
-        "figures",
-        out,
-        settings=recorded,
-        threads=threads,
-        inputs=inputs,
-        plugins=_readers([labels]),
-        beside=(out.with_name("registration.png"), out.with_name("fit.png")),
-    ):
-        from hilsplat.evaluate.figures.panel import run_figures
-
-        run_figures(
-            parts,
-            out,
-            section,
-            protocol,
-            fit=fit,
-            truth=truth,
-            labels=labels,
-            data_root=data_root,
-            queries=json_option("--queries", queries, list),
-            threads=threads,
-        )
+        "figures", out, settings=both, threads=threads, inputs=inputs, plugins=readers, beside=beside
+    ) as run:
+        run(parts, out, section, protocol, fit=fit, **against, queries=texts, threads=threads)
 
 
 @app.command()
@@ -239,33 +190,16 @@ def comparison(
 ) -> None:
     """Compare variants: queries by method, one query in four views, features at three levels."""
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
-    recorded, compared = {"figures": section, "evaluate": protocol}, json_option("--variants", variants, list)
-    inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared}
-    inputs |= _truth_inputs(truth, [labels] if labels else [], data_root)
+    compared, named = json_option("--variants", variants, list), json_option("--names", names, dict)
+    texts, both = json_option("--queries", queries, list), {"figures": section, "evaluate": protocol}
+    against: dict[str, Any] = {"truth": truth, "labels": labels, "data_root": data_root}
+    read, readers = _truth_inputs(**against)
+    inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared} | read
+    beside = (out.with_name("views.png"), out.with_name("features.png"))
     with stage(
-        "comparison",
-        out,
-        settings=recorded,
-        threads=threads,
-        inputs=inputs,
-        plugins=_readers([labels]),
-        beside=(out.with_name("views.png"), out.with_name("features.png")),
-    ):
-        from hilsplat.evaluate.figures.comparison import run_comparison
-
-        run_comparison(
-            folder,
-            compared,
-            json_option("--names", names, dict),
-            out,
-            section,
-            protocol,
-            truth=truth,
-            labels=labels,
-            data_root=data_root,
-            queries=json_option("--queries", queries, list),
-            threads=threads,
-        )
+        "comparison", out, settings=both, threads=threads, inputs=inputs, plugins=readers, beside=beside
+    ) as run:
+        run(folder, compared, named, out, section, protocol, **against, queries=texts, threads=threads)
 
 
 @app.command()
@@ -275,10 +209,8 @@ def sweep(
     out: Annotated[Path, typer.Option(help="PNG to write, with a PDF beside it")],
 ) -> None:
     """Plot a sweep from its table: the paper's curves and ours."""
-    with stage("sweep", out, inputs={"table": table}):
-        from hilsplat.evaluate.figures.sweep_plot import run_sweep_plot
-
-        run_sweep_plot(name, table, out)
+    with stage("sweep", out, inputs={"table": table}) as run:
+        run(name, table, out)
 
 
 @app.command()
@@ -289,7 +221,6 @@ def efficiency(
     ),
 ) -> None:
     """Print the time of each stage, from the benchmark files of a run."""
-    start_logging()
     from hilsplat.evaluate.tables.efficiency import run_efficiency
 
     typer.echo(run_efficiency(results, out))

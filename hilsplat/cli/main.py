@@ -1,7 +1,6 @@
 """The `hilsplat` command: one subcommand per stage, and user commands for scenes and models.
 
-Commands are thin: each reads its settings, locks its output, calls one function of the package and writes the
-provenance. Heavy libraries are imported by the functions, not by these files.
+Commands import heavy libraries only when they run.
 """
 
 import gc
@@ -20,14 +19,12 @@ import typer  # noqa: E402
 
 from hilsplat.base.errors import HilsplatError, require_working_directory, system_error  # noqa: E402
 from hilsplat.base.processes import end_with_workflow  # noqa: E402
-from hilsplat.cli.apps import app  # noqa: E402
+from hilsplat.cli.stage import app, start_logging  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
 # isort: off
-from hilsplat.cli import run_command, scene_commands, segment_commands, embed_commands  # noqa: E402, F401
-from hilsplat.cli import field_commands  # noqa: E402, F401
-from hilsplat.cli import evaluate_commands, user_commands, export_command, view_command  # noqa: E402, F401
-from hilsplat.cli import world_commands, model_commands, dataset_commands, cache_commands  # noqa: E402, F401
+from hilsplat.cli import scene_commands, stage_commands, evaluate_commands, user_commands  # noqa: E402, F401
+from hilsplat.cli import group_commands, dataset_commands  # noqa: E402, F401
 # isort: on
 
 
@@ -67,6 +64,7 @@ def options(
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
             os.dup2(file, stream.fileno())  # also redirects libraries that print to the file descriptor
+    start_logging()
     if version:
         from hilsplat.base.provenance import library_versions
 

@@ -1,28 +1,52 @@
-"""Commands from photographs to Gaussians: new, poses, gaussians."""
+"""Commands that start a project, add scenes and run the workflow."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilsplat.cli.apps import app
-from hilsplat.cli.stage import (
-    DEFAULT_CACHE,
-    Cache,
-    PathIn,
-    PathOut,
-    Seed,
-    Settings,
-    Threads,
-    section_of,
-    stage,
-    start_logging,
-)
+from hilsplat.cli.stage import app
 
 POSES_HELP = (
     "a COLMAP model, a transforms.json, or a folder with either; none: structure from motion; default: the "
     "poses in the folder"
 )
+
+
+@app.command()
+def init(folder: Annotated[Path, typer.Argument(help="folder of the project")] = Path()) -> None:
+    """Write commented config/config.yaml and config/scenes.tsv to edit; they replace the installed ones."""
+    from hilsplat.workflow.run import start_project
+
+    for path in start_project(folder):
+        typer.echo(f"wrote {path}")
+
+
+@app.command("run")
+def run_command(
+    targets: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="TARGET",
+            help="scenes (photos/desk or desk), rules (tables) or files; default: everything",
+            show_default=False,
+        ),
+    ] = None,
+    config: Annotated[
+        list[Path] | None,
+        typer.Option(help="configuration file that overrides config/config.yaml; may be repeated"),
+    ] = None,
+) -> None:
+    """Run the workflow for everything in the configuration, or for single scenes, tables or files.
+
+    A killed run continues. Options after -- are passed to Snakemake: hilsplat run desk -- --cores 1
+    """
+    from hilsplat.workflow.run import run
+
+    options = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else []
+    names = targets or []
+    raise typer.Exit(run(names[: len(names) - len(options)], config or [], options))
 
 
 @app.command()
@@ -54,7 +78,6 @@ def new(
 
     Reports what was found, what is used, and what is likely to fail.
     """
-    start_logging()
     from hilsplat.photos.add import add_scene
     from hilsplat.scene.sheet import read_sheet
     from hilsplat.workflow.models import models_of_photographs
@@ -67,65 +90,3 @@ def new(
     features = read_sheet(sheet, checked_groups=())[-1].features
     for line in models_of_photographs(sheet.with_name("config.yaml"), name, features):
         typer.echo(line)
-
-
-@app.command("poses")
-def find_poses(
-    images: PathIn,
-    out: PathOut,
-    name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
-    unit: Annotated[str, typer.Option(help="unit of length: metre or arbitrary")] = "arbitrary",
-    render: Annotated[bool, typer.Option(help="the images are renders: an ideal pinhole lens")] = False,
-    poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
-    settings: Settings = "{}",
-    seed: Seed = 0,
-    threads: Threads = 1,
-) -> None:
-    """Compute the camera poses of photographs, or import a COLMAP model or transforms.json."""
-    section = section_of("poses", settings)
-    inputs = {"images": images, **({"poses": poses} if poses and poses.exists() else {})}
-    with stage("poses", out, settings=section, seed=seed, threads=threads, inputs=inputs):
-        from hilsplat.scene.poses import run_poses
-
-        run_poses(images, out, name, unit, render, section, seed, threads, poses)
-
-
-@app.command()
-def gaussians(
-    scene: PathIn,
-    out: PathOut,
-    report: Annotated[Path, typer.Option(help="folder for the fit's report")],
-    settings: Settings = "{}",
-    existing: Annotated[
-        Path | None,
-        typer.Option(help="a 3DGS PLY of your own, in the source's coordinates; replaces the fit"),
-    ] = None,
-    dataparser: Annotated[
-        Path | None,
-        typer.Option(help="nerfstudio's dataparser_transforms.json, if that PLY is in its coordinates"),
-    ] = None,
-    transforms: Annotated[
-        Path | None, typer.Option(help="the transforms.json with the source's poses, for --dataparser")
-    ] = None,
-    cache: Cache = DEFAULT_CACHE,
-    seed: Seed = 0,
-    threads: Threads = 1,
-) -> None:
-    """Fit 3D Gaussians to the training views, or use your own; a JSON file records their coordinates."""
-    section = section_of("gaussians", settings)
-    optional = {"existing": existing, "dataparser": dataparser, "transforms": transforms}
-    inputs = {"scene": scene, **{name: path for name, path in optional.items() if path}}
-    beside = (out.with_suffix(".json"), report)
-    with stage(
-        "gaussians",
-        out,
-        settings=section,
-        seed=seed,
-        threads=threads,
-        inputs=inputs,
-        beside=beside,
-        device=section.device,
-    ):
-        from hilsplat.splat.fit import run_gaussians
-
-        run_gaussians(scene, out, report, cache, section, seed, threads, existing, dataparser, transforms)

@@ -1,4 +1,4 @@
-"""Options shared by commands, and the log, lock and provenance of each stage."""
+"""The command's groups, options shared by commands, and the log, lock and provenance of each stage."""
 
 import logging
 import os
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +14,22 @@ from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, re
 from hilsplat.base.errors import HilsplatError, SettingsError, system_error
 from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.models.store import model_path
-from hilsplat.workflow.stages import stage_code
+from hilsplat.workflow.stages import stage_code, stage_function
+
+app = typer.Typer(
+    help="Turn photographs into a 3D Gaussian scene that answers text queries at three semantic levels.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+world_app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_args_is_help=True)
+models_app = typer.Typer(help="Get, list, check, split and train models (SAM, CLIP).", no_args_is_help=True)
+datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
+cache_app = typer.Typer(help="Show or prune the caches of a results folder.", invoke_without_command=True)
+app.add_typer(world_app, name="world")
+app.add_typer(models_app, name="models")
+app.add_typer(datasets_app, name="datasets")
+app.add_typer(cache_app, name="cache")
 
 PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
@@ -69,22 +84,21 @@ def stage(
     settings: Any = None,
     seed: int | None = None,
     threads: int = 1,
-    inputs: Mapping[str, Path | Sequence[Path]] | None = None,
+    inputs: Mapping[str, Path | Sequence[Path] | None] | None = None,
     plugins: tuple[str, ...] = (),
     beside: tuple[Path, ...] = (),
-    device: Literal["auto", "cpu", "cuda"] | None = None,
-) -> Iterator[None]:
-    """Run a stage's function call with its log, lock, disk space check and provenance.
+) -> Iterator[Any]:
+    """Yield a stage's function, to be called with a log, lock, disk space check and provenance record.
 
     Args:
         name: key of `STAGES`.
         out: output; its provenance is written next to it.
-        settings: the section that the stage uses, or several sections by name.
-        seed: seed of everything random; None if nothing is random.
-        inputs: files and folders that the stage reads, or lists of files, by name.
+        settings: the section that the stage uses, or several sections by name. If it has the setting
+            `device`, provenance records the device that `auto` resolves to.
+        seed: None if nothing is random.
+        inputs: files and folders that the stage reads, or lists of files, by name; None for those not given.
         plugins: import paths of the readers or baselines that it uses (`base.plugins`).
         beside: further outputs.
-        device: setting of the rasteriser's device; provenance records the device that `auto` resolves to.
 
     Raises:
         ArtifactError: an output would replace something other than an earlier output of the stage.
@@ -94,13 +108,15 @@ def stage(
     from hilsplat.splat.rasterise.device import choose_device
 
     start_logging(timestamps=True)
+    device = getattr(settings, "device", None)
     os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
+    given = {key: paths for key, paths in (inputs or {}).items() if paths is not None}
     try:
-        require_replaceable((out, *beside), name, _each(inputs or {}))
+        require_replaceable((out, *beside), name, _each(given))
         require_free_space(out.parent, MIN_FREE_MIB)
         with output_lock(out):
-            read, code = Inputs(name, inputs or {}), stage_code(name, plugins)
-            yield
+            read, code = Inputs(name, given), stage_code(name, plugins)
+            yield stage_function(name)
             try:
                 read.require_unchanged()
             except HilsplatError:
@@ -139,7 +155,6 @@ def _command() -> list[str]:
 
 
 def _recorded(settings: Any) -> dict[str, Any]:
-    """Return settings in the form that provenance records."""
     if isinstance(settings, dict):
         return {name: _recorded(section) for name, section in settings.items()}
     return settings.model_dump(mode="json") if settings is not None else {}

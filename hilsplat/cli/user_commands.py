@@ -1,15 +1,17 @@
-"""Commands that query a finished scene, check results and machine, and print all settings."""
+"""Commands that use a finished scene, check results and machine, and print all settings."""
 
 import gc
 import glob
+import json
+from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilsplat.base.errors import SettingsError
-from hilsplat.cli.apps import app
-from hilsplat.cli.stage import Results, Threads, start_logging
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.cli.stage import DataRoot, Results, Threads, app
 
 SceneName = Annotated[
     str,
@@ -55,7 +57,6 @@ def query(
     Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
     answers' Gaussians (selection.ply).
     """
-    start_logging()
     gc.disable()  # garbage collection would take a tenth of the two seconds
     try:
         from hilsplat.query.answer import answer
@@ -101,7 +102,6 @@ def verify(
     results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
 ) -> None:
     """Check every digest of a results folder, and print the Snakemake command that repairs it."""
-    start_logging()
     from hilsplat.workflow.records import verify
 
     report, is_whole = verify(results)
@@ -115,9 +115,6 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="print a list of findings as JSON")] = False,
 ) -> None:
     """Check this machine: libraries, GPU, models, disk, memory. The exit status is 1 if there is a fault."""
-    import json
-    from dataclasses import asdict
-
     from hilsplat.workflow.doctor import examine
 
     findings = []
@@ -140,8 +137,133 @@ def settings(
     ] = False,
 ) -> None:
     """Print every setting: default, choices or range, unit, origin, meaning."""
-    import json
-
     from hilsplat.configuration import config_schema, knob_table
 
     typer.echo(json.dumps(config_schema(), indent=1) if schema else knob_table())
+
+
+class Form(StrEnum):
+    """Export formats of a scene."""
+
+    TREE = "tree"
+    PLY = "ply"
+    COLMAP = "colmap"
+    NERFSTUDIO = "nerfstudio"
+    LANGSPLAT = "langsplat"
+    LABELS = "labels"
+
+
+@app.command()
+def export(
+    scene: SceneName,
+    form: Annotated[
+        Form,
+        typer.Option(
+            "--as",
+            help="tree: nodes as JSON, picture and PLY; ply: a 3DGS PLY; colmap: images and sparse/0; "
+            "nerfstudio: images and transforms.json; langsplat: as colmap, with PLY and language_features; "
+            "labels: the scene's annotations as those of LERF-OVS",
+        ),
+    ] = Form.TREE,
+    variant: Annotated[str, typer.Option(help="variant, for tree and langsplat")] = "default",
+    results: Results = Path("results"),
+    data_root: DataRoot = Path(),
+    out: Annotated[
+        Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder, replaced")
+    ] = None,
+    threads: Threads = 2,
+) -> None:
+    """Write a scene for other programs: tree, Gaussians, poses, LangSplat's features, or labels.
+
+    Poses and Gaussians are in the coordinates of the scene's source.
+    """
+    folder = scene_folder(scene, results)
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ArtifactError(f"--out {out} exists", fix="name a new folder, or remove it first")
+    name = form.value if variant == "default" else f"{form.value}-{variant}"
+    typer.echo(_write(form, folder, out or folder / "export" / name, variant, data_root, threads))
+
+
+def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, threads: int) -> str:
+    """Write an export, and return a human-readable summary."""
+    from hilsplat.scene.scene import Scene
+
+    if form is Form.TREE:
+        from hilsplat.query.tree_picture import export_tree
+
+        return export_tree(folder, variant, out, threads)
+    if form is Form.PLY:
+        from hilsplat.splat.coordinates import write_source_ply
+
+        number = write_source_ply(folder / "gaussians.ply", out / "point_cloud.ply")
+        return f"wrote {number} Gaussians to {out / 'point_cloud.ply'}"
+    opened = Scene.load(folder / "scene")
+    views = len(opened.cameras)
+    if form is Form.COLMAP:
+        from hilsplat.scene.exporting import write_colmap
+
+        write_colmap(opened, out)
+        return f"wrote images and sparse/0 of {views} views to {out}"
+    if form is Form.NERFSTUDIO:
+        from hilsplat.scene.exporting import write_nerfstudio
+
+        write_nerfstudio(opened, out)
+        return f"wrote images, transforms.json and points.ply of {views} views to {out}"
+    if form is Form.LANGSPLAT:
+        from hilsplat.embed.langsplat_export import export_langsplat
+        from hilsplat.scene.finished import FinishedScene
+
+        parts = FinishedScene.locate(folder, variant).parts
+        export_langsplat(opened, parts.masks, parts.clip, parts.gaussians, out)
+        return f"wrote images, sparse/0, point_cloud.ply and language_features of {views} views to {out}"
+    from hilsplat.annotate.exporting import export_labels
+
+    number = export_labels(opened, folder, data_root, out)
+    return f"wrote labels of {number} views to {out}"
+
+
+Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")]
+Browser = Annotated[bool, typer.Option(help="open the page in a browser")]
+
+
+@app.command()
+def view(
+    scene: SceneName,
+    variant: Annotated[str, typer.Option(help="variant that answers first")] = "default",
+    results: Results = Path("results"),
+    port: Port = 0,
+    browser: Browser = True,
+    threads: Threads = 2,
+) -> None:
+    """View and query a scene in a browser on this machine.
+
+    During a run, the page shows the Gaussians, and accepts queries as soon as possible. Press Ctrl-C to stop.
+    """
+    from hilsplat.viewer.app import run_view
+
+    folder = scene_folder(scene, results)
+    run_view(folder, variant=variant, port=port, browser=browser, threads=threads, on_ready=typer.echo)
+
+
+@app.command()
+def annotate(
+    scene: SceneName,
+    variant: Annotated[str, typer.Option(help="variant whose masks or nodes are proposed")] = "default",
+    results: Results = Path("results"),
+    data_root: DataRoot = Path(),
+    port: Port = 0,
+    browser: Browser = True,
+    threads: Threads = 2,
+) -> None:
+    """Annotate the photographs of a scene, with levels and parents, in a browser on this machine.
+
+    Writes annotated/DATASET/SCENE below the data root after each change; evaluate reads it like any data set.
+    """
+    from hilsplat.annotate.app import run_annotate
+    from hilsplat.scene.scene import Scene
+
+    folder = scene_folder(scene, results)
+    labels = data_root / "annotated" / Scene.load(folder / "scene").name
+    run_annotate(
+        folder, labels, variant=variant, port=port, browser=browser, threads=threads, on_ready=typer.echo
+    )

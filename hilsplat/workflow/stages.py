@@ -1,6 +1,5 @@
 """Registry of the function of each stage."""
 
-from collections.abc import Callable
 from typing import Any
 
 from hilsplat.base.errors import HilsplatError
@@ -55,6 +54,6 @@ def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
     return code_digest(STAGES[stage], *plugins)
 
 
-def stage_function(stage: str) -> Callable[..., Any]:
+def stage_function(stage: str) -> Any:
     """Import the function of a stage, or the module if `STAGES` names one."""
     return load(STAGES[stage])

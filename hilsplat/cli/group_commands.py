@@ -1,0 +1,237 @@
+"""Groups of commands: the synthetic world, model folders, and caches."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilsplat.cli.stage import (
+    DEFAULT_CACHE,
+    PathOut,
+    Results,
+    Settings,
+    Threads,
+    cache_app,
+    models_app,
+    section_of,
+    stage,
+    world_app,
+)
+
+SceneWithMasks = Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")]
+MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks to measure")]
+NEIGHBOURS = 2
+"""Number of nearest views that each view is compared with."""
+
+
+@world_app.command("make")
+def world_make(
+    source: Annotated[str, typer.Option(help="scene to make, as world:KIND:SEED")],
+    out: PathOut,
+    settings: Settings = "{}",
+    threads: Threads = 1,
+) -> None:
+    """Make a synthetic scene: images, and the truth that only evaluate reads."""
+    section = section_of("world", settings)
+    beside = (out / "images", out / "truth")
+    with stage("world", out, settings=section, threads=threads, beside=beside) as run:
+        run(source, section, out, threads)
+
+
+@world_app.command("show")
+def world_show(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
+    results: Results = Path("results"),
+) -> None:
+    """Draw a contact sheet beside the scene: views, labels by level, the tree with its texts."""
+    from hilsplat.world.sheet import show_world
+
+    target = results / scene / "world.png"
+    show_world(results / scene / "world", target)
+    typer.echo(f"wrote {target}")
+
+
+@world_app.command("classes")
+def world_classes(
+    out: Annotated[Path, typer.Option(help="PNG to write")] = Path("world_classes.png"),
+) -> None:
+    """Draw one object of each class."""
+    from hilsplat.world.gallery import draw_classes
+
+    draw_classes(out)
+    typer.echo(f"wrote {out}")
+
+
+@world_app.command("gallery")
+def world_gallery(
+    kind: Annotated[str, typer.Argument(help="kind of scene: tabletop, room or street")],
+    seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
+) -> None:
+    """Draw one view of each scene, with its true labels by level, as world_KIND.png."""
+    from hilsplat.world.gallery import draw_scenes
+
+    target = Path(f"world_{kind}.png")
+    draw_scenes(kind, seeds, target)
+    typer.echo(f"wrote {target}")
+
+
+@world_app.command("inconsistency")
+def world_inconsistency(
+    scene: SceneWithMasks, variant: MeasuredMasks = "default", results: Results = Path("results")
+) -> None:
+    """Measure with exact geometry how often a surface point has different masks in the two nearest views.
+
+    Writes consistency.csv beside the masks.
+    """
+    truth, masks_folder = results / scene / "world" / "truth", results / scene / variant / "masks"
+    target = masks_folder.with_name("consistency.csv")
+    with stage("consistency", target, inputs={"truth": truth, "masks": masks_folder}) as run:
+        table = run(truth, masks_folder, target, NEIGHBOURS)
+    typer.echo(table)
+
+
+@world_app.command("masks")
+def world_masks(
+    scene: SceneWithMasks,
+    variant: MeasuredMasks = "default",
+    results: Results = Path("results"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="PNG to write, with a CSV and a PDF beside it; default: beside the masks"),
+    ] = None,
+) -> None:
+    """Measure masks against the true regions by level, and draw where they fail."""
+    folder = results / scene
+    truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
+    target = out or masks_folder.with_name("masks_truth.png")
+    inputs = {"scene": folder / "scene", "truth": truth, "masks": masks_folder}
+    with stage("mask_truth", target, inputs=inputs, beside=(target.with_suffix(".csv"),)) as run:
+        table = run(folder / "scene", truth, masks_folder, target)
+    typer.echo(table)
+
+
+@world_app.command("semantic-tree")
+def world_tree(
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
+    variant: Annotated[str, typer.Option(help="variant whose tree to measure")] = "default",
+    results: Results = Path("results"),
+    threads: Threads = 2,
+) -> None:
+    """Measure the 3D semantic tree against the true nodes: matches, purity, parents.
+
+    Writes tree_truth.csv beside the tree.
+    """
+    folder = results / scene
+    semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
+    target = semantic_tree.with_name("tree_truth.csv")
+    inputs = {
+        "scene": folder / "scene",
+        "gaussians": folder / "gaussians.ply",
+        "truth": truth,
+        "semantic_tree": semantic_tree,
+    }
+    with stage("tree_truth", target, inputs=inputs) as run:
+        table = run(inputs["scene"], inputs["gaussians"], semantic_tree, truth, target, threads)
+    typer.echo(table)
+
+
+@models_app.command("get")
+def models_get(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="names of `hilsplat models list`, or owner/name on the hub; default: the recommended pair",
+            show_default=False,
+        ),
+    ] = None,
+    revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
+    variant: Annotated[
+        str, typer.Option(help="networks of another precision: quantized, fp16, int8, ...; default: full")
+    ] = "",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder of the models; default: HILSPLAT_MODELS, or the data folder of the user, which all "
+            "projects share",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Fetch released models from the model hub and check them.
+
+    An interrupted download resumes where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
+    usual proxy variables are respected.
+    """
+    from hilsplat.hub.get import get_models
+
+    typer.echo(get_models(names or (), out, revision, variant))
+
+
+@models_app.command("list")
+def models_list() -> None:
+    """List released and installed models, with size, licence and use."""
+    from hilsplat.hub.overview import models_table
+
+    typer.echo(models_table())
+
+
+@models_app.command("check")
+def models_check(
+    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all that are here")] = None,
+    variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
+) -> None:
+    """Describe a model folder, or all installed ones, and time one image."""
+    from hilsplat.embed.model_check import check_model
+    from hilsplat.hub.overview import check_models
+
+    text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
+    typer.echo(text)
+    if num_failed:
+        raise typer.Exit(1)
+
+
+@models_app.command("split")
+def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
+    """Split the model.onnx of an exported CLIP into its image and text networks."""
+    from hilsplat.models.clip_split import split_clip
+
+    for path in split_clip(folder):
+        typer.echo(f"wrote {path}")
+
+
+@cache_app.callback()
+def cache_show(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Option(help="cache folder")] = DEFAULT_CACHE,
+) -> None:
+    """Show the size of each cache."""
+    from hilsplat.base.cache import size_table
+
+    context.obj = folder
+    if context.invoked_subcommand is None:
+        typer.echo(size_table(folder))
+
+
+@cache_app.command("prune")
+def cache_prune(
+    context: typer.Context,
+    days: Annotated[
+        float | None, typer.Option(min=0, help="delete entries not used for this many days")
+    ] = None,
+    max_mib: Annotated[
+        float | None,
+        typer.Option(min=0, help="delete the least recently used entries until this much is left"),
+    ] = None,
+    stage: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="cache to prune: masks, clip, contributions or gaussians (checkpoints of fits, kept for a "
+            "day); default: all, but gaussians only with --days"
+        ),
+    ] = None,
+) -> None:
+    """Delete unfinished files of killed jobs and, with a limit, cache entries, which can be recomputed."""
+    from hilsplat.base.cache import prune_cache, size_table
+
+    number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
+    typer.echo(f"deleted {number} files, {freed_mib:.1f} MiB\n{size_table(context.obj)}")
