@@ -14,7 +14,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.cli import segment_commands
+from hilsplat.cli import stage_commands
 from hilsplat.cli import stage as around
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.scene.cameras import Cameras
@@ -142,7 +142,7 @@ def test_probabilities_stay_probabilities():
 def command(world, monkeypatch):
     """The subcommand `hilsplat masks`, without its hold on the log."""
     monkeypatch.setattr(around, "start_logging", lambda *_, **__: None)
-    return lambda **options: segment_commands.masks(scene=world / "scene", out=world / "out", **options)
+    return lambda **options: stage_commands.masks(scene=world / "scene", out=world / "out", **options)
 
 
 def test_the_command_wants_the_truth_and_records_it(world, command):
