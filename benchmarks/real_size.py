@@ -128,7 +128,7 @@ def export_clip(out: Path) -> None:
     from optimum.exporters.onnx import main_export
     from transformers.models.clip.tokenization_clip import bytes_to_unicode
 
-    from hilsplat.models.clip_split import split_whole
+    from hilsplat.models.onnx_graph import split_whole
 
     torch.manual_seed(0)
     torch_folder = out / "torch"

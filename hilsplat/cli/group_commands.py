@@ -193,7 +193,7 @@ def models_check(
 @models_app.command("split")
 def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
     """Split the model.onnx of an exported CLIP into its image and text networks."""
-    from hilsplat.models.clip_split import split_clip
+    from hilsplat.models.onnx_graph import split_clip
 
     for path in split_clip(folder):
         typer.echo(f"wrote {path}")

@@ -24,7 +24,6 @@ logger = logging.getLogger(__name__)
 
 SIGLIP_TOKENS = 64
 """Text length of a SigLIP if its configuration does not specify one."""
-
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
 """Patterns of model folders in `models/`."""
 

@@ -28,14 +28,11 @@ logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
 """Relative difference between the aspect ratios of maps and view that is attributed to rounding."""
-
 LEAST_SHARE = 0.5
 """Share of the training views that must have files; with fewer, the files are likely from another scene."""
-
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
 """Number of masks embedded again as a check, and the minimum median cosine of their vectors. The same CLIP
 reaches 0.99; another one of the same width about 0."""
-
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the four maps, in order; the first map mixes all levels."""
 

@@ -17,10 +17,8 @@ from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
 """Folder for measured timings, and for int8 networks if the models are read-only."""
-
 LARGEST_PROVIDER_DIFFERENCE = 0.02
 """Largest relative difference attributed to rounding, such as that of TF32 products on CUDA."""
-
 Seconds = dict[str, float]
 """Timings. SAM: per "image", and per prompt for "masks" and the optional "preview". CLIP: per "crop"."""
 

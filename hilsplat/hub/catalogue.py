@@ -18,17 +18,15 @@ from huggingface_hub.utils import validate_repo_id
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import DownloadError
-from hilsplat.models.clip_split import WHOLE
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
+from hilsplat.models.onnx_graph import WHOLE
 from hilsplat.models.store import RELEASES, Release
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers does
 not run code in it (`weights_only`)."""
-
 SMALL_BYTES = 50_000_000
 """Text files of a PyTorch model above this size are not part of its tokenizer."""
-
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
 """Possible paths of a whole CLIP without `.onnx`."""
 

@@ -9,13 +9,12 @@ from importlib import metadata
 from pathlib import Path
 
 from hilsplat.base.errors import ModelError
-from hilsplat.models.clip_split import split_whole, whole_clip
+from hilsplat.models.onnx_graph import split_whole, whole_clip
 
 logger = logging.getLogger(__name__)
 
 NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
 """Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
-
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 
 LAST_LINES = 15

@@ -29,23 +29,19 @@ from hilsplat.hub.catalogue import (
 )
 from hilsplat.hub.export import export_networks, require_exporter
 from hilsplat.hub.refusals import explain_refusals
-from hilsplat.models.clip_split import split_whole
+from hilsplat.models.onnx_graph import split_whole
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
 """File in a model folder that records its origin."""
-
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
 """Waits between attempts to download a file."""
-
 CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
 """Errors of a connection that breaks."""
-
 SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
-
 EXPORT_FACTOR = 4
 """Disk space for an export, as a multiple of the weights' size: weights, whole network, and its halves."""
 

@@ -15,39 +15,27 @@ from typing import Any
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, sha256_of_json
 from hilsplat.base.errors import ArtifactError, ModelError
-from hilsplat.models.clip_split import whole_clip
-from hilsplat.models.layouts import (
-    LAYOUTS,
-    OTHER_TYPES,
-    SECTIONS,
-    SUPPORTED,
-    TORCH_SUFFIXES,
-    layout_of,
-)
+from hilsplat.models.layouts import LAYOUTS, OTHER_TYPES, SECTIONS, SUPPORTED, TORCH_SUFFIXES, layout_of
 from hilsplat.models.network import Network
+from hilsplat.models.onnx_graph import whole_clip
 from hilsplat.models.store import model_path
 
+OTHER_FOLDER = "name a folder in a layout that docs/models.md lists"
+WHOLE_COPY = "fetch a whole copy"
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 """Preprocessing steps that our code always performs."""
 
 
 @dataclass(frozen=True)
 class ModelFolder:
-    """A complete model folder.
-
-    Attributes:
-        layout: key of `LAYOUTS`.
-        preprocessing: image preprocessing, with the keys of `preprocessor_config.json`.
-        networks: file of each network by name, including optional networks that exist.
-        files: all files included in the digest.
-    """
+    """A complete model folder."""
 
     folder: Path
-    layout: str
+    layout: str  # key of `LAYOUTS`
     config: dict[str, Any]
-    preprocessing: dict[str, Any]
-    networks: dict[str, Path]
-    files: tuple[Path, ...]
+    preprocessing: dict[str, Any]  # of images, with the keys of `preprocessor_config.json`
+    networks: dict[str, Path]  # file of each network by name, including optional networks that exist
+    files: tuple[Path, ...]  # all files included in the digest
 
     @property
     def kind(self) -> str:
@@ -62,9 +50,8 @@ class ModelFolder:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the names and bytes of the files, independent of the folder's path; computed once."""
-        return sha256_of_json(
-            [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
-        )
+        files = [(path.relative_to(self.folder).as_posix(), sha256_of_file(path)) for path in self.files]
+        return sha256_of_json(files)
 
     def network(self, name: str, graph: bytes | None = None, provider: str | None = None) -> Network:
         """Open one of the model's networks and check its inputs and outputs (see `Network`)."""
@@ -85,10 +72,10 @@ def open_model_folder(
         ModelError: the folder or some of its files are missing, or it contains another kind of model.
     """
     folder = model_path(folder)
-    way_out = "name a folder in a layout that docs/models.md lists" + (f", or {fix}" if fix else "")
+    fix = f", or {fix}" if fix else ""
     if not folder.is_dir():
-        raise ModelError(f"model folder {folder} is missing", fix=way_out)
-    name, config = _layout_of(folder, kind, way_out)
+        raise ModelError(f"model folder {folder} is missing", fix=OTHER_FOLDER + fix)
+    name, config = _layout_of(folder, kind, OTHER_FOLDER + fix)
     layout = LAYOUTS[name]
     ending = f"_{variant}.onnx" if variant else ".onnx"
     networks, missing = {}, []
@@ -109,7 +96,7 @@ def open_model_folder(
     return ModelFolder(folder, name, config, preprocessing, networks, files)
 
 
-def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[str, Any]]:
+def _layout_of(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str, Any]]:
     """Return the layout and configuration of a folder, or raise a ModelError if it is of another kind."""
     supported = "; ".join(SUPPORTED[each] for each in ([kind] if kind else SUPPORTED))
     try:
@@ -119,16 +106,16 @@ def _layout_of(folder: Path, kind: str | None, way_out: str) -> tuple[str, dict[
             f"model folder {folder} has no readable config.json",
             expected=f"config.json of {supported}",
             found=", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder",
-            fix=way_out,
+            fix=fix,
         ) from error
     name, config = layout_of(config), config if isinstance(config, dict) else {}
     model_type = config.get("model_type", name)
     if name is None or (kind is not None and LAYOUTS[name].kind != kind):
         raise ModelError(
-            f"model folder {folder} holds another kind of model",
+            f"model folder {folder} contains another kind of model",
             expected=supported,
             found=f"model_type {model_type!r}",
-            fix=OTHER_TYPES.get(str(model_type), way_out),
+            fix=OTHER_TYPES.get(str(model_type), fix),
         )
     return name, config
 
@@ -137,28 +124,25 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: 
     """Return the error for a folder that lacks files: what was found instead, and how to fix it."""
     layout = LAYOUTS[name]
     found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    expected = [*layout.described, *(f"{spec.places[-1]}.onnx" for spec in layout.networks.values())]
     variants = variants_of(folder, name)
     if any(file.endswith(".onnx") for file in missing) and variants:
         listed = ", ".join(repr(each) for each in variants)
-        way_out = f"its networks come as variants: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+        way_out = f"its networks exist in variants: set {SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
         way_out = f"split its single network into the two that are needed: hilsplat models split {folder}"
-    elif not any(file.endswith(".onnx") for file in found) and any(
-        file.endswith(TORCH_SUFFIXES) for file in found
-    ):
+    elif any(file.endswith(TORCH_SUFFIXES) for file in found) and not any(folder.rglob("*.onnx")):
         way_out = (
-            "these are PyTorch's weights, and hilsplat runs ONNX networks: get an ONNX export of the model "
+            "these are PyTorch weights, and hilsplat reads ONNX networks: fetch an ONNX export of the model "
             "(hilsplat models get), or export it (docs/models.md)"
         )
     else:
-        way_out = "complete the folder from where it came"
+        way_out = "fetch or export the whole model again"
     return ModelError(
         f"model folder {folder} lacks {', '.join(missing)}",
-        expected=", ".join(
-            [*layout.described, *(f"{spec.places[-1]}.onnx" for spec in layout.networks.values())]
-        ),
+        expected=", ".join(expected),
         found=", ".join(found[:20]),
-        fix=way_out + (f", or {fix}" if fix else ""),
+        fix=way_out + fix,
     )
 
 
@@ -166,30 +150,24 @@ def variants_of(folder: Path, layout: str) -> list[str]:
     """Return the suffixes, such as `fp16`, for which a folder has all networks; "" for the plain names."""
     found = []
     for spec in LAYOUTS[layout].networks.values():
-        endings = set()
+        rests = set[str]()
         for place in spec.places:
-            stem = Path(place).name
-            for path in (folder / place).parent.glob(f"{stem}*.onnx"):
-                rest = path.stem.removeprefix(stem)
-                if not rest or rest.startswith("_"):
-                    endings.add(rest[1:])
-        found.append(endings)
+            plain = Path(place).name
+            rests |= {path.stem.removeprefix(plain) for path in folder.glob(f"{place}*.onnx")}
+        found.append({rest[1:] for rest in rests if rest[:1] in ("", "_")})
     return sorted(set.intersection(*found))
 
 
 def _preprocessing_of(path: Path) -> dict[str, Any]:
     """Read the image preprocessing; keys of open_clip are converted.
 
-    Raises:
-        ModelError: the file cannot be read, disables a step, or contains an invalid mean or deviation.
+    A ModelError is raised if the file cannot be read, disables a step, or has an invalid mean or deviation.
     """
     try:
-        found = read_json(path)
+        found = {key: value for key, value in read_json(path).items() if value is not None}
     except ArtifactError as error:
-        raise ModelError(f"{path} cannot be read: {error}", fix="fetch a whole copy") from error
-    found = {key: value for key, value in found.items() if value is not None}
-    switched_off = [key for key in SWITCHES if found.get(key) is False]
-    if switched_off:
+        raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
+    if switched_off := [key for key in SWITCHES if found.get(key) is False]:
         raise ModelError(
             f"{path} switches off {', '.join(switched_off)}",
             expected="images resized, divided by 255 and normalised, as in the released models",
@@ -205,20 +183,16 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
         values = found.get(key, [])
         are_numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
         if not are_numbers or not all(least < value < math.inf for value in values):
-            raise ModelError(
-                f"{path}: {key} cannot be used",
-                expected="finite numbers" + (" above 0" if least == 0 else ""),
-                found=str(values)[:80],
-                fix="fetch a whole copy",
-            )
+            expected = "finite numbers" + (" above 0" if least == 0 else "")
+            problem = f"{path}: {key} cannot be used"
+            raise ModelError(problem, expected=expected, found=str(values)[:80], fix=WHOLE_COPY)
     return found
 
 
 def external_weights(network: Path, folder: Path) -> list[Path]:
     """Return the weight files beside a network that its graph names, without reading the weights.
 
-    Raises:
-        ModelError: the graph cannot be read, or such a file is missing or outside the model folder.
+    A ModelError is raised if such a file is missing or outside the model folder.
     """
     if not network.stat().st_size:
         return []  # opening the network reports the problem
@@ -242,7 +216,7 @@ def external_weights(network: Path, folder: Path) -> list[Path]:
                 f"network {network} cannot be opened: its weights are missing",
                 expected=f"the file {name} beside it",
                 found=", ".join(sorted(other.name for other in network.parent.iterdir())),
-                fix="fetch a whole copy",
+                fix=WHOLE_COPY,
             )
         found.append(path)
     return found

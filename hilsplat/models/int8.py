@@ -30,7 +30,6 @@ LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
 """Minimum agreement of both precisions: mean IoU of masks from the same prompts, mean cosine of vectors,
 and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views differ
 by more."""
-
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 """Number of crops for checking a CLIP; number of views, and of prompts per side, for checking a SAM."""
 

@@ -9,42 +9,27 @@ Axes = tuple[int | None, ...]
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """Inputs and outputs of one network of a model.
+    """Inputs and outputs of one network of a model, by name."""
 
-    Attributes:
-        inputs: names and axes of required inputs.
-        outputs: names and axes of required outputs; others are ignored.
-        optional: names of inputs that are passed if the network has them.
-        places: possible paths without `.onnx`, relative to the folder; the first that exists is used.
-        synonyms: output name -> alternative name in some exports.
-    """
-
-    inputs: Mapping[str, Axes]
-    outputs: Mapping[str, Axes]
-    optional: tuple[str, ...] = ()
-    places: tuple[str, ...] = ()
-    synonyms: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, Axes]  # required inputs
+    outputs: Mapping[str, Axes]  # required outputs; others are ignored
+    optional: tuple[str, ...] = ()  # inputs that are passed if the network has them
+    places: tuple[
+        str, ...
+    ] = ()  # possible paths without `.onnx` in the folder; the first that exists is used
+    synonyms: Mapping[str, str] = field(default_factory=dict)  # output -> alternative name in some exports
 
 
 @dataclass(frozen=True)
 class Layout:
-    """File names of a kind of model.
+    """File names of a kind of model."""
 
-    Attributes:
-        kind: "sam" for segmentation, "clip" for comparing images with texts.
-        networks: required networks, by the names used in this package.
-        further: optional networks, used if the folder contains them.
-        preprocessing: file with the image preprocessing.
-        tokenizer: file of the tokenizer; "" if the model does not read texts.
-        beside: further files that are included in the digest if they exist.
-    """
-
-    kind: str
-    networks: Mapping[str, NetworkSpec]
-    further: Mapping[str, NetworkSpec] = field(default_factory=dict)
+    kind: str  # "sam" for segmentation, "clip" for comparing images with texts
+    networks: Mapping[str, NetworkSpec]  # required networks, by the names used in this package
+    further: Mapping[str, NetworkSpec] = field(default_factory=dict)  # used if the folder contains them
     preprocessing: str = "preprocessor_config.json"
-    tokenizer: str = ""
-    beside: tuple[str, ...] = ()
+    tokenizer: str = ""  # empty if the model does not read texts
+    beside: tuple[str, ...] = ()  # further files that are included in the digest if they exist
 
     @property
     def usable(self) -> dict[str, NetworkSpec]:
@@ -155,6 +140,5 @@ OTHER_TYPES = {
 
 SECTIONS = {"sam": "masks", "clip": "clip"}
 """Settings section that selects the model, by kind."""
-
 TORCH_SUFFIXES = (".safetensors", ".bin", ".pt", ".pth")
 """Suffixes of PyTorch weight files."""

@@ -9,27 +9,21 @@ from hilsplat.models.folder import ModelFolder, input_side_px
 
 PROCESS_MIB = 1500
 """Memory of a stage without its networks: libraries, images, candidates, masks."""
-
 MIB = 2**20
 ATTENTION_COPIES = 3.5
 """Number of arrays of the size of a layer's attention weights that exist at once. Measured: 2615 MiB for an
 image in SAM ViT-B, whose attention weights take 768 MiB."""
-
 ACTIVATIONS = 35
 """Memory of an image in SAM with row-wise attention, in arrays of all patch features. Measured: 475 MiB in
 ViT-B, whose patch features take 12 MiB."""
-
 PROMPT_MIB = 64
 """Memory per prompt in SAM's exported decoder, for a 1024 px image. Measured: 507 MiB for 8 in ViT-B."""
-
 FACTORED_MIB = 250
 """Memory of all prompts of a 1024 px image in the factored decoder. Measured: 104 MiB while 1024 prompts are
 previewed, plus the masks of the prompts that are kept."""
-
 CLIP_TOKEN_MIB = 0.03
 """Memory per patch of a crop in a CLIP, besides two arrays of attention weights. Measured: 521 MiB for 64
 crops in ViT-B/16."""
-
 UNKNOWN_BYTES_PER_PX = 400
 """Memory for encoding an image, per pixel, if the configuration does not describe the network (sam-tiny)."""
 
@@ -54,9 +48,7 @@ class Needs:
 def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Needs:
     """Estimate the memory of a model from its configuration and file sizes.
 
-    Args:
-        batch: prompts (SAM) or crops (CLIP) per call.
-        as_exported: run SAM's networks unchanged (see `segment.sam.SamModel.as_exported`).
+    `batch` is the number of prompts (SAM) or crops (CLIP) per call, `as_exported` that of a `SamModel`.
     """
     files = {*model.networks.values(), *(path for path in model.files if "onnx" in path.name)}
     weights = 1.2 * sum(path.stat().st_size for path in files) / MIB
@@ -94,8 +86,7 @@ def _patch_px(vision: dict[str, Any]) -> int:
     return vision.get("patch_size", 16)
 
 
-SYSTEM = Path("/")
-"""Parent folder of `proc` and `sys`; tests use other folders."""
+SYSTEM = Path("/")  # parent folder of `proc` and `sys`; tests use other folders
 
 CGROUP_FILES = {
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),

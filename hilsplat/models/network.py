@@ -14,6 +14,7 @@ from hilsplat.models.layouts import Axes, NetworkSpec
 
 logger = logging.getLogger(__name__)
 
+EXPORT_AGAIN = "export the model in the layout of the Hugging Face ONNX exports"
 POINTER_BYTES = 1024
 """Size below which a file may be a pointer from a clone without Git LFS."""
 
@@ -35,8 +36,7 @@ def execution_providers() -> list[str]:
 def one_thread_session(network: bytes | str, providers: list[str]) -> onnxruntime.InferenceSession:
     """Open a network (its graph or path) that runs in one thread per call.
 
-    Stages are faster if they process several views at once, and results then do not depend on the number of
-    threads.
+    Stages are faster if they process several views at once, and results then don't depend on threads.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -48,26 +48,19 @@ class Network:
     """An ONNX network with checked names; inputs are cast to its types, and outputs are float32.
 
     Each call runs in one thread (`one_thread_session`), and several threads may call a network.
+
+    Args:
+        path: the `.onnx` file.
+        graph: a modified graph to use instead of the file (`onnx_graph`).
+        provider: the only execution provider to use, or None for the first that works.
+
+    Raises:
+        ModelError: it cannot be read, or its inputs or outputs have unexpected names or axes.
     """
 
     def __init__(
-        self,
-        path: Path,
-        spec: NetworkSpec,
-        graph: bytes | None = None,
-        provider: str | None = None,
+        self, path: Path, spec: NetworkSpec, graph: bytes | None = None, provider: str | None = None
     ) -> None:
-        """Open a network.
-
-        Args:
-            path: the `.onnx` file.
-            spec: its inputs and outputs.
-            graph: a modified graph to use instead of the file (`onnx_graph`).
-            provider: the only execution provider to use, or None for the first that works.
-
-        Raises:
-            ModelError: it cannot be read, or its inputs or outputs have unexpected names or axes.
-        """
         self.path = path
         if path.stat().st_size < POINTER_BYTES and path.read_bytes().startswith(b"version https://git-lfs"):
             raise ModelError(
@@ -82,7 +75,7 @@ class Network:
             raise ModelError(
                 f"network {path} cannot be opened: {error}",
                 found=f"a file of {path.stat().st_size} bytes",
-                fix="export it again, or fetch a whole copy (with its file of weights, if it has one)",
+                fix="export it again, or fetch a whole copy (with its weights file, if it has one)",
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
@@ -101,20 +94,18 @@ class Network:
     ) -> None:
         wrong = [name for name in expected if name not in found]
         wrong += [name for name in found if name not in expected and name not in optional]
-        wrong += [
-            name
-            for name, axes in expected.items()
-            if name in found and not (_fits(found[name].shape, axes) and found[name].type in DTYPES)
-        ]
+        for name, axes in expected.items():
+            if name in found and not (_fits(found[name].shape, axes) and found[name].type in DTYPES):
+                wrong.append(name)
         if wrong:
+            axes_of = {
+                name: ", ".join(str(axis or "any") for axis in axes) for name, axes in expected.items()
+            }
             raise ModelError(
-                f"network {self.path} has other {what} than expected: {', '.join(dict.fromkeys(wrong))}",
-                expected=", ".join(
-                    f"{name} ({', '.join('any' if axis is None else str(axis) for axis in axes)})"
-                    for name, axes in expected.items()
-                ),
+                f"network {self.path} has other {what} than expected: {', '.join(wrong)}",
+                expected=", ".join(f"{name} ({axes})" for name, axes in axes_of.items()),
                 found=", ".join(f"{name} {list(item.shape)} {item.type}" for name, item in found.items()),
-                fix="export the model in the layout of the Hugging Face ONNX exports",
+                fix=EXPORT_AGAIN,
             )
 
     def fixed_axis(self, name: str, axis: int) -> int | None:
@@ -125,42 +116,32 @@ class Network:
     def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
         """Run the network once, and return the outputs in the order of the spec.
 
-        Raises:
-            ModelError: the network rejects the inputs.
+        A ModelError is raised if the network rejects the inputs, or an output has another number of axes.
         """
-        cast = {
-            name: np.asarray(value, DTYPES[self.inputs[name].type])
-            for name, value in feeds.items()
-            if name in self.inputs
-        }
+        known = {name: value for name, value in feeds.items() if name in self.inputs}
+        cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in known.items()}
         try:
             outputs = self.session.run(list(self.spec.outputs), cast)
         except Exception as error:  # onnxruntime's errors share no public base class
-            shapes = ", ".join(f"{name} {value.shape}" for name, value in cast.items())
             raise ModelError(
                 f"network {self.path} failed: {error}",
-                found=shapes,
+                found=", ".join(f"{name} {value.shape}" for name, value in cast.items()),
                 fix="check that preprocessor_config.json belongs to this network",
             ) from error
         for (name, axes), output in zip(self.spec.outputs.items(), outputs, strict=True):
             if output.ndim != len(axes):
                 raise ModelError(
-                    f"network {self.path} returned {name} with {output.ndim} axes",
+                    f"network {self.path} returned {name} of shape {output.shape}",
                     expected=f"{len(axes)} axes",
-                    found=f"shape {output.shape}",
-                    fix="export the model in the layout of the Hugging Face ONNX exports",
+                    fix=EXPORT_AGAIN,
                 )
         return [output.astype(np.float32, copy=False) for output in outputs]
 
 
 def _fits(shape: Sequence[Any], axes: Axes) -> bool:
     """Return whether a declared shape, which may be empty or contain names, is compatible with these axes."""
-    if not shape:
-        return True
-    return len(shape) == len(axes) and all(
-        expected is None or not isinstance(length, int) or length == expected
-        for length, expected in zip(shape, axes, strict=True)
-    )
+    fixed = [(length, axis) for length, axis in zip(shape, axes, strict=False) if isinstance(length, int)]
+    return not shape or (len(shape) == len(axes) and all(axis in (None, length) for length, axis in fixed))
 
 
 def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:

@@ -19,71 +19,48 @@ from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
 """Folder of a project's own models, relative to the working directory of a command or run."""
-
 FOLDER_VARIABLE = "HILSPLAT_MODELS"
 """Environment variable with the path of `user_models`."""
-
 AUTO = "auto"
 """Setting value that selects a pretrained model if there is one."""
-
 EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
 """Models of the synthetic world that are included in the project."""
 
 
 @dataclass(frozen=True)
 class Release:
-    """A released model that `hilsplat models get` accepts by name.
+    """A released model that `hilsplat models get` accepts by name."""
 
-    Attributes:
-        name: name of its folder.
-        family: "sam" or "clip".
-        megabytes: approximate size of the download; the exact size is reported before a transfer.
-        licence: licence of the weights.
-        use: recommended use.
-    """
-
-    name: str
-    family: str
+    name: str  # of its folder
     repository: str
-    megabytes: int
-    licence: str
+    megabytes: int  # approximate size of the download; the exact size is reported before a transfer
     use: str
+    family: str = "sam"  # or "clip"
+    licence: str = "Apache-2.0"  # of the weights
 
 
 RELEASES = (
-    Release("sam-vit-huge", "sam", "Xenova/sam-vit-huge", 2570, "Apache-2.0", "the paper's masks; a GPU"),
+    Release("sam-vit-huge", "Xenova/sam-vit-huge", 2570, "the paper's masks; a GPU"),
+    Release("sam-vit-large", "Xenova/sam-vit-large", 1250, "between huge and base; a GPU"),
+    Release("sam-vit-base", "Xenova/sam-vit-base", 376, "the smallest original SAM"),
     Release(
-        "sam-vit-large", "sam", "Xenova/sam-vit-large", 1250, "Apache-2.0", "between huge and base; a GPU"
-    ),
-    Release("sam-vit-base", "sam", "Xenova/sam-vit-base", 376, "Apache-2.0", "the smallest original SAM"),
-    Release(
-        "sam2.1-hiera-small",
-        "sam",
-        "onnx-community/sam2.1-hiera-small-ONNX",
-        184,
-        "Apache-2.0",
-        "masks of photographs, on a CPU",
+        "sam2.1-hiera-small", "onnx-community/sam2.1-hiera-small-ONNX", 184, "masks of photographs, on a CPU"
     ),
     Release(
-        "sam2.1-hiera-base-plus",
-        "sam",
-        "onnx-community/sam2.1-hiera-base-plus-ONNX",
-        328,
-        "Apache-2.0",
-        "between small and ViT-B",
+        "sam2.1-hiera-base-plus", "onnx-community/sam2.1-hiera-base-plus-ONNX", 328, "between small and ViT-B"
     ),
-    Release("edgetam", "sam", "onnx-community/EdgeTAM-ONNX", 37, "Apache-2.0", "the fastest encoder"),
-    Release("slimsam-77", "sam", "Xenova/slimsam-77-uniform", 40, "Apache-2.0", "little memory or time"),
+    Release("edgetam", "onnx-community/EdgeTAM-ONNX", 37, "the fastest encoder"),
+    Release("slimsam-77", "Xenova/slimsam-77-uniform", 40, "little memory or time"),
     Release(
         "clip-vit-b-16-laion2b",
-        "clip",
         "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
         600,
-        "MIT",
         "words as in LangSplat and the paper; exported here (extra export)",
+        "clip",
+        "MIT",
     ),
     Release(
-        "clip-vit-base-patch16", "clip", "Xenova/clip-vit-base-patch16", 601, "MIT", "words, ready to use"
+        "clip-vit-base-patch16", "Xenova/clip-vit-base-patch16", 601, "words, ready to use", "clip", "MIT"
     ),
 )
 """Released models, in the order of preference of `auto` within each family."""
@@ -94,11 +71,11 @@ RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
 
 @dataclass(frozen=True)
 class PresentModel:
-    """An existing model folder; only opening it checks that it is complete. Fields as in `read_model`."""
+    """An existing model folder; only opening it checks that it is complete."""
 
     folder: Path
-    family: str
-    embedded: bool
+    family: str  # "sam" or "clip"
+    embedded: bool  # trained on the synthetic world only
 
 
 def is_embedded(config: Mapping[str, Any]) -> bool:
@@ -107,10 +84,7 @@ def is_embedded(config: Mapping[str, Any]) -> bool:
 
 
 def read_model(folder: Path) -> PresentModel | None:
-    """Return the model in a folder, or None if it has no network or its config.json is not supported.
-
-    Its family is "sam" or "clip"; it is embedded if it was trained on the synthetic world only.
-    """
+    """Return the model in a folder, or None if it has no network or its config.json is not supported."""
     place = model_path(folder)
     try:
         config = parse_json((place / "config.json").read_text(encoding="utf-8"))
@@ -131,7 +105,7 @@ def user_models() -> Path:
 def model_path(path: str | Path) -> Path:
     """Find a model folder named in the settings: as given, in the installation, or among the user's models.
 
-    A folder that is in none of these is returned unchanged, so that messages show what the user wrote.
+    Any other path is returned unchanged, so that messages show what the user wrote.
     """
     place = project_path(path)
     of_user = user_models() / place.name
@@ -141,9 +115,8 @@ def model_path(path: str | Path) -> Path:
 def present_models(*stores: Path) -> list[PresentModel]:
     """Return the models in folders, best first: released ones in their order, others by name, embedded last.
 
-    Args:
-        stores: parent folders of models; if several contain the same name, the first counts. Default: the
-            project's models, the user's models, and the embedded models of the installation.
+    If several stores (parent folders of models) contain the same name, the first counts. Default: the
+    project's models, the user's models, and the embedded models of the installation.
     """
     order = {release.name: number for number, release in enumerate(RELEASES)}
     by_name: dict[str, PresentModel] = {}
@@ -163,10 +136,9 @@ def broken_models() -> list[Path]:
 
 
 def _folders(*stores: Path) -> list[Path]:
-    folders = [
-        path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*") if path.is_dir()
-    ]
-    return folders + [project_path(path) for path in EMBEDDED.values() if not stores]
+    paths = [path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*")]
+    embedded = [] if stores else [project_path(path) for path in EMBEDDED.values()]
+    return [path for path in paths if path.is_dir()] + embedded
 
 
 @functools.cache
@@ -192,9 +164,8 @@ def model_digest(folder: Path, cache: Path) -> str:
 
 def real_model(family: str) -> Path | None:
     """Return the model that `auto` selects: the best pretrained model of a family, or None."""
-    return next(
-        (each.folder for each in present_models() if each.family == family and not each.embedded), None
-    )
+    models = (model for model in present_models() if model.family == family)
+    return next((model.folder for model in models if not model.embedded), None)
 
 
 def meaningless(name: str) -> str:

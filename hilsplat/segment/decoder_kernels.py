@@ -28,7 +28,6 @@ from hilsplat.base.lanes import (
 
 LEAST = np.float32(-126)
 """Lowest exponent of a normal float32."""
-
 one_row, three_rows, four_rows, six_rows, seven_rows, eight_rows = map(rows_of_products, (1, 3, 4, 6, 7, 8))
 
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)

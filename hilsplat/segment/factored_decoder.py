@@ -35,10 +35,8 @@ from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
 BLOCK = 64
 """Maximum pixels per block. Its arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
-
 PROMPTS = 16
 """Prompts per call. They process each block one after the other while it is in the cache."""
-
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
 
 

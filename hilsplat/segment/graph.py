@@ -17,23 +17,17 @@ from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
 """Longer side at which images are segmented; finer texture is not a part of an object."""
-
 BASE_SCALE = 80.0
 """Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
-
 CONTRAST = 6.0
 """Colour difference (CIELAB) from all neighbours that keeps a region of exactly a level's least size
 separate; larger regions need less, in inverse proportion to their width."""
-
 THIN_PX = 4.0
 """A region narrower than this (at working size) is a seam that blur leaves along a strong edge."""
-
 THIN_HURRY = 0.01
 """Factor on the cost of merging a seam: seams merge first, into the more similar side."""
-
 LIGHTNESS = 0.6
 """Weight of lightness relative to a* and b*: shading changes lightness within an object."""
-
 CLEAR_EDGE = 40.0
 """Colour difference across a border from which the predicted IoU is 1."""
 

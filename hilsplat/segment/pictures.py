@@ -19,7 +19,6 @@ from hilsplat.segment.masks import HierarchicalMasks
 
 GOLDEN = 0.6180339887498949
 """Hue step between rows, the golden ratio: consecutive rows have clearly different colours."""
-
 UNCOVERED = 0.35
 """Brightness of pixels without a mask."""
 

@@ -36,7 +36,6 @@ logger = logging.getLogger(__name__)
 
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the decoder's three outputs, in their order: fine to coarse."""
-
 LOGIT_STEP = 1 / 8
 """Logits are rounded to this step and clipped to +-127 steps, so that a view's candidates take a few MB of
 cache. Borders move by less than 0.01 low-resolution pixels where the logit changes by 5 per pixel, as is
@@ -80,10 +79,8 @@ class Thresholds:
 REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
 """LangSplat's thresholds for a released SAM. A ViT-B call takes 60 MB per prompt, and calls of more than 8
 prompts are no faster per prompt."""
-
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Prompts on which the factored decoder is compared with the network, and the largest difference allowed."""
-
 OWN = "mask_generation"
 """Key of `config.json` under which a model specifies its own `Thresholds`."""
 

@@ -8,10 +8,8 @@ from hilsplat.segment.masks import HierarchicalMasks
 
 BOXES_AT_ONCE = 256
 """Boxes compared with all following ones in one step."""
-
 INNER_COVERED = 0.85
 """A mask counts as contained if at least this share of it is inside another mask (LangSplat)."""
-
 INNER_COVERS = 0.5
 """A contained mask must cover less than this share of its container (LangSplat)."""
 

@@ -8,7 +8,7 @@ import pytest
 
 from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
-from hilsplat.models.clip_split import split_clip
+from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.masks import HierarchicalMasks
 
 TOLERANCE = 1e-4

@@ -7,7 +7,7 @@ import pytest
 
 from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_model
-from hilsplat.models.clip_split import split_clip
+from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.segment.sam import Frame, SamModel, point_grid
 from hilsplat.settings import MasksSettings

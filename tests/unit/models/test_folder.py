@@ -9,8 +9,8 @@ import pytest
 from onnx import helper, numpy_helper
 
 from hilsplat.base.errors import ModelError
-from hilsplat.models.clip_split import split_clip
 from hilsplat.models.folder import external_weights, open_model_folder, variants_of
+from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
 from tests.unit.segment.handmade import save_network, tensor
@@ -66,7 +66,7 @@ def test_a_variant_is_chosen_by_its_ending(sam):
     plain = open_model_folder(sam).digest
     for path in (sam / "onnx").glob("*.onnx"):
         path.rename(path.with_name(f"{path.stem}_fp16.onnx"))
-    with pytest.raises(ModelError, match=r"come as variants: set masks.variant to one of 'fp16'"):
+    with pytest.raises(ModelError, match=r"exist in variants: set masks.variant to one of 'fp16'"):
         SamModel.load(sam)
     model = SamModel.load(sam, "fp16")
     assert model.encoder.path.name == "vision_encoder_fp16.onnx"

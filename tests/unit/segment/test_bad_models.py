@@ -99,7 +99,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
             partial(write_disc_sam, heads=4),
             r"other outputs(.|\n)*expected .*\(any, any, 3\)(.|\n)*'P', 4\]",
         ),
-        (as_torch, r"PyTorch's weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
+        (as_torch, r"PyTorch weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
         *(
             (
                 partial(replaced, name="config.json", content=b'{"model_type": "%s"}' % model_type),

@@ -30,8 +30,8 @@ def test_a_device_that_is_not_here_is_refused(section):
     [
         ("masks", "models/nope", "model folder models/nope is missing"),
         ("clip", "models/nope", "model folder models/nope is missing"),
-        ("masks", "models/clip-tiny", "holds another kind of model"),
-        ("clip", "models/sam-tiny", "holds another kind of model"),
+        ("masks", "models/clip-tiny", "contains another kind of model"),
+        ("clip", "models/sam-tiny", "contains another kind of model"),
         ("clip", "hilsplat", "no readable config.json"),
     ],
 )
