@@ -58,12 +58,10 @@ class WorldSettings(Section):
     views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
     image_px: int = knob(256, "height and width of each view", unit="px", ge=32, le=4096)
     arc_deg: float = knob(360.0, "azimuth covered by the cameras; a ring is 360", unit="degree", gt=0, le=360)
-    objects: int = knob(
-        6, "number of objects to place; the log says how many fitted", unit="objects", ge=1, le=30
-    )
+    objects: int = knob(6, "objects to place; the log says how many fitted", unit="objects", ge=1, le=30)
     samples: int = knob(3, "samples per pixel along each side", ge=1, le=8)
     min_area_px: int = knob(
-        60, "wholes and parts whose visible region is smaller are not scored", unit="px", ge=1
+        60, "wholes and parts with a smaller visible region are not scored", unit="px", ge=1
     )
 
 
@@ -71,34 +69,26 @@ class PosesSettings(Section):
     """Camera poses, from structure from motion or imported."""
 
     max_side_px: int = knob(
-        1600, "images with a longer side are shrunk to it", unit="px", ge=64, origin="3DGS: 1600"
+        1600, "larger images are shrunk to this longer side", unit="px", ge=64, origin="3DGS: 1600"
     )
     camera_model: Literal["auto", "simple_pinhole", "simple_radial", "opencv"] = knob(
-        "auto", "lens model; auto: simple_radial for photographs, simple_pinhole for renders"
+        "auto", "lens model; auto: simple_radial, for renders simple_pinhole"
     )
     single_camera: Literal["auto", "yes", "no"] = knob(
-        "auto",
-        "whether all photographs share one camera; auto: those of the same size and EXIF focal length do",
-        origin="COLMAP",
+        "auto", "one camera for all photographs; auto: one per size and EXIF focal length", origin="COLMAP"
     )
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
-        "auto",
-        "which pairs of views are matched; auto: exhaustive up to 200 views, sequential above",
-        origin="COLMAP",
+        "auto", "pairs of views to match; auto: exhaustive up to 200 views, then sequential", origin="COLMAP"
     )
     mapper: Literal["incremental", "global"] = knob(
         "incremental", "structure-from-motion algorithm", origin="COLMAP"
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     min_registered_share: float = knob(
-        0.7,
-        "least share of the views in the largest model; the stage fails below it",
-        unit="share",
-        gt=0,
-        le=1,
+        0.7, "poses fail if the largest model has a smaller share of the views", unit="share", gt=0, le=1
     )
     several_models: Literal["largest", "stop"] = knob(
-        "largest", "if the photographs fall into several models: use the largest, or stop"
+        "largest", "if the photographs form several models: use the largest, or stop"
     )
     test_every: int = knob(
         8, "every n-th view is held out for testing; 0: none", unit="views", ge=0, origin="3DGS"
@@ -109,9 +99,7 @@ class GaussiansSettings(Section):
     """Fit of the 3D Gaussians."""
 
     iterations: int = knob(3000, "most optimisation steps, each on one view", ge=1, origin="3DGS: 30000")
-    steps_per_view: int = knob(
-        60, "optimisation steps per training view, where that makes fewer than `iterations`", ge=1
-    )
+    steps_per_view: int = knob(60, "steps per training view, if that is fewer than `iterations`", ge=1)
     max_gaussians: int = knob(50_000, "largest number of Gaussians at any step", ge=100)
     image_scale: float = knob(
         1.0, "scale of the images that the fit sees; 0.5 halves their sides", gt=0, le=1
@@ -123,9 +111,7 @@ class GaussiansSettings(Section):
         0.75, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
     )
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
-    ssim_weight: float = knob(
-        0.2, "weight of D-SSIM in the photometric loss; L1 has the rest", ge=0, le=1, origin="3DGS"
-    )
+    ssim_weight: float = knob(0.2, "weight of D-SSIM in the loss; L1 has the rest", ge=0, le=1, origin="3DGS")
     # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
     # config/paper.yaml uses the published number and sizes of steps.
     means_rate: float = knob(
@@ -140,11 +126,7 @@ class GaussiansSettings(Section):
         4e-3, "step size of the constant harmonics; the others have a twentieth", gt=0, origin="3DGS: 2.5e-3"
     )
     densify_from: float = knob(
-        0.06,
-        "share of the iterations after which densification begins",
-        ge=0,
-        le=1,
-        origin="3DGS: 500 / 30000",
+        0.06, "share of the iterations before densification", ge=0, le=1, origin="3DGS: 500 / 30000"
     )
     densify_until: float = knob(
         0.6, "share of the iterations after which densification ends", ge=0, le=1, origin="3DGS: 0.5"
@@ -159,9 +141,7 @@ class GaussiansSettings(Section):
         "black", "colour behind the Gaussians", origin="3DGS"
     )
     strategy: Literal["default", "mcmc"] = knob(
-        "default",
-        "density control; default: clone, split and prune (3DGS); mcmc: relocate, and add noise",
-        origin="3DGS",
+        "default", "default: clone, split and prune (3DGS); mcmc: relocate, and add noise", origin="3DGS"
     )
     mcmc_growth: float = knob(
         0.05, "mcmc: growth per densification, up to max_gaussians", unit="share", ge=0, le=1, origin="MCMC"
@@ -173,8 +153,8 @@ class GaussiansSettings(Section):
     )
     initial: Literal["points", "random", "frozen"] = knob(
         "points",
-        "initial Gaussians; points: at the sparse points; random: at random points that cameras see; frozen: "
-        "one at each sparse point, where it stays, and no others (for evaluate.points: frozen)",
+        "initial Gaussians; points: at the sparse points; random: at random points that cameras see; "
+        "frozen: one fixed at each sparse point and no others (for evaluate.points: frozen)",
         origin="OpenGaussian on ScanNet: frozen",
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
@@ -188,41 +168,36 @@ class MasksSettings(Section):
 
     segmenter: Literal["auto", "sam", "graph", "truth-perturbed"] = knob(
         "sam",
-        "sam: the SAM in `model`; graph: OpenCV's graph segmentation, without weights, for photographs; "
-        "auto: sam if a real one is there, else graph; "
-        "truth-perturbed: a diagnostic, true masks of a synthetic scene with the faults in section perturb",
+        "sam: the SAM in `model`; graph: OpenCV's graph segmentation, without weights; auto: sam if "
+        "pretrained, else graph; truth-perturbed: a diagnostic, true masks of a synthetic scene with the "
+        "faults in perturb",
     )
     model: str = knob(
         "models/sam-tiny",
-        "folder of a SAM in the Hugging Face ONNX export layout; auto: the best real one that is here, else "
-        "models/sam-tiny",
+        "SAM folder (Hugging Face ONNX export); auto: the best pretrained one, else models/sam-tiny",
     )
     variant: str = knob(
         "",
-        "ending of the networks' names, such as fp16 for vision_encoder_fp16.onnx; empty: the plain names",
+        "suffix of the networks' names, such as fp16 for vision_encoder_fp16.onnx",
         pattern=r"^[A-Za-z0-9_.-]*$",
     )
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "arithmetic of the encoder; auto: int8 on a CPU if it agrees with fp32 on the scene's photographs, "
-        "never for the embedded model",
+        "encoder arithmetic; auto: int8 on a CPU if it agrees with fp32 on the scene, never if embedded",
     )
     key_views: float = knob(
-        1.0,
-        "share of the training views that get masks; below 1, those that together see most of the Gaussians",
-        gt=0,
-        le=1,
+        1.0, "share of the training views to segment; below 1: those that see the most Gaussians", gt=0, le=1
     )
     prompts: Literal["grid", "guided"] = knob(
         "grid",
-        "points of views after the key views; grid: as everywhere; guided: the nodes of the key views, and "
-        "grid points that none explains",
+        "points in views after the key views; guided: nodes of the key views, and grid points that none "
+        "explains",
         origin="SAM, LangSplat: grid",
     )
     levels: Literal["head", "tree"] = knob(
         "head",
-        "what gives a mask its level; head: the head of SAM that made it; tree: its depth in the tree of all "
-        "masks of the view, by which theta decides levels",
+        "source of levels; head: SAM's output head; tree: depth in the tree of all masks of the view, by "
+        "theta",
         origin="paper: three levels by theta; LangSplat: head",
     )
     theta: float | None = knob(
@@ -231,70 +206,57 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
-        "prompts per call of a decoder in onnxruntime; auto: the number in the model folder, else 8, since a "
-        "real SAM takes 60 MB for each",
+        "prompts per decoder call; auto: the model folder's number, else 8 (full-size SAM: 60 MB each)",
         origin="LangSplat: 64",
     )
     crop_layers: int = knob(
-        0,
-        "layers of overlapping crops that are segmented besides the whole image",
-        ge=0,
-        le=2,
-        origin="LangSplat: 1",
+        0, "layers of overlapping crops segmented besides the image", ge=0, le=2, origin="LangSplat: 1"
     )
     predicted_iou_min: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "only masks with a higher predicted IoU, which may exceed 1, are kept; 0: all; auto: the number in "
-        "the model folder, else 0.7",
+        "masks need a higher predicted IoU, which may exceed 1; 0: all; auto: the model folder's number, "
+        "else 0.7",
         origin="SAM: 0.88, LangSplat: 0.7",
     )
     stability_min: Probability | Auto = knob(
         "auto",
-        "masks with a lower stability are dropped; auto: the number in the model folder, else 0.85",
+        "least stability of a mask; auto: the model folder's number, else 0.85",
         origin="SAM: 0.95, LangSplat: 0.85",
     )
     stability: Literal["estimate", "full"] = knob(
         "estimate",
-        "where stability counts pixels; estimate: in the network's small masks; full: at the view's size",
+        "where stability counts pixels; estimate: in the network's small masks; full: in the view",
         origin="SAM: full",
     )
     generator: Literal["hilsplat", "official"] = knob(
         "hilsplat",
-        "official: every rule of SAM's automatic generator as published, with stability: full "
-        "(docs/segment.md lists what differs)",
+        "official: every rule of SAM's generator as published, with stability: full (docs/segment.md)",
         origin="SAM, LangSplat: official",
     )
     stability_offset: float = knob(1.0, "shift of the logits in the stability test", gt=0, origin="SAM")
     box_nms_iou: float = knob(
         0.7,
-        "box IoU above which the worse mask is dropped; from 0.95 on, every prompt is decoded even where a "
-        "preview shows that it repeats another",
+        "box IoU above which the worse mask is dropped; at 0.95 or more, every prompt is decoded",
         gt=0,
         le=1,
         origin="SAM",
     )
     min_area_px: int = knob(
-        16,
-        "smaller masks are dropped, smaller islands and holes removed",
-        unit="px",
-        ge=1,
-        origin="LangSplat: 100",
+        16, "smaller masks, islands and holes are removed", unit="px", ge=1, origin="LangSplat: 100"
     )
     nms_iou: float = knob(
         0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat"
     )
     nms_score: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "only masks with a higher predicted IoU x stability are kept; 0: all; auto: the number in the model "
-        "folder, else 0.7",
+        "masks need a higher predicted IoU x stability; 0: all; auto: the model folder's number, else 0.7",
         origin="LangSplat: 0.7",
     )
     nms_inner: float = knob(
         0.5, "threshold of the suppression of inner masks", ge=0, le=1, origin="LangSplat"
     )
     graph_scales: tuple[float, float, float] = knob(
-        (0.12, 0.04, 0.015),
-        "graph: smallest segment at whole, part, subpart, as a share of the image side",
+        (0.12, 0.04, 0.015), "graph: smallest segment at whole, part, subpart, as a share of the image side"
     )
 
 
@@ -343,7 +305,7 @@ class CoverageTreeSettings(Section):
 
     theta: float = knob(
         0.9,
-        "a mask becomes the child of another that covers more than this share of it",
+        "a mask is the child of one that covers more than this share of it",
         unit="share",
         gt=0.5,
         lt=1,
@@ -356,31 +318,27 @@ class ClipSettings(Section):
 
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "arithmetic of the network of pictures; auto: int8 on a CPU if it agrees with fp32 on crops of the "
-        "scene, never for the embedded model",
+        "image network arithmetic; auto: int8 on a CPU if it agrees with fp32 on crops, never if embedded",
     )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
-        "which masks get a vector; nodes: the crops that show each node best; masks: all; auto: all if "
-        "autoencoder.targets is mask, else nodes",
+        "masks to embed; nodes: those that show each node best; masks: all; auto: by autoencoder.targets",
         origin="paper, LangSplat: masks",
     )
     crops_per_node: int = knob(5, "nodes: the most crops that a node's vector is averaged from", ge=1, le=32)
 
     model: str = knob(
         "models/clip-tiny",
-        "folder of a CLIP in the Hugging Face ONNX export layout; auto: the best real one that is here, else "
-        "models/clip-tiny",
+        "CLIP folder (Hugging Face ONNX export); auto: the best pretrained one, else models/clip-tiny",
     )
     variant: str = knob(
         "",
-        "ending of the networks' names, such as fp16 for vision_model_fp16.onnx; empty: the plain names",
+        "suffix of the networks' names, such as fp16 for vision_model_fp16.onnx",
         pattern=r"^[A-Za-z0-9_.-]*$",
     )
     crop: Literal["box", "langsplat"] = knob(
         "box",
-        "box: the whole box of a mask, shrunk by area; langsplat: without its last row and column, shrunk by "
-        "bilinear sampling",
+        "box: a mask's whole box, area filter; langsplat: without its last row and column, bilinear",
         origin="LangSplat",
     )
     background: Literal["black", "keep"] = knob(
@@ -395,8 +353,8 @@ class ContributionsSettings(Section):
     min_weight: float = knob(1 / 255, "smaller weights of a Gaussian at a pixel are dropped", ge=0, lt=1)
     keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
-        "what is kept; gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with "
-        "fewer non-zeros; none: neither, enough for a semantic tree without a field",
+        "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-"
+        "zeros; none: neither, enough for a semantic tree without a field",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
         "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
@@ -408,8 +366,8 @@ class SemanticTreeSettings(Section):
 
     evidence: Literal["masks", "features"] = knob(
         "masks",
-        "what nodes are made from; masks: linked across views; features: Gaussians clustered by features "
-        "that L alone trains, with the weights and readings of section field",
+        "masks: linked across views; features: Gaussians clustered by features that L alone trains, with "
+        "the weights and readings of section field",
         origin="paper: features",
     )
     feature_size: int = knob(6, "features: numbers of a feature", ge=2, le=64, origin="OpenGaussian: 6")
@@ -421,10 +379,7 @@ class SemanticTreeSettings(Section):
         0.5, "a node becomes the child of a coarser one that holds more than this share of it", gt=0, lt=1
     )
     whole_side: float = knob(
-        0.35,
-        "graph: regions that touch in 3D are joined to wholes up to about this size, as a share of a view's "
-        "side",
-        gt=0,
+        0.35, "graph: regions that touch in 3D form wholes up to about this share of a view's side", gt=0
     )
 
     @property
@@ -442,7 +397,7 @@ class AutoencoderSettings(Section):
     latent: int = knob(16, "size d of a latent", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
-        "vector that a mask is given; node: that of the node that it fits best; mask: its own",
+        "a mask's vector; node: that of the node that it fits best; mask: its own",
         origin="paper: mask",
     )
     epochs: int = knob(100, "network: passes over all vectors", ge=1, origin="LangSplat: 100")
@@ -472,12 +427,12 @@ class FieldSettings(Section):
     weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
     instance_mode: Literal["literal", "coverage_tree"] = knob(
         "coverage_tree",
-        "reading of L_ins; literal: Eq. 3 as printed; coverage_tree: by depth in the coverage tree",
+        "literal: Eq. 3 as printed; coverage_tree: by depth in the coverage tree",
         origin="paper: literal",
     )
     part_mode: Literal["literal", "disentangle"] = knob(
         "disentangle",
-        "reading of L_part; literal: Eq. 5 as printed; disentangle: as its prose has it, parts repel",
+        "literal: Eq. 5 as printed; disentangle: as its prose says, parts repel",
         origin="paper: literal",
     )
     omega: float = knob(
@@ -486,27 +441,27 @@ class FieldSettings(Section):
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
     start: Literal["average", "median", "random", "langsplat"] = knob(
         "average",
-        "first features of Gaussians; average, median: of the latents of the masks that show them (the "
-        "geometric median is robust, like L1); random: in [-1, 1); langsplat: those of a variant with "
+        "initial features; average, median: of the latents of the masks that show a Gaussian (the "
+        "geometric median is robust, like L1); random: in [-1, 1); langsplat: from a variant with "
         "method.name langsplat and the same autoencoder",
     )
     ridge: float = knob(0.1, "weight of the pull towards the first features, per visible mass", ge=0)
     trainer: Literal["fast", "literal"] = knob(
         "fast",
-        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: render a view, step by "
-        "Adam (iterations, rate), the same objective in hours",
+        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: render a view, step "
+        "by Adam (iterations, rate), the same objective in hours",
         origin="paper: literal",
     )
     iterations: int = knob(30_000, "steps of the literal trainer, each on one view", ge=1, origin="paper")
     rate: float = knob(0.0025, "Adam step size of the literal trainer", gt=0, origin="LangSplat")
     language: Literal["squared", "l1"] = knob(
         "squared",
-        "regression to the latents; l1: LangSplat's, which the literal trainer alone can take",
+        "regression to the latents; l1 (LangSplat's) needs the literal trainer",
         origin="LangSplat: l1",
     )
     min_labelled_share: float = knob(
         0.3,
-        "a Gaussian gets a latent at a level if masks of the level hold this share of its weight; 0: always",
+        "a Gaussian gets a latent at a level if the level's masks hold this share of its weight; 0: always",
         ge=0,
         lt=1,
         origin="paper, LangSplat: 0",
@@ -516,8 +471,8 @@ class FieldSettings(Section):
     min_mask_px: int = knob(50, "smaller masks take no part in L_ins and L_part", unit="px", ge=1)
     prune_cosine: float = knob(
         1.0,
-        "L_ins and L_part leave out a mask whose mean feature has a higher cosine than this with that of a "
-        "larger, unrelated mask of its view and level; 1: keep all",
+        "L_ins and L_part omit a mask if the cosine of its mean feature with that of a larger, unrelated "
+        "mask of the same view and level is higher; 1: keep all",
         ge=0,
         le=1,
         origin="paper: pruning, no number",
@@ -538,32 +493,31 @@ class FieldSettings(Section):
 class MethodSettings(Section):
     """The method that computes the field: ours or a baseline (hilsplat/methods)."""
 
-    name: str = knob("hilsplat", "hilsplat, or a baseline in hilsplat/methods/registry.py")
+    name: str = knob(
+        "hilsplat",
+        "hilsplat, or a baseline in hilsplat/methods/registry.py; all but hilsplat, lifted, occam and "
+        "dr_splat are trained",
+    )
     steps: int = knob(
         1800,
-        "all but hilsplat, lifted, occam, dr_splat: training steps, each on one view; langsplat, "
-        "langsplat_v2 and gaussian_grouping take them for each level, the others for all together",
+        "trained methods: steps, each on one view; langsplat, langsplat_v2 and gaussian_grouping take "
+        "them for each level, the others for all together",
         ge=1,
         origin="LangSplat, LangSplatV2: 30000",
     )
-    rate: float = knob(
-        0.0025, "all but hilsplat, lifted, occam, dr_splat: Adam step size", gt=0, origin="LangSplat"
-    )
+    rate: float = knob(0.0025, "trained methods: Adam step size", gt=0, origin="LangSplat")
     pixel_step: int = knob(
-        2,
-        "all but hilsplat, lifted, occam, dr_splat: every n-th pixel of every n-th row is used",
-        ge=1,
-        origin="LangSplat: 1",
+        2, "trained methods: every n-th pixel of every n-th row is used", ge=1, origin="LangSplat: 1"
     )
     codebook: tuple[Size, Size] = knob(
         (64, 10),
-        "opengaussian: groups by feature and position, and groups by feature of each of them",
+        "opengaussian: groups by feature and position, and groups by feature within each",
         origin="OpenGaussian: (64, 10) on LERF, (64, 5) on ScanNet",
     )
     thresholds: tuple[Granularity, Granularity, Granularity] | Auto = knob(
         "auto",
-        "granularity of whole, part, subpart; omniseg3d: least average cosine of a cluster, growing; vch: "
-        "longest edge of a component, falling; auto: the method's own",
+        "granularity of whole, part, subpart; omniseg3d: least average cosine of a cluster, growing; vch:"
+        " longest edge of a component, falling; auto: the method's own",
     )
 
     @property
@@ -576,20 +530,18 @@ class EvaluateSettings(Section):
     """Queries and evaluation protocols."""
 
     canonical: tuple[str, ...] = knob(
-        ("object", "things", "stuff", "texture"),
-        "canonical phrases that relevancy compares a text with",
-        origin="LERF, LangSplat",
+        ("object", "things", "stuff", "texture"), "canonical phrases for relevancy", origin="LERF, LangSplat"
     )
     template: str = knob(
         "{}",
-        "sentence around every text and canonical phrase, which replaces {}, such as 'a photo of a {}'",
+        "prompt template for texts and canonical phrases, such as 'a photo of a {}'",
         origin="LERF, LangSplat: {}",
         pattern=r"^[^{}]*\{\}[^{}]*$",
     )
     relevancy_scale: float = knob(10.0, "scale of the cosines in the relevancy", gt=0, origin="LangSplat")
     filter_px: int = knob(
         0,
-        "side of the mean filter on relevancy maps; 0: proportional to the image height, 30 px at 730 px",
+        "side of the mean filter on relevancy maps; 0: by image height, 30 px at 730 px",
         unit="px",
         ge=0,
         origin="LangSplat: 30, paper: 20",
@@ -600,7 +552,7 @@ class EvaluateSettings(Section):
     )
     threshold_on: Literal["normalised_pm1", "raw"] = knob(
         "normalised_pm1",
-        "scale of the threshold; normalised_pm1: a map stretched to [-1, 1], so that 0.4 is 0.7 of its range",
+        "scale of the threshold; normalised_pm1: maps stretched to [-1, 1], so 0.4 is 70 % of the range",
         origin="LangSplat's code",
     )
     majority: bool = knob(
@@ -608,34 +560,31 @@ class EvaluateSettings(Section):
     )
     level_rule: Literal["max", "mean_in_mask"] = knob(
         "max",
-        "level if none is given: that of the highest value, or of the highest mean inside its mask",
+        "level if none is given: that of the highest value, or of the highest mean in its mask",
         origin="LangSplat: max",
     )
     node_select: float = knob(
         0.95,
-        "which nodes are selected with the best one: those whose cosine margin is at most 1 - node_select "
-        "times the range of margins at the level below the best, or three times that if they look like it",
+        "nodes selected with the best: those whose cosine margin is at most 1 - node_select times the "
+        "range of margins at the level below the best, or three times that if they look like it",
         ge=0,
         le=1,
     )
     ancestors: float = knob(
-        0.2,
-        "share of the mean margin of a node's ancestors that is added to its own margin to rank nodes",
-        ge=0,
+        0.2, "share of the mean margin of a node's ancestors added to its own to rank nodes", ge=0
     )
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "what answers the queries; each has its rows in the tables"
     )
     view_consistency: bool = knob(
-        True,
-        "score whether answers cover the same surface in neighbouring views (synthetic scenes)",
+        True, "score whether answers agree on surfaces in neighbouring views (synthetic scenes)"
     )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
-        "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within 10 cm; "
-        "density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or a PLY of your "
-        "own with one Gaussian per point)",
+        "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within 10 "
+        "cm; density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or your own"
+        " PLY with one Gaussian per point)",
         origin="OpenGaussian: frozen",
     )
 
@@ -644,9 +593,7 @@ class QuerySettings(Section):
     """Vocabulary for node names and for detecting doubtful answers."""
 
     vocabulary: str = knob(
-        "auto",
-        "text file of the words that name nodes; auto: `vocabulary.txt` in the folder of the CLIP, else "
-        "1,400 common things, parts and surfaces",
+        "auto", "text file of words to name nodes; auto: vocabulary.txt of the CLIP, else 1,400 common words"
     )
 
 
