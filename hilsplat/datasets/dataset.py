@@ -30,18 +30,15 @@ class Dataset:
         name: key in the registry, and data set in rows and paths.
         title: name as written in papers.
         labels: "images" if their pixels are labelled, "points" if the points of a mesh or a scan are.
-        folder: the data set's folder below `data_root`.
+        folder: the data set's folder below `data_root`; all other paths are relative to it.
         scenes: scenes in the paper's tables.
         terms: obligations of the user under the licence, in one sentence.
-        citation: authors, title, venue, year.
-        layout: the expected file tree below `folder`, as user-facing text.
-        required: paths that a scene needs, relative to `folder`.
-        open: reads a scene, given the data set's folder and the scene's name; returns a `LabelledScene` or a
-            `PointScene`.
+        layout: the expected file tree, as user-facing text.
+        required: paths that a scene needs.
+        open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
         open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
-        protocols: names of the protocols that score it (`evaluate.protocols.cards`), in addition to those for
-            every labelled image.
-        label_places: glob patterns, below `folder`, of a scene's files that only evaluation reads.
+        protocols: protocols that score it (`evaluate.protocols.cards`), besides those of any labelled image.
+        label_places: glob patterns of a scene's files that only evaluation reads.
     """
 
     name: str
@@ -72,28 +69,23 @@ class Dataset:
         return tuple(scene for scene in self.scenes if not self.missing(root, scene))
 
     def locate(self, data_root: Path) -> Path:
-        """Return the data set's folder below `data_root`.
-
-        Raises:
-            SceneError: it is missing, or is one level too high or too deep.
-        """
+        """Return the data set's folder; raise SceneError if it isn't directly below `data_root`."""
         data_root = Path(data_root).expanduser()
         root = data_root / self.folder
         if self._has_begun(root):
             return root
-        for deeper in _folders(root):
-            if self._has_begun(deeper):
-                raise SceneError(
-                    f"{self.title} is one level too deep in {root}",
-                    expected=f"its scenes in {root}",
-                    found=f"them in {deeper}",
-                    fix=f"move the content of {deeper} one level up",
-                )
+        for deeper in filter(self._has_begun, _folders(root)):
+            raise SceneError(
+                f"{self.title} is one level too deep in {root}",
+                expected=f"its scenes in {root}",
+                found=f"its scenes in {deeper}",
+                fix=f"move the content of {deeper} one level up",
+            )
         if self._has_begun(data_root):
             raise SceneError(
                 f"{data_root} is the folder of {self.title} itself",
-                expected=f"a folder that holds {self.folder}/",
-                fix=f"rename it {self.folder} if it is not, and set data_root to the folder above it",
+                expected=f"a folder that contains {self.folder}/",
+                fix=f"rename it to {self.folder} if necessary, and set data_root to its parent folder",
             )
         for deeper in _folders(data_root):
             if self._has_begun(deeper / self.folder):
@@ -111,11 +103,7 @@ class Dataset:
         )
 
     def require(self, root: Path, scene: str) -> None:
-        """Raise if a scene lacks a required path.
-
-        Raises:
-            SceneError: a path is missing, for instance because an archive was unpacked only in part.
-        """
+        """Raise SceneError if a scene lacks a required path, for instance after unpacking only part of it."""
         missing = self.missing(root, scene)
         if missing:
             here = [place for place in self.required(scene) if place not in missing]

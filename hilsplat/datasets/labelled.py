@@ -1,13 +1,14 @@
 """Scenes with labelled images, as returned by every reader of such a data set.
 
-Labels, images and poses of a view are keyed by its name in the scene ("frame_00041.png", see
-`scene.view_names.view_name`), so that a label matches its image and camera even if other views are missing.
+Labels, images and poses are keyed by view name ("frame_00041.png", see `scene.view_names.view_name`), so that
+a label matches its image and camera even if other views are missing.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -19,9 +20,11 @@ from hilsplat.base.files import list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import SceneReport
-from hilsplat.scene.importers.known_poses import KnownView, find_known_poses
-from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.view_names import view_name
+
+if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
+    from hilsplat.scene.importers.known_views import KnownView
 
 Found = TypeVar("Found")
 
@@ -40,8 +43,7 @@ class LabelledRegion:
         boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
         level: None if the data set has no levels.
         path: texts from the whole down to this region; just its text without levels.
-        any_grey: reads all non-black pixels of the label, for protocols that use those as truth; None: the
-            same as `pixels`.
+        any_grey: reads all non-black pixels, for protocols that use those as truth; None if as `pixels`.
     """
 
     text: str
@@ -85,7 +87,7 @@ class LabelledScene:
 
     Attributes:
         images: image file of each view, for all images of the scene.
-        poses: folder in which `scene.known_poses` finds poses; None if the scene has none.
+        poses: folder in which `find_known_poses` finds poses; None if the scene has none.
         views: labelled regions by view, in label order.
         warnings: one sentence for each item that was reinterpreted.
     """
@@ -99,7 +101,7 @@ class LabelledScene:
 
     @property
     def prompts(self) -> tuple[str, ...]:
-        """All texts of the scene, sorted (capitals first)."""
+        """Texts of the scene, sorted (capitals first)."""
         return tuple(sorted({region.text for regions in self.views.values() for region in regions}))
 
     @property
@@ -108,11 +110,7 @@ class LabelledScene:
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> None:
-        """Check that every labelled view has a pose.
-
-        Raises:
-            SceneError: labelled views have no pose; the message lists them.
-        """
+        """Raise SceneError, with a list, if labelled views have no pose."""
         missing = [view for view in self.views if view not in names]
         if missing:
             shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
@@ -184,20 +182,34 @@ def images_by_view(folder: Path) -> dict[str, Path]:
 
 
 def image_size_hw(path: Path) -> tuple[int, int]:
-    """Return height and width of an image as stored, without reading its pixels.
-
-    Raises:
-        ImageError: it is missing or not an image.
-    """
+    """Return an image's height and width as stored, from its header; raise ImageError if it is unreadable."""
     return _read("image", path, lambda image: (image.height, image.width))
 
 
-def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return the foreground of a grey mask file: values of at least `least`.
+def mask_region(
+    path: Path,
+    foreground: int,
+    image_hw: tuple[int, int],
+    warnings: list[str],
+    share: float = 0.0,
+    least_grey: int | None = None,
+) -> LabelledRegion:
+    """Return the region of a grey mask file that is named after its text; extend `warnings` if it is resized.
 
-    Raises:
-        ImageError: it is missing, truncated or not an image.
+    Args:
+        foreground: lowest grey value of the region.
+        share: as in `check_label_size`.
+        least_grey: lowest value for protocols that use any grey as truth, if that differs.
     """
+    size_hw = image_size_hw(path)
+    warnings += check_label_size(f"mask {path}", size_hw, image_hw, share)
+    any_grey = None if least_grey is None else partial(read_mask_file, path, least_grey)
+    pixels = partial(read_mask_file, path, foreground)
+    return LabelledRegion(path.stem, size_hw, pixels, path=(path.stem,), any_grey=any_grey)
+
+
+def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels of a grey mask file with values of at least `least`; raise ImageError if damaged."""
     return _read("mask", path, lambda image: np.asarray(image.convert("L")) >= least)
 
 
@@ -216,14 +228,9 @@ def _read(kind: str, path: Path, read: Callable[[Image.Image], Found]) -> Found:
 def check_label_size(
     where: str, label_hw: tuple[int, int], image_hw: tuple[int, int], share: float = 0.0
 ) -> list[str]:
-    """Compare the size of a label with that of its image.
+    """Compare the size of a label, described by `where`, with that of its image; report if it is resized.
 
-    Args:
-        where: description of the label that starts the message.
-        share: tolerated height difference at equal widths, beyond rounding, as a share of the image's height.
-
-    Returns:
-        A sentence stating that the label is resized; empty if the sizes are equal.
+    `share` is the tolerated height difference at equal widths, beyond rounding, as a share of the height.
 
     Raises:
         SceneError: one is not a scaled copy of the other.
@@ -244,6 +251,18 @@ def check_label_size(
     ]
 
 
+def require_images(labelled: Iterable[str], images: Mapping[str, Path]) -> None:
+    """Raise SceneError if a labelled view has no image."""
+    orphans = sorted(set(labelled) - set(images))
+    if orphans:
+        raise SceneError(
+            f"labelled views have no image: {', '.join(orphans)}",
+            expected=f"images of that name in {next(iter(images.values())).parent}",
+            found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
+            fix="unpack the images again; those of another release are numbered differently",
+        )
+
+
 def unlisted_texts(found: Iterable[str], published: Collection[str]) -> list[str]:
     """Return a sentence naming texts that a non-empty published list lacks, if any."""
     new = sorted(set(found) - set(published))
@@ -256,13 +275,15 @@ def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> 
     return [f"published frames without {what}: {', '.join(gone)}"] if gone else []
 
 
-def posed_images(folder: Path, dataset: str) -> dict[str, KnownView]:
+def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
     """Return the posed views of a scene folder by view name, sorted by stem.
 
     Raises:
         SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, so that
             labels of undistorted images would not fit.
     """
+    from hilsplat.scene.importers.known_views import read_source
+
     known = find_known_poses(folder)
     if known is None:
         raise SceneError(

@@ -1,13 +1,13 @@
-"""The supported data sets, by name.
+"""The supported data sets by name, and the output of `hilsplat datasets`.
 
 A reader's module describes its data set in a constant (see `dataset.Dataset`); one line here adds it.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hilsplat.base.errors import SceneError
+from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.plugins import Plugins
 from hilsplat.datasets.dataset import Dataset
 
@@ -22,7 +22,7 @@ DATASETS: Plugins[Dataset] = Plugins(
         "3d_ovs": "hilsplat.datasets.images.ovs3d:DATASET",
         "hi_lerf": "hilsplat.datasets.images.hi:HI_LERF",
         "hi_3dovs": "hilsplat.datasets.images.hi:HI_3DOVS",
-        "annotated": "hilsplat.datasets.images.annotated:DATASET",
+        "annotated": "hilsplat.datasets.images.hi:ANNOTATED",
         "scannet": "hilsplat.datasets.points.scannet:DATASET",
         "scannet200": "hilsplat.datasets.points.scannet:SCANNET200_DATASET",
         "replica": "hilsplat.datasets.points.replica:DATASET",
@@ -38,22 +38,25 @@ def readers_of(labels: Collection[str]) -> tuple[str, ...]:
     return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
 
 
+LISTED = "list them with: hilsplat datasets list"
+
+
 def open_labelled(name: str, data_root: Path) -> "LabelledScene":
     """Open a scene with labels on images, by a name such as "lerf_ovs/figurines".
 
     Raises:
         SceneError: there is no such data set, its labels are on points, or the scene cannot be read.
     """
-    dataset_name, _, scene = name.partition("/")
-    dataset = dataset_of(dataset_name)
-    if dataset.labels != "images" or not scene:
+    dataset = dataset_of(name.partition("/")[0])
+    if dataset.labels != "images":
         raise SceneError(
             f"{name!r} names no scene with labels on images",
             expected="<data set>/<scene>, such as lerf_ovs/figurines",
-            found=f"a data set with labels on {dataset.labels}" if scene else "no scene",
-            fix="list them with: hilsplat datasets list",
+            found=f"a data set with labels on {dataset.labels}",
+            fix=LISTED,
         )
-    return dataset.open(dataset.locate(data_root), scene)
+    scene: Any = open_labels(name, data_root)
+    return scene
 
 
 def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
@@ -65,25 +68,81 @@ def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
     if not scene:
-        raise SceneError(
-            f"{name!r} names no scene",
-            expected="<data set>/<scene>, such as scannet/scene0000_00",
-            fix="list them with: hilsplat datasets list",
-        )
+        expected = "<data set>/<scene>, such as scannet/scene0000_00"
+        raise SceneError(f"{name!r} names no scene", expected=expected, fix=LISTED)
     return dataset.open(dataset.locate(data_root), scene)
 
 
 def dataset_of(name: str) -> Dataset:
-    """Look up a data set.
+    """Return a data set by name; raise SceneError, with the known names, if there is none."""
+    if name not in DATASETS:
+        raise SceneError(
+            f"data set {name!r} is unknown", expected=f"one of {', '.join(DATASETS)}", fix=LISTED
+        )
+    return DATASETS[name]
+
+
+def overview(data_root: Path | None) -> str:
+    """Describe all data sets, with the scenes present below a folder if one is given."""
+    paragraphs = []
+    for dataset in DATASETS.values():
+        lines = [
+            f"{dataset.name}: {dataset.title}, labels on {dataset.labels}",
+            f"  citation  {dataset.citation}",
+            f"  licence   {dataset.licence}",
+            f"  terms     {dataset.terms}",
+            f"  scenes    {', '.join(dataset.scenes) or 'all that are present'}",
+        ]
+        if data_root is not None:
+            lines.extend(f"  {line}" for line in _presence(dataset, data_root))
+        lines.append("  layout")
+        lines.extend(f"    {line}" for line in dataset.layout.rstrip().splitlines())
+        paragraphs.append("\n".join(lines))
+    return "\n\n".join(paragraphs)
+
+
+def _presence(dataset: Dataset, data_root: Path) -> list[str]:
+    """Return lines that list a data set's complete scenes, and what is missing from the others."""
+    try:
+        root = dataset.locate(data_root)
+    except SceneError as error:
+        return ["found     no scene", *(f"          {line}" for line in str(error).splitlines())]
+    lines = [f"found     {', '.join(dataset.found(root)) or 'no complete scene'} (in {root})"]
+    for scene in dataset.scenes:
+        missing = dataset.missing(root, scene)
+        if missing:
+            lines.append(f"missing   {scene}: {', '.join(missing)}")
+    return lines
+
+
+def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
+    """Read whole scenes of a data set, by default those at least partly present.
+
+    Returns:
+        A report of what was found, and the number of scenes that cannot be read.
 
     Raises:
-        SceneError: there is no data set with this name.
+        SceneError: the data set's folder is missing.
     """
-    try:
-        return DATASETS[name]
-    except KeyError as error:
-        raise SceneError(
-            f"data set {name!r} is unknown",
-            expected=f"one of {', '.join(DATASETS)}",
-            fix="list them with: hilsplat datasets list",
-        ) from error
+    root = dataset.locate(data_root)
+    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
+    absent = []
+    for scene in [] if scenes else known:
+        inside = {place for place in dataset.required(scene) if not place.startswith("..")}
+        if inside <= set(dataset.missing(root, scene)):
+            absent.append(scene)
+    lines, num_failed = [], 0
+    for scene in scenes or [scene for scene in known if scene not in absent]:
+        try:
+            report = dataset.check(root, scene)
+        except HilsplatError as error:
+            num_failed += 1
+            lines.append(f"{dataset.name}/{scene}: cannot be read")
+            lines.extend(f"  {line}" for line in str(error).splitlines())
+            continue
+        facts = ", ".join(f"{what}: {value}" for what, value in report.facts.items())
+        lines.append(f"{dataset.name}/{scene}: {facts}")
+        lines.extend(f"  warning   {sentence}" for sentence in report.warnings)
+    if absent:
+        lines.append(f"{dataset.name}: missing: {', '.join(absent)}")
+    return "\n".join(lines), num_failed

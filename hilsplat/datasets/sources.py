@@ -9,8 +9,7 @@ from pathlib import Path
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
-
-DATA_PREFIX = "data:"
+from hilsplat.scene.sheet import DATA_PREFIX
 
 LABELS_ON = {"lerf_ovs": "hi_lerf", "3d_ovs": "hi_3dovs"}
 """Data set -> another one that also labels its images, with levels."""
@@ -25,11 +24,7 @@ def published(source: str) -> tuple[str, str] | None:
 
 
 def absence(source: str, data_root: str) -> str | None:
-    """Return a sentence on why a `data:` source of the scene sheet cannot be used; None if it can.
-
-    Args:
-        data_root: folder of the data sets; empty if not set.
-    """
+    """Return why a `data:` source of the sheet cannot be used, or None; `data_root` is empty if not set."""
     if not source.startswith(DATA_PREFIX):
         return None
     if not data_root:
@@ -48,12 +43,9 @@ def absence(source: str, data_root: str) -> str | None:
 
 
 def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
-    """Return scenes on disk that are in no row, for data sets without a fixed list of scenes (Waymo).
+    """Return scenes on disk that are in no row's source, for data sets without a list of scenes (Waymo).
 
-    Args:
-        sources: sources of all rows of the scene sheet.
-        groups: groups that are run; such a data set has the name of its group.
-        data_root: empty if not set.
+    Such a data set has the name of its group; `data_root` is empty if not set.
     """
     open_ended = [dataset_of(name) for name in groups if data_root and name in DATASETS]
     found = [
@@ -66,10 +58,9 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Return labels to score a scene against, as `data set/scene`, its own first; none without the data.
+    """Return labels to score the scene of a row against, as `data set/scene`, its own first.
 
     Args:
-        source: source in a row of the scene sheet.
         data_root: folder of the data sets; empty for the working folder, which may contain own annotations.
         row: name of the row, `dataset/scene`.
     """
@@ -79,12 +70,12 @@ def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
     if place is None or absence(source, data_root) is not None:
         return own
     name, scene = place
-    found = [f"{name}/{scene}", *own]
+    found = (f"{name}/{scene}", *own)
     if name in LABELS_ON:
         other = dataset_of(LABELS_ON[name])
         if not other.missing(_folder(other, data_root), scene):
-            found.append(f"{other.name}/{scene}")
-    return tuple(found)
+            found = (*found, f"{other.name}/{scene}")
+    return found
 
 
 def _folder(dataset: Dataset, data_root: str) -> Path:
@@ -121,17 +112,10 @@ def is_exported(source: str) -> bool:
 
 
 def export_images(name: str, data_root: Path, out: Path) -> int:
-    """Write images and poses of a scene with labelled points to a folder that `poses` imports.
+    """Write images and poses of `data set/scene` to a folder for `poses`; return the number of images.
 
-    The vertices of a labelled mesh are also written, without labels, as initial (optionally frozen) positions
-    of Gaussians. Lidar points are not written, because the sky and distant objects have none.
-
-    Args:
-        name: `data set/scene`.
-        out: folder for `images/`, `transforms.json` and, for a mesh, `points.ply`.
-
-    Returns:
-        The number of images.
+    The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (optionally
+    frozen) positions of Gaussians. Lidar points aren't, because the sky and distant objects have none.
 
     Raises:
         SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.

@@ -16,10 +16,10 @@ from hilsplat.base.progress import track
 from hilsplat.photos.check import CHECK_SIDE_PX, CheckedPhoto, photo_doubts
 from hilsplat.photos.intake import prepared_photographs
 from hilsplat.scene.features import EXIF_ORIENTATION, exif_focal_px
-from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.layouts import (
     NO_POSES,
     dataparser_of,
+    find_known_poses,
     has_known_poses,
     label_files,
     langsplat_features,

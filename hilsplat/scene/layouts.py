@@ -1,7 +1,11 @@
-"""Layouts of folders of photographs; fast to import at the start of the workflow."""
+"""Layouts of folders of photographs and known poses; fast to import at the start of the workflow."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from hilsplat.base.artifacts import parse_json
+from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 
 TRAINED = ("output", "outputs", "exports", "language_features")
@@ -9,6 +13,8 @@ TRAINED = ("output", "outputs", "exports", "language_features")
 
 MODELS = ("sparse/0", "sparse")
 """Folders of a COLMAP model, in order of preference."""
+
+MODEL_FILES = ("cameras", "images", "points3D")
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 """Pose files of nerfstudio and other programs, in order of preference."""
@@ -24,6 +30,17 @@ DATAPARSER = "dataparser_transforms.json"
 
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
 """Paths of a PLY exported by nerfstudio or a viewer; a PLY of 3DGS is preferred."""
+
+
+def read_json_object(path: Path, fix: str) -> dict[str, Any]:
+    """Read a JSON object of another program; raise SceneError with the given fix if it cannot be read."""
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{path} is not valid JSON: {error}", fix=fix) from error
+    if not isinstance(content, dict):
+        raise SceneError(f"{path} is not a JSON object", found=type(content).__name__, fix=fix)
+    return content
 
 
 def trained_gaussians(folder: Path) -> Path | None:
@@ -105,6 +122,82 @@ def has_known_poses(folder: Path, named: Path | None = None) -> bool:
         or (folder / POSES_BOUNDS).is_file()
         or polycam_folders(folder) is not None
         or record3d_export(folder) is not None
+    )
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """Location of the poses of a folder.
+
+    Attributes:
+        root: folder of the images.
+        kind: "colmap", "transforms", "llff", "polycam" or "record3d".
+        files: COLMAP's model folder; the transforms files (training, then test); LLFF's file; Polycam's
+            folders of images and cameras; or Record3D's image folder and pose file.
+    """
+
+    root: Path
+    kind: str
+    files: tuple[Path, ...]
+
+
+def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
+    """Search for poses of COLMAP, transforms files, LLFF, Polycam and Record3D, in this order; None if none.
+
+    Args:
+        named: a COLMAP model, a transforms file, or a folder with either, used instead of the poses in
+            `folder`; `layouts.NO_POSES` to ignore all poses.
+
+    Raises:
+        SceneError: there is a `sparse/` folder without a complete model, or `named` has no poses.
+    """
+    folder = Path(folder)
+    if named == NO_POSES:
+        return None
+    if named is not None:
+        return _named_poses(folder, named)
+    for place in MODELS:
+        if _is_model(folder / place):
+            return KnownPoses(folder, "colmap", (folder / place,))
+    for name in TRANSFORMS:
+        if (folder / name).is_file():
+            files = [folder / name]
+            if name == "transforms_train.json" and (folder / "transforms_test.json").is_file():
+                files.append(folder / "transforms_test.json")
+            return KnownPoses(folder, "transforms", tuple(files))
+    if (folder / POSES_BOUNDS).is_file():
+        return KnownPoses(folder, "llff", (folder / POSES_BOUNDS,))
+    for kind, export in (("polycam", polycam_folders(folder)), ("record3d", record3d_export(folder))):
+        if export is not None:
+            return KnownPoses(folder, kind, export)
+    if (folder / "sparse").is_dir():
+        raise SceneError(
+            f"{folder / 'sparse'} does not hold a complete COLMAP model",
+            expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
+            found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
+            fix="complete the model, or rename sparse/ to have the poses computed",
+        )
+    return None
+
+
+def _named_poses(folder: Path, named: Path) -> KnownPoses:
+    if named.is_file() and named.suffix == ".json":
+        return KnownPoses(folder, "transforms", (named,))
+    if _is_model(named):
+        return KnownPoses(folder, "colmap", (named,))
+    found = find_known_poses(named) if named.is_dir() else None
+    if found is None or found.kind not in ("colmap", "transforms"):
+        raise SceneError(
+            f"{named} has no poses for {folder}",
+            expected="a COLMAP model, a transforms.json, or a folder with either",
+            fix="correct the path, or leave it out to use what is beside the images",
+        )
+    return KnownPoses(folder, found.kind, found.files)
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{name}{suffix}").is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt")
     )
 
 

@@ -8,14 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 from plyfile import PlyData, PlyElement
 
 from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.errors import SceneError
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 
-OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Conversion of camera axes, which is its own inverse."""
+
 HALF_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """Offset added to a K with integer pixel centres; here, the centre of the first pixel is (0.5, 0.5)."""
 
@@ -45,17 +47,25 @@ class PosedImage:
         return np.linalg.inv(self.cam_from_world)
 
 
-def cam_from_world_of(world_from_cam: Float[np.ndarray, "4 4"], where: str) -> Float[np.ndarray, "4 4"]:
-    """Invert a camera-to-world matrix, and refuse one that is not a rotation and translation."""
-    rigid = are_rotations(world_from_cam[:3, :3], RIGID_TOLERANCE)
-    if not rigid or not np.allclose(world_from_cam[3], [0, 0, 0, 1]):
+def rigid_pose(world_from_cam: Float[np.ndarray, "rows columns"], where: str) -> Float64[np.ndarray, "4 4"]:
+    """Return a camera-to-world matrix, 3 x 4 or 4 x 4, as 4 x 4; refuse one that is not rigid.
+
+    Raises:
+        SceneError: it has another shape, is not finite, scales or mirrors, or its last row is not 0 0 0 1.
+    """
+    pose = np.eye(4)
+    usable = world_from_cam.shape in ((3, 4), (4, 4)) and np.isfinite(world_from_cam).all()
+    if usable:
+        pose[: len(world_from_cam)] = world_from_cam
+        usable = are_rotations(pose[:3, :3], RIGID_TOLERANCE) and np.allclose(pose[3], [0, 0, 0, 1])
+    if not usable:
         raise SceneError(
             f"{where}: the pose is not a rotation and translation",
-            expected="a 4 x 4 camera-to-world matrix, row by row, last row 0 0 0 1",
+            expected="a 4 x 4 camera-to-world matrix, last row 0 0 0 1, without scale or mirroring",
             found=np.array2string(world_from_cam, precision=4, suppress_small=True).replace("\n", ""),
-            fix="export the poses again",
+            fix="export the poses again, without scaling the cameras",
         )
-    return np.linalg.inv(world_from_cam)
+    return pose
 
 
 def write_posed_images(
@@ -66,10 +76,9 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
-    Images are copied byte for byte; distortion is kept, because `poses` undistorts. Points, if any, are
-    written to `points.ply` and become the scene's sparse points, in the same order.
-
-    An existing folder is replaced. Points are in the unit of the poses.
+    Images are copied byte for byte; distortion is kept, because `poses` undistorts. Points, if any, are in
+    the unit of the poses, and become the scene's sparse points in the same order (`points.ply`). An existing
+    folder is replaced.
     """
     names = [image.name for image in images]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
@@ -106,7 +115,7 @@ def _frame(image: PosedImage) -> dict[str, object]:
     height, width = image.size_hw
     frame: dict[str, object] = {
         "file_path": f"images/{image.name}",
-        "transform_matrix": (image.world_from_cam @ OPENCV_TO_OPENGL).tolist(),
+        "transform_matrix": (image.world_from_cam @ OPENGL_TO_OPENCV).tolist(),
         "w": width,
         "h": height,
         "fl_x": float(image.K[0, 0]),

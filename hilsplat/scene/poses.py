@@ -25,8 +25,7 @@ from hilsplat.scene.features import (
     prepare_images,
 )
 from hilsplat.scene.importers.importing import import_poses
-from hilsplat.scene.importers.known_poses import find_known_poses
-from hilsplat.scene.layouts import photo_folder
+from hilsplat.scene.layouts import find_known_poses, photo_folder
 from hilsplat.scene.lost_views import name_neighbours, plot_lost
 from hilsplat.scene.sheet import MIN_PHOTOS
 from hilsplat.settings import PosesSettings

@@ -14,8 +14,8 @@ from hilsplat.annotate.importing import imported
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import read_config
 from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.importers.known_views import read_colmap, read_transforms
+from hilsplat.scene.layouts import find_known_poses
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.workflow.plan import Plan
 from tests.conftest import PROJECT

@@ -1,10 +1,9 @@
-"""Hi-LERF and Hi-3DOVS: labels at three levels on images of LERF-OVS and 3D-OVS.
+"""Labels at three levels: Hi-LERF and Hi-3DOVS, on images of LERF-OVS and 3D-OVS, and your own scenes.
 
 The paper publishes frames and levels but neither labels nor a format. Our format is LERF-OVS's label file
 with three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
-id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` adds
-`origin`: drawn, edited, accepted or proposed. The images are those of the other data set, whose folder is
-beside this one; `annotated.py` reads the same format without a published data set.
+id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes it
+for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
 
 A frame without an image or a label, an invalid parent, or a child outside its parent causes a warning, never
 an error.
@@ -21,7 +20,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
-from hilsplat.datasets.images.lerf_ovs import label_files
+from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
@@ -43,11 +42,7 @@ OUTSIDE_SHARE = 0.01
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene: one region per object; several objects may share a text.
-
-    Args:
-        dataset: "hi_lerf" or "hi_3dovs".
-        root: the folder of that name; the folder with the images is next to it.
+    """Read the labels of a scene of `dataset`: one region per object; several objects may share a text.
 
     Raises:
         SceneError: images or labels are missing, or a label file cannot be used.
@@ -67,16 +62,32 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
         warnings += check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
         views[view] = regions_of(labels, warnings)
     listed = FRAMES[dataset].get(scene, ())
-    warnings += missing_frames("image", listed, images)
-    warnings += missing_frames("label", listed, files)
+    warnings += missing_frames("image", listed, images) + missing_frames("label", listed, files)
     return LabelledScene(dataset, scene, images, source, views, tuple(warnings))
 
 
-def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
-    """Return one region per object of a file, except for unaccepted proposals.
+def open_annotated(root: Path, scene: str) -> LabelledScene:
+    """Read your annotations of a scene, such as "photos/desk": one region per drawn or accepted object.
 
-    Args:
-        warnings: extended by a sentence for each item that was reinterpreted.
+    Files whose objects have no level are read like LERF-OVS: one region per text. The photographs are the
+    scene's own undistorted ones; evaluation compares the labels' size with the scene's cameras.
+
+    Raises:
+        SceneError: there are none, or a label file cannot be used.
+    """
+    ANNOTATED.require(root, scene)
+    warnings: list[str] = []
+    views: dict[str, tuple[LabelledRegion, ...]] = {}
+    for view, path in label_files(root / scene).items():
+        labels = read_isat(path)
+        warnings += labels.warnings
+        has_levels = any("level" in thing.keys for thing in labels.objects)
+        views[view] = regions_of(labels, warnings) if has_levels else merged_regions(labels)
+    return LabelledScene("annotated", scene, {}, None, views, tuple(warnings))
+
+
+def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
+    """Return one region per object of a file, except for unaccepted proposals; extend `warnings`.
 
     Raises:
         SceneError: an id or a level cannot be used.
@@ -88,7 +99,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
         labels = replace(labels, objects=accepted)
     objects = by_id(labels)
     parents = parents_of(labels, objects, warnings)
-    warnings += nesting_violations(labels, objects, parents)
+    warnings += _nesting_violations(labels, objects, parents)
     return tuple(
         LabelledRegion(
             thing.category,
@@ -96,7 +107,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
             partial(thing.mask, labels.size_hw),
             thing.box_xyxy[None],
             Level(thing.keys["level"]),
-            path_of(number, objects, parents),
+            _path_of(number, objects, parents),
         )
         for number, thing in objects.items()
     )
@@ -130,16 +141,13 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
                 found=repr(level),
                 fix="correct it; plain LERF-OVS labels have no levels and belong below lerf_ovs/label",
             )
-        objects[number] = thing if same is None else joined(same, thing)
+        if same is not None:
+            low = np.minimum(same.box_xyxy[:2], thing.box_xyxy[:2])
+            high = np.maximum(same.box_xyxy[2:], thing.box_xyxy[2:])
+            polygons = (*same.polygons, *thing.polygons)
+            thing = replace(same, polygons=polygons, box_xyxy=np.concatenate([low, high]))
+        objects[number] = thing
     return objects
-
-
-def joined(one: IsatObject, other: IsatObject) -> IsatObject:
-    """Merge two pieces of an object."""
-    low = np.minimum(one.box_xyxy[:2], other.box_xyxy[:2])
-    high = np.maximum(one.box_xyxy[2:], other.box_xyxy[2:])
-    polygons = (*one.polygons, *other.polygons)
-    return replace(one, polygons=polygons, box_xyxy=np.concatenate([low, high]))
 
 
 def parents_of(
@@ -153,7 +161,7 @@ def parents_of(
         if parent is None:
             continue
         where = f"{labels.path.name}, id {number} ({thing.category})"
-        if parent not in objects:
+        if not isinstance(parent, int) or parent not in objects:
             warnings.append(f"{where}: its parent {parent!r} does not exist")
         elif objects[parent].keys["level"] != level - 1:
             found = objects[parent].keys["level"]
@@ -163,7 +171,7 @@ def parents_of(
     return parents
 
 
-def nesting_violations(
+def _nesting_violations(
     labels: IsatFile, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> list[str]:
     """Return a sentence for every child with more than `OUTSIDE_SHARE` of its area outside its parent."""
@@ -177,21 +185,20 @@ def nesting_violations(
         if outside > OUTSIDE_SHARE * area_px:
             sentences.append(
                 f"{labels.path.name}, id {number} ({objects[number].category}): {outside / area_px:.1%} of "
-                f"it lies outside its parent {parent} ({objects[parent].category})"
+                f"its area is outside its parent {parent} ({objects[parent].category})"
             )
     return sentences
 
 
-def path_of(
-    number: int, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
+def _path_of(
+    number: int | None, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
 ) -> tuple[str, ...]:
     """Return the texts from the outermost known ancestor down to an object."""
-    texts = []
-    step: int | None = number
-    while step is not None:
-        texts.append(objects[step].category)
-        step = parents[step]
-    return tuple(reversed(texts))
+    texts: list[str] = []
+    while number is not None:
+        texts.insert(0, objects[number].category)
+        number = parents[number]
+    return tuple(texts)
 
 
 def _dataset(name: str, title: str, frame: str) -> Dataset:
@@ -219,3 +226,29 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
 HI_LERF = _dataset("hi_lerf", "Hi-LERF", "frame_00041")
 HI_3DOVS = _dataset("hi_3dovs", "Hi-3DOVS", "01")
 HI_DATASETS: dict[str, Dataset] = {dataset.name: dataset for dataset in (HI_LERF, HI_3DOVS)}
+
+
+class Annotated(Dataset):
+    """A data set without published scenes: its scenes are those that have been annotated."""
+
+    def found(self, root: Path) -> tuple[str, ...]:
+        """Return the scenes that have a label file below the folder."""
+        files = root.glob("*/*/*.json")
+        return tuple(sorted({f"{path.parent.parent.name}/{path.parent.name}" for path in files}))
+
+
+ANNOTATED = Annotated(
+    name="annotated",
+    title="Own annotations",
+    labels="images",
+    folder="annotated",
+    scenes=(),
+    licence="yours; the photographs keep theirs",
+    terms="Draw them with: hilsplat annotate SCENE",
+    citation="none",
+    layout="""annotated/
+  <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), a file per annotated photograph""",
+    required=lambda scene: (scene,),
+    open=open_annotated,
+    label_places=lambda scene: (f"{scene}/*.json",),
+)

@@ -48,13 +48,7 @@ class IsatObject:
 
 @dataclass(frozen=True, eq=False)
 class IsatFile:
-    """The objects of one image.
-
-    Attributes:
-        size_hw: size of the annotated image, px.
-        objects: in the order of the file.
-        warnings: one sentence for each irregularity, naming file and object.
-    """
+    """The objects of one image, in the order of the file, and a warning for each irregularity."""
 
     path: Path
     size_hw: tuple[int, int]
@@ -81,11 +75,7 @@ def read_isat(path: Path) -> IsatFile:
 
 
 def parse_isat(path: Path, content: Any) -> IsatFile:
-    """Check the content of a label file; `path` is used in messages only.
-
-    Raises:
-        SceneError: as in `read_isat`.
-    """
+    """Check the content of a label file, as `read_isat`; `path` is used in messages only."""
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no list `objects`",
@@ -124,7 +114,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
             f"{where} has no category", found=repr(category), fix="set the query for it as category"
         )
     where = f"{where} ({category})"
-    if not isinstance(entry.get("iscrowd", 0), bool | int):  # 0 in some files, false in others
+    if not isinstance(entry.get("iscrowd", 0), int):  # 0 in some files, false in others
         raise SceneError(
             f"{where}: iscrowd is not a number", found=repr(entry["iscrowd"]), fix="write 0 or 1"
         )
@@ -150,25 +140,19 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
 
 def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
     """Return the polygons, given one or a list of polygons of [x, y] pairs."""
-    expected = "a list of [x, y] pairs, or a list of such lists"
     try:
         nested = isinstance(value[0][0], list)
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
-    except (TypeError, IndexError, KeyError, ValueError) as error:
+        usable = all(each.shape == (len(each), 2) and np.isfinite(each).all() for each in polygons)
+    except (TypeError, IndexError, KeyError, ValueError):
+        usable = False
+    if not usable:
         raise SceneError(
             f"{where}: segmentation is not a polygon",
-            expected=expected,
+            expected="a list of [x, y] pairs, or a list of such lists",
             found=repr(value)[:80],
             fix="export the labels again; flat COCO lists x1, y1, x2, ... are a different format",
-        ) from error
-    for polygon in polygons:
-        if polygon.ndim != 2 or polygon.shape[1] != 2 or not np.isfinite(polygon).all():
-            raise SceneError(
-                f"{where}: segmentation is not a polygon",
-                expected=expected,
-                found=f"numbers of shape {polygon.shape}",
-                fix="export the labels again",
-            )
+        )
     return polygons
 
 

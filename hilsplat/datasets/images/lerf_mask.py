@@ -5,7 +5,6 @@ the masks of the first, `test_mask/1` those of the second. Every mask file is na
 """
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -13,11 +12,11 @@ from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
-    check_label_size,
     image_size_hw,
     images_by_view,
+    mask_region,
     posed_images,
-    read_mask_file,
+    require_images,
     unlisted_texts,
 )
 from hilsplat.datasets.published import PROMPTS
@@ -39,37 +38,27 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the test masks of a scene, such as "figurines"; pixels are read when needed.
 
     Raises:
-        SceneError: a part of the scene is missing, the mask folders do not match the test views, or a
-            prompt has a dot.
+        SceneError: part of the scene is missing, mask folders don't match test views, or a prompt has a dot.
     """
     DATASET.require(root, scene)
     folder = root / scene
     images = images_by_view(folder / "images")
     masks = _mask_folders(folder / "test_mask", held_out_views(folder))
+    require_images(masks, images)
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, place in masks.items():
-        if view not in images:
-            raise SceneError(
-                f"test view {view} of {scene} has no image",
-                expected=f"an image of that name in {folder / 'images'}",
-                fix="unpack the images again",
-            )
         image_hw = image_size_hw(images[view])
         regions = []
         for path in sorted(place.glob("*.png")):
-            text = path.stem
-            if "." in text:  # at which the published evaluation would cut it
+            if "." in path.stem:  # at which the published evaluation would cut it
                 raise SceneError(
                     f"mask {path} cannot be named after its prompt",
                     expected="a prompt without a dot",
-                    found=text,
+                    found=path.stem,
                     fix="rename the file",
                 )
-            size_hw = image_size_hw(path)
-            warnings += check_label_size(f"mask {path}", size_hw, image_hw)
-            pixels = partial(read_mask_file, path, FOREGROUND)
-            regions.append(LabelledRegion(text, size_hw, pixels, path=(text,)))
+            regions.append(mask_region(path, FOREGROUND, image_hw, warnings))
         if not regions:
             raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
         views[view] = tuple(regions)

@@ -23,6 +23,7 @@ from hilsplat.datasets.labelled import (
     image_size_hw,
     images_by_view,
     missing_frames,
+    require_images,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
@@ -41,20 +42,12 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the labels of a scene, such as "figurines"; masks are rasterised when needed.
 
     Raises:
-        SceneError: a part of the scene is missing, a label file cannot be used, or a labelled frame has
-            no image.
+        SceneError: a part is missing, a label file cannot be used, or a labelled frame has no image.
     """
     DATASET.require(root, scene)
     images = images_by_view(root / scene / "images")
     files = label_files(root / "label" / scene)
-    orphans = sorted(set(files) - set(images))
-    if orphans:
-        raise SceneError(
-            f"labelled frames of {scene} have no image: {', '.join(orphans)}",
-            expected=f"an image of that name in {root / scene / 'images'}",
-            found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
-            fix="unpack the images again; those of another release are numbered differently",
-        )
+    require_images(files, images)
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, path in files.items():
@@ -74,11 +67,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def label_files(folder: Path) -> dict[str, Path]:
-    """Return the label files of a folder by view.
-
-    Raises:
-        SceneError: there are none.
-    """
+    """Return the label files of a folder by view; raise SceneError if there are none."""
     paths = sorted(path for path in folder.glob("*.json") if path.name[0] != ".")
     files = {view_name(path.stem): path for path in paths}
     if not files:
@@ -96,16 +85,13 @@ def merged_regions(labels: IsatFile) -> tuple[LabelledRegion, ...]:
     objects: dict[str, list[IsatObject]] = {}
     for thing in labels.objects:
         objects.setdefault(thing.category, []).append(thing)
-    return tuple(
-        LabelledRegion(
-            category,
-            labels.size_hw,
-            partial(fill_polygons, [each for thing in same for each in thing.polygons], labels.size_hw),
-            np.stack([thing.box_xyxy for thing in same]),
-            path=(category,),
-        )
-        for category, same in objects.items()
-    )
+    regions = []
+    for category, same in objects.items():
+        polygons = [polygon for thing in same for polygon in thing.polygons]
+        boxes = np.stack([thing.box_xyxy for thing in same])
+        pixels = partial(fill_polygons, polygons, labels.size_hw)
+        regions.append(LabelledRegion(category, labels.size_hw, pixels, boxes, path=(category,)))
+    return tuple(regions)
 
 
 DATASET = Dataset(

@@ -5,7 +5,6 @@ test view is a folder with one mask per class. Only the value 255 is foreground,
 truth `any grey`.
 """
 
-from functools import partial
 from pathlib import Path
 
 from hilsplat.base.errors import SceneError
@@ -13,11 +12,11 @@ from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import (
     LabelledRegion,
     LabelledScene,
-    check_label_size,
     image_size_hw,
     images_by_view,
+    mask_region,
     missing_frames,
-    read_mask_file,
+    require_images,
     unlisted_texts,
 )
 from hilsplat.datasets.published import FRAMES, PROMPTS
@@ -45,7 +44,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     The regions of a view are ordered like the sorted prompts; some may have no pixels.
 
     Raises:
-        SceneError: a part of the scene or a mask is missing, or a view has no image.
+        SceneError: part of the scene or a mask is missing, or a view has no image.
     """
     DATASET.require(root, scene)
     folder = root / scene
@@ -64,15 +63,9 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             expected="00/, 04/, ...",
             fix="unpack segmentations again",
         )
+    require_images([view_name(place.name) for place in places], images)
     for place in places:
         view = view_name(place.name)
-        if view not in images:
-            raise SceneError(
-                f"view {place.name} of {scene} is segmented but has no image",
-                expected=f"{place.name}.jpg or {place.name}.png in {folder / 'images'}",
-                found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
-                fix="unpack the images again",
-            )
         views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
     posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
     warnings += missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views)
@@ -117,15 +110,10 @@ def _regions(
         )
     if extra:
         warnings.append(f"{place.name}: masks of unknown classes are not read: {', '.join(extra)}")
-    regions = []
-    for prompt in prompts:
-        path = files[prompt]
-        size_hw = image_size_hw(path)
-        warnings += check_label_size(f"mask {path}", size_hw, image_hw, SHAPE_TOLERANCE)
-        read = partial(read_mask_file, path, FOREGROUND)
-        any_grey = partial(read_mask_file, path, 1)
-        regions.append(LabelledRegion(prompt, size_hw, read, path=(prompt,), any_grey=any_grey))
-    return tuple(regions)
+    return tuple(
+        mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, least_grey=1)
+        for prompt in prompts
+    )
 
 
 DATASET = Dataset(

@@ -1,4 +1,4 @@
-"""Readers for file formats of labelled points."""
+"""Readers for file formats of labelled points; each raises SceneError if a file is missing or damaged."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,53 +6,35 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
-from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import listing
+from hilsplat.scene import layouts
 
 UNPACK_AGAIN = "unpack or download it again; the copy is incomplete"
 
 
 def require_file(path: Path, fix: str = UNPACK_AGAIN) -> Path:
-    """Return the path of a file that must exist.
-
-    Raises:
-        SceneError: it is missing; the message lists what the folder contains.
-    """
+    """Return the path of a file that must exist; the error lists what its folder contains."""
     if not path.is_file():
         raise SceneError(f"{path} is missing", found=listing(path.parent), fix=fix)
     return path
 
 
 def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
-    """Read a JSON object that must have the given keys.
-
-    Raises:
-        SceneError: it is missing, not JSON, not an object, or lacks a key.
-    """
-    require_file(path)
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # UnicodeDecodeError is one
-        raise SceneError(f"{path} is not valid JSON: {error}", fix=UNPACK_AGAIN) from error
-    lacking = [key for key in keys if key not in content] if isinstance(content, dict) else list(keys)
-    if lacking:
-        found = sorted(content) if isinstance(content, dict) else [type(content).__name__]
+    """Read a JSON object that must have the given keys."""
+    content = layouts.read_json_object(require_file(path), UNPACK_AGAIN)
+    if not content.keys() >= set(keys):
         raise SceneError(
             f"{path} does not have the expected content",
             expected=f"an object with {', '.join(keys)}",
-            found=", ".join(found[:12]) or "an empty object",
+            found=", ".join(sorted(content)[:12]) or "an empty object",
             fix=UNPACK_AGAIN,
         )
     return content
 
 
 def read_numbers(path: Path, columns: int) -> np.ndarray:
-    """Read a text file of numbers, `columns` per line (inf and nan are allowed).
-
-    Raises:
-        SceneError: it is missing, or a line has a different number of values.
-    """
+    """Read a text file of numbers, `columns` per line (inf and nan are allowed)."""
     require_file(path)
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
@@ -74,25 +56,15 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
 
 
 def read_matrix(path: Path) -> np.ndarray:
-    """Read a 4 x 4 matrix from text.
-
-    Raises:
-        SceneError: it has a different shape.
-    """
+    """Read a 4 x 4 matrix from text."""
     matrix = read_numbers(path, 4)
-    if matrix.shape != (4, 4):
-        raise SceneError(
-            f"{path} is not a matrix", expected="4 lines", found=f"{len(matrix)}", fix=UNPACK_AGAIN
-        )
+    if len(matrix) != 4:
+        raise SceneError(f"{path} is not a matrix", expected="4 lines", found=len(matrix), fix=UNPACK_AGAIN)
     return matrix
 
 
 def read_ply(path: Path, corners: int) -> PlyData:
-    """Read a mesh whose faces have `corners` corners each.
-
-    Raises:
-        SceneError: it is missing, truncated, not a PLY file, or has different faces.
-    """
+    """Read a mesh whose faces have `corners` corners each."""
     require_file(path)
     lists = {"face": {"vertex_indices": corners}}
     try:
@@ -110,11 +82,7 @@ def read_ply(path: Path, corners: int) -> PlyData:
 
 
 def ply_column(path: Path, content: PlyData, element: str, name: str) -> np.ndarray:
-    """Return a property of all vertices or faces, by name.
-
-    Raises:
-        SceneError: the file has no such property.
-    """
+    """Return a property of all vertices or faces, by name."""
     data = content[element].data
     if name not in data.dtype.names:
         raise SceneError(
@@ -133,11 +101,7 @@ def ply_places(path: Path, content: PlyData) -> np.ndarray:
 
 
 def ply_faces(path: Path, content: PlyData) -> np.ndarray:
-    """Return the corners of all faces, int32 (F, corners).
-
-    Raises:
-        SceneError: a corner is not a vertex.
-    """
+    """Return the corners of all faces, int32 (F, corners); each must be a vertex."""
     faces = ply_column(path, content, "face", "vertex_indices").astype(np.int32)
     count = len(content["vertex"].data)
     if faces.size and (faces.min() < 0 or faces.max() >= count):
@@ -151,11 +115,7 @@ def ply_faces(path: Path, content: PlyData) -> np.ndarray:
 
 
 def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:
-    """Sort files by the number in their stem, after a prefix: 2 comes before 10.
-
-    Raises:
-        SceneError: a stem is not a number.
-    """
+    """Sort files by the number in their stem, after a prefix: 2 comes before 10."""
     numbered = []
     for path in paths:
         stem = path.stem.removeprefix(prefix)

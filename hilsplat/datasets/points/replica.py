@@ -1,5 +1,7 @@
 """Replica: rendered sequences in three layouts, the labelled quad mesh, and labels per vertex as text.
 
+All readers raise SceneError if a file is missing, damaged, or doesn't match the others.
+
 | | NICE-SLAM | Semantic-NeRF, vMAP |
 |---|---|---|
 | images | `results/frame000000.jpg` | `rgb/rgb_0.png` |
@@ -11,54 +13,44 @@ Poses are camera-to-world in OpenCV axes, 16 numbers per line.
 """
 
 import logging
-from dataclasses import dataclass
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, Int32
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
-from hilsplat.datasets.classes.replica import SCENES
+from hilsplat.datasets.classes.replica import NAMES, SCENES
 from hilsplat.datasets.dataset import Dataset, listing
 from hilsplat.datasets.labelled import image_size_hw
-from hilsplat.datasets.points.labelled_points import PointScene
-from hilsplat.datasets.points.point_files import UNPACK_AGAIN, by_number, read_json_object, read_numbers
-from hilsplat.datasets.points.replica_mesh import read_labelled_mesh, read_semantic_mesh
-from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
+from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
+from hilsplat.datasets.points.point_files import (
+    UNPACK_AGAIN,
+    by_number,
+    ply_column,
+    ply_faces,
+    ply_places,
+    read_json_object,
+    read_numbers,
+    read_ply,
+    require_file,
+)
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Storage layout of a sequence's frames.
-
-    Attributes:
-        folder: image folder.
-        prefix: what precedes the number in names of images.
-        poses: name of the pose file.
-    """
-
-    folder: str
-    prefix: str
-    poses: str
+LAYOUTS = (("traj.txt", "results", "frame"), ("traj_w_c.txt", "rgb", "rgb_"))
+"""Pose file, image folder and prefix of image names: of NICE-SLAM, and of Semantic-NeRF and vMAP."""
 
 
-NICE_SLAM = Layout("results", "frame", "traj.txt")
-SEMANTIC_NERF = Layout("rgb", "rgb_", "traj_w_c.txt")
-
-
-def layout_of(folder: Path) -> Layout:
-    """Return the layout of a sequence, recognised by its pose file.
-
-    Raises:
-        SceneError: it has neither layout.
-    """
-    for layout in (NICE_SLAM, SEMANTIC_NERF):
-        if (folder / layout.poses).is_file() and (folder / layout.folder).is_dir():
-            return layout
-    inner = sorted(path.parent for name in ("traj.txt", "traj_w_c.txt") for path in folder.glob(f"*/{name}"))
+def layout_of(folder: Path) -> tuple[str, str, str]:
+    """Return the row of `LAYOUTS` whose pose file and image folder are in a sequence's folder."""
+    for poses, images, prefix in LAYOUTS:
+        if (folder / poses).is_file() and (folder / images).is_dir():
+            return poses, images, prefix
+    inner = sorted(path.parent for poses, _, _ in LAYOUTS for path in folder.glob(f"*/{poses}"))
     raise SceneError(
         f"{folder} does not hold a rendered sequence",
         expected="traj.txt with results/, or traj_w_c.txt with rgb/",
@@ -68,11 +60,7 @@ def layout_of(folder: Path) -> Layout:
 
 
 def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """Return K and its image size from `cam_params.json`, which is beside a NICE-SLAM sequence.
-
-    Raises:
-        SceneError: the file is damaged.
-    """
+    """Return K and its image size from `cam_params.json`, which is beside a NICE-SLAM sequence."""
     camera = read_json_object(path, ("camera",))["camera"]
     try:
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
@@ -103,47 +91,38 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
 
     Returns:
         The images and a sentence for each item that was skipped.
-
-    Raises:
-        SceneError: no layout fits, frames exceed the poses, or there are no frames.
     """
-    layout = layout_of(folder)
-    path = folder / layout.poses
+    pose_file, image_folder, prefix = layout_of(folder)
+    path = folder / pose_file
     poses = read_numbers(path, 16).reshape(-1, 4, 4)
     named = [
         image
-        for image in list_images(folder / layout.folder)
-        if image.stem.startswith(layout.prefix) and image.stem.removeprefix(layout.prefix).isdecimal()
+        for image in list_images(folder / image_folder)
+        if image.stem.startswith(prefix) and image.stem.removeprefix(prefix).isdecimal()
     ]  # the others are depth or colour visualisations
-    frames = by_number(named, layout.prefix)
+    frames = by_number(named, prefix)
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:
+        missing = f", the first without a line is frame {beyond[0]}" if beyond else ""
         raise SceneError(
-            f"{path} does not match the images in {folder / layout.folder}",
+            f"{path} does not match the images in {folder / image_folder}",
             expected="one line per frame, or more",
-            found=f"{len(poses)} lines, {len(frames)} images"
-            + (f", the first without a line is frame {beyond[0]}" if beyond else ""),
+            found=f"{len(poses)} lines, {len(frames)} images{missing}",
             fix=UNPACK_AGAIN,
         )
     lens = folder.parent / "cam_params.json"
-    own = layout is NICE_SLAM and lens.is_file()
+    own = pose_file == LAYOUTS[0][0] and lens.is_file()
     K, size_hw = read_lens(lens) if own else default_lens(frames[0][1])
-    images = tuple(
-        PosedImage(
-            image.name, image, cam_from_world_of(poses[number], f"{path}, line {number + 1}"), K, size_hw
-        )
-        for number, image in frames[::every]
-    )
+    images = []
+    for number, image in frames[::every]:
+        pose = np.linalg.inv(rigid_pose(poses[number], f"{path}, line {number + 1}"))
+        images.append(PosedImage(image.name, image, pose, K, size_hw))
     more = len(poses) - len(frames)
-    return images, (f"{more} poses have no image and are skipped",) if more else ()
+    return tuple(images), (f"{more} poses have no image and are skipped",) if more else ()
 
 
 def sequence_folder(root: Path, scene: str) -> Path:
-    """Return a scene's rendered sequence: `room0/` (NICE-SLAM), `room_0/imap/00` (vMAP), `room_0/Sequence_1`.
-
-    Raises:
-        SceneError: none of them exists.
-    """
+    """Return a rendered sequence: `room0` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`."""
     places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
     for place in places:
         if (root / place).is_dir():
@@ -156,16 +135,138 @@ def sequence_folder(root: Path, scene: str) -> Path:
     )
 
 
-def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
-    """Read a scene: the sequence, and the labels of the original release or else of OpenNeRF.
+INSTANCES_PER_CLASS = 1000
+"""Values in instance files are class * 1000 + instance; values below 1000 are not objects."""
+
+
+def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
+    """Return the class of each object id, from `info_semantic.json`; negative ids (undefined, none) become 0.
+
+    Names and ids must be those of the release.
+    """
+    content = read_json_object(path, ("classes", "id_to_label"))
+    try:
+        classes = np.asarray(content["id_to_label"], dtype=np.int32).reshape(-1)
+        names = {int(entry["id"]): str(entry["name"]) for entry in content["classes"]}
+    except (TypeError, ValueError, KeyError) as error:
+        raise SceneError(
+            f"{path} cannot be read: {error!r}",
+            expected="id_to_label: a list of class ids; classes: objects with id and name",
+            fix=UNPACK_AGAIN,
+        ) from error
+    other = [f"{number} {name}" for number, name in names.items() if NAMES.get(number) != name]
+    strange = sorted(set(classes[classes > 0].tolist()) - set(NAMES))
+    if other or strange:
+        raise SceneError(
+            f"{path} has classes that Replica does not",
+            expected=f"the {len(NAMES)} of the release, such as {NAMES[1]} (1)",
+            found=", ".join([*other[:5], *(f"class id {number}" for number in strange[:5])]),
+            fix="take the file of the original release",
+        )
+    return np.maximum(classes, 0)
+
+
+def object_of_vertices(
+    faces: Int[np.ndarray, "F c"], object_of_face: Int[np.ndarray, " F"], num_vertices: int
+) -> Int32[np.ndarray, " P"]:
+    """Return the most frequent object of each vertex's faces, -1 without faces; the lowest id wins ties."""
+    corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
+    pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
+    # The last entry of each vertex has the most votes and, among ties, the smallest id.
+    order = np.lexsort((-pairs[1], votes, pairs[0]))
+    vertex, owner = pairs[0][order], pairs[1][order]
+    last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True)) if len(vertex) else order
+    result = np.full(num_vertices, -1, dtype=np.int32)
+    result[vertex[last]] = owner[last]
+    return result
+
+
+def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
+    """Split each quad into triangles, corners 0 1 2 and 0 2 3; degenerate ones are dropped."""
+    triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    return triangles[(triangles != triangles[:, [1, 2, 0]]).all(axis=1)]
+
+
+def read_semantic_mesh(habitat: Path) -> LabelledPoints:
+    """Return the vertices of `mesh_semantic.ply` with the class and instance of most of their faces.
+
+    The file numbers objects from 0; `instance_id` is that number + 1, and 0 if the class is undefined.
+    """
+    path = habitat / "mesh_semantic.ply"
+    mesh = read_ply(path, 4)
+    classes = class_of_objects(habitat / "info_semantic.json")
+    quads = ply_faces(path, mesh)
+    of_face = ply_column(path, mesh, "face", "object_id").astype(np.int64)
+    if of_face.size and (of_face.min() < 0 or of_face.max() >= len(classes)):
+        raise SceneError(
+            f"{path} and info_semantic.json do not belong together",
+            expected=f"object ids 0 to {len(classes) - 1}",
+            found=f"{of_face.min()} to {of_face.max()}",
+            fix="take both files from the same scene",
+        )
+    xyz = ply_places(path, mesh)
+    owner = object_of_vertices(quads, of_face, len(xyz))
+    class_id = np.where(owner >= 0, classes[owner], 0).astype(np.int32)
+    instance = np.where(class_id > 0, owner + 1, 0).astype(np.int32)
+    return LabelledPoints(xyz, class_id, instance, "replica", triangles_of(quads))
+
+
+def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]:
+    """Read `semantic_labels_<scene>.txt`: a known class id for each vertex; negative ones become 0."""
+    require_file(path)
+    try:
+        labels = np.array(path.read_text(encoding="utf-8").split(), dtype=np.int32)
+    except ValueError as error:
+        raise SceneError(f"{path} does not hold whole numbers: {error}", fix=UNPACK_AGAIN) from error
+    if len(labels) != num_vertices:
+        raise SceneError(
+            f"{path} does not label the vertices of its mesh",
+            expected=f"{num_vertices} lines",
+            found=f"{len(labels)}",
+            fix="take the mesh and the labels of the same scene and release",
+        )
+    unknown = Counter(labels[~np.isin(labels, [*NAMES, 0, -1, -2])].tolist())
+    if unknown:
+        raise SceneError(
+            f"{path} has classes that Replica does not",
+            expected=f"1 to {max(NAMES)}, 0, -1 or -2",
+            found=", ".join(f"{number} ({count} lines)" for number, count in sorted(unknown.items())[:5]),
+            fix="use semantic_labels_<scene>.txt, not instance_labels_<scene>.txt",
+        )
+    return np.maximum(labels, 0)
+
+
+def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = None) -> LabelledPoints:
+    """Read a mesh of the NICE-SLAM package (quads or triangles) with OpenNeRF's text files of vertex labels.
 
     Args:
-        scene: name as spelt in the release, such as room_0.
-        every: use every n-th frame.
-
-    Raises:
-        SceneError: a file is missing, damaged or does not match the others.
+        labels: `semantic_labels_<scene>.txt`.
+        instances: `instance_labels_<scene>.txt` (class * 1000 + instance), if available.
     """
+    try:
+        mesh = read_ply(mesh_path, 3)
+        faces = ply_faces(mesh_path, mesh)
+    except SceneError:
+        mesh = read_ply(mesh_path, 4)
+        faces = triangles_of(ply_faces(mesh_path, mesh))
+    xyz = ply_places(mesh_path, mesh)
+    class_id = read_vertex_labels(labels, len(xyz))
+    instance = np.zeros(len(xyz), dtype=np.int32)
+    if instances is not None:
+        values = read_numbers(instances, 1)[:, 0].astype(np.int32)
+        if len(values) != len(xyz):
+            raise SceneError(
+                f"{instances} does not label the vertices of {mesh_path}",
+                expected=f"{len(xyz)} lines",
+                found=len(values),
+                fix="take the files of the same scene",
+            )
+        instance = np.where(values >= INSTANCES_PER_CLASS, values, 0).astype(np.int32)
+    return LabelledPoints(xyz, class_id, instance, "replica", faces)
+
+
+def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
+    """Read a scene, such as "room_0": every n-th frame, and the labels of the release or else of OpenNeRF."""
     habitat, short = root / scene / "habitat", scene.replace("_", "")
     text = root / f"semantic_labels_{short}.txt"
     if habitat.is_dir():

@@ -1,7 +1,8 @@
 """ScanNet v2 and ScanNet200: exported frames, the evaluated mesh, NYU40 and ScanNet200 labels, instances.
 
 The layout is that of the ScanNet release, with the frames exported from `.sens` by its own reader:
-`color/<n>.jpg`, `pose/<n>.txt` (camera-to-world, OpenCV axes), `intrinsic/intrinsic_color.txt`.
+`color/<n>.jpg`, `pose/<n>.txt` (camera-to-world, OpenCV axes), `intrinsic/intrinsic_color.txt`. All readers
+raise SceneError if a file is missing, damaged, or doesn't match the others.
 """
 
 import csv
@@ -31,7 +32,7 @@ from hilsplat.datasets.points.point_files import (
     read_ply,
     require_file,
 )
-from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, cam_from_world_of
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
 
 logger = logging.getLogger(__name__)
 
@@ -41,20 +42,12 @@ SAME_PLACE_M = 1e-4
 
 
 def scan_folder(root: Path, scan: str) -> Path:
-    """Return the folder of a scan, `scans/<scan>` below the data set's folder.
-
-    Raises:
-        SceneError: it is in the wrong place, or contains a `.sens` archive whose frames are not exported.
-    """
+    """Return a scan's folder; refuse one in the wrong place, or with frames still in a `.sens` archive."""
     folder = root / "scans" / scan
     for wrong in (folder / scan, root / scan, root / "scans" / "scans" / scan):
         if not (folder / f"{scan}_vh_clean_2.ply").is_file() and wrong.is_dir():
-            raise SceneError(
-                f"scan {scan} is in the wrong place",
-                expected=folder,
-                found=wrong,
-                fix=f"move {wrong} to {folder}",
-            )
+            fix = f"move {wrong} to {folder}"
+            raise SceneError(f"scan {scan} is in the wrong place", expected=folder, found=wrong, fix=fix)
     if (folder / f"{scan}.sens").is_file() and not (folder / "color").is_dir():
         raise SceneError(
             f"the frames of {scan} are still inside {scan}.sens",
@@ -66,11 +59,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 
 
 def read_label_table(path: Path) -> dict[str, int]:
-    """Return the id of each raw category in `scannetv2-labels.combined.tsv`, 0 if it is not one of the 200.
-
-    Raises:
-        SceneError: it is missing, lacks a column, or has an id that is not a number.
-    """
+    """Return the id of each raw category in `scannetv2-labels.combined.tsv`, 0 if not one of the 200."""
     require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
     found = {}
     with path.open(encoding="utf-8", newline="") as stream:
@@ -100,11 +89,7 @@ def read_scan_info(path: Path) -> dict[str, str]:
 
 
 def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix that aligns a scan's walls with the axes.
-
-    Raises:
-        SceneError: the scan has none (test scans) or a damaged one.
-    """
+    """Return the matrix that aligns a scan's walls with the axes; test scans have none."""
     words = read_scan_info(folder / f"{scan}.txt").get("axisAlignment", "").split()
     try:
         return np.array([float(word) for word in words]).reshape(4, 4)
@@ -128,9 +113,6 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
 
     Returns:
         The images and a sentence for each item that was skipped.
-
-    Raises:
-        SceneError: a folder is missing, a name is not a number, or no frame has a pose.
     """
     if not (folder / "color").is_dir():
         raise SceneError(
@@ -152,7 +134,8 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
         if not np.isfinite(world_from_cam).all():
             lost.append(number)
             continue
-        images.append(PosedImage(path.name, path, cam_from_world_of(world_from_cam, str(pose)), K, size_hw))
+        cam_from_world = np.linalg.inv(rigid_pose(world_from_cam, str(pose)))
+        images.append(PosedImage(path.name, path, cam_from_world, K, size_hw))
     if not images:
         raise SceneError(
             f"no frame of {scan} can be used",
@@ -184,9 +167,6 @@ def read_truth(
 
     NYU40 ids are those of `.labels.ply`; ScanNet200 ids and instances (objectId + 1) come from the
     aggregation. A vertex in two groups belongs to the later one, as in the official exporter.
-
-    Raises:
-        SceneError: files are missing, damaged or do not belong together.
     """
     mesh_path = folder / f"{scan}_vh_clean_2.ply"
     label_path = folder / f"{scan}_vh_clean_2.labels.ply"
@@ -254,30 +234,25 @@ def _from_aggregation(
 
 
 def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> PointScene:
-    """Read a scan.
-
-    Args:
-        root: folder with `scans/` and the label table.
-        every: use every n-th frame.
-        aligned: rotate mesh and poses by the scan's axisAlignment; by default neither is rotated.
-
-    Raises:
-        SceneError: a file is missing, damaged or does not match the others.
-    """
+    """Read every n-th frame and the labels of a scan; `aligned` applies axisAlignment to mesh and poses."""
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
     truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))
     images, of_images = read_images(folder, scan, every)
     if aligned:
         turn = axis_alignment(folder, scan)
-        images = tuple(
-            replace(image, cam_from_world=image.cam_from_world @ np.linalg.inv(turn)) for image in images
-        )
+        back = np.linalg.inv(turn)
+        images = tuple(replace(image, cam_from_world=image.cam_from_world @ back) for image in images)
         xyz = (truth["nyu40"].xyz @ turn[:3, :3].T + turn[:3, 3]).astype(np.float32)
         truth = {labelling: replace(points, xyz=xyz) for labelling, points in truth.items()}
     for warning in (*of_images, *of_labels):
         logger.warning("%s: %s", scan, warning)
     return PointScene(scan, images, truth, (*of_images, *of_labels))
+
+
+def _label_files(scan: str) -> tuple[str, ...]:
+    suffixes = ("_vh_clean_2.labels.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")
+    return tuple(f"scans/{scan}/{scan}{suffix}" for suffix in suffixes)
 
 
 DATASET = Dataset(
@@ -302,17 +277,10 @@ DATASET = Dataset(
       scene0000_00_vh_clean_2.0.010000.segs.json
       scene0000_00.aggregation.json
       scene0000_00.txt                 optional: size of the images, axisAlignment""",
-    required=lambda scan: tuple(
-        f"scans/{scan}/{name}"
-        for name in (
-            "color",
-            "pose",
-            "intrinsic/intrinsic_color.txt",
-            f"{scan}_vh_clean_2.ply",
-            f"{scan}_vh_clean_2.labels.ply",
-            f"{scan}_vh_clean_2.0.010000.segs.json",
-            f"{scan}.aggregation.json",
-        )
+    required=lambda scan: (
+        *(f"scans/{scan}/{name}" for name in ("color", "pose", "intrinsic/intrinsic_color.txt")),
+        f"scans/{scan}/{scan}_vh_clean_2.ply",
+        *_label_files(scan),
     ),
     open=open_scan,
     protocols=(
@@ -323,12 +291,7 @@ DATASET = Dataset(
         "scannet200/benchmark",
         "scannet200/instances",
     ),
-    label_places=lambda scan: (
-        LABEL_TABLE,
-        f"scans/{scan}/{scan}_vh_clean_2.labels.ply",
-        f"scans/{scan}/{scan}_vh_clean_2.0.010000.segs.json",
-        f"scans/{scan}/{scan}.aggregation.json",
-    ),
+    label_places=lambda scan: (LABEL_TABLE, *_label_files(scan)),
 )
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")

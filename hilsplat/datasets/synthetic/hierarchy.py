@@ -58,11 +58,7 @@ class HierarchyAnnotations:
     views: Mapping[str, tuple[int, ...]]
 
     def label_image(self, view: str, level: Level) -> Int32[np.ndarray, "H W"]:
-        """Return the node id per pixel, -1 where the level has none.
-
-        Raises:
-            ArtifactError: the label image is missing.
-        """
+        """Return the node id per pixel, -1 for none; raise ArtifactError if the label image is missing."""
         path = label_path(self.folder, view, level)
         if not path.is_file():
             raise ArtifactError(f"label image {path} is missing", fix="write the annotations again")
@@ -87,18 +83,13 @@ class HierarchyAnnotations:
         """Return the texts from the whole down to the node: ("bear", "head", "nose")."""
         texts: list[str] = []
         while node_id != NONE:
-            node = self.nodes[node_id]
-            texts.append(node.text)
-            node_id = node.parent
-        return tuple(reversed(texts))
+            texts.insert(0, self.nodes[node_id].text)
+            node_id = self.nodes[node_id].parent
+        return tuple(texts)
 
     @staticmethod
     def load(folder: Path) -> "HierarchyAnnotations":
-        """Read the folder.
-
-        Raises:
-            ArtifactError: annotations.json is missing or in a different format.
-        """
+        """Read the folder; raise ArtifactError if annotations.json is missing or in a different format."""
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(
@@ -107,10 +98,7 @@ class HierarchyAnnotations:
                 found=record.get("format"),
             )
         nodes = tuple(
-            AnnotatedNode(
-                node["id"], node["level"], node["parent"], node["text"], tuple(node.get("synonyms", ()))
-            )
-            for node in record["nodes"]
+            AnnotatedNode(**{**node, "synonyms": tuple(node.get("synonyms", ()))}) for node in record["nodes"]
         )
         views = {view: tuple(ids) for view, ids in record["views"].items()}
         return HierarchyAnnotations(folder, nodes, views)

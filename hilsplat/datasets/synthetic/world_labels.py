@@ -83,24 +83,24 @@ def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> In
 def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
     """Return points with classes by labelling, in the frame of the world's true cameras, metres.
 
-    Args:
-        world: output folder of the world stage.
-        kind: "room": mesh vertices visible to a camera, because a scanner wouldn't capture the others;
-            labellings nyu40, scannet200 and replica. "street": returns of the lidar; labelling waymo.
+    A room has mesh vertices visible to a camera, because a scanner wouldn't capture the others, labelled as
+    nyu40, scannet200 and replica. A street has the returns of its lidar, labelled as waymo.
 
     Raises:
         SceneError: the world is of a different kind.
         ArtifactError: a file is missing or damaged.
     """
+    texts = [node.text for node in HierarchyAnnotations.load(world / "truth").nodes]
     if kind == "street":
-        return {"waymo": _lidar(world)}
+        scan = read_npz(world / "truth" / "lidar.npz")
+        instance, classes = waymo_labels(scan["node_ids"], texts).T
+        return {"waymo": LabelledPoints(scan["points"].astype(np.float64), classes, instance, "waymo")}
     if kind != "room":
         raise SceneError(
             f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="leave it out"
         )
     path = world / "truth" / "mesh.ply"
     mesh = read_ply(path, 3)
-    texts = [node.text for node in HierarchyAnnotations.load(world / "truth").nodes]
     seen = ply_column(path, mesh, "vertex", "views") > 0
     whole = ply_column(path, mesh, "vertex", "whole").astype(np.int32)[seen]
     xyz = ply_places(path, mesh)[seen].astype(np.float64)
@@ -118,10 +118,3 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
 def _of_nodes(class_of_node: list[int], node: Int32[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
     """Return the class of each point's node; 0 for points without a node."""
     return np.array([*class_of_node, 0], dtype=np.int32)[node]
-
-
-def _lidar(world: Path) -> LabelledPoints:
-    scan = read_npz(world / "truth" / "lidar.npz")
-    nodes = HierarchyAnnotations.load(world / "truth").nodes
-    labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
-    return LabelledPoints(scan["points"].astype(np.float64), labels[:, 1], labels[:, 0], "waymo")

@@ -1,4 +1,7 @@
-"""Waymo v2 (2.0.1): one parquet file per component and segment, read by pyarrow."""
+"""Waymo v2 (2.0.1): one parquet file per component and segment, read by pyarrow.
+
+All readers raise SceneError if a component is missing, damaged, or doesn't match the others.
+"""
 
 from collections.abc import Iterator
 from functools import partial
@@ -11,8 +14,15 @@ from jaxtyping import Float
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import listing
 from hilsplat.datasets.points.point_files import UNPACK_AGAIN
-from hilsplat.datasets.waymo.frames import CAMERAS, TOP, CameraShot, LidarFrame, LidarReturn
-from hilsplat.datasets.waymo.geometry import WaymoCamera, beam_inclinations
+from hilsplat.datasets.waymo.frames import (
+    CAMERAS,
+    TOP,
+    CameraShot,
+    LidarFrame,
+    LidarReturn,
+    WaymoCamera,
+    beam_inclinations,
+)
 
 COMPONENTS = (
     "camera_image",
@@ -38,12 +48,7 @@ def read_component(
 ) -> list[dict[str, Any]]:
     """Return the rows of a component in file order: lists as arrays, other values unchanged.
 
-    Args:
-        columns: column names, including keys.
-        only: required value by column; other rows are not decoded.
-
-    Raises:
-        SceneError: the file is missing, damaged, or lacks a column.
+    If `only` gives a required value by column, other rows are not decoded.
     """
     import pyarrow as pa
     import pyarrow.parquet as parquet
@@ -74,22 +79,7 @@ def read_component(
             found=f"a file of {path.stat().st_size} bytes",
             fix=UNPACK_AGAIN,
         ) from error
-    values = [[_plain(value) for value in table.column(name)] for name in columns]
-    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
-
-
-def _plain(value: Any) -> Any:
-    """Return the value of a cell: an array for a list, None for a null."""
-    if not value.is_valid:
-        return None
-    listed = getattr(value, "values", None)
-    return value.as_py() if listed is None else listed.to_numpy(zero_copy_only=False)
-
-
-def labelled_frames(split: Path, segment: str) -> tuple[int, ...]:
-    """Return the time stamps of the labelled frames, in order."""
-    rows = read_component(split, "lidar_segmentation", segment, [FRAME], {LASER: TOP})
-    return tuple(sorted(row[FRAME] for row in rows))
+    return table.to_pandas().to_dict("records")
 
 
 def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4"]]:
@@ -100,11 +90,7 @@ def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4
 
 
 def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
-    """Yield the labelled frames of a segment, in order.
-
-    Raises:
-        SceneError: a component is missing or damaged, or components do not belong together.
-    """
+    """Yield the labelled frames of a segment, in order."""
     poses = vehicle_poses(split, segment)
     calibration = "[LiDARCalibrationComponent]"
     place, beams = f"{calibration}.extrinsic.transform", f"{calibration}.beam_inclination"
@@ -115,7 +101,8 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
             f"lidar_calibration of {segment} has {len(lidar)} rows for the top lidar", fix=UNPACK_AGAIN
         )
     projected = component_path(split, "lidar_camera_projection", segment).is_file()
-    for time in labelled_frames(split, segment):
+    labelled = read_component(split, "lidar_segmentation", segment, [FRAME], {LASER: TOP})
+    for time in sorted(row[FRAME] for row in labelled):
         read = partial(_range_images, split, segment, time)
         images = read("lidar", "LiDARComponent", depth=4)
         labels = read("lidar_segmentation", "LiDARSegmentationLabelComponent", depth=2)
@@ -134,20 +121,11 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
             for image, label, cell in zip(images, labels, cells, strict=True)
             if image is not None
         ]
-        inclinations = beam_inclinations(
-            lidar[0][f"{beams}.values"],
-            lidar[0][f"{beams}.min"],
-            lidar[0][f"{beams}.max"],
-            pixel_pose.shape[0],
-        )
-        yield LidarFrame(
-            time,
-            poses[time],
-            lidar[0][place].reshape(4, 4),
-            inclinations,
-            pixel_pose.astype(np.float32),
-            tuple(returns),
-        )
+        values, lowest, highest = (lidar[0][f"{beams}.{name}"] for name in ("values", "min", "max"))
+        inclinations = beam_inclinations(values, lowest, highest, pixel_pose.shape[0])
+        in_vehicle = lidar[0][place].reshape(4, 4)
+        pixel_pose = pixel_pose.astype(np.float32)
+        yield LidarFrame(time, poses[time], in_vehicle, inclinations, pixel_pose, tuple(returns))
 
 
 def _range_images(
@@ -182,7 +160,7 @@ def _range_images(
     return images
 
 
-def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
+def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
     """Return the cameras of the car, by number from 1."""
     base = "[CameraCalibrationComponent]"
     inner = [f"{base}.intrinsic.{name}" for name in INTRINSIC]
@@ -200,12 +178,8 @@ def cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
 
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
-    """Yield the images of every n-th frame, by time, then camera.
-
-    Raises:
-        SceneError: a component is missing or damaged, or a camera has no calibration.
-    """
-    known = cameras(split, segment)
+    """Yield the images of every n-th frame, by time, then camera."""
+    known = _cameras(split, segment)
     pose = "[CameraImageComponent].pose.transform"
     rows = read_component(split, "camera_image", segment, [FRAME, CAMERA])
     strange = sorted({row[CAMERA] for row in rows} - set(known))

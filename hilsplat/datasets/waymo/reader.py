@@ -21,16 +21,16 @@ logger = logging.getLogger(__name__)
 
 SPLITS = ("validation", "training")
 """Splits searched for a segment. Labels of the testing split are not public."""
+LABELS = "lidar_segmentation"
 RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord"
 """Name of a segment's file in release 1; the prefix up to `segment-` may be missing."""
 
 
 def find_parquet(root: Path, segment: str) -> Path | None:
     """Return the split folder that contains a segment in release 2, or None."""
-    for split in SPLITS:
-        if parquet.component_path(root / split, "lidar_segmentation", segment).is_file():
-            return root / split
-    return None
+    places = (root / split for split in SPLITS)
+    has_labels = (path for path in places if parquet.component_path(path, LABELS, segment).is_file())
+    return next(has_labels, None)
 
 
 def find_record(root: Path, segment: str) -> Path | None:
@@ -45,11 +45,9 @@ def find_record(root: Path, segment: str) -> Path | None:
 
 
 def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
-    """Read a segment: all labelled frames of the top lidar with both returns, and the images.
+    """Read a segment: all labelled frames of the top lidar with both returns, images of every n-th frame.
 
-    Args:
-        segment: context name, such as 10023947602400723454_1120_000_1140_000.
-        every: use images of every n-th frame only; all labelled frames are read.
+    A segment is named by its context, such as 10023947602400723454_1120_000_1140_000.
 
     Raises:
         SceneError: the segment is missing or damaged, or has no labelled frame.
@@ -68,14 +66,15 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
         frames, shots = records.lidar_frames(record), records.camera_shots(record, every)
         release = "1"
     else:
-        wrong = sorted(root.glob(f"*/*/*/{segment}.parquet"))
+        found = listing(root)
+        fix = "download all components of the segment, or its .tfrecord; testing has no labels"
+        if wrong := sorted(root.glob(f"*/*/*/{segment}.parquet")):
+            found, fix = f"{wrong[0]}, one level too deep", f"move {wrong[0].parents[1]} to {root}"
         raise SceneError(
             f"segment {segment} is not in {root}",
-            expected=f"<split>/lidar_segmentation/{segment}.parquet, split one of {', '.join(SPLITS)}",
-            found=f"{wrong[0]}, one level too deep" if wrong else listing(root),
-            fix=f"move {wrong[0].parents[1]} to {root}"
-            if wrong
-            else "download all components of the segment, or its .tfrecord; testing has no labels",
+            expected=f"<split>/{LABELS}/{segment}.parquet, split one of {', '.join(SPLITS)}",
+            found=found,
+            fix=fix,
         )
     segment_from_world = np.linalg.inv(first)
     points = [frame_points(frame, segment_from_world) for frame in frames]

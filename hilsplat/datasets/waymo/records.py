@@ -1,7 +1,8 @@
 """Waymo v1 (1.4.3): TFRecord files of Frame messages, read without TensorFlow.
 
 protobuf decodes the messages; this module reads the records around them, because the package `tfrecord` would
-add two dependencies and allocate as much memory as a damaged length states.
+add two dependencies and allocate as much memory as a damaged length states. All readers raise SceneError if
+the file is missing, damaged or truncated.
 """
 
 import struct
@@ -17,8 +18,15 @@ from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points.point_files import UNPACK_AGAIN, require_file
-from hilsplat.datasets.waymo.frames import CAMERAS, TOP, CameraShot, LidarFrame, LidarReturn
-from hilsplat.datasets.waymo.geometry import WaymoCamera, beam_inclinations
+from hilsplat.datasets.waymo.frames import (
+    CAMERAS,
+    TOP,
+    CameraShot,
+    LidarFrame,
+    LidarReturn,
+    WaymoCamera,
+    beam_inclinations,
+)
 
 _FIELDS = """
 MatrixShape: repeated int32 dims 1
@@ -70,8 +78,7 @@ def matrix(compressed: bytes, dtype: type) -> np.ndarray:
     """Decode a zlib-compressed MatrixInt32 or MatrixFloat.
 
     Raises:
-        DecodeError, zlib.error: the data is damaged.
-        ValueError: the shape does not fit the values.
+        DecodeError, zlib.error, ValueError: the data is damaged, or the shape does not fit the values.
     """
     kind = MESSAGES["MatrixInt32" if dtype is np.int32 else "MatrixFloat"]
     found = kind.FromString(zlib.decompress(compressed))
@@ -79,11 +86,7 @@ def matrix(compressed: bytes, dtype: type) -> np.ndarray:
 
 
 def records(path: Path) -> Iterator[bytes]:
-    """Yield the records of a TFRecord file, without their checksums.
-
-    Raises:
-        SceneError: the file is missing, is not a TFRecord, or ends inside a record.
-    """
+    """Yield the records of a TFRecord file, without their checksums."""
     require_file(path)
     left = path.stat().st_size
     with path.open("rb") as stream:
@@ -129,11 +132,7 @@ def _transform(message: Any, where: str) -> np.ndarray:
 
 
 def lidar_frames(path: Path) -> Iterator[LidarFrame]:
-    """Yield the frames of a file in which the top lidar is labelled.
-
-    Raises:
-        SceneError: the file is damaged.
-    """
+    """Yield the frames of a file in which the top lidar is labelled."""
     for where, frame in frames(path):
         try:
             laser = _named(frame.lasers, TOP)
@@ -178,23 +177,16 @@ def _named(messages: Iterable[Any], name: int) -> Any:
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
-    """Yield the images of every n-th frame, by frame, then camera.
-
-    Raises:
-        SceneError: the file is damaged.
-    """
+    """Yield the images of every n-th frame, by frame, then camera."""
     for number, (where, frame) in enumerate(frames(path)):
         if number % every:
             continue
         for image in sorted(frame.images, key=lambda image: image.name):
             try:
                 lens = _named(frame.context.camera_calibrations, image.name)
-                camera = WaymoCamera(
-                    CAMERAS[image.name - 1],
-                    np.array(lens.intrinsic),
-                    _transform(lens.extrinsic, where),
-                    (lens.height, lens.width),
-                )
+                name, size_hw = CAMERAS[image.name - 1], (lens.height, lens.width)
+                place = _transform(lens.extrinsic, where)
+                camera = WaymoCamera(name, np.array(lens.intrinsic), place, size_hw)
             except (ValueError, IndexError) as error:
                 raise SceneError(f"{where} cannot be read: {error}", fix=UNPACK_AGAIN) from error
             yield CameraShot(frame.timestamp_micros, camera, image.image, _transform(image.pose, where))

@@ -17,8 +17,8 @@ from hilsplat.base.progress import track
 from hilsplat.scene.assemble import PosedView, split_views, undistort, write_scene
 from hilsplat.scene.colmap import pycolmap, sparse_points
 from hilsplat.scene.features import EXIF_ORIENTATION, features_and_matches, import_images, incremental_options
-from hilsplat.scene.importers.known_poses import KnownPoses, KnownView
-from hilsplat.scene.importers.known_views import read_source
+from hilsplat.scene.importers.known_views import KnownView, read_source
+from hilsplat.scene.layouts import KnownPoses
 from hilsplat.scene.view_names import view_names
 from hilsplat.settings import PosesSettings
 

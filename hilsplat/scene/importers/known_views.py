@@ -1,30 +1,69 @@
-"""Readers of posed views: COLMAP, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D."""
+"""Readers of posed views: COLMAP, transforms.json (nerfstudio, Blender), LLFF, Polycam, Record3D.
+
+All readers raise SceneError if a file cannot be used. Layouts and axes of phone exports are those of
+nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py`.
+"""
 
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
-from hilsplat.base.artifacts import parse_json
-from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES
+from hilsplat.base.artifacts import read_npy
+from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.files import IMAGE_SUFFIXES, list_images
 from hilsplat.base.images import open_image
 from hilsplat.base.rotations import RIGID_TOLERANCE, are_rotations
 from hilsplat.scene.cameras import MAX_SIDE_PX
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
-from hilsplat.scene.importers.known_poses import KnownPoses, KnownView, checked
-from hilsplat.scene.importers.llff import read_llff
 from hilsplat.scene.importers.model_files import require_whole_files
-from hilsplat.scene.importers.phone_exports import OPENGL_TO_OPENCV, read_polycam, read_record3d
+from hilsplat.scene.layouts import KnownPoses, read_json_object
+from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
 Points = tuple[np.ndarray, np.ndarray]
 """Positions and colours."""
 
 Errors = dict[str, dict[str, Any]]
 """Number of observations and mean reprojection error of each view."""
+
+AGAIN = "export it again"
+
+FARTHEST = 1e9
+"""Largest coordinate, in the source's units, up to which 32-bit numbers can resolve a scene."""
+
+MAX_VIEWS = 300
+"""Maximum number of views of a phone export, sampled evenly, because a recording has many more frames than a
+scene needs (nerfstudio: 300 for Record3D, 600 for Polycam)."""
+
+POLYCAM_BORDER_PX = 15
+"""Width of the black borders of corrected images, from undistortion (nerfstudio: `crop_border_pixels`)."""
+
+Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""ARKit's world has y up; scenes here have z up. This is a cyclic permutation, so nothing is mirrored."""
+
+
+@dataclass(frozen=True)
+class KnownView:
+    """A posed view as described by its source, before its image is read.
+
+    Attributes:
+        image: its file, or None if missing.
+        camera: its lens, for the image size stated by the source.
+        cam_from_source: world-to-camera transform, OpenCV axes.
+        border_px: width of a blank border to crop, px of the camera.
+    """
+
+    name: str
+    image: Path | None
+    camera: pycolmap.Camera
+    cam_from_source: Float64[np.ndarray, "4 4"]
+    is_test: bool = False
+    border_px: int = 0
 
 
 def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Errors]:
@@ -35,6 +74,35 @@ def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Erro
         return *read_transforms(known), {}
     readers = {"polycam": read_polycam, "record3d": read_record3d, "llff": read_llff}
     return checked(readers[known.kind](known), known), None, {}
+
+
+def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
+    """Return the views; refuse an invalid lens or pose, and three or more views with the same pose."""
+    for view in views:
+        values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
+        focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
+        pose = view.cam_from_source
+        is_size = (values[-2:] > 0).all() and (values[-2:] <= MAX_SIDE_PX).all()
+        if not np.isfinite(values).all() or min(focal, default=0) <= 0 or not is_size:
+            fault, found = "lens", f"{view.camera.model_name} {values.tolist()}"
+            expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
+        elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
+            fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
+            expected = "a matrix that neither scales nor mirrors, from a quaternion that is not 0"
+        elif np.abs(pose[:3, 3]).max() > FARTHEST:
+            fault, found, expected = "position", str(pose[:3, 3].tolist()), "coordinates up to 1e9"
+        else:
+            continue
+        raise SceneError(
+            f"the {fault} of {view.name} cannot be that of a camera",
+            expected=expected,
+            found=found,
+            fix=f"export the poses again: {known.files[0]}",
+        )
+    poses = np.stack([view.cam_from_source for view in views]) if views else np.zeros((0, 4, 4))
+    if len(views) > 2 and np.allclose(poses, poses[0]):
+        raise SceneError(f"all {len(views)} views of {known.files[0]} have the same pose", fix=AGAIN)
+    return views
 
 
 def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points, Errors]:
@@ -57,9 +125,7 @@ def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points, Errors]:
         }
         points = sparse_points(model)
     except (ValueError, RuntimeError, IndexError) as error:  # also for references to missing entries
-        raise SceneError(
-            f"the COLMAP model in {folder} cannot be read: {error}", fix="export it again with COLMAP"
-        ) from error
+        raise SceneError(f"the COLMAP model in {folder} cannot be read: {error}", fix=AGAIN) from error
     return checked(views, known), points, errors
 
 
@@ -94,15 +160,11 @@ def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
     views: list[KnownView] = []
     points = None
     for file in known.files:
-        try:
-            content = parse_json(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise SceneError(f"{file} is not valid JSON: {error}", fix="export it again") from error
-        if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-            raise SceneError(f"{file} has no list `frames`", fix="export it again")
-        for number, frame in enumerate(content["frames"]):
-            if not isinstance(frame, dict):
-                raise SceneError(f"{file}, frame {number} is not an object", fix="export it again")
+        content = read_json_object(file, AGAIN)
+        frames = content.get("frames")
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise SceneError(f"{file} has no list `frames` of objects", fix=AGAIN)
+        for number, frame in enumerate(frames):
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
             _check_inside(file.parent, content["ply_file_path"])
@@ -115,28 +177,15 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
     where = f"{file}, frame {number}"
     try:
         name = str(frame["file_path"]).removeprefix("./")
-        source_from_cam = np.array(frame["transform_matrix"], dtype=np.float64)
-    except (KeyError, ValueError, TypeError) as error:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)[:3]  # the last row may be missing
+    except (KeyError, ValueError, TypeError, IndexError) as error:
         raise SceneError(
-            f"{where}: file_path or transform_matrix cannot be used: {error!r}", fix="export it again"
+            f"{where}: file_path or transform_matrix cannot be used: {error!r}", fix=AGAIN
         ) from error
-    if (
-        source_from_cam.shape not in ((4, 4), (3, 4))
-        or not np.isfinite(source_from_cam).all()
-        or not are_rotations(source_from_cam[:3, :3], RIGID_TOLERANCE)
-    ):
-        raise SceneError(
-            f"{where} ({name}): transform_matrix is not a rigid pose",
-            expected="a 4 x 4 camera-to-world matrix whose rotation part neither scales nor mirrors",
-            found=np.array2string(source_from_cam, precision=4, suppress_small=True).replace("\n", ""),
-            fix="export it again without scaling the cameras",
-        )
-    pose = np.eye(4)
-    pose[:3] = source_from_cam[:3]
+    source_from_cam = rigid_pose(matrix, f"{where} ({name}), transform_matrix") @ OPENGL_TO_OPENCV
     image = _find_image(known.root, name)
     camera = _frame_camera(where, frame, image)
-    is_test = file.name == "transforms_test.json"
-    return KnownView(name, image, camera, np.linalg.inv(pose @ OPENGL_TO_OPENCV), is_test)
+    return KnownView(name, image, camera, np.linalg.inv(source_from_cam), file.name == "transforms_test.json")
 
 
 def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> pycolmap.Camera:
@@ -144,9 +193,8 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
     try:
         width, height = frame.get("w"), frame.get("h")
         if width is None or height is None:
-            if image is None:
-                width = height = 2  # not used: a view without an image is skipped
-            else:
+            width = height = 2  # not used: a view without an image is skipped
+            if image is not None:
                 with open_image(image) as opened:
                     width, height = opened.size
         width, height = int(width), int(height)
@@ -159,13 +207,10 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
         lens = [float(frame.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2")]
         further = [float(frame.get(key, 0.0)) for key in ("k3", "k4")]
     except KeyError as error:
-        raise SceneError(
-            f"{where} has no focal length",
-            expected="fl_x (px) or camera_angle_x (radians)",
-            fix="export it again",
-        ) from error
+        expected = "fl_x (px) or camera_angle_x (radians)"
+        raise SceneError(f"{where} has no focal length", expected=expected, fix=AGAIN) from error
     except (TypeError, ValueError, OverflowError, OSError) as error:
-        raise SceneError(f"{where}: intrinsics cannot be used: {error}", fix="export it again") from error
+        raise SceneError(f"{where}: intrinsics cannot be used: {error}", fix=AGAIN) from error
     model = str(frame.get("camera_model", "OPENCV"))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or any(further):
         raise SceneError(
@@ -178,7 +223,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
             f"{where}: focal length and size cannot be those of a photograph",
             expected=f"more than 0, sides of at most {MAX_SIDE_PX} px",
             found=f"{focal_x:g} and {focal_y:g}, {width:g} x {height:g} px",
-            fix="export it again",
+            fix=AGAIN,
         )
     name, distortion = ("OPENCV", lens) if any(lens) else ("PINHOLE", [])
     params = [focal_x, focal_y, *centre, *distortion]
@@ -202,3 +247,127 @@ def _read_ply_points(path: Path) -> Points:
     else:
         rgb = np.full(xyz.shape, 128, dtype=np.uint8)
     return xyz, rgb
+
+
+def read_llff(known: KnownPoses) -> list[KnownView]:
+    """Read the posed views of an LLFF scene; row i of `poses_bounds.npy` is that of the i-th image by name.
+
+    The first 15 of its 17 numbers are a 3 x 5 matrix, row by row: rotation columns (down, right, back),
+    translation, and the column (height, width, focal). OpenCV's axes are x = right, y = down, z = -back. The
+    last two are the near and the far depth. The lens is SIMPLE_PINHOLE with its centre in the middle, for the
+    image size on disk.
+    """
+    path, folder = known.files[0], known.root / "images"
+    try:
+        rows = read_npy(path)
+    except ArtifactError as error:
+        raise SceneError(str(error).splitlines()[0], fix="unpack it again") from error
+    if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
+        raise SceneError(
+            f"{path} does not contain LLFF poses",
+            expected="finite numbers of shape (images, 17)",
+            found=f"shape {rows.shape}",
+            fix="unpack it again",
+        )
+    matrices = rows.astype(np.float64)[:, :15].reshape(-1, 3, 5)
+    source_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
+    down, right, back = (matrices[:, :, column] for column in range(3))
+    source_from_cam[:, :3, :3] = np.stack([right, down, -back], axis=2)
+    source_from_cam[:, :3, 3] = matrices[:, :, 3]
+    proper = are_rotations(source_from_cam[:, :3, :3], RIGID_TOLERANCE) & (matrices[:, :, 4] > 0).all(axis=1)
+    if not proper.all():
+        raise SceneError(
+            f"{path}, row {int(np.argmin(proper))}: not a rigid pose with size and focal length",
+            expected="rotation columns down, right, back, then translation, then height, width, focal",
+            fix="write it again with LLFF's axes",
+        )
+    images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
+    if len(images) != len(rows):
+        raise SceneError(
+            f"{path} has {len(rows)} poses for {len(images)} images",
+            expected="one row per image, in the order of their names",
+            found=f"{images[0].name} to {images[-1].name}" if images else "no images",
+            fix="unpack the images again, and remove files that are not photographs of the scene",
+        )
+    views = []
+    for image, pose, matrix in zip(images, np.linalg.inv(source_from_cam), matrices, strict=True):
+        with open_image(image) as opened:
+            width, height = opened.size
+        _, width_px, focal_px = matrix[:, 4]
+        params = [float(focal_px * width / width_px), width / 2, height / 2]
+        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=width, height=height, params=params)
+        views.append(KnownView(image.name, image, camera, pose))
+    return views
+
+
+def read_polycam(known: KnownPoses) -> list[KnownView]:
+    """Read the posed views of a raw Polycam export.
+
+    `keyframes/cameras/<stem>.json` or its corrected version contains fx, fy, cx, cy, width, height in px, and
+    t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
+    """
+    images, cameras = known.files
+    border_px = POLYCAM_BORDER_PX if images.name.startswith("corrected") else 0
+    views = []
+    for image in _spread(list_images(images)):
+        file = cameras / f"{image.stem}.json"
+        if not file.is_file():
+            continue  # Polycam omits cameras that it could not correct
+        content = read_json_object(file, AGAIN)
+        try:
+            entries = [float(content[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
+            size = {side: int(content[side]) for side in ("width", "height")}
+            params = [float(content[key]) for key in ("fx", "fy", "cx", "cy")]
+            camera = pycolmap.Camera(model="PINHOLE", params=params, **size)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SceneError(
+                f"{file} is not a camera of Polycam: {error!r}",
+                expected="fx, fy, cx, cy, width, height and t_00 to t_23",
+                fix="export the raw data again (developer mode)",
+            ) from error
+        pose = _phone_pose(np.array(entries).reshape(3, 4), str(file))
+        views.append(KnownView(image.name, image, camera, pose, border_px=border_px))
+    return views
+
+
+def read_record3d(known: KnownPoses) -> list[KnownView]:
+    """Read the posed views of a Record3D export.
+
+    `metadata` contains `K` by columns, `w` and `h` in px, and `poses`, one row per image <number>.jpg:
+    quaternion xyzw and position of the camera in the world, metres, OpenGL axes.
+    """
+    from scipy.spatial.transform import Rotation
+
+    folder, file = known.files
+    content = read_json_object(file, AGAIN)
+    try:
+        intrinsics = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
+        width, height = int(content["w"]), int(content["h"])
+        rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
+        matrices = np.concatenate([Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:, None]], axis=2)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SceneError(
+            f"{file} does not contain poses of Record3D: {error!r}",
+            expected="K (9 numbers), w, h, and poses (rows of 7 numbers)",
+            fix="export the recording again",
+        ) from error
+    images = {int(path.stem): path for path in list_images(folder) if path.stem.isdigit()}
+    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+    views = []
+    for number in _spread(sorted(number for number in images if number < len(matrices))):
+        camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+        pose = _phone_pose(matrices[number], f"{file}, pose {number}")
+        views.append(KnownView(images[number].name, images[number], camera, pose))
+    return views
+
+
+def _spread(items: list[Any]) -> list[Any]:
+    """Sample at most `MAX_VIEWS` items evenly, including the first and the last."""
+    if len(items) <= MAX_VIEWS:
+        return items
+    return [items[row] for row in np.linspace(0, len(items) - 1, MAX_VIEWS).round().astype(int)]
+
+
+def _phone_pose(world_from_cam: Float64[np.ndarray, "3 4"], where: str) -> Float64[np.ndarray, "4 4"]:
+    """Convert a camera-to-world matrix (OpenGL axes, y up) to world-to-camera (OpenCV axes, z up)."""
+    return np.linalg.inv(Z_UP_FROM_Y_UP @ rigid_pose(world_from_cam, where) @ OPENGL_TO_OPENCV)

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
+from hilsplat.scene.layouts import read_json_object
+
+FIX = "copy it again from nerfstudio"
 
 BEFORE_APPLIED_TRANSFORM = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 """Transform of COLMAP's coordinates in versions of `ns-process-data` that record no `applied_transform`."""
@@ -21,10 +23,10 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
     coordinate system, which `applied_transform` and `applied_scale` in that file relate to the original one.
     Without `transforms`, a COLMAP model has the poses.
     """
-    content = _read(dataparser)
+    content = read_json_object(dataparser, FIX)
     applied, applied_scale = np.eye(4), 1.0
     if transforms is not None:
-        saved = _read(transforms)
+        saved = read_json_object(transforms, FIX)
         if "applied_transform" in saved:
             applied = _matrix(transforms, "applied_transform", saved)
         elif (transforms.parent / "colmap/sparse/0").is_dir():
@@ -33,16 +35,6 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
     training_from_source = _matrix(dataparser, "transform", content) @ np.linalg.inv(applied)
     training_from_source[:3] *= _scale(dataparser, "scale", content) / applied_scale
     return np.linalg.inv(training_from_source)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = parse_json(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{path} cannot be read: {error}", fix="copy it again from nerfstudio") from error
-    if not isinstance(content, dict):
-        raise SceneError(f"{path} is not a JSON object", fix="copy it again from nerfstudio")
-    return content
 
 
 def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
@@ -57,7 +49,7 @@ def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray
             f"{path}: {key} cannot be used",
             expected="a 3 x 4 matrix that can be inverted",
             found=repr(content.get(key))[:80],
-            fix="copy it again from nerfstudio",
+            fix=FIX,
         )
     return matrix
 

@@ -14,9 +14,8 @@ from hilsplat.photos.add import add_scene
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.exporting import write_colmap as export_colmap
 from hilsplat.scene.exporting import write_nerfstudio
-from hilsplat.scene.importers import phone_exports
-from hilsplat.scene.importers.known_poses import find_known_poses
-from hilsplat.scene.layouts import NO_POSES
+from hilsplat.scene.importers import known_views
+from hilsplat.scene.layouts import NO_POSES, find_known_poses
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
@@ -201,7 +200,9 @@ def test_poses_that_mirror_or_scale_are_refused(tmp_path, factors):
         pose = np.array(frame["transform_matrix"])
         pose[:3, :3] *= factors
         frame["transform_matrix"] = pose.tolist()
-    with pytest.raises(SceneError, match=r"frame 1 \(images/b\): transform_matrix is not a rigid pose"):
+    with pytest.raises(
+        SceneError, match=r"frame 1 \(images/b\), transform_matrix: the pose is not a rotation"
+    ):
         import_scene(tmp_path / "in", tmp_path / "scene")
 
 
@@ -286,7 +287,7 @@ def test_record3d_exports_are_turned_to_z_up(tmp_path):
 
 
 def test_long_recordings_are_thinned_evenly(tmp_path, monkeypatch):
-    monkeypatch.setattr(phone_exports, "MAX_VIEWS", 4)
+    monkeypatch.setattr(known_views, "MAX_VIEWS", 4)
     write_record3d(tmp_path / "in", count=10)
     scene = import_scene(tmp_path / "in", tmp_path / "scene")
     assert scene.cameras.names == tuple(f"{number}.png" for number in (0, 3, 6, 9))
@@ -307,8 +308,8 @@ def test_an_r3d_archive_is_imported(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{}", r"does not hold poses of Record3D: KeyError\('K'\)"),
-        ("[]", "does not hold a JSON object"),
+        ("{}", r"does not contain poses of Record3D: KeyError\('K'\)"),
+        ("[]", "is not a JSON object"),
         ("{", "is not valid JSON"),
         ('{"K": [1,0,0,0,1,0,0,0,1], "w": 1, "h": 1, "poses": [[0,0,0,0,0,0,0]]}', "poses of Record3D"),
     ],
@@ -324,5 +325,5 @@ def test_a_polycam_camera_that_scales_is_refused(tmp_path):
     write_polycam(tmp_path / "in", corrected=False)
     path = tmp_path / "in/keyframes/cameras/1.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "t_00": -2.0}))
-    with pytest.raises(SceneError, match=r"cameras/1\.json: not a rigid pose"):
+    with pytest.raises(SceneError, match=r"cameras/1\.json: the pose is not a rotation"):
         import_scene(tmp_path / "in", tmp_path / "scene")

@@ -9,8 +9,9 @@ import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.importers.known_poses import KnownPoses, KnownView, checked
+from hilsplat.scene.importers.known_views import KnownView, checked
 from hilsplat.scene.importers.model_files import RECORDS, require_whole_files
+from hilsplat.scene.layouts import KnownPoses
 from tests.unit.scene.test_importers import write_colmap
 
 FILES = sorted(f"{name}.bin" for name in RECORDS)

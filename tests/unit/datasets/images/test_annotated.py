@@ -8,7 +8,7 @@ import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
-from hilsplat.datasets.images.annotated import DATASET
+from hilsplat.datasets.images.hi import ANNOTATED
 from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.datasets.sources import label_files, label_sets
@@ -46,7 +46,7 @@ def test_a_scene_is_opened_by_its_two_names(root):
     assert (mug.text, mug.level, mug.path) == ("mug", Level.WHOLE, ("mug",))
     assert (rim.text, rim.level, rim.path) == ("rim", Level.PART, ("mug", "rim"))
     assert np.count_nonzero(mug.mask()) == 80 and np.count_nonzero(rim.mask()) == 8
-    assert DATASET.found(root / "annotated") == ("photos/desk",)
+    assert ANNOTATED.found(root / "annotated") == ("photos/desk",)
 
 
 def test_what_is_only_proposed_is_no_annotation(root):

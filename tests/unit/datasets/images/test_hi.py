@@ -84,7 +84,7 @@ def test_a_child_outside_its_parent_is_reported_with_its_share(root):
 
     edit(root, change)
     reported = "; ".join(HI_LERF.open(root, "ramen").warnings)
-    assert "id 4 (nose): 50.0% of it lies outside its parent 1 (head)" in reported
+    assert "id 4 (nose): 50.0% of its area is outside its parent 1 (head)" in reported
 
 
 def test_one_percent_outside_is_rasterisation(root):
@@ -103,7 +103,7 @@ def test_one_percent_outside_is_rasterisation(root):
 
     edit(root, change)
     reported = [line for line in HI_LERF.open(root, "ramen").warnings if "outside its parent" in line]
-    assert reported == ["frame_00002.json, id 92 (c): 9.1% of it lies outside its parent 90 (a)"]
+    assert reported == ["frame_00002.json, id 92 (c): 9.1% of its area is outside its parent 90 (a)"]
 
 
 @pytest.mark.parametrize(

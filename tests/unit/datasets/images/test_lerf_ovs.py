@@ -114,7 +114,7 @@ def test_labelled_frames_without_image_or_pose_are_named(root):
     with pytest.raises(SceneError, match=r"have no pose: frame_00004\.png\n"):
         open_scene(root, "figurines").check_posed(["frame_00002.png", "frame_00003.png"])
     (root / "figurines" / "images" / "frame_00004.jpg").unlink()
-    with pytest.raises(SceneError, match=r"labelled frames of figurines have no image: frame_00004\.png\n"):
+    with pytest.raises(SceneError, match=r"labelled views have no image: frame_00004\.png\n"):
         open_scene(root, "figurines")
 
 

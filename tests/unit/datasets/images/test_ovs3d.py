@@ -8,7 +8,6 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import open_scene, read_classes
 from hilsplat.datasets.labelled import posed_images
-from hilsplat.scene.importers.llff import read_poses_bounds
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
@@ -59,17 +58,19 @@ def test_poses_of_llff_are_read_back_equal(true_world, root):
         assert np.allclose(view.camera.calibration_matrix(), camera.K)
 
 
-def test_a_camera_that_looks_along_minus_z_of_its_llff_frame(tmp_path):
+def test_llff_columns_are_down_right_and_back(root):
     # World axes as LLFF's camera: its columns (down, right, back) are -y, x, z of the world, so the
     # camera is at (1, 2, 3), looks along -z, and has world x on its right and -y below it.
     matrix = np.array([[0, 1, 0, 1, 30], [-1, 0, 0, 2, 40], [0, 0, 1, 3, 50]], float)
-    np.save(tmp_path / "poses_bounds.npy", np.concatenate([matrix.ravel(), [0.5, 9.0]])[None])
-    poses, sizes, bounds = read_poses_bounds(tmp_path / "poses_bounds.npy")
+    rows = np.tile([*matrix.ravel(), 0.5, 9.0], (4, 1))
+    rows[:, 3] += [0, 1, 2, 3]
+    np.save(root / "bed" / "poses_bounds.npy", rows)
+    view = posed_images(root / "bed", "3D-OVS")["00.png"]
     ahead, right, below = ([1, 2, 1, 1], [2, 2, 3, 1], [1, 1, 3, 1])
-    assert np.allclose(poses[0] @ ahead, [0, 0, 2, 1])
-    assert np.allclose(poses[0] @ right, [1, 0, 0, 1])
-    assert np.allclose(poses[0] @ below, [0, 1, 0, 1])
-    assert sizes.tolist() == [[30, 40, 50]] and bounds.tolist() == [[0.5, 9.0]]
+    assert np.allclose(view.cam_from_source @ ahead, [0, 0, 2, 1])
+    assert np.allclose(view.cam_from_source @ right, [1, 0, 0, 1])
+    assert np.allclose(view.cam_from_source @ below, [0, 1, 0, 1])
+    assert view.camera.calibration_matrix().tolist() == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]  # 40 x 24 px
 
 
 def test_the_focal_length_scales_with_the_image_on_disk(true_world, root):
@@ -94,7 +95,7 @@ def test_the_poses_stage_imports_llff(tmp_path, true_world, root):
     ("change", "message"),
     [
         (lambda rows: rows[:, :16], r"shape \(4, 16\)"),
-        (lambda rows: np.where(np.arange(17) == 3, np.nan, rows), "does not hold LLFF poses"),
+        (lambda rows: np.where(np.arange(17) == 3, np.nan, rows), "does not contain LLFF poses"),
         (lambda rows: rows * np.where(np.arange(17) % 5 == 0, -1, 1), "row 0: not a rigid pose"),
         (
             lambda rows: np.where((np.arange(17) == 14) & (np.arange(4) == 2)[:, None], 0, rows),
@@ -159,7 +160,7 @@ def test_a_mask_of_an_unknown_class_is_reported(root):
 
 def test_a_segmented_view_without_image_is_named(root):
     (root / "bed" / "images" / "03.jpg").unlink()
-    with pytest.raises(SceneError, match="view 03 of bed is segmented but has no image"):
+    with pytest.raises(SceneError, match=r"labelled views have no image: 03\.png"):
         open_scene(root, "bed")
 
 

@@ -8,9 +8,10 @@ import pytest
 from PIL import Image
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.points.replica import open_scene, read_images
-from hilsplat.datasets.points.replica_mesh import (
+from hilsplat.datasets.points.replica import (
     object_of_vertices,
+    open_scene,
+    read_images,
     read_labelled_mesh,
     read_semantic_mesh,
     triangles_of,

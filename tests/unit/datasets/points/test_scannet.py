@@ -12,8 +12,8 @@ from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.scene.importers.known_poses import find_known_poses
 from hilsplat.scene.importers.known_views import read_transforms
+from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.posed_images import write_posed_images
 from tests.unit.datasets.writers.ply import write_ply
 from tests.unit.datasets.writers.scannet import write_label_table, write_scan

@@ -14,7 +14,7 @@ from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.synthetic.world_labels import labelled_points, replica_id, scannet_ids, waymo_labels
 from hilsplat.datasets.waymo import reader as waymo
 from hilsplat.scene.importers.importing import import_poses
-from hilsplat.scene.importers.known_poses import find_known_poses
+from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings, PosesSettings, WorldSettings
 from hilsplat.splat.fit import fit_gaussians

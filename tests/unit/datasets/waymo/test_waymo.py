@@ -10,11 +10,14 @@ import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.datasets.waymo.frames import CameraShot, LidarFrame, LidarReturn, frame_points
-from hilsplat.datasets.waymo.geometry import (
+from hilsplat.datasets.waymo.frames import (
+    CameraShot,
+    LidarFrame,
+    LidarReturn,
     WaymoCamera,
     beam_inclinations,
     column_azimuths,
+    frame_points,
     range_image_points,
     rotation_of,
 )

@@ -151,7 +151,7 @@ def write_poses_bounds(
     height_width_focal: Float64[np.ndarray, "N 3"],
     bounds: Float64[np.ndarray, "N 2"],
 ) -> None:
-    """Write the file, the inverse of `read_poses_bounds`."""
+    """Write LLFF's file, the inverse of `known_views.read_llff`."""
     world_from_cam = np.linalg.inv(cam_from_world)
     right, down, forward = (world_from_cam[:, :3, column] for column in range(3))
     matrices = np.stack([down, right, -forward, world_from_cam[:, :3, 3], height_width_focal], axis=2)

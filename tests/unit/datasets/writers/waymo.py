@@ -8,8 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as parquet
 
-from hilsplat.datasets.waymo.frames import CAMERAS, TOP, CameraShot, LidarFrame
-from hilsplat.datasets.waymo.geometry import WaymoCamera
+from hilsplat.datasets.waymo.frames import CAMERAS, TOP, CameraShot, LidarFrame, WaymoCamera
 from hilsplat.datasets.waymo.parquet import CAMERA, FRAME, INTRINSIC, LASER, component_path
 
 

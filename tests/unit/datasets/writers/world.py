@@ -13,8 +13,15 @@ from hilsplat.base.images import read_image
 from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.synthetic.world_labels import replica_id, scannet_ids, waymo_labels
-from hilsplat.datasets.waymo.frames import CameraShot, LidarFrame, LidarReturn
-from hilsplat.datasets.waymo.geometry import CV_FROM_WAYMO, WaymoCamera, column_azimuths, rotation_of
+from hilsplat.datasets.waymo.frames import (
+    CV_FROM_WAYMO,
+    CameraShot,
+    LidarFrame,
+    LidarReturn,
+    WaymoCamera,
+    column_azimuths,
+    rotation_of,
+)
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.posed_images import PosedImage
 from tests.unit.datasets.writers.replica import write_semantic_mesh, write_sequence
