@@ -1,6 +1,6 @@
 """Adam for training with hand-written gradients, in one pass over the parameters."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
@@ -18,18 +18,16 @@ class Adam:
     Attributes:
         values: parameters, float32, contiguous.
         rate: step size; it may change between steps.
-        eps: number added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS,
-            which the published codes of language fields keep.
+        eps: number added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS and
+            in published code of language fields.
     """
 
     values: np.ndarray
     rate: float
     eps: float = 1e-15
-    steps: int = 0
-    _moments: tuple[np.ndarray, np.ndarray] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._moments = np.zeros(self.values.size, np.float32), np.zeros(self.values.size, np.float32)
+        self.steps, self._moments = 0, np.zeros((2, self.values.size), np.float32)
 
     def step(self, gradient: np.ndarray) -> None:
         """Take one step, on a single thread, so that the bytes are always the same."""

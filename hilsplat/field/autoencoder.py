@@ -1,18 +1,41 @@
-"""Stage `autoencoder`: fit the scene's code, a network or PCA, and encode the masks with it."""
+"""Stage `autoencoder`: fit the scene's code, a network or PCA, and encode the masks with it.
 
+The network is trained by closed-form gradients on BLAS: its matrices are so small (64 x 128) that torch's
+overhead would take most of a step.
+"""
+
+import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from hilsplat.base.artifacts import atomic_folder, read_index, sha256_of_file, write_index, write_npz
+from hilsplat.base.compiled import compiled
 from hilsplat.base.progress import stage_log
 from hilsplat.embed.vectors import mask_embeddings, require_every_vector
-from hilsplat.field.code import Code, autoencoder_file
-from hilsplat.field.linear_code import LinearCode
+from hilsplat.field.adam import Adam
+from hilsplat.field.code import (
+    NORM_EPS,
+    Autoencoder,
+    Code,
+    Layer,
+    LinearCode,
+    autoencoder_file,
+    layers_of,
+    torch_generator,
+    unit,
+)
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings
+
+Arrays = dict[str, np.ndarray]
+
+Passed = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Values for the backward pass through a layer: inputs (B, I) of the linear layer, after BatchNorm and ReLU;
+normalised inputs (B, I) of a BatchNorm and their reciprocal deviations (I), both empty if there is none."""
 
 
 def mask_targets(
@@ -22,9 +45,9 @@ def mask_targets(
 
     Args:
         clip: each mask's own vector, or zero if it has none.
-        tree: nodes with their vectors, and the node that each mask fits best.
-        targets: "node": the vector of that node, or the mean of all nodes for a mask that shares no Gaussian
-            with any; "mask": its own vector, as in the paper, which is also used if the tree has no nodes.
+        targets: "node": the vector of the node that the mask fits best, or the mean of all nodes for a mask
+            that shares no Gaussian with any; "mask": its own vector, as in the paper, which is also used if
+            the tree has no nodes.
     """
     if targets == "node" and len(tree):
         or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
@@ -40,13 +63,13 @@ def run_autoencoder(
     settings: AutoencoderSettings,
     seed: int,
 ) -> None:
-    """Train the scene's autoencoder and encode every mask.
+    """Fit the scene's code and encode every mask.
 
     Writes `autoencoder.safetensors`, `latents.npz` (rows as in the contributions) and `index.json`.
 
     Raises:
-        MisalignedArtifactError: if the semantic tree or the CLIP vectors belong to other masks.
-        ArtifactError: if a mask needs its own vector and has none.
+        MisalignedArtifactError: the semantic tree or the CLIP vectors belong to other masks.
+        ArtifactError: a mask needs its own vector and has none.
     """
     require_same_masks(semantic_tree_folder, contributions_folder)
     tree = SemanticTree.load(semantic_tree_folder, clip_folder)
@@ -59,8 +82,6 @@ def run_autoencoder(
         if settings.code == "pca":
             model = LinearCode.fit(train, settings.latent)
         else:
-            from hilsplat.field.network_training import train_autoencoder
-
             model = train_autoencoder(train, settings, seed)
         latents = model.encode_array(target)
         decoded = model.decode_array(model.encode_array(train))
@@ -83,3 +104,170 @@ def run_autoencoder(
                 decoder_cosine_own=round(own, 6),
                 autoencoder_sha256=sha256_of_file(autoencoder_file(folder)),
             )
+
+
+def train_autoencoder(
+    vectors: Float32[np.ndarray, "B C"], settings: AutoencoderSettings, seed: int
+) -> Autoencoder:
+    """Train on one scene's unit vectors: Adam with cosine decay, full batches drawn without replacement.
+
+    Equal inputs and seeds give equal bytes on any number of the stage's threads (the command line limits BLAS
+    to one thread). The seed determines the initial weights and the order of vectors.
+    """
+    twister = torch_generator(seed)
+    channels, latent = vectors.shape[1], settings.latent
+    data = np.ascontiguousarray(vectors)
+    if len(data) == 1:
+        data = np.repeat(data, 2, axis=0)  # BatchNorm needs two rows
+    batch = min(settings.batch, len(data))
+    per_epoch = len(data) // batch
+    steps = max(settings.epochs * per_epoch, settings.min_steps)
+    arrays = Autoencoder.drawn(channels, latent, twister).arrays
+    drawn = {name: values for name, values in arrays.items() if "running" not in name}
+    flat = np.concatenate([values.reshape(-1) for values in drawn.values()])
+    slope = np.empty_like(flat)
+    parameters, gradients = _as_arrays(flat, drawn), _as_arrays(slope, drawn)
+    adam = Adam(flat, settings.learning_rate, eps=1e-8)
+    for step in range(steps):
+        place = step % per_epoch
+        if place == 0:
+            order = torch_order(len(data), twister)
+        chosen = data[order[place * batch : (place + 1) * batch]]
+        loss_gradients(parameters, chosen, latent, settings.cosine_weight, gradients)
+        adam.rate = settings.learning_rate * (1 + math.cos(math.pi * step / steps)) / 2
+        adam.step(slope)
+    return Autoencoder(channels, latent, parameters | statistics(parameters, data, latent))
+
+
+def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray, " n"]:
+    """Return the order that `torch.randperm(count)` draws from this generator state."""
+    order = np.arange(count)
+    _swap(order, twister.randint(0, 2**32, max(count - 1, 0), np.uint32))
+    return order
+
+
+@compiled
+def _swap(order, drawn):
+    """Swap each place with itself or a later one, as drawn."""
+    for place in range(len(drawn)):
+        other = place + np.int64(drawn[place]) % (len(order) - place)
+        order[place], order[other] = order[other], order[place]
+
+
+def _as_arrays(flat: Float32[np.ndarray, " P"], like: Arrays) -> Arrays:
+    """Return consecutive views of `flat` with the names and shapes of `like`."""
+    parts = np.split(flat, np.cumsum([values.size for values in like.values()])[:-1])
+    return {name: part.reshape(like[name].shape) for name, part in zip(like, parts, strict=True)}
+
+
+def loss_gradients(
+    parameters: Arrays,
+    vectors: Float32[np.ndarray, "B C"],
+    latent: int,
+    cosine_weight: float,
+    gradients: Arrays,
+) -> None:
+    """Write the gradients of the mean squared error plus `cosine_weight` times the mean of 1 - cosine.
+
+    Inputs and outputs have unit length, so the squared error of a vector is 2 (1 - cosine), over C channels.
+
+    Departs: LangSplat computes the cosine along the batch axis, which compares channels, not vectors.
+    """
+    channels = vectors.shape[1]
+    encoder, decoder = layers_of(channels, latent)
+    codes, to_codes = _there(parameters, encoder, vectors)
+    latents = unit(codes)
+    outputs, to_outputs = _there(parameters, decoder, latents)
+    slope = -vectors * np.float32((2 / channels + cosine_weight) / len(vectors))
+    slope = _back(parameters, decoder, to_outputs, _slope_before_unit(outputs, slope), gradients)
+    _back(parameters, encoder, to_codes, _slope_before_unit(codes, slope), gradients)
+
+
+def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int) -> Arrays:
+    """Compute the mean and unbiased variance of all vectors at each BatchNorm, for use after training."""
+    found: Arrays = {}
+    encoder, _ = layers_of(data.shape[1], latent)
+    values = data
+    for layer, after in pairwise(encoder):
+        values = _there(parameters, [layer], values)[0]
+        found[f"{after.norm}.running_mean"] = values.mean(axis=0)
+        found[f"{after.norm}.running_var"] = values.var(axis=0, ddof=1)
+    return found
+
+
+def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
+    """Return the outputs of layers, with the batch's statistics, and the values for the backward pass."""
+    passed = []
+    for layer in layers:
+        scaled, spread = values[:0], values[:0, 0]
+        if layer.norm:
+            norm = parameters[f"{layer.norm}.weight"], parameters[f"{layer.norm}.bias"]
+            scaled, spread, values = _normalised(values, *norm)
+        elif layer.relu:
+            values = np.maximum(values, 0)
+        passed.append((values, scaled, spread))
+        values = values @ parameters[f"{layer.name}.weight"].T
+        values += parameters[f"{layer.name}.bias"]
+    return values, passed
+
+
+def _back(
+    parameters: Arrays, layers: list[Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
+) -> np.ndarray:
+    """Compute the gradients of the layers' parameters, and return that of their inputs."""
+    for layer, (values, scaled, spread) in zip(layers[::-1], passed[::-1], strict=True):
+        np.matmul(slope.T, values, out=gradients[f"{layer.name}.weight"])
+        np.sum(slope, axis=0, out=gradients[f"{layer.name}.bias"])
+        slope = slope @ parameters[f"{layer.name}.weight"]
+        if layer.relu:
+            slope *= values > 0
+        if layer.norm:
+            names = f"{layer.norm}.weight", f"{layer.norm}.bias"
+            of_norm = (gradients[name] for name in names)
+            _normalised_back(slope, scaled, spread, parameters[names[0]], *of_norm)
+    return slope
+
+
+def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return the gradient before `unit` from that after it; the component along the vectors vanishes."""
+    length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
+    units = values / length
+    return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
+
+
+@compiled(error_model="numpy")
+def _normalised(values, weight, bias):
+    """Apply BatchNorm with the batch's statistics and ReLU; return scaled inputs, 1 / deviation, outputs."""
+    rows, columns = values.shape
+    mean, var = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    scaled, out = np.empty_like(values), np.empty_like(values)
+    share = np.float32(1.0 / rows)
+    for row in range(rows):
+        for c in range(columns):
+            mean[c] += share * values[row, c]
+    for row in range(rows):
+        for c in range(columns):
+            var[c] += share * (values[row, c] - mean[c]) ** 2
+    spread = np.float32(1.0) / np.sqrt(var + np.float32(NORM_EPS))
+    for row in range(rows):
+        for c in range(columns):
+            scaled[row, c] = (values[row, c] - mean[c]) * spread[c]
+            out[row, c] = max(scaled[row, c] * weight[c] + bias[c], np.float32(0.0))
+    return scaled, spread, out
+
+
+@compiled(error_model="numpy")
+def _normalised_back(slope, scaled, spread, weight, of_weight, of_bias):
+    """Turn `slope` of a BatchNorm's outputs into that of its inputs, and write those of weight and bias."""
+    rows, columns = slope.shape
+    of_weight[:] = 0
+    of_bias[:] = 0
+    for row in range(rows):
+        for c in range(columns):
+            of_weight[c] += slope[row, c] * scaled[row, c]
+            of_bias[c] += slope[row, c]
+    share = np.float32(1.0 / rows)
+    for row in range(rows):
+        for c in range(columns):
+            common = share * (of_bias[c] + scaled[row, c] * of_weight[c])
+            slope[row, c] = weight[c] * spread[c] * (slope[row, c] - common)

@@ -1,57 +1,296 @@
-"""The scene's code from CLIP vectors to a few numbers and back, by a network or linearly; reading it."""
+"""The scene's code from CLIP vectors to a few numbers and back: linear, or LangSplat's network."""
 
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
-from hilsplat.base.arrays import read_tensors
+from hilsplat.base.arrays import read_tensors, write_tensors
 from hilsplat.base.artifacts import read_npz, remake, sealed
+from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError
+from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_products
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.linear_code import LinearCode
 from hilsplat.segment.digests import require_same_masks
 
 CHUNK_ROWS = 4096
 """Rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache."""
 
+ENCODER_WIDTHS = (256, 128, 64, 32)
+DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
+NORM_EPS = 1e-5
+"""Epsilon added to the variances of BatchNorm, as in torch."""
 
-@runtime_checkable
-class Code(Protocol):
-    """Encoder and decoder of CLIP vectors: `linear_code.LinearCode` or `network_code.Autoencoder`."""
+ROWS = 2 * WIDE_COLUMNS
+"""Rows that pass through the layers together, so that weights are read from the L2 cache once for all."""
 
-    @property
-    def channels(self) -> int:
-        """Width C of the CLIP vectors."""
+UNITS = MOST_ROWS
+"""Outputs of a layer that are summed together; layers are padded to a multiple."""
 
-    @property
-    def latent(self) -> int:
-        """Size d of a latent."""
+_add_products = rows_of_products(UNITS)
+
+
+class LinearCode:
+    """Code e = unit(m + U z) with d principal directions around the mean.
+
+    It involves no training and no randomness. Unlike with a network, the code of an average is the average
+    of the codes, and a cosine with any vector takes d products, so relevancy needs no decoding. A network,
+    however, can adapt its d numbers nonlinearly to the vectors of the scene.
+
+    Args:
+        mean: m.
+        basis: U, with orthonormal rows.
+    """
+
+    def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
+        self.mean, self.basis = mean, basis
+        self.latent, self.channels = basis.shape
+
+    @staticmethod
+    def fit(vectors: Float32[np.ndarray, "B C"], latent: int) -> "LinearCode":
+        """Compute the principal directions of the vectors; each direction's largest component is positive.
+
+        If the vectors span fewer than d directions, the remaining ones are arbitrary.
+        """
+        data = vectors.astype(np.float64)
+        mean = data.mean(axis=0)
+        centred = data - mean
+        _, directions = np.linalg.eigh(np.einsum("bc,bd->cd", centred, centred))
+        basis = directions[:, ::-1][:, :latent].T
+        peak = np.abs(basis).argmax(axis=1)
+        basis = basis * np.sign(basis[np.arange(len(basis)), peak])[:, None]
+        return LinearCode(mean.astype(np.float32), basis.astype(np.float32))
 
     def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
-        """Encode vectors as latents."""
+        """Return the coordinates along the directions."""
+        return ((vectors - self.mean) @ self.basis.T).astype(np.float32)
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
         """Decode latents to vectors of unit length."""
+        vectors = self.mean + latents @ self.basis
+        length = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        return (vectors / length).astype(np.float32)
+
+    def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple:
+        """Return m.v and U v of each vector, |m|^2, and U m, so that e.v = (m.v + z.Uv) / |m + U z|."""
+        return (
+            (vectors @ self.mean).astype(np.float32),
+            np.ascontiguousarray(vectors @ self.basis.T, np.float32),
+            float(self.mean @ self.mean),
+            (self.basis @ self.mean).astype(np.float32),
+        )
 
     def save(self, path: Path) -> None:
         """Write a .safetensors file; equal codes give equal bytes."""
+        arrays = {"mean": self.mean, "basis": self.basis}
+        write_tensors(path, arrays, code="pca", channels=self.channels, latent=self.latent)
+
+
+class PackedLayers(NamedTuple):
+    """Dense layers with ReLUs between them, in the layout of one compiled loop.
+
+    The values stay in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
+    the registers. The order of the sums of a row does not depend on the other rows.
+
+    Attributes:
+        widths: number of inputs, then of each layer's outputs.
+    """
+
+    widths: Int64[np.ndarray, " L_plus_1"]
+    weights: Float32[np.ndarray, " W"]
+    biases: Float32[np.ndarray, " V"]
+
+    @staticmethod
+    def of(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> "PackedLayers":
+        """Pack weights (outputs, inputs) and biases (outputs) of each layer."""
+        widths = [layers[0][0].shape[1], *(len(bias) for _, bias in layers)]
+        weights, biases = [], []
+        for weight, bias in layers:
+            missing = -len(bias) % UNITS
+            weights.append(np.pad(weight, ((0, missing), (0, 0))).reshape(-1))
+            biases.append(np.pad(bias, (0, missing)))
+        found = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
+        return PackedLayers(np.array(widths), *found)
+
+    def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
+        """Return the outputs of the last layer, scaled to unit length."""
+        out = np.empty((len(rows), self.widths[-1]), np.float32)
+        _through(np.ascontiguousarray(rows, np.float32), *self, out)
+        return out
+
+
+@compiled
+def _through(rows, widths, weights, biases, out):
+    widest = (widths.max() + UNITS - 1) // UNITS * UNITS
+    values, following = np.zeros(widest * ROWS, np.float32), np.zeros(widest * ROWS, np.float32)
+    lengths = np.empty(ROWS, np.float32)
+    for begin in range(0, len(rows), ROWS):
+        count = min(ROWS, len(rows) - begin)
+        for channel in range(widths[0]):
+            for row in range(count):
+                values[channel * ROWS + row] = rows[begin + row, channel]
+        weight, bias = 0, 0
+        for layer in range(len(widths) - 1):
+            inputs, outputs = widths[layer], (widths[layer + 1] + UNITS - 1) // UNITS * UNITS
+            for unit in range(outputs):
+                following[unit * ROWS : (unit + 1) * ROWS] = biases[bias + unit]
+            for unit in range(0, outputs, UNITS):
+                for lane in range(0, ROWS, WIDE_COLUMNS):
+                    to = unit * ROWS + lane
+                    _add_products(
+                        following, to, ROWS, weights, weight, inputs, values, lane, ROWS, inputs, False, True
+                    )
+                weight += UNITS * inputs
+            if layer < len(widths) - 2:
+                for place in range(outputs * ROWS):
+                    following[place] = max(following[place], np.float32(0))
+            bias += outputs
+            values, following = following, values
+        lengths[:] = 0
+        for channel in range(widths[-1]):
+            for row in range(ROWS):
+                lengths[row] += values[channel * ROWS + row] ** 2
+        for row in range(ROWS):
+            lengths[row] = max(np.sqrt(lengths[row]), np.float32(1e-12))
+        for channel in range(widths[-1]):
+            for row in range(ROWS):
+                values[channel * ROWS + row] /= lengths[row]
+        for row in range(count):
+            for channel in range(widths[-1]):
+                out[begin + row, channel] = values[channel * ROWS + row]
+
+
+class Layer(NamedTuple):
+    """A linear layer, with the normalisation and activation before it.
+
+    Attributes:
+        name: name of its weights in the file.
+        norm: name of the BatchNorm before it; empty if there is none.
+        relu: whether a ReLU is applied to its inputs, after the BatchNorm.
+    """
+
+    name: str
+    norm: str
+    relu: bool
+    inputs: int
+    outputs: int
+
+
+def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
+    """Return the layers of encoder and decoder; no layer is wider than the vectors."""
+    sides = []
+    for side, widths, norm in (("encoder", ENCODER_WIDTHS, True), ("decoder", DECODER_WIDTHS, False)):
+        between = [min(width, channels) for width in widths]
+        ends = [channels, *between, latent] if norm else [latent, *between, channels]
+        every = 3 if norm else 2  # numbering of torch's nn.Sequential, which counts norms and ReLUs
+        sides.append(
+            [
+                Layer(f"{side}.{every * k}", f"{side}.{every * k - 2}" if norm and k else "", k > 0, *sizes)
+                for k, sizes in enumerate(pairwise(ends))
+            ]
+        )
+    return sides[0], sides[1]
+
+
+def torch_generator(seed: int) -> np.random.RandomState:
+    """Return the generator that `torch.manual_seed(seed)` initialises, a Mersenne Twister."""
+    return np.random.RandomState(seed % 2**32)
+
+
+def unit(vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B C"]:
+    """Scale rows to unit length."""
+    return vectors / np.maximum(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)), np.float32(1e-12))
+
+
+class Autoencoder:
+    """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
+
+    Departs: layer widths never exceed C. The encoder's BatchNorm (measured better than LayerNorm or none)
+    is trained on full batches only, and then uses the statistics of all vectors: see
+    `autoencoder.train_autoencoder`. Arrays are named and laid out as in torch's modules.
+    """
+
+    def __init__(self, channels: int, latent: int, arrays: Mapping[str, np.ndarray]) -> None:
+        self.channels, self.latent = channels, latent
+        self.arrays = dict(arrays)
+        self._encoder, self._decoder = layers_of(channels, latent)
+
+    def encode_array(self, vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B D"]:
+        """Encode vectors as latents of unit length."""
+        values = vectors
+        for layer in self._encoder:
+            weight, bias = self._affine(layer.name)
+            if layer.norm:
+                scale, shift = self._affine(layer.norm)
+                mean, var = (self.arrays[f"{layer.norm}.running_{name}"] for name in ("mean", "var"))
+                factor = scale / np.sqrt(var + np.float32(NORM_EPS))
+                values = np.maximum(values * factor + (shift - mean * factor), 0)
+            values = values @ weight.T + bias
+        return unit(values)
+
+    def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
+        """Decode latents of any length to vectors of unit length."""
+        return self._packed_decoder.through(latents)
+
+    def _affine(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        return self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
+
+    @cached_property
+    def _packed_decoder(self) -> PackedLayers:
+        return PackedLayers.of([self._affine(layer.name) for layer in self._decoder])
+
+    @staticmethod
+    def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
+        """Draw the weights that torch draws from this generator state; BatchNorm is the identity."""
+        arrays: dict[str, np.ndarray] = {}
+        for layer in (layer for side in layers_of(channels, latent) for layer in side):
+            if layer.norm:
+                values = {"weight": 1, "bias": 0, "running_mean": 0, "running_var": 1}
+                for name, value in values.items():
+                    arrays[f"{layer.norm}.{name}"] = np.full(layer.inputs, value, np.float32)
+            reach = float(np.float32(layer.inputs**-0.5))
+            for name, shape in (("weight", (layer.outputs, layer.inputs)), ("bias", (layer.outputs,))):
+                share = (twister.randint(0, 2**32, shape, np.uint32) % 2**24) * 2.0**-24
+                arrays[f"{layer.name}.{name}"] = (2 * reach * share - reach).astype(np.float32)
+        return Autoencoder(channels, latent, arrays)
+
+    @staticmethod
+    def from_arrays(channels: int, latent: int, arrays: dict[str, np.ndarray]) -> "Autoencoder":
+        """Build a trained network from its saved weights.
+
+        Raises:
+            ValueError: an array is missing or has another shape.
+        """
+        model = Autoencoder.drawn(channels, latent, torch_generator(0))
+        for name, values in model.arrays.items():
+            if name not in arrays or arrays[name].shape != values.shape:
+                raise ValueError(f"{name} of shape {values.shape} is missing")
+            model.arrays[name] = arrays[name]
+        return model
+
+    def save(self, path: Path) -> None:
+        """Write a .safetensors file; equal weights give equal bytes."""
+        write_tensors(path, self.arrays, channels=self.channels, latent=self.latent)
+
+
+Code = LinearCode | Autoencoder
 
 
 def load_code(folder: Path) -> Code:
     """Read the network or linear code of a finished folder.
 
     Raises:
-        ArtifactError: if the file is missing or damaged.
+        ArtifactError: the file is missing or damaged.
     """
     path = autoencoder_file(folder)
     state, about = read_tensors(path)
     try:
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
-        from hilsplat.field.network_code import Autoencoder
-
         return Autoencoder.from_arrays(about["channels"], about["latent"], state)
     except (KeyError, ValueError) as error:
         raise ArtifactError(f"{path} is of another version: {error}", fix=remake(path)) from error
@@ -66,7 +305,7 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
     """Return the latent of each mask, in the contributions' row order.
 
     Raises:
-        MisalignedArtifactError: if the latents belong to other masks.
+        MisalignedArtifactError: the latents belong to other masks.
     """
     require_same_masks(folder, contributions.folder)
     return read_npz(sealed(folder, "latents.npz"), "latents")["latents"]

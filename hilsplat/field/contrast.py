@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.losses import (
@@ -32,55 +32,48 @@ class ViewRelations:
         rows: selected masks of all levels.
         depth: depth of the deepest common ancestor of each pair of them.
         level: their levels.
-        part_rows: selected masks of PART and of SUBPART.
-        part_parent: rows of their parents in the coverage tree, -1 for none.
+        parts: selected masks of PART and of SUBPART, and the rows of their parents, -1 for none.
     """
 
     rows: Int64[np.ndarray, " m"]
     depth: Int64[np.ndarray, "m m"]
     level: Int64[np.ndarray, " m"]
-    part_rows: tuple[Int64[np.ndarray, " _"], ...]
-    part_parent: tuple[Int64[np.ndarray, " _"], ...]
+    parts: tuple[tuple[Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]], ...]
 
 
 def view_relations(
     contributions: Contributions,
     parents: dict[str, np.ndarray],
     settings: FieldSettings,
-    means: Float32[np.ndarray, "M D"] | None = None,
+    means: Float32[np.ndarray, "M D"],
 ) -> list[ViewRelations]:
     """Select the masks of each view for the contrastive losses, largest first.
 
     Args:
         parents: parent of each mask in the coverage tree, by view (row among the view's masks).
-        settings: least size of a mask, and pruning.
-        means: mean lifted feature of each mask, used to prune similar masks; None keeps all.
+        means: mean lifted feature of each mask, used to prune similar masks.
     """
     relations = []
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
-        pixels = contributions.pixels[rows]
-        half = contributions.half_pixels[rows]
-        parent = parents[view]
+        pixels, half, parent = contributions.pixels[rows], contributions.half_pixels[rows], parents[view]
         depth = common_ancestor_depth(parent)
         usable = (pixels >= settings.min_mask_px) & (half > 0) & (half < pixels)
-        chosen: dict[Level, np.ndarray] = {}
+        chosen = []
         for level in LEVELS:
             local = np.flatnonzero(usable & (contributions.level[rows] == int(level)))
             order = local[np.lexsort((local, -pixels[local]))][:MAX_MASKS_PER_LEVEL]
-            if means is not None and settings.prune_cosine < 1:
-                order = order[
-                    distinct(means[rows[order]], depth[np.ix_(order, order)], settings.prune_cosine)
-                ]
-            chosen[level] = np.sort(order)
-        every = np.sort(np.concatenate(list(chosen.values())))
+            if settings.prune_cosine < 1:
+                related = depth[np.ix_(order, order)]
+                order = order[distinct(means[rows[order]], related, settings.prune_cosine)]
+            chosen.append(np.sort(order))
+        every = np.sort(np.concatenate(chosen))
         visible_parent = np.where((parent != NONE) & (pixels[parent] > 0), rows[parent], NONE)
         relations.append(
             ViewRelations(
                 rows=rows[every],
                 depth=depth[np.ix_(every, every)],
                 level=contributions.level[rows[every]].astype(np.int64),
-                part_rows=tuple(rows[chosen[level]] for level in LEVELS[1:]),
-                part_parent=tuple(visible_parent[chosen[level]] for level in LEVELS[1:]),
+                parts=tuple((rows[own], visible_parent[own]) for own in chosen[1:]),
             )
         )
     return relations
@@ -96,7 +89,7 @@ def distinct(
 
     Args:
         means: features, in order of preference.
-        depth: `common_ancestor_depth` of the rows; 0 means unrelated.
+        depth: `common_ancestor_depth` of the rows.
         most_alike: cosine above which a row is dropped.
     """
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
@@ -111,9 +104,7 @@ def compared(relations: list[ViewRelations]) -> tuple[int, int]:
     """Return the number of views in the mean of L_ins, and of pairs of view and level in that of L_part."""
     instance = sum(len(view.rows) > 1 for view in relations)
     part = sum(
-        len(rows) > 1 and bool((parent != NONE).any())
-        for view in relations
-        for rows, parent in zip(view.part_rows, view.part_parent, strict=True)
+        len(rows) > 1 and bool((parent != NONE).any()) for view in relations for rows, parent in view.parts
     )
     return instance, part
 
@@ -152,12 +143,12 @@ def part_term(
         other_halves: mean feature over the other pixels.
 
     Returns:
-        the loss, and its gradients with respect to means, halves and other halves.
+        the loss, and its gradients for the three.
     """
     losses = []
     by_means, by_halves, by_others = (np.zeros(means.shape) for _ in range(3))
     for view in relations:
-        for rows, parent in zip(view.part_rows, view.part_parent, strict=True):
+        for rows, parent in view.parts:
             has_parent = parent != NONE
             if len(rows) < 2 or not has_parent.any():
                 continue
@@ -181,10 +172,8 @@ class Contrast:
     """The contrastive losses as functions of the field.
 
     Attributes:
-        masks: A.
-        half_masks: A over a random half of each mask's pixels.
-        pixels: n.
-        half_pixels: number of pixels in the halves.
+        masks: A; `half_masks` is A over a random half of each mask's pixels.
+        pixels: n; `half_pixels` counts those of the halves.
     """
 
     masks: MaskOperator

@@ -7,6 +7,7 @@ part, `contrast` for the hierarchy losses and `solver` for their minimisation.
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 
 from hilsplat.base.artifacts import read_index, read_npz, sealed, sha256_of_file, write_json
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
@@ -44,41 +45,39 @@ def run_field(
         start: field from which `start: langsplat` begins.
 
     Raises:
-        MisalignedArtifactError: if an input belongs to other masks, Gaussians or codes.
-        SettingsError: if an input that the settings require is missing.
+        MisalignedArtifactError: an input belongs to other masks, Gaussians or codes.
+        SettingsError: an input that the settings require is missing.
     """
-    if (settings.trainer == "literal") != (rendered is not None):
-        raise SettingsError(
-            "field.trainer and the options don't fit together",
-            expected="--scene, --gaussians and --masks with trainer: literal, and only there",
-        )
-    if (settings.start == "langsplat") != (start is not None):
-        raise SettingsError(
-            "field.start and the options don't fit together",
-            expected="--start <field.safetensors> with start: langsplat, and only there",
-        )
+    for name, wanted, given, options in (
+        (
+            "trainer",
+            settings.trainer == "literal",
+            rendered,
+            "--scene, --gaussians and --masks with trainer: literal",
+        ),
+        ("start", settings.start == "langsplat", start, "--start <field.safetensors> with start: langsplat"),
+    ):
+        if wanted != (given is not None):
+            raise SettingsError(
+                f"field.{name} and the options don't fit together", expected=f"{options}, and only there"
+            )
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]
     latents = load_latents(autoencoder_folder, contributions)
     parents = read_parents(tree_folder, contributions)
+    code_sha256 = sha256_of_file(autoencoder_file(autoencoder_folder))
     with stage_log("field", scene) as counts:
-        masks, half_masks = (
-            MaskOperator.of(contributions.matrix(name), contributions.level, threads)
-            for name in ("A", "A_half")
-        )
-        pixels = contributions.pixels.astype(np.float32)
-        problem = QuadraticProblem.of(
-            masks,
-            contributions.quadratic(threads),
-            pixels,
-            latents,
-            (settings.weight_language, settings.weight_clustering, settings.ridge),
-            _first_features(start, contributions, autoencoder_folder) if start else settings.start,
-            seed,
-        )
-        relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
-        half_pixels = contributions.half_pixels.astype(np.float32)
-        contrast = Contrast(masks, half_masks, pixels, half_pixels, relations, settings)
+        first: str | np.ndarray = settings.start
+        if start is not None:
+            begun = LanguageField.load(start)
+            made_from = contributions.gaussians_sha256, code_sha256
+            if (begun.gaussians_sha256, begun.autoencoder_sha256) != made_from:
+                raise MisalignedArtifactError(
+                    f"{start} belongs to other Gaussians, or to another code",
+                    fix="compute both fields from the same Gaussians and autoencoder",
+                )
+            first = begun.features
+        problem, contrast = field_losses(contributions, parents, latents, settings, first, seed, threads)
         if rendered is None:
             features, report = solve_field(problem, contrast, settings)
         else:
@@ -89,10 +88,7 @@ def run_field(
             )
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
-        field = LanguageField(
-            features, contributions.gaussians_sha256, sha256_of_file(autoencoder_file(autoencoder_folder))
-        )
-        field.save(out)
+        LanguageField(features, contributions.gaussians_sha256, code_sha256).save(out)
         unseen = int((problem.mass.max(axis=1) == 0).sum())
         write_json(
             Path(out).with_suffix(".report.json"),
@@ -102,30 +98,41 @@ def run_field(
                 "unseen_gaussians": unseen,
                 "masks": len(contributions),
                 "latent": features.shape[2],
-                "contrasted_masks": sum(len(view.rows) for view in relations),
+                "contrasted_masks": sum(len(view.rows) for view in contrast.relations),
                 **report,
             },
         )
         counts |= {"masks": len(contributions), "Gaussians": len(features), "unseen": unseen}
 
 
-def _first_features(path: Path, contributions: Contributions, autoencoder_folder: Path) -> np.ndarray:
-    """Return the features of a field, which must be of the same Gaussians and code."""
-    field = LanguageField.load(path)
-    digest = sha256_of_file(autoencoder_file(autoencoder_folder))
-    if (field.gaussians_sha256, field.autoencoder_sha256) != (contributions.gaussians_sha256, digest):
-        raise MisalignedArtifactError(
-            f"{path} belongs to other Gaussians, or to another code",
-            fix="compute both fields from the same Gaussians and autoencoder",
-        )
-    return field.features
+def field_losses(
+    contributions: Contributions,
+    parents: dict[str, np.ndarray],
+    latents: Float32[np.ndarray, "M D"],
+    settings: FieldSettings,
+    start: str | Float32[np.ndarray, "N 3 D"],
+    seed: int,
+    threads: int,
+) -> tuple[QuadraticProblem, Contrast]:
+    """Return the losses of a scene's field; `start` and `seed` are those of `QuadraticProblem.of`."""
+    masks, half_masks = (
+        MaskOperator.of(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
+    )
+    pixels, half_pixels = (
+        count.astype(np.float32) for count in (contributions.pixels, contributions.half_pixels)
+    )
+    weights = settings.weight_language, settings.weight_clustering, settings.ridge
+    quadratic = contributions.quadratic(threads)
+    problem = QuadraticProblem.of(masks, quadratic, pixels, latents, weights, start, seed)
+    relations = view_relations(contributions, parents, settings, masks.means(problem.lifted))
+    return problem, Contrast(masks, half_masks, pixels, half_pixels, relations, settings)
 
 
 def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
     """Return the parent of each mask in the coverage tree of each view.
 
     Raises:
-        MisalignedArtifactError: if the trees were computed from other masks.
+        MisalignedArtifactError: the trees were computed from other masks.
     """
     require_same_masks(tree_folder, contributions.folder)
     return {

@@ -14,9 +14,9 @@ class LanguageField:
     """One latent per Gaussian and level.
 
     Attributes:
-        features: latents of N Gaussians at L = 3 levels, coarse to fine; 0 for no latent.
+        features: latents of N Gaussians at three levels, coarse to fine; 0 for no latent.
         gaussians_sha256: digest of the Gaussians' PLY.
-        autoencoder_sha256: digest of the autoencoder that decodes the latents.
+        autoencoder_sha256: digest of the code that decodes the latents.
     """
 
     features: Float32[np.ndarray, "N 3 D"]
@@ -33,6 +33,6 @@ class LanguageField:
         """Read `field.safetensors`.
 
         Raises:
-            ArtifactError: if the file is missing, damaged or not a language field.
+            ArtifactError: the file is missing, damaged or not a language field.
         """
         return made(LanguageField, *read_tensors(path), path)

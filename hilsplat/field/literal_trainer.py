@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
+from hilsplat.contributions.stage import label_maps, painted_indicator, random_half
 from hilsplat.field.adam import Adam
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
 from hilsplat.field.problem import QuadraticProblem
@@ -58,33 +58,26 @@ class ViewTargets:
     relations: ViewRelations
 
 
-@dataclass(frozen=True)
-class Shares:
-    """Factors that turn losses of one view into an estimate of the whole objective: see `view_losses`."""
-
-    views: int
-    pixels: float
-    instance: int
-    part: int
-
-
 def view_losses(
     shown: Float64[np.ndarray, "P 3 D"],
     view: ViewTargets,
     latents: Float32[np.ndarray, "M D"],
     settings: FieldSettings,
-    shares: Shares,
+    shares: tuple[int, float, int, int],
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
     """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
+
+    The losses are scaled so that their mean over all views equals the solver's objective.
 
     Args:
         shown: rendered features divided by alpha, channels of each level.
         latents: latent of every mask of the scene.
-        shares: factors that make the mean over all views equal the solver's objective.
+        shares: number of views and of labelled pixels, and the counts of `compared`, over the scene.
 
     Returns:
         unweighted losses by name; gradient with respect to the maps, 0 where no mask is painted.
     """
+    num_views, num_pixels, num_instance, num_part = shares
     pixels, levels, channels = shown.shape
     flat = shown.reshape(pixels, levels * channels)
     count = np.diff(view.painted.indptr).astype(np.float64)[:, None]
@@ -95,14 +88,12 @@ def view_losses(
     )
     own = sums / np.maximum(count, 1)
     mask_of = np.full((pixels, levels), -1)
-    mask_of[view.painted.indices, np.repeat(view.level, np.diff(view.painted.indptr))] = np.repeat(
-        np.arange(len(view.rows)), np.diff(view.painted.indptr)
-    )
+    of_entry = np.repeat(of_level[0], np.diff(view.painted.indptr))
+    mask_of[view.painted.indices, view.level[of_entry]] = of_entry
     inside = mask_of >= 0
-    at = mask_of[inside]
-    here = shown[inside]
+    at, here = mask_of[inside], shown[inside]
     gradient = np.zeros_like(shown)
-    scale = shares.views / shares.pixels
+    scale = num_views / num_pixels
     to_latent, to_mean = here - latents[view.rows[at]], here - own[at]
     losses = {"clustering": scale * float(np.square(to_mean).sum())}
     by_pixel = 2 * scale * settings.weight_clustering * to_mean
@@ -118,15 +109,15 @@ def view_losses(
     means[view.rows] = own
     halves[view.rows] = half_sums / np.maximum(half_count, 1)
     others[view.rows] = (sums - half_sums) / rest
-    entries = compared([view.relations])
+    in_instance, in_part = compared([view.relations])
     losses["instance"], by_means = instance_term(means, [view.relations], settings)
     losses["part"], (own_part, by_half, by_other) = part_term(
         means, halves, others, [view.relations], settings
     )
-    for name, found, of_all in (("instance", entries[0], shares.instance), ("part", entries[1], shares.part)):
-        losses[name] *= shares.views * found / max(of_all, 1)
-    ins = settings.weight_instance * shares.views * entries[0] / max(shares.instance, 1)
-    part = settings.weight_part * shares.views * entries[1] / max(shares.part, 1)
+    losses["instance"] *= num_views * in_instance / max(num_instance, 1)
+    losses["part"] *= num_views * in_part / max(num_part, 1)
+    ins = settings.weight_instance * num_views * in_instance / max(num_instance, 1)
+    part = settings.weight_part * num_views * in_part / max(num_part, 1)
     of_mask = (ins * by_means + part * own_part)[view.rows] / np.maximum(count, 1)
     of_other = part * by_other[view.rows] / rest
     of_half = part * by_half[view.rows] / np.maximum(half_count, 1) - of_other
@@ -156,7 +147,7 @@ def train_literally(
         the features, and a report: every term of the objective before and after, and the loss curve.
 
     Raises:
-        MisalignedArtifactError: if the contributions belong to other Gaussians or other masks.
+        MisalignedArtifactError: the contributions belong to other Gaussians or other masks.
     """
     scene_folder, gaussians_ply, masks_folder = rendered
     scene = Scene.load(scene_folder)
@@ -164,18 +155,12 @@ def train_literally(
     gaussians, device = load_ply(gaussians_ply), choose_device("auto")
     features = problem.lifted.reshape(len(gaussians), -1).astype(np.float32)
     channels = features.shape[1] // len(LEVELS)
-    shares = Shares(len(contributions.views), problem.total_pixels, *compared(contrast.relations))
+    shares = len(contributions.views), problem.total_pixels, *compared(contrast.relations)
     report: dict[str, object] = {"start": problem.terms(problem.lifted) | contrast.values(problem.lifted)}
     targets: dict[int, ViewTargets] = {}
     order, queue = np.random.default_rng(seed), list[int]()
     adam, curve, recent = Adam(features, settings.rate), list[dict[str, float]](), list[float]()
     log_every, begin = max(1, settings.iterations // CURVE_POINTS), time.perf_counter()
-    weights = {
-        "language": settings.weight_language,
-        "clustering": settings.weight_clustering,
-        "instance": settings.weight_instance,
-        "part": settings.weight_part,
-    }
     ridge = 2 * settings.ridge / problem.total_pixels * problem.mass[:, :, None]
     for step in range(1, settings.iterations + 1):
         queue = queue or order.permutation(len(contributions.views)).tolist()
@@ -183,8 +168,9 @@ def train_literally(
         camera = scene.cameras[contributions.views[number]]
         seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
         if number not in targets:
+            covered = seen.alpha.reshape(-1) >= MIN_ALPHA
             relations = contrast.relations[number]
-            targets[number] = _targets(contributions, masks_folder, number, seen.alpha, relations)
+            targets[number] = _targets(contributions, masks_folder, number, covered, relations)
         alpha = np.maximum(seen.alpha.reshape(-1, 1), 1e-6)
         shown = (seen.image[..., 3:].reshape(len(alpha), -1) / alpha).astype(np.float64)
         maps = shown.reshape(len(alpha), len(LEVELS), channels)
@@ -196,7 +182,7 @@ def train_literally(
             pull = ridge * (features.reshape(problem.lifted.shape) - problem.lifted)
             gradient = gradient + pull.reshape(features.shape)
         adam.step(gradient)
-        recent.append(sum(weights[name] * value for name, value in losses.items()))
+        recent.append(sum(getattr(settings, f"weight_{name}") * value for name, value in losses.items()))
         if step % log_every == 0 or step == settings.iterations:
             seconds = round(time.perf_counter() - begin, 2)
             curve.append({"step": step, "loss": float(np.mean(recent)), "seconds": seconds})
@@ -211,18 +197,15 @@ def _targets(
     contributions: Contributions,
     masks_folder: Path,
     number: int,
-    alpha: Float32[np.ndarray, "H W"],
+    covered: Bool[np.ndarray, " P"],
     relations: ViewRelations,
 ) -> ViewTargets:
     view = contributions.views[number]
     masks = load_masks(masks_folder, view, digests_in(contributions.folder))
     labels = label_maps(masks)
-    covered: Bool[np.ndarray, " P"] = alpha.reshape(-1) >= MIN_ALPHA
-    half = random_half(view, len(labels))
-    return ViewTargets(
-        contributions.rows_of_views()[number],
-        masks.level.astype(np.int64) - 1,
-        painted_indicator(labels, len(masks), covered),
-        painted_indicator(labels, len(masks), covered & half),
-        relations,
+    painted, half = (
+        painted_indicator(labels, len(masks), pixels)
+        for pixels in (covered, covered & random_half(view, len(labels)))
     )
+    rows = contributions.rows_of_views()[number]
+    return ViewTargets(rows, masks.level.astype(np.int64) - 1, painted, half, relations)

@@ -55,11 +55,7 @@ def instance_loss_literal(
 
     Args:
         means: mean rendered feature of each mask of one view, all levels; at least two.
-        level: `Level` of each mask.
         omega: similarity degree, above 1.
-
-    Returns:
-        output of `log_distance_loss`.
     """
     return log_distance_loss(means, -np.abs(level[:, None] - level[None]) * math.log(omega))
 
@@ -72,8 +68,6 @@ def instance_loss_tree(
     Departs: the depth of the deepest common ancestor in the coverage tree replaces |l_i - l_j| of Eq. 3.
     Unrelated masks thus have a target distance of 1, parts of one object 1 / Omega, and subparts of one part
     1 / Omega^2, which is the nesting that the paper's text describes.
-
-    `depth` is that of `common_ancestor_depth`; the rest is as in `instance_loss_literal`.
     """
     return log_distance_loss(means, -depth * math.log(omega))
 
@@ -158,7 +152,7 @@ def part_loss_literal(
         tau: temperature.
 
     Returns:
-        mean over anchors, 0 if there are none; and its gradient with respect to the means.
+        the loss, 0 without anchors, and its gradient for the means.
     """
     similarity, pull_back = similarity_without_parent(means, means, parent_means)
     has_parent = parent != NONE
@@ -195,10 +189,9 @@ def part_loss_disentangle(
         other_half: mean over the remaining pixels.
         has_parent: masks with a parent, which are the anchors; at least one.
         parent_means: mean feature of each mask's parent (any value for orphans).
-        tau: temperature.
 
     Returns:
-        mean over anchors, and its gradients with respect to the halves.
+        mean over anchors, and its gradients for both halves.
     """
     by_half = np.zeros(half.shape)
     anchors = np.flatnonzero(has_parent)

@@ -14,21 +14,13 @@ LangSplat's regression with squared instead of absolute differences, averaged ov
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from hilsplat.base.compiled import compiled
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average, lifted_median
 from hilsplat.contributions.quadratic import Quadratic, level_mass
-from hilsplat.field.one_pass import (
-    add_by_channel,
-    add_scaled,
-    channel_dots,
-    pull,
-    redirect,
-    scaled_squares,
-)
 
 
 @dataclass(frozen=True)
@@ -41,7 +33,7 @@ class QuadraticProblem:
         pixels: n.
         latents: h.
         lifted: start of the field, to which the ridge pulls.
-        weights: weights of the language loss, the clustering loss and the ridge.
+        weights: of the language loss, the clustering loss and the ridge.
     """
 
     masks: MaskOperator
@@ -59,12 +51,13 @@ class QuadraticProblem:
         pixels: Float32[np.ndarray, " M"],
         latents: Float32[np.ndarray, "M D"],
         weights: tuple[float, float, float],
-        start: Literal["average", "median", "random", "langsplat"] | np.ndarray = "average",
+        start: str | Float32[np.ndarray, "N 3 D"] = "average",
         seed: int = 0,
     ) -> "QuadraticProblem":
         """Compute the mass and the start of the field, to which the ridge pulls.
 
-        `start` names the start or is its features (N, 3, D), as for "langsplat"; `seed` is for "random".
+        Args:
+            start: "average", "median", "random" (from `seed`), or features.
         """
         mass = level_mass(quadratic)
         if isinstance(start, np.ndarray):
@@ -129,10 +122,9 @@ def conjugate_gradient(
     steps: int,
     curved: Float32[np.ndarray, "N 3 D"] | None = None,
 ) -> np.ndarray:
-    """Minimise the quadratic part in a few steps, preconditioned by the visible mass.
+    """Minimise the quadratic part in a few steps, preconditioned by the visible mass; `curved` is G start.
 
-    `curved` is G times the start, if known. Levels and channels do not interact, so each has its own step
-    size. Dot products are summed in float64 in a fixed order.
+    Levels and channels do not interact, so each has its own step size.
     """
     scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
@@ -157,3 +149,84 @@ def _ratio(
 ) -> Float32[np.ndarray, "3 D"]:
     """Return the quotient, or 0 if a channel is already solved."""
     return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)
+
+
+# Updates and sums over a whole field in one pass, without temporaries of its size. They are memory-bound:
+# three levels of sixteen numbers for a million Gaussians are 192 MB, and a NumPy expression reads and writes
+# that much for each operator. Sums are taken in float64 in a fixed order.
+
+
+@compiled
+def channel_dots(a, b):
+    """Sum the products of two fields (N, 3, D) over Gaussians, per level and channel."""
+    out = np.zeros(a.shape[1:])
+    for n in range(len(a)):
+        for level in range(a.shape[1]):
+            for c in range(a.shape[2]):
+                out[level, c] += np.float64(a[n, level, c]) * np.float64(b[n, level, c])
+    return out
+
+
+@compiled
+def scaled_squares(scale, a):
+    """Return `channel_dots` of a field and scale (N, 3) times the field."""
+    out = np.zeros(a.shape[1:])
+    for n in range(len(a)):
+        for level in range(a.shape[1]):
+            for c in range(a.shape[2]):
+                value = a[n, level, c]
+                out[level, c] += np.float64(value) * np.float64(scale[n, level] * value)
+    return out
+
+
+@compiled
+def add_scaled(factor, scale, a, out):
+    """Add factor times scale (N, 3) times a field to `out`."""
+    for n in range(len(a)):
+        for level in range(a.shape[1]):
+            weight = factor * scale[n, level]
+            for c in range(a.shape[2]):
+                out[n, level, c] += weight * a[n, level, c]
+
+
+@compiled
+def add_by_channel(factors, a, out):
+    """Add a field times the factor (3, D) of each level and channel to `out`."""
+    for n in range(len(a)):
+        for level in range(a.shape[1]):
+            for c in range(a.shape[2]):
+                out[n, level, c] += factors[level, c] * a[n, level, c]
+
+
+@compiled
+def redirect(scale, residual, ratio, direction):
+    """Compute the next conjugate direction: scale (N, 3) times residual plus ratio (3, D) times the last."""
+    for n in range(len(residual)):
+        for level in range(residual.shape[1]):
+            for c in range(residual.shape[2]):
+                step = scale[n, level] * residual[n, level, c]
+                direction[n, level, c] = step + ratio[level, c] * direction[n, level, c]
+
+
+@compiled
+def add_slope(factor, curved, right, scale, out):
+    """Add the slope factor (curved - right) of a quadratic form to `out`, and multiply by scale (N, 3)."""
+    for n in range(len(out)):
+        for level in range(out.shape[1]):
+            for c in range(out.shape[2]):
+                slope = factor * (curved[n, level, c] - right[n, level, c])
+                out[n, level, c] = (out[n, level, c] + slope) * scale[n, level]
+
+
+@compiled
+def pull(mass, features, start):
+    """Return the sum of mass (N, 3) times the squared distance between two fields."""
+    total = 0.0
+    for n in range(len(features)):
+        for level in range(features.shape[1]):
+            square = 0.0
+            for c in range(features.shape[2]):
+                apart = np.float64(features[n, level, c]) - np.float64(start[n, level, c])
+                square += apart * apart
+            total += mass[n, level] * square
+    return total

@@ -10,8 +10,7 @@ from jaxtyping import Float, Float32
 
 from hilsplat.base.compiled import compiled
 from hilsplat.field.contrast import Contrast
-from hilsplat.field.one_pass import add_slope
-from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
+from hilsplat.field.problem import QuadraticProblem, add_slope, conjugate_gradient
 from hilsplat.settings import FieldSettings
 
 LBFGS_MEMORY = 8
@@ -24,13 +23,8 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 def solve_field(
     problem: QuadraticProblem, contrast: Contrast, settings: FieldSettings
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Solve by lifting, conjugate gradient, and L-BFGS if a contrastive loss has a weight.
-
-    Returns:
-        the features, and a report: every loss before and after each phase.
-    """
-    weights = (settings.weight_instance, settings.weight_part)
-    total = problem.total_pixels
+    """Return the features, and a report with every loss before and after each phase."""
+    weights, total = (settings.weight_instance, settings.weight_part), problem.total_pixels
     # The steps of L-BFGS take much memory, so its variables are only those that a mask shows. They are scaled
     # by the root of the mass, which makes the quadratic part nearly isotropic.
     shown = np.flatnonzero(problem.mass)
@@ -84,10 +78,8 @@ def keep_labelled(
     get the mask's full latent and match its queries everywhere: the regression uses only labelled pixels.
 
     Args:
-        features: the solved field.
         mass: visible weight in labelled pixels of each level.
         total_mass: visible weight in all pixels.
-        min_share: minimum share of the weight in labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
     return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)
@@ -122,10 +114,8 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
             break
         del direction
         # reuse the memory of vectors no longer needed: one takes over 100 MiB in a large scene
-        moved, turned = (
-            np.subtract(candidate, point, out=point),
-            np.subtract(new_gradient, gradient, out=gradient),
-        )
+        moved = np.subtract(candidate, point, out=point)
+        turned = np.subtract(new_gradient, gradient, out=gradient)
         curvature = dot(moved, turned)
         if curvature > 0:
             memory = [*memory, (moved, turned, curvature)][-LBFGS_MEMORY:]
@@ -152,13 +142,9 @@ def _dot(a, b):
     return (s + t) + (u + v)
 
 
-def _add(factor: float, vector: np.ndarray, out: np.ndarray) -> None:
-    """Add a multiple of a vector to `out`, in float32, without a temporary."""
-    _add_flat(np.float32(factor), vector.reshape(-1), out.reshape(-1))
-
-
 @compiled
-def _add_flat(factor, vector, out):
+def _add(factor, vector, out):
+    """Add a multiple of a flat vector to `out`, in float32, without a temporary."""
     for i in range(len(out)):
         out[i] += factor * vector[i]
 
@@ -166,18 +152,17 @@ def _add_flat(factor, vector, out):
 def _two_loops(
     gradient: np.ndarray, memory: list[tuple[np.ndarray, np.ndarray, float]], first_step: float
 ) -> np.ndarray:
-    """Return the approximate inverse Hessian times the gradient, from the remembered steps."""
+    """Return the approximate inverse Hessian times the gradient, from the steps in memory."""
     result = gradient.copy()
-    factors = []
+    flat, factors = result.reshape(-1), []
     for moved, turned, curvature in reversed(memory):
         factor = dot(moved, result) / curvature
-        _add(-factor, turned, result)
+        _add(np.float32(-factor), turned.reshape(-1), flat)
         factors.append(factor)
     if memory:
         _, turned, curvature = memory[-1]
-        result *= np.float32(curvature / dot(turned, turned))
-    else:
-        result *= np.float32(first_step)
+        first_step = curvature / dot(turned, turned)
+    result *= np.float32(first_step)
     for (moved, turned, curvature), factor in zip(memory, reversed(factors), strict=True):
-        _add(factor - dot(turned, result) / curvature, moved, result)
+        _add(np.float32(factor - dot(turned, result) / curvature), moved.reshape(-1), flat)
     return result

@@ -16,13 +16,14 @@ Departs from the published code:
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float32
+from scipy.cluster.vq import vq
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
-from hilsplat.contributions.view_matrices import painted_indicator
-from hilsplat.methods.common.quantise import ProductQuantiser
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.contributions.stage import painted_indicator
+from hilsplat.methods.common.groups import kmeans
+from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
 TOP_GAUSSIANS = 45
@@ -37,9 +38,8 @@ UNSEEN = 1e-9
 
 def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
     """Return the `count` largest weights of each row; lower columns win ties."""
-    data = weights.data.copy()
-    _drop_lighter(weights.indptr, data, count)
-    kept = sp.csr_matrix((data, weights.indices.copy(), weights.indptr.copy()), shape=weights.shape)
+    kept = weights.copy()
+    _drop_lighter(kept.indptr, kept.data, count)
     kept.eliminate_zeros()
     return kept
 
@@ -49,8 +49,7 @@ def register(
 ) -> Float32[np.ndarray, "N 3 C"]:
     """Return unit averages of unit mask vectors over the pixels that a Gaussian dominates; zero without any.
 
-    Args:
-        count: number of Gaussians that dominate a pixel, those with the largest weights.
+    The `count` Gaussians with the largest weights dominate a pixel.
     """
     contributions = inputs.contributions
     sums = np.zeros((contributions.num_gaussians, len(LEVELS), vectors.shape[1]), np.float32)
@@ -66,17 +65,35 @@ def register(
     return np.where(length > UNSEEN, sums / np.maximum(length, UNSEEN), np.float32(0))
 
 
+def codebooks(vectors: Float32[np.ndarray, "B C"], seed: int) -> list[Float32[np.ndarray, "256 S"]]:
+    """Return a codebook for each part of a vector (product quantisation; Jegou et al., PAMI 2011)."""
+    return [kmeans(part, 256, seed + at)[0] for at, part in enumerate(_parts(vectors))]
+
+
+def quantised(
+    vectors: Float32[np.ndarray, "n C"], books: list[Float32[np.ndarray, "_ S"]]
+) -> Float32[np.ndarray, "n C"]:
+    """Replace each part of the vectors by its nearest entry of the codebook, a byte if that has 256."""
+    nearest = [
+        book[vq(part, book, check_finite=False)[0]] for part, book in zip(_parts(vectors), books, strict=True)
+    ]
+    return np.concatenate(nearest, axis=1)[:, : vectors.shape[1]]
+
+
+def _parts(vectors: Float32[np.ndarray, "n C"]) -> list[Float32[np.ndarray, "n S"]]:
+    """Return parts of `PART` elements; the last is padded with zeros."""
+    filled = np.pad(vectors, ((0, 0), (0, -vectors.shape[1] % PART)))
+    return [np.ascontiguousarray(filled[:, at : at + PART]) for at in range(0, filled.shape[1], PART)]
+
+
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Average, quantise and decode mask vectors; Gaussians that dominate no pixel get zeros."""
-    code = inputs.linear_code("dr_splat")
+    code, features = inputs.linear_code("dr_splat"), inputs.no_features()
     vectors = code.decode_array(inputs.latents)
-    averages = register(inputs, vectors, TOP_GAUSSIANS)
-    quantiser = ProductQuantiser.fit(vectors, PART, seed)
-    features = np.zeros((*averages.shape[:2], code.latent), np.float32)
+    averages, books = register(inputs, vectors, TOP_GAUSSIANS), codebooks(vectors, seed)
     for level in LEVELS:
         seen = averages[:, level.index].any(axis=1)
-        stored = quantiser.encode(averages[seen, level.index])
-        features[seen, level.index] = code.encode_array(quantiser.decode(stored, code.channels))
+        features[seen, level.index] = code.encode_array(quantised(averages[seen, level.index], books))
     return features
 
 
@@ -97,6 +114,3 @@ def _drop_lighter(indptr, data, count):
                 equal -= 1
             elif data[k] <= least:
                 data[k] = 0
-
-
-METHOD = Method("dr_splat", "Dr. Splat", "kaist-ami/Dr-Splat train.py", fit)

@@ -17,16 +17,12 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.contrast import Contrast, view_relations
-from hilsplat.field.field import read_parents
-from hilsplat.field.problem import QuadraticProblem
+from hilsplat.field.field import field_losses, read_parents
 from hilsplat.field.solver import solve_field
 from hilsplat.methods.common.groups import CENTRES, group_means, merged_centres
 from hilsplat.semantic_tree.build import run_semantic_tree
-from hilsplat.semantic_tree.level_nodes import MIN_FIT, LevelNodes
-from hilsplat.semantic_tree.nodes import best_fits, level_ious
+from hilsplat.semantic_tree.nodes import MIN_FIT, LevelNodes, best_fits, level_ious
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 
 CENTRE_OF = 4
@@ -37,45 +33,6 @@ STEPS = 60
 
 RIDGE = 1e-3
 """Weight of the penalty towards the random start, which keeps unobserved directions from drifting."""
-
-
-def identity_features(
-    contributions: Contributions,
-    parents: dict[str, np.ndarray],
-    settings: FieldSettings,
-    size: int,
-    steps: int,
-    seed: int,
-    threads: int,
-) -> tuple[Float32[np.ndarray, "N 3 D"], Float32[np.ndarray, "M D"]]:
-    """Train features with L alone, from a random start.
-
-    Args:
-        parents: per view, the coverage tree's parent of each mask.
-        settings: weights and readings of L_h, L_ins and L_part.
-        steps: L-BFGS steps.
-        threads: threads for matrix products; the result does not depend on it.
-
-    Returns:
-        features, nan for Gaussians in no mask of a level; the mean feature of each mask.
-    """
-    alone = {"weight_language": 0.0, "ridge": RIDGE, "start": "random", "cg_steps": 0, "lbfgs_steps": steps}
-    settings = settings.model_copy(update=alone)
-    masks, halves = (
-        MaskOperator.of(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
-    )
-    pixels = contributions.pixels.astype(np.float32)
-    no_latents = np.zeros((len(contributions), size), np.float32)
-    weights = (0.0, settings.weight_clustering, settings.ridge)
-    problem = QuadraticProblem.of(
-        masks, contributions.quadratic(threads), pixels, no_latents, weights, "random", seed
-    )
-    relations = view_relations(contributions, parents, settings)
-    half_pixels = contributions.half_pixels.astype(np.float32)
-    contrast = Contrast(masks, halves, pixels, half_pixels, relations, settings)
-    features, _ = solve_field(problem, contrast, settings)
-    means = masks.means(features)
-    return np.where((problem.mass > 0)[:, :, None], features, np.nan).astype(np.float32), means
 
 
 def farthest_alike(
@@ -92,18 +49,13 @@ def farthest_alike(
     return tuple(0.5 * float(np.median(values)) if values else np.inf for values in found)
 
 
-def joined_clusters(
-    features: Float32[np.ndarray, "n D"], farthest: float, seed: int
-) -> Int64[np.ndarray, " n"]:
-    """Return each row's cluster: k-means centres, merged up to an average distance of `farthest`."""
-    count = int(np.clip(len(features) // CENTRE_OF, 1, CENTRES))
-    return merged_centres(features, count, (farthest,), seed, "euclidean")[:, 0]
-
-
 def nested_clusters(
     features: Float32[np.ndarray, "N 3 D"], farthest: tuple[float, ...], seed: int
 ) -> Int64[np.ndarray, "N 3"]:
-    """Return each Gaussian's cluster per level, -1 where its feature is nan; clusters nest."""
+    """Return each Gaussian's cluster per level, -1 where its feature is nan; clusters nest.
+
+    A cluster is divided by k-means, whose centres are merged up to an average distance of `farthest`.
+    """
     found = np.full(features.shape[:2], NONE, np.int64)
     around = np.zeros(len(features), np.int64)
     for level in LEVELS:
@@ -111,7 +63,9 @@ def nested_clusters(
         number = 0
         for cluster in np.unique(around[has]):
             inside = np.flatnonzero(has & (around == cluster))
-            own = joined_clusters(features[inside, level.index], farthest[level.index], seed)
+            rows, most = features[inside, level.index], farthest[level.index]
+            count = int(np.clip(len(rows) // CENTRE_OF, 1, CENTRES))
+            own = merged_centres(rows, count, (most,), seed, "euclidean")[:, 0]
             found[inside, level.index] = number + own
             number += int(own.max()) + 1
         # Gaussians without a cluster remain grouped by their whole.
@@ -131,20 +85,21 @@ def run_feature_tree(
 ) -> None:
     """Write a semantic tree whose nodes are clusters of features trained with L alone.
 
-    Args:
-        out: output folder, as in `run_semantic_tree`.
-        field_settings: weights and readings of L.
-        threads: number of threads; results do not depend on it.
+    Results do not depend on `threads`.
 
     Raises:
         MisalignedArtifactError: an input belongs to other masks.
     """
     contributions = Contributions.load(contributions_folder)
     parents = read_parents(coverage_folder, contributions)
-    features, means = identity_features(
-        contributions, parents, field_settings, settings.feature_size, STEPS, seed, threads
-    )
-    clusters = nested_clusters(features, farthest_alike(means, contributions, parents), seed)
+    alone = {"weight_language": 0.0, "ridge": RIDGE, "cg_steps": 0, "lbfgs_steps": STEPS, "prune_cosine": 1.0}
+    losses = field_settings.model_copy(update=alone)
+    no_latents = np.zeros((len(contributions), settings.feature_size), np.float32)
+    problem, contrast = field_losses(contributions, parents, no_latents, losses, "random", seed, threads)
+    features, _ = solve_field(problem, contrast, losses)
+    farthest = farthest_alike(problem.masks.means(features), contributions, parents)
+    features = np.where((problem.mass > 0)[:, :, None], features, np.float32(np.nan))
+    clusters = nested_clusters(features, farthest, seed)
     S, mass = contributions.matrix("S"), contributions.mass()
 
     def nodes_of(level: Level, rows: Int64[np.ndarray, " m"]) -> LevelNodes:

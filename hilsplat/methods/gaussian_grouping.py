@@ -29,11 +29,9 @@ from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import features_of_groups, group_means, nearest
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import product, train
-from hilsplat.methods.method import Method, MethodInputs
-from hilsplat.semantic_tree.level_nodes import level_nodes
-from hilsplat.semantic_tree.nodes import MIN_VISIBLE_PX
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
+from hilsplat.semantic_tree.nodes import MIN_VISIBLE_PX, level_nodes
 from hilsplat.settings import MethodSettings, SemanticTreeSettings
 
 CHANNELS = 16
@@ -73,9 +71,7 @@ def identity_of_gaussians(
 ) -> Int64[np.ndarray, " N"]:
     """Train codes and classifier of a level, and classify the Gaussians.
 
-    Args:
-        identity: identity of every mask of the scene at the level, -1 for none.
-        settings: steps and rate.
+    `identity` is that of every mask of the scene at the level, -1 for none.
     """
     num_classes = int(identity.max()) + 1
     draw = torch.Generator().manual_seed(seed)
@@ -99,7 +95,7 @@ def identity_of_gaussians(
         return total
 
     if num_classes > 1:
-        train(views, [{"params": [codes, classifier], "lr": settings.rate}], loss, settings, seed)
+        train(views, [codes, classifier], loss, settings, seed)
     with one_torch_thread():
         return (codes.detach() @ classifier.detach()).argmax(1).numpy()
 
@@ -110,8 +106,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     A level without identities gets zeros.
     """
     contributions, latents = inputs.contributions, inputs.latents
-    views = labelled_views(inputs, settings.pixel_step)
-    features = np.zeros((contributions.num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
+    views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()
     for level in LEVELS:
         rows = contributions.rows_of(level)
         of_row = mask_identities(contributions, level, inputs.threads)
@@ -124,6 +119,3 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         means, _ = group_means(latents[rows[has]], of_row[has], int(of_row.max()) + 1)
         features[:, level.index] = features_of_groups(group, means.astype(np.float32))
     return features
-
-
-METHOD = Method("gaussian_grouping", "Gaussian Grouping", "lkeab/gaussian-grouping train.py", fit)

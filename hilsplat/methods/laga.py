@@ -28,14 +28,17 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
-from hilsplat.contributions.rows import Contributions
-from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means, unit_rows
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
-from hilsplat.methods.common.quantise import kmeans
+from hilsplat.field.code import LinearCode
+from hilsplat.methods.common.groups import (
+    density_clusters,
+    features_of_groups,
+    group_means,
+    kmeans,
+    unit_rows,
+)
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 SLICES = (16, 8, 8)
@@ -80,9 +83,8 @@ def nested_loss(
 ) -> Float[Tensor, ""]:
     """Return the contrast of pixels with mask prototypes per prefix, plus a penalty for slice lengths not 1.
 
-    Args:
-        masks: pixels of the masks of whole, part, subpart.
-        random: draws the pixels used outside a mask: as many as inside, besides all hard ones.
+    `masks` has the pixels of the masks of whole, part, subpart. Pixels outside a mask are drawn, as many as
+    inside; all hard ones are also used.
     """
     inside = [torch.from_numpy(each) for each in masks]
     last = len(LEVELS) - 1
@@ -110,36 +112,18 @@ def nested_loss(
     return total
 
 
-def train_features(
-    views: list[LabelledView], num_gaussians: int, settings: MethodSettings, seed: int
-) -> Float32[np.ndarray, "N 32"]:
-    """Return trained features of Gaussians, with slices of unit length."""
-    features = alike(num_gaussians, sum(SLICES), seed)
-
-    def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        weights, seen = of_seen(view.weights)
-        rendered = product(weights, unit_slices(features[seen]))
-        return nested_loss(rendered, masks_of_pixels(view.labels), random)
-
-    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed, PIXELS)
-    return unit_slices(features.detach()).numpy()
-
-
 def objects(
     features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
-    """Return the object of each Gaussian and of each mask, -1 for none; features and prototypes are unit.
+    """Return the object of each Gaussian and of each mask, -1 for none: a density cluster of prototypes.
 
-    Args:
-        radius: radius of density clusters of prototypes.
-        least: minimum number of masks within the radius of a dense one, including itself.
+    Features and prototypes have unit length; `radius` and `least` are those of `density_clusters`.
     """
     of_mask = density_clusters(prototypes, radius, least)
-    num = int(of_mask.max(initial=NONE)) + 1
-    if not num:
-        return np.full(len(features), NONE, np.int64), of_mask
     has = of_mask != NONE
-    centres = np.zeros((num, prototypes.shape[1]), np.float32)
+    if not has.any():
+        return np.full(len(features), NONE, np.int64), of_mask
+    centres = np.zeros((of_mask.max() + 1, prototypes.shape[1]), np.float32)
     np.add.at(centres, of_mask[has], prototypes[has])
     return (features @ unit_rows(centres).T).argmax(axis=1).astype(np.int64), of_mask
 
@@ -193,19 +177,22 @@ def object_latents(
     return found
 
 
-def large_masks(inputs: MethodInputs, contributions: Contributions) -> Bool[np.ndarray, " M"]:
-    """Return whether each mask is visible in some pixels and has at least the minimum share of its view."""
-    image = np.array([np.prod(inputs.view_camera(view).size_hw) for view in contributions.views])
-    return (contributions.pixels > 0) & (contributions.area_px > MIN_SHARE * image[contributions.view])
-
-
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train features, find objects at each level, and assign each the code of its descriptors."""
     contributions, code = inputs.contributions, inputs.linear_code("laga")
-    views = labelled_views(inputs, settings.pixel_step)
-    features = train_features(views, contributions.num_gaussians, settings, seed)
-    A, large = contributions.matrix("A"), large_masks(inputs, contributions)
-    fields, least = [], min(LEAST_MASKS, len(contributions.views))
+    views, found = labelled_views(inputs, settings.pixel_step), inputs.no_features()
+    trained = alike(contributions.num_gaussians, sum(SLICES), seed)
+
+    def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
+        weights, seen = of_seen(view.weights)
+        rendered = product(weights, unit_slices(trained[seen]))
+        return nested_loss(rendered, masks_of_pixels(view.labels), random)
+
+    train(views, [trained], loss, settings, seed, PIXELS)
+    features = unit_slices(trained.detach()).numpy()
+    A, least = contributions.matrix("A"), min(LEAST_MASKS, len(contributions.views))
+    image_px = np.array([np.prod(inputs.view_camera(view).size_hw) for view in contributions.views])
+    large = (contributions.pixels > 0) & (contributions.area_px > MIN_SHARE * image_px[contributions.view])
     for level in LEVELS:
         rows = contributions.rows_of(level)
         rows = rows[large[rows]]
@@ -214,8 +201,5 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         own, prototypes = unit_rows(features[:, prefix]), unit_rows(shown)
         group, of_mask = objects(own, prototypes, RADIUS[level.index], least)
         latents = object_latents(of_mask, inputs.latents[rows], code, seed)
-        fields.append(features_of_groups(group, latents))
-    return np.stack(fields, axis=1)
-
-
-METHOD = Method("laga", "LaGa", "SJTU-DeepVisionLab/LaGa train_affinity_features.py, inference.ipynb", fit)
+        found[:, level.index] = features_of_groups(group, latents)
+    return found

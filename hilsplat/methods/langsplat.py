@@ -17,17 +17,102 @@ Departs from the published code:
 LangSplat. It also trains all levels in one run. It treats alpha and unit length like this module.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float32
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, models, register_model
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam
-from hilsplat.methods.common.pixels import LabelledView, in_random_order, labelled_views
-from hilsplat.methods.common.quads import WIDTH, load, plus, signs_of_difference, store, zeros
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order, labelled_views
 from hilsplat.settings import MethodSettings
+
+# Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
+# `hilsplat.base.lanes` has sixteen lanes; codes of three channels would waste thirteen. Operations are
+# neither fused nor reordered, so results are bit-identical to plain loops over the channels.
+WIDTH = 4
+_FLOAT = ir.FloatType()
+_VECTOR = ir.VectorType(_FLOAT, WIDTH)
+_ZEROS = ir.Constant(_VECTOR, [ir.Constant(_FLOAT, 0.0)] * WIDTH)
+
+
+class QuadType(types.Type):
+    """numba type of four float32 values."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Quad")
+
+
+QUAD = QuadType()
+
+
+@register_model(QuadType)
+class _QuadModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _VECTOR)
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+
+
+def _all(builder: Any, scalar: Any) -> Any:
+    vector = ir.Constant(_VECTOR, ir.Undefined)
+    for lane in range(WIDTH):
+        vector = builder.insert_element(vector, scalar, ir.Constant(ir.IntType(32), lane))
+    return vector
+
+
+@intrinsic
+def load(typingctx, array, index):
+    """Return four consecutive numbers of a flat float32 array."""
+    return QUAD(array, types.intp), lambda context, builder, sig, args: builder.load(
+        _pointer(context, builder, sig.args[0], *args), align=4
+    )
+
+
+@intrinsic
+def store(typingctx, array, index, value):
+    """Write four consecutive numbers of a flat float32 array."""
+
+    def codegen(context, builder, sig, args):
+        builder.store(args[2], _pointer(context, builder, sig.args[0], args[0], args[1]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, QUAD), codegen
+
+
+@intrinsic
+def plus(typingctx, total, scale, row):
+    """Return total + scale * row; each product is rounded before the addition."""
+    return QUAD(QUAD, types.float32, QUAD), lambda context, builder, sig, args: builder.fadd(
+        args[0], builder.fmul(_all(builder, args[1]), args[2])
+    )
+
+
+@intrinsic
+def zeros(typingctx):
+    """Return four zeros."""
+    return QUAD(), lambda context, builder, sig, args: _ZEROS
+
+
+@intrinsic
+def signs_of_difference(typingctx, a, b, scale):
+    """Return scale where a > b, -scale where a < b, 0 where they are equal; NaN is kept."""
+
+    def codegen(context, builder, sig, args):
+        apart, up = builder.fsub(args[0], args[1]), _all(builder, args[2])
+        above = builder.fcmp_ordered(">", apart, _ZEROS)
+        below = builder.fcmp_ordered("<", apart, _ZEROS)
+        return builder.select(above, up, builder.select(below, builder.fneg(up), apart))
+
+    return QUAD(QUAD, QUAD, types.float32), codegen
 
 
 def train_level(
@@ -40,10 +125,7 @@ def train_level(
 ) -> Float32[np.ndarray, "N D"]:
     """Train by Adam from zero, one random view per step, each once before any is repeated.
 
-    Args:
-        views: train views with labelled pixels at this level, at least one.
-        settings: steps and rate.
-        seed: seed of the order of views.
+    `views` are train views with labelled pixels at this level, at least one.
     """
     channels = latents.shape[1]
     wide = channels + -channels % WIDTH
@@ -69,11 +151,9 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
     Args:
         indptr, indices, data: weights (pixels x Gaussians), CSR.
         labels: row of the code painted at each pixel, -1 for none.
-        codes: float32, flat, `wide` numbers per row.
+        codes, features, gradient: float32, flat, `wide` numbers per row or Gaussian; `gradient` is written.
         channels: size of a code; padding after it is 0.
-        wide: numbers per Gaussian, a multiple of `WIDTH`.
-        features: float32, flat, `wide` numbers per Gaussian.
-        gradient: same shape as `features`; written.
+        wide: multiple of `WIDTH`.
     """
     gradient[:] = 0
     labelled = 0
@@ -96,14 +176,10 @@ def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other, each with its own seed."""
-    views, latents = labelled_views(inputs, settings.pixel_step), inputs.latents
-    num = inputs.contributions.num_gaussians
-    features = np.zeros((num, len(LEVELS), latents.shape[1]), np.float32)
+    views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()
     for level in track(list(LEVELS), "levels trained"):
         if labelled := [view for view in views if len(view.at(level))]:
-            own_seed = seed + level.index
-            features[:, level.index] = train_level(labelled, latents, level, num, settings, own_seed)
+            features[:, level.index] = train_level(
+                labelled, inputs.latents, level, len(features), settings, seed + level.index
+            )
     return features
-
-
-METHOD = Method("langsplat", "LangSplat", "minghanqin/LangSplat train.py", fit)

@@ -22,10 +22,9 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam
-from hilsplat.field.linear_code import LinearCode
-from hilsplat.methods.common.pixels import LabelledView, in_random_order, labelled_views
-from hilsplat.methods.common.quantise import kmeans
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.field.code import LinearCode
+from hilsplat.methods.common.groups import kmeans
+from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order, labelled_views
 from hilsplat.settings import MethodSettings
 
 ENTRIES = 64
@@ -76,15 +75,16 @@ def step(
         targets: code of the mask painted at each pixel.
     """
     chosen, shares = largest_shares(logits)
+    rows = weights.indptr, weights.indices, weights.data
     mixed = np.zeros((weights.shape[0], len(codebook)), np.float32)
-    _mix(weights.indptr, weights.indices, weights.data, chosen, shares, mixed)
+    _mix(*rows, chosen, shares, mixed)
     vectors = as_vectors(targets, code)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     entries = as_vectors(codebook, code)
     loss, by_rendered = cosine_loss(mixed @ entries, vectors)
     by_mixed = by_rendered @ entries.T
     by_share, by_logits = np.zeros_like(shares), np.zeros_like(logits)
-    _pull(weights.indptr, weights.indices, weights.data, chosen, shares, by_mixed, by_share, by_logits)
+    _pull(*rows, chosen, shares, by_mixed, by_share, by_logits)
     return loss, by_logits, (mixed.T @ by_rendered)[:, :-1]
 
 
@@ -103,8 +103,6 @@ def train_level(
     Args:
         views: train views with labelled pixels at this level, at least one.
         codebook: initial entries, at least `KEPT`.
-        settings: steps and rate.
-        seed: seed of the order of views.
     """
     logits, entries = np.zeros((num_gaussians, len(codebook)), np.float32), codebook.copy()
     of_logits, of_entries = Adam(logits, settings.rate), Adam(entries, settings.rate)
@@ -122,13 +120,12 @@ def train_level(
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train the three levels one after the other; Gaussians in no mask of a level get zeros."""
-    contributions, latents, code = inputs.contributions, inputs.latents, inputs.linear_code("langsplat_v2")
-    views = labelled_views(inputs, settings.pixel_step)
-    features = np.zeros((contributions.num_gaussians, len(LEVELS), latents.shape[1]), np.float32)
+    latents, code = inputs.latents, inputs.linear_code("langsplat_v2")
+    views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()
     for level in track(list(LEVELS), "levels trained"):
         if labelled := [view for view in views if len(view.at(level))]:
             own_seed = seed + level.index
-            codebook, _ = kmeans(latents[contributions.rows_of(level)], ENTRIES, own_seed)
+            codebook, _ = kmeans(latents[inputs.contributions.rows_of(level)], ENTRIES, own_seed)
             features[:, level.index] = train_level(
                 labelled, latents, level, len(features), codebook, code, settings, own_seed
             )
@@ -182,6 +179,3 @@ def _pull(indptr, indices, data, chosen, shares, by_mixed, by_share, by_logits):
             mean += shares[g, k] * by_share[g, k]
         for k in range(kept):
             by_logits[g, chosen[g, k]] = shares[g, k] * (by_share[g, k] - mean)
-
-
-METHOD = Method("langsplat_v2", "LangSplatV2", "ZhaoYujie2002/LangSplatV2 train.py", fit)

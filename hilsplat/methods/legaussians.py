@@ -32,11 +32,9 @@ from torch.nn.functional import cross_entropy
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS
-from hilsplat.methods.common.groups import standardised
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
-from hilsplat.methods.common.quantise import kmeans
+from hilsplat.methods.common.groups import kmeans, standardised
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 ENTRIES = 128
@@ -80,21 +78,15 @@ def smoothing_loss(
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
 
 
-def entries_of_gaussians(
-    views: list[LabelledView],
-    entry: Int64[np.ndarray, " M"],
-    means: Float32[np.ndarray, "N 3"],
-    settings: MethodSettings,
-    seed: int,
-) -> Int64[np.ndarray, "N 3"]:
-    """Train codes, uncertainties and networks of all levels; return the entry of each Gaussian.
-
-    Args:
-        entry: codebook index of every mask of the scene, at the mask's level.
-        means: Gaussian centres, scene units.
-        settings: steps and rate.
-    """
-    num, levels = len(means), len(LEVELS)
+def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+    """Quantise, train, and look up the entries; Gaussians in no mask of a level get zeros."""
+    contributions, latents = inputs.contributions, inputs.latents
+    codebooks, entry = [], np.zeros(len(latents), np.int64)
+    for level in LEVELS:
+        rows = contributions.rows_of(level)
+        codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
+        codebooks.append(codebook)
+    views, num, levels = labelled_views(inputs, settings.pixel_step), contributions.num_gaussians, len(LEVELS)
     codes = alike(num, levels * CHANNELS, seed)
     doubt = torch.full((num, levels), float(np.log(FIRST_UNCERTAINTY / (1 - FIRST_UNCERTAINTY))))
     doubt.requires_grad_()
@@ -102,7 +94,7 @@ def entries_of_gaussians(
         torch.manual_seed(seed)
         decoders = [network((CHANNELS, *DECODER_WIDTHS, ENTRIES)) for _ in LEVELS]
         position = network((3, *POSITION_WIDTHS, levels * CHANNELS))
-    places = torch.from_numpy(standardised(means))
+    places = torch.from_numpy(standardised(contributions.means()))
 
     def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
         weights, seen = of_seen(view.weights)
@@ -124,28 +116,12 @@ def entries_of_gaussians(
 
     networks = [weight for each in (*decoders, position) for weight in each.parameters()]
     groups = [
-        {"params": [codes], "lr": settings.rate},
+        {"params": [codes]},
         {"params": networks, "lr": NETWORK_RATE * settings.rate},
         {"params": [doubt], "lr": UNCERTAINTY_RATE},
     ]
     train(views, groups, loss, settings, seed, PIXELS)
     with one_torch_thread(), torch.no_grad():
         own = unit(codes.reshape(num, levels, CHANNELS))
-        return torch.stack([decoders[k](own[:, k]).argmax(1) for k in range(levels)], 1).numpy()
-
-
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Quantise, train, and look up the entries; Gaussians in no mask of a level get zeros."""
-    contributions, latents = inputs.contributions, inputs.latents
-    codebooks, entry = [], np.zeros(len(latents), np.int64)
-    for level in LEVELS:
-        rows = contributions.rows_of(level)
-        codebook, entry[rows] = kmeans(latents[rows], ENTRIES, seed + level.index)
-        codebooks.append(codebook)
-    views = labelled_views(inputs, settings.pixel_step)
-    found = entries_of_gaussians(views, entry, contributions.means(), settings, seed)
-    features = np.stack([codebook[own] for codebook, own in zip(codebooks, found.T, strict=True)], axis=1)
-    return np.where(inputs.seen()[..., None], features, np.float32(0))
-
-
-METHOD = Method("legaussians", "LEGaussians", "buaavrcg/LEGaussians train.py", fit)
+        features = [book[decoders[k](own[:, k]).argmax(1).numpy()] for k, book in enumerate(codebooks)]
+    return np.where(inputs.seen()[..., None], np.stack(features, axis=1), np.float32(0))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from hilsplat.contributions.mask_operator import MaskOperator, lifted_average
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
 
@@ -19,6 +19,3 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     pixels = contributions.pixels.astype(np.float32)
     mass = masks.spread(pixels[:, None])[:, :, 0]
     return lifted_average(masks, mass, pixels, inputs.latents)
-
-
-METHOD = Method("lifted", "lifted CLIP, training-free", "the idea of Occam's LGS", fit)

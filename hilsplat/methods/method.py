@@ -1,25 +1,30 @@
-"""Baseline interface: a function that computes a language field from the same artifacts as our method.
+"""Stage `method`: compute a language field by a baseline, from the same artifacts as our method.
 
 All other stages (Gaussians, masks, CLIP vectors, the scene's code, queries, protocols, tables) are shared, so
 that rows of a table differ only by method.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float32, Int32, Int64
 
-from hilsplat.base.errors import SettingsError
+from hilsplat.base.artifacts import sha256_of_file
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.view_matrices import label_maps
-from hilsplat.field.code import load_code, load_latents
-from hilsplat.field.linear_code import LinearCode
+from hilsplat.contributions.stage import label_maps
+from hilsplat.field.code import LinearCode, autoencoder_file, load_code, load_latents
+from hilsplat.field.language_field import LanguageField
+from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
@@ -28,6 +33,8 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import MethodSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
+
+View = TypeVar("View")
 
 
 @dataclass(frozen=True)
@@ -75,6 +82,10 @@ class MethodInputs:
         """Return a view's camera."""
         return self._loaded[1].cameras[view]
 
+    def no_features(self) -> Float32[np.ndarray, "N 3 D"]:
+        """Return a field of zeros."""
+        return np.zeros((self.contributions.num_gaussians, len(LEVELS), self.latents.shape[1]), np.float32)
+
     def seen(self) -> Bool[np.ndarray, "N 3"]:
         """Return whether a mask of the level contains the Gaussian."""
         masks = MaskOperator.of(self.contributions.matrix("A"), self.contributions.level)
@@ -104,20 +115,88 @@ class MethodInputs:
 
 
 Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
+"""A baseline: maps inputs, settings and a seed to the features of every Gaussian and level, (N, 3, D)."""
+
+
+def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: int) -> None:
+    """Compute the field of a scene by a baseline, and write it to `out`, a `field.safetensors`.
+
+    Raises:
+        SettingsError: there is no such method.
+        ArtifactError: the method returned features of the wrong shape or non-finite values.
+    """
+    fit, contributions = method_of(settings.name), inputs.contributions
+    with stage_log(f"method {settings.name}", Path(inputs.scene_folder).parent.name) as counts:
+        features = np.asarray(fit(inputs, settings, seed), dtype=np.float32)
+        expected = (contributions.num_gaussians, len(LEVELS), inputs.latents.shape[1])
+        if features.shape != expected or not np.isfinite(features).all():
+            raise ArtifactError(
+                f"method {settings.name} did not return a language field",
+                expected=f"finite features of shape {expected}",
+                found=f"shape {features.shape}, {np.count_nonzero(~np.isfinite(features))} not finite",
+                fix=f"correct hilsplat/methods/{settings.name}.py",
+            )
+        digest = sha256_of_file(autoencoder_file(inputs.autoencoder_folder))
+        LanguageField(features, contributions.gaussians_sha256, digest).save(out)
+        counts |= {"Gaussians": len(features), "latent": expected[2]}
 
 
 @dataclass(frozen=True)
-class Method:
-    """One baseline.
+class LabelledView:
+    """Covered pixels of one view that are labelled at any level, on the grid of `method.pixel_step`.
 
     Attributes:
-        name: key in the registry, and value of `method.name` in a variant.
-        title: name in tables.
-        source: repository or paper that it follows; departures are in the module's docstring.
-        fit: maps (inputs, settings, seed) to the features of every Gaussian and level, (N, 3, D).
+        number: index of the view in the contributions.
+        rows: rows of the view's masks in the contributions.
+        weights: compositing weights (pixels x Gaussians), rows summing to 1.
+        labels: row, among the view's masks, of the mask painted at each pixel and level, -1 for none.
+        xy: column and row of each pixel, px.
     """
 
-    name: str
-    title: str
-    source: str
-    fit: Fit
+    number: int
+    rows: Int64[np.ndarray, " m"]
+    weights: sp.csr_matrix
+    labels: Int32[np.ndarray, "p 3"]
+    xy: Int64[np.ndarray, "p 2"]
+
+    def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
+        """Return the given pixels, in that order."""
+        return LabelledView(
+            self.number, self.rows, self.weights[pixels], self.labels[pixels], self.xy[pixels]
+        )
+
+    def at(self, level: Level) -> Int64[np.ndarray, " q"]:
+        """Return the pixels labelled at a level, in order."""
+        return np.flatnonzero(self.labels[:, level.index] >= 0)
+
+
+def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
+    """Return the labelled pixels of all train views that have any, on every `pixel_step`-th row and column.
+
+    Raises:
+        ArtifactError: no view has a labelled pixel.
+    """
+    found = []
+    rows = inputs.contributions.rows_of_views()
+    for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
+        weights, labels = inputs.view_weights(name), inputs.view_labels(name)
+        height, width = inputs.view_camera(name).size_hw
+        grid = np.arange(height * width).reshape(height, width)[::pixel_step, ::pixel_step].ravel()
+        covered = np.diff(weights.indptr)[grid] > 0
+        pixels = grid[covered & (labels[grid] >= 0).any(axis=1)]
+        if len(pixels):
+            xy = np.stack([pixels % width, pixels // width], axis=1)
+            found.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))
+    if not found:
+        raise ArtifactError(
+            f"no train view has a pixel on a grid of {pixel_step} px that a mask labels",
+            fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and run the masks stage again",
+        )
+    return found
+
+
+def in_random_order(views: Sequence[View], random: np.random.Generator) -> Iterator[View]:
+    """Yield views without end, each once before any is repeated."""
+    while True:
+        for number in random.permutation(len(views))[::-1]:
+            yield views[number]

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int64
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import MethodInputs
 from hilsplat.scene.cameras import Camera
 from hilsplat.settings import MethodSettings
 
@@ -33,10 +33,9 @@ def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.n
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Lift all levels; Gaussians whose centre is in no mask of any view get zeros."""
-    contributions, latents = inputs.contributions, inputs.latents
+    contributions, latents, sums = inputs.contributions, inputs.latents, inputs.no_features()
     means = contributions.means().astype(np.float64)
-    sums = np.zeros((len(means), len(LEVELS), latents.shape[1]), np.float32)
-    total = np.zeros((len(means), len(LEVELS)), np.float32)
+    total = np.zeros(sums.shape[:2], np.float32)
     rows_of_views = contributions.rows_of_views()
     for view, rows in zip(track(list(contributions.views), "views"), rows_of_views, strict=True):
         pixel = centre_pixels(means, inputs.view_camera(view))
@@ -52,6 +51,3 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
             sums[gaussians[shown], level.index] += weight[:, None] * own[label[shown]]
             total[gaussians[shown], level.index] += weight
     return np.where(total[..., None] > 0, sums / np.maximum(total, 1e-12)[..., None], np.float32(0))
-
-
-METHOD = Method("occam", "Occam's LGS", "insait-institute/OccamLGS, arXiv 2412.01807", fit)

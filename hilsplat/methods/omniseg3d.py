@@ -27,9 +27,8 @@ from torch.nn.functional import log_softmax
 
 from hilsplat.base.levels import LEVELS
 from hilsplat.methods.common.groups import cluster_field, clusters, thresholds_of
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import alike, product, segment_means, train, unit
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 CHANNELS = 16
@@ -68,7 +67,6 @@ def hierarchical_loss(
 
     Args:
         rendered: unit features of pixels.
-        patch: patch of each pixel.
         shared: number of masks that two patches share.
     """
     num = len(shared)
@@ -95,11 +93,15 @@ def hierarchical_loss(
     return total
 
 
-def train_features(
-    views: list[LabelledView], num_gaussians: int, settings: MethodSettings, seed: int
-) -> Float32[np.ndarray, "N D"]:
-    """Return trained unit features of Gaussians."""
-    features = alike(num_gaussians, CHANNELS, seed)
+def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+    """Train features, cluster them at three thresholds, and assign the clusters the codes of masks.
+
+    Raises:
+        SettingsError: the thresholds do not increase.
+    """
+    thresholds = thresholds_of(settings, THRESHOLDS)
+    views = labelled_views(inputs, settings.pixel_step)
+    features = alike(inputs.contributions.num_gaussians, CHANNELS, seed)
 
     def loss(view: LabelledView, _: np.random.Generator, __: float) -> Tensor:
         patch, shared = patches(view.labels)
@@ -109,20 +111,5 @@ def train_features(
         rendered = unit(product(view.weights[inside], unit(features)))
         return hierarchical_loss(rendered, torch.from_numpy(patch[inside]), torch.from_numpy(shared))
 
-    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
-    return unit(features.detach()).numpy()
-
-
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, cluster them at three thresholds, and assign the clusters the codes of masks.
-
-    Raises:
-        SettingsError: the thresholds do not increase.
-    """
-    thresholds = thresholds_of(settings, THRESHOLDS)
-    views = labelled_views(inputs, settings.pixel_step)
-    features = train_features(views, inputs.contributions.num_gaussians, settings, seed)
-    return cluster_field(inputs, clusters(features, thresholds, seed))
-
-
-METHOD = Method("omniseg3d", "OmniSeg3D", "OceanYing/OmniSeg3D-GS train.py", fit)
+    train(views, [features], loss, settings, seed)
+    return cluster_field(inputs, clusters(unit(features.detach()).numpy(), thresholds, seed))

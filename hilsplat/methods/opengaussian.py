@@ -26,12 +26,9 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.common.groups import features_of_groups, group_latents, group_means, standardised
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
-from hilsplat.methods.common.quantise import kmeans
+from hilsplat.methods.common.groups import associated_codes, group_means, kmeans, standardised
 from hilsplat.methods.common.training import product, segment_means, train, unit
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 CHANNELS = 6
@@ -71,9 +68,10 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
 
 
 def instance_features(
-    views: list[LabelledView], contributions: Contributions, settings: MethodSettings, seed: int
+    inputs: MethodInputs, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Return trained instance features of all levels, mapped from unit length to [0, 1]."""
+    views, contributions = labelled_views(inputs, settings.pixel_step), inputs.contributions
     num, levels = contributions.num_gaussians, len(LEVELS)
     start = np.random.default_rng(seed).random((num, levels, CHANNELS), dtype=np.float32)
     features = torch.from_numpy(start * 2 - 1).requires_grad_()
@@ -97,7 +95,7 @@ def instance_features(
             total = total + contrast_loss(means[own, each.index], done)
         return total
 
-    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
+    train(views, [features], loss, settings, seed)
     return ((unit(features.detach()) + 1) / 2).numpy()
 
 
@@ -109,10 +107,7 @@ def instances(
 ) -> Int64[np.ndarray, " N"]:
     """Return each Gaussian's group in the two codebooks: coarse group x number of fine groups + fine group.
 
-    Args:
-        features: instance features of a level.
-        means: Gaussian centres, scene units.
-        codebook: number of coarse groups, and of fine groups in each.
+    `codebook` is the number of coarse groups, and of fine groups in each.
     """
     num_coarse, num_fine = codebook
     placed = np.concatenate([features, np.float32(POSITION) * standardised(means)], axis=1)
@@ -140,25 +135,19 @@ def level_field(
         return np.zeros((contributions.num_gaussians, inputs.latents.shape[1]), np.float32)
     leaf = np.full(contributions.num_gaussians, NONE, np.int64)
     leaf[shown] = instances(features[shown], contributions.means()[shown], codebook, seed)
-    num = codebook[0] * codebook[1]
-    of_leaf, _ = group_means(features[shown], leaf[shown], num)
+    of_leaf, _ = group_means(features[shown], leaf[shown], codebook[0] * codebook[1])
     of_mask = A @ features
 
     def closeness(mask: np.ndarray, group: np.ndarray) -> np.ndarray:
         return 1 - np.abs(of_mask[mask] - of_leaf[group]).mean(axis=1)
 
-    return features_of_groups(leaf, group_latents(leaf, num, contributions, rows, inputs.latents, closeness))
+    return associated_codes(inputs, leaf, rows, closeness)
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train instance features, group Gaussians, and assign the groups the codes of masks."""
-    views = labelled_views(inputs, settings.pixel_step)
-    features = instance_features(views, inputs.contributions, settings, seed)
-    fields = [
-        level_field(inputs, level, features[:, level.index], settings.codebook, seed + level.index)
-        for level in LEVELS
-    ]
-    return np.stack(fields, axis=1)
-
-
-METHOD = Method("opengaussian", "OpenGaussian", "yanmin-wu/OpenGaussian train.py", fit)
+    features, found = instance_features(inputs, settings, seed), inputs.no_features()
+    for level in LEVELS:
+        own, level_seed = features[:, level.index], seed + level.index
+        found[:, level.index] = level_field(inputs, level, own, settings.codebook, level_seed)
+    return found

@@ -1,4 +1,4 @@
-"""The baselines by name. To add one, write a file with a constant `METHOD` and add a line here."""
+"""The baselines by name. To add one, write a file with a function `fit` and add a line here."""
 
 from typing import TYPE_CHECKING
 
@@ -7,22 +7,22 @@ from hilsplat.base.plugins import Plugins
 from hilsplat.settings import MethodSettings
 
 if TYPE_CHECKING:
-    from hilsplat.methods.method import Method
+    from hilsplat.methods.method import Fit
 
-METHODS: Plugins["Method"] = Plugins(
+METHODS: Plugins["Fit"] = Plugins(
     {
-        "dr_splat": "hilsplat.methods.dr_splat:METHOD",
-        "gaussian_grouping": "hilsplat.methods.gaussian_grouping:METHOD",
-        "laga": "hilsplat.methods.laga:METHOD",
-        "langsplat": "hilsplat.methods.langsplat:METHOD",
-        "langsplat_v2": "hilsplat.methods.langsplat_v2:METHOD",
-        "legaussians": "hilsplat.methods.legaussians:METHOD",
-        "lifted": "hilsplat.methods.lifted:METHOD",
-        "occam": "hilsplat.methods.occam:METHOD",
-        "omniseg3d": "hilsplat.methods.omniseg3d:METHOD",
-        "opengaussian": "hilsplat.methods.opengaussian:METHOD",
-        "saga": "hilsplat.methods.saga:METHOD",
-        "vch": "hilsplat.methods.vch:METHOD",
+        "dr_splat": "hilsplat.methods.dr_splat:fit",
+        "gaussian_grouping": "hilsplat.methods.gaussian_grouping:fit",
+        "laga": "hilsplat.methods.laga:fit",
+        "langsplat": "hilsplat.methods.langsplat:fit",
+        "langsplat_v2": "hilsplat.methods.langsplat_v2:fit",
+        "legaussians": "hilsplat.methods.legaussians:fit",
+        "lifted": "hilsplat.methods.lifted:fit",
+        "occam": "hilsplat.methods.occam:fit",
+        "omniseg3d": "hilsplat.methods.omniseg3d:fit",
+        "opengaussian": "hilsplat.methods.opengaussian:fit",
+        "saga": "hilsplat.methods.saga:fit",
+        "vch": "hilsplat.methods.vch:fit",
     }
 )
 
@@ -31,11 +31,7 @@ OURS: str = MethodSettings().name
 
 
 def require_method(name: str) -> None:
-    """Raise if a name is neither ours nor a baseline's.
-
-    Raises:
-        SettingsError: there is no such method.
-    """
+    """Raise a `SettingsError` if a name is neither ours nor a baseline's."""
     if name != OURS and name not in METHODS:
         raise SettingsError(
             f"method.name: there is no method {name!r}",
@@ -44,7 +40,7 @@ def require_method(name: str) -> None:
         )
 
 
-def method_of(name: str) -> "Method":
+def method_of(name: str) -> "Fit":
     """Load a baseline.
 
     Raises:

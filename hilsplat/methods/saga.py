@@ -29,9 +29,8 @@ from torch import Tensor
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import cluster_field, clusters, nearest
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 CHANNELS = 32
@@ -67,10 +66,8 @@ def together(
 ) -> Bool[np.ndarray, "p p"]:
     """Return whether two pixels share a mask up to the scale, or the smallest mask above it.
 
-    Args:
-        labels: mask of each pixel at each level, -1 for none; no mask has two levels.
-        scales: scales of these masks.
-        scale: the scale at which pixels are grouped.
+    `labels` is the mask of each pixel at each level, -1 for none, and `scales` the scales of these masks; no
+    mask has two levels.
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
@@ -96,12 +93,7 @@ def affinity_loss(
     """Return a loss that raises gated cosines within groups, lowers positive ones across, keeps length 1.
 
     Pairs used are those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
-
-    Args:
-        gates: gate of each scale.
-        same: whether two pixels are together at each scale.
-        weight: weight of each pair.
-        random: draws easy pairs.
+    `same` is whether two pixels are together at each scale.
     """
     gated = unit(rendered[None] * gates[:, None])
     cosine = gated @ gated.transpose(1, 2)
@@ -132,21 +124,11 @@ def neighbour_mean(means: Float32[np.ndarray, "N 3"]) -> sp.csr_matrix:
     return sp.csr_matrix((data, (rows, near.ravel())), shape=(len(means), len(means)))
 
 
-def train_features(
-    views: list[LabelledView],
-    contributions: Contributions,
-    scales: Float64[np.ndarray, " M"],
-    asked: Float64[np.ndarray, " s"],
-    settings: MethodSettings,
-    seed: int,
-) -> Float32[np.ndarray, "s N 32"]:
-    """Train features and gate; return the unit features gated for each scale.
-
-    Args:
-        scales: scales of all masks.
-        asked: scales of the returned features.
-        settings: steps and rate.
-    """
+def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
+    """Train features, cluster them at each level's median scale, and assign clusters the codes of masks."""
+    contributions = inputs.contributions
+    scales = mask_scales(contributions)
+    views = labelled_views(inputs, settings.pixel_step)
     features = alike(contributions.num_gaussians, CHANNELS, seed)
     draw = torch.Generator().manual_seed(seed)
     gate = (2 * torch.rand(2, CHANNELS, generator=draw) - 1).requires_grad_()  # slope and offset
@@ -167,23 +149,12 @@ def train_features(
         rendered = product(weights, unit(features[seen]))
         return affinity_loss(rendered, gates(at), same, pair_weights(area), random)
 
-    train(views, [{"params": [features, gate], "lr": settings.rate}], loss, settings, seed, PIXELS)
-    with torch.no_grad():
-        return unit(product(smooth, unit(features))[None] * gates(asked)[:, None]).numpy()
-
-
-def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, cluster them at each level's median scale, and assign clusters the codes of masks."""
-    contributions = inputs.contributions
-    scales = mask_scales(contributions)
+    train(views, [features, gate], loss, settings, seed, PIXELS)
     found = [level for level in LEVELS if len(contributions.rows_of(level))]
-    medians = [np.median(scales[contributions.rows_of(level)]) for level in found]
-    views = labelled_views(inputs, settings.pixel_step)
-    gated = train_features(views, contributions, scales, np.array(medians), settings, seed)
+    medians = np.array([np.median(scales[contributions.rows_of(level)]) for level in found])
+    with torch.no_grad():
+        gated = unit(product(smooth, unit(features))[None] * gates(medians)[:, None]).numpy()
     group = np.full((contributions.num_gaussians, len(LEVELS)), NONE, np.int64)
     for level, own in zip(found, gated, strict=True):
         group[:, level.index] = clusters(own, (COSINE,), seed)[:, 0]
     return cluster_field(inputs, group)
-
-
-METHOD = Method("saga", "SAGA", "Jumpat/SegAnyGAussians train_contrastive_feature.py", fit)

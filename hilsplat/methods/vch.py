@@ -30,9 +30,8 @@ from torch.nn.functional import softplus
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import NONE
 from hilsplat.methods.common.groups import cluster_field, nearest, thresholds_of
-from hilsplat.methods.common.pixels import LabelledView, labelled_views
 from hilsplat.methods.common.training import alike, product, train, unit
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.settings import CoverageTreeSettings, MethodSettings
 
@@ -90,9 +89,8 @@ def ultrametric(
 ) -> Float[Tensor, " k"]:
     """Return the longest edge between each pair of pixels in the minimum spanning tree; differentiable.
 
-    Args:
-        penalty: added to an edge's length when the tree is chosen, not in the result.
-        pairs: pairs of pixels; the distance is 2 without a path and 0 from a pixel to itself.
+    The penalty is added to an edge's length when the tree is chosen, not in the result. The result is 2 for a
+    pair without a path, and 0 from a pixel to itself.
     """
     num = len(vectors)
     held = vectors.detach().numpy()
@@ -125,13 +123,9 @@ def triplets(
     parent: Int32[np.ndarray, " m"],
     random: np.random.Generator,
 ) -> Int64[np.ndarray, "3 k"]:
-    """Return, per mask, pixels a and b inside, and c outside but in its parent (anywhere, for a root).
+    """Draw, per mask, `PAIRS` pixels a and b inside, and c outside but in its parent (anywhere, for a root).
 
-    Args:
-        labels: row of the mask at each pixel and level, -1 for none.
-        level: `Level` of each mask.
-        parent: row of each mask's parent, -1 for none.
-        random: draws `PAIRS` triplets per mask.
+    `labels` has the row of the mask at each pixel and level, `parent` that of each mask's parent, or -1.
     """
     found = []
     for mask in np.unique(labels[labels >= 0]):
@@ -142,33 +136,6 @@ def triplets(
         if len(own) > 1 and len(other):
             found.append(np.stack([random.choice(each, PAIRS) for each in (own, own, other)]))
     return np.concatenate(found, axis=1) if found else np.zeros((3, 0), np.int64)
-
-
-def train_features(
-    views: list[LabelledView],
-    trees: dict[int, tuple[np.ndarray, np.ndarray]],
-    num_gaussians: int,
-    settings: MethodSettings,
-    seed: int,
-) -> Float32[np.ndarray, "N D"]:
-    """Return trained unit vectors of Gaussians; `trees` has level and parent of masks, by view number."""
-    features = alike(num_gaussians, CHANNELS, seed)
-
-    def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
-        a, b, c = chosen = triplets(view.labels, *trees[view.number], random)
-        if not chosen.shape[1]:
-            return features.sum() * 0
-        vectors = unit(product(view.weights, unit(features)))
-        edges = neighbouring_pixels(view.xy)
-        borders = (view.labels[edges[0]] != view.labels[edges[1]]).sum(axis=1)
-        pairs = np.concatenate([chosen[[0, 1]], chosen[[0, 2]]], axis=1)
-        near, far = ultrametric(vectors, edges, BORDER * borders, pairs).chunk(2)
-        dots = (vectors[a] * (vectors[c] - vectors[b])).sum(1)
-        # -log of the softmax of the pair inside versus the pair across
-        return softplus(dots / TEMPERATURE).mean() + softplus((near - far) / TEMPERATURE).mean()
-
-    train(views, [{"params": [features], "lr": settings.rate}], loss, settings, seed)
-    return unit(features.detach()).numpy()
 
 
 def components(
@@ -190,9 +157,7 @@ def components(
         graph = sp.csr_matrix((np.ones(kept.sum()), (a[kept], b[kept])), shape=(num, num))
         number, part = connected_components(graph, directed=False)
         order = np.argsort(-np.bincount(part, minlength=number), kind="stable")
-        rank = np.empty(number, np.int64)
-        rank[order] = np.arange(number)
-        rank = rank[part]
+        rank = np.argsort(order)[part]
         large, small = np.flatnonzero(rank < LARGEST), np.flatnonzero(rank >= LARGEST)
         rank[small] = rank[large[cKDTree(means[large]).query(means[small])[1]]]
         found.append(rank)
@@ -208,12 +173,25 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     thresholds = thresholds_of(settings, THRESHOLDS)
     contributions = inputs.contributions
     views = labelled_views(inputs, settings.pixel_step)
-    trees = {}
+    trees = {}  # level and parent of the masks, by view number
     for view in views:
         masks = inputs.view_masks(contributions.views[view.number])
         trees[view.number] = (masks.level, coverage_tree(masks, CoverageTreeSettings().theta)[0])
-    features = train_features(views, trees, contributions.num_gaussians, settings, seed)
-    return cluster_field(inputs, components(features, contributions.means(), thresholds))
+    features = alike(contributions.num_gaussians, CHANNELS, seed)
 
+    def loss(view: LabelledView, random: np.random.Generator, _: float) -> Tensor:
+        a, b, c = chosen = triplets(view.labels, *trees[view.number], random)
+        if not chosen.shape[1]:
+            return features.sum() * 0
+        vectors = unit(product(view.weights, unit(features)))
+        edges = neighbouring_pixels(view.xy)
+        borders = (view.labels[edges[0]] != view.labels[edges[1]]).sum(axis=1)
+        pairs = np.concatenate([chosen[[0, 1]], chosen[[0, 2]]], axis=1)
+        near, far = ultrametric(vectors, edges, BORDER * borders, pairs).chunk(2)
+        dots = (vectors[a] * (vectors[c] - vectors[b])).sum(1)
+        # -log of the softmax of the pair inside versus the pair across
+        return softplus(dots / TEMPERATURE).mean() + softplus((near - far) / TEMPERATURE).mean()
 
-METHOD = Method("vch", "VCH", "hardyho/ultrametric_feature_fields", fit)
+    train(views, [features], loss, settings, seed)
+    trained = unit(features.detach()).numpy()
+    return cluster_field(inputs, components(trained, contributions.means(), thresholds))

@@ -3,11 +3,13 @@
 No command may end with a traceback or change a file that was in the project before.
 """
 
+import itertools
 import shutil
 import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from hilsplat.base.arrays import read_tensors, write_tensors
 from hilsplat.base.artifacts import write_npz
 from hilsplat.configuration import read_config
 from hilsplat.datasets.images.isat import read_isat
+from hilsplat.query.answer import answer, file_name
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.device import cuda_problem
@@ -35,20 +38,16 @@ DEEP = "[" * 100_000
 HUGE_PLY = "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n1\n"
 OUT = ("--out", "results/new")
 
+OWN_CONFIG = partial(read_config, Path("config/config.yaml"))
 COVERAGE = ("coverage-tree", "--masks", str(MASKS), *OUT)
-CONTRIBUTE = ("contributions", "--scene", str(SCENE / "scene"), "--gaussians", str(GAUSSIANS))
-CONTRIBUTE = (*CONTRIBUTE, "--masks", str(MASKS), *OUT)
-SOLVE = ("field", "--contributions", str(CONTRIBUTIONS), "--coverage-tree", str(TREE))
-SOLVE = (*SOLVE, "--autoencoder", str(CODE), *OUT)
+CONTRIBUTE = (*f"contributions --scene {SCENE}/scene --gaussians {GAUSSIANS} --masks {MASKS}".split(), *OUT)
+SOLVE = (*f"field --contributions {CONTRIBUTIONS} --coverage-tree {TREE} --autoencoder {CODE}".split(), *OUT)
+FIT = ("gaussians", "--scene", str(SCENE / "scene"))
 ASK = ("query", "photos/desk", "mug")
 POSES = ("poses", "--images", "photos", *OUT)
 NEW = ("new", "chair", "photos")
 CHECK = ("run", "--config")
 CHECK_MODEL = ("models", "check", "models/copy")
-
-
-def read_own_config() -> object:
-    return read_config(Path("config/config.yaml"))
 
 
 Command = tuple[str, ...] | Callable[[], object]
@@ -129,16 +128,18 @@ def with_model(file: str, content: str) -> Callable[[], object]:
     ]
 
 
+def langsplat_texts() -> None:
+    """Write LangSplat's maps of all views as texts instead of numbers."""
+    Path("theirs").mkdir()
+    for view, kind in itertools.product(range(6), "sf"):
+        np.save(f"theirs/{view:03d}_{kind}.npy", np.array(["a"]))
+
+
 def png_of(width: int, height: int) -> bytes:
     """Return the beginning of a PNG with the given size in its header."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + struct.pack(">I", 13)
-        + header
-        + struct.pack(">I", zlib.crc32(header))
-        + b"\0\0\0\0IDAT"
-    )
+    checked = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    return b"\x89PNG\r\n\x1a\n" + checked + b"\0\0\0\0IDAT"
 
 
 def plan(**config: object) -> Callable[[], object]:
@@ -165,9 +166,6 @@ ROWS = {
         "000.png.npz lacks",
         "runs",
         f"--forcerun {MASKS}",
-    ),
-    "masks that are a single array": row(
-        write(MASKS / "000.png.npz", b"\x93NUMPY\x01\x00"), COVERAGE, "000.png.npz cannot be read"
     ),
     "an index whose views are a list": row(
         write(MASKS / "index.json", '{"views": []}'), COVERAGE, "index.json"
@@ -232,11 +230,6 @@ ROWS = {
     "a scene that does not exist": row(
         nothing, ("query", "photos/none", "mug"), "results/photos/none is missing"
     ),
-    "a scene with no stage": row(
-        lambda: Path("results/photos/later").mkdir(parents=True),
-        ("query", "photos/later", "mug"),
-        "photos/later is not finished",
-    ),
     "a scene that is not finished": row(
         lambda: Path("results/photos/later/default").mkdir(parents=True),
         ("query", "photos/later", "mug"),
@@ -267,15 +260,8 @@ ROWS = {
         "not numbers",
     ),
     "LangSplat's maps as text": row(
-        lambda: [
-            Path("theirs").mkdir(),
-            *(
-                np.save(f"theirs/{view:03d}_{kind}.npy", np.array(["a"]))
-                for view in range(6)
-                for kind in "sf"
-            ),
-        ],
-        (*("masks", "--scene", str(SCENE / "scene"), "--features", "theirs", "--out", "results/m"),),
+        langsplat_texts,
+        ("masks", "--scene", str(SCENE / "scene"), "--features", "theirs", *OUT),
         "_s.npy cannot be read",
         "not numbers",
     ),
@@ -287,7 +273,6 @@ ROWS = {
         "at most 20000",
         "1000000000",
     ),
-    "labels 100,000 deep": row(write("l.json", DEEP), lambda: read_isat(Path("l.json")), "nested too deeply"),
     # ---- output paths
     "an output below a file": row(
         nothing,
@@ -309,10 +294,7 @@ ROWS = {
     "a seed beyond 64 bits": row(nothing, (*POSES, "--seed", str(10**30)), "--seed"),
     "iterations beyond 64 bits": row(
         nothing,
-        (
-            *("gaussians", "--scene", str(SCENE / "scene"), "--report", "r", *OUT),
-            *("--settings", f'{{"iterations": {10**30}}}'),
-        ),
+        (*FIT, "--report", "r", *OUT, "--settings", f'{{"iterations": {10**30}}}'),
         "gaussians.iterations",
         "less than or equal to 2000000000",
     ),
@@ -373,13 +355,13 @@ ROWS = {
     "a misspelt variant in labels": row(nothing, plan(labels={"lifeted": "x"}), "labels.lifeted", "'lifted'"),
     "YAML with a bracket left open": row(
         write("config/config.yaml", "seed: 0\nonly: [a\nseeds: 1\n"),
-        read_own_config,
+        OWN_CONFIG,
         "config/config.yaml, line 3",
         "is not YAML",
     ),
     "YAML with tabs": row(
         write("config/config.yaml", "masks:\n\tmodel: x\n"),
-        read_own_config,
+        OWN_CONFIG,
         "config/config.yaml, line 2, column 1",
     ),
     "YAML for --configfile in Latin-1": row(
@@ -393,7 +375,7 @@ ROWS = {
         "did you mean 'weight_part'",
     ),
     "YAML that is a list": row(
-        write("config/config.yaml", "- a\n"), read_own_config, "does not hold settings", "list"
+        write("config/config.yaml", "- a\n"), OWN_CONFIG, "does not hold settings", "list"
     ),
 }
 
@@ -417,23 +399,19 @@ def test_bad_input_is_reported_and_nothing_is_lost(
 
 @pytest.mark.skipif(cuda_problem() is None, reason="this machine has CUDA")
 @pytest.mark.parametrize("section", ["gaussians", "contributions"])
-def test_a_device_that_is_not_here_is_reported(section: str, project: Path, told: Callable[..., str]) -> None:
+def test_a_missing_device_is_reported(section: str, project: Path, told: Callable[..., str]) -> None:
     assert f"{section}.device" in told(plan(**{section: {"device": "cuda"}}))
 
 
 @pytest.mark.parametrize("text", ["mug " * 100, r"$\frac{$", "mug/../../x", "ü" * 90, "--"])
-def test_any_text_can_be_asked_and_has_a_folder_of_its_own(text: str, project: Path, capsys) -> None:
-    from hilsplat.query.answer import answer, file_name
-
+def test_any_text_is_a_valid_query_with_its_own_folder(text: str, project: Path, capsys) -> None:
     lines = list(answer(SCENE, text, views=1))
     assert lines[-1].startswith("wrote")
     (folder,) = [path for path in (SCENE / "queries").iterdir() if not path.name.startswith(".")]
     assert folder.name == file_name(text) and (folder / "panel.png").is_file()
 
 
-def test_texts_that_look_alike_as_folders_have_different_ones() -> None:
-    from hilsplat.query.answer import file_name
-
+def test_similar_texts_have_different_folders() -> None:
     texts = ["a b", "a-b", "a > b", "a--b", "a/b", "$$", "%%", "query", "x" * 300, "x" * 301]
     assert len({file_name(text) for text in texts}) == len(texts)
     assert all(len(file_name(text)) < 120 for text in texts)

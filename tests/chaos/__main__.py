@@ -3,9 +3,9 @@
     make chaos                                       # 30 kills, seed 0
     python -m tests.chaos --kills 5 --seed 3 --minutes 20 --work ../chaos
 
-A run is started and, after a random time, hit by a fault; then the same command is started again. When the
-run is complete, its tables are compared byte by byte with those of an undisturbed run, and the next run
-starts without results. After that, user commands are killed while they write (`commands`). The final report
+A fault is injected into a run at a random time; then the same command is started again. When the run is
+complete, its tables are compared byte by byte with those of an undisturbed run, and the next run starts
+without results. After that, user commands are killed while they write (`commands`). The final report
 lists kills and their cost. The exit code is 1 if a table differs, or if a start without a fault failed.
 
 The faults of a full and a read-only disk need results on a small tmpfs; they are skipped with a notice if
@@ -41,7 +41,6 @@ class Tally:
     """Faults, costs of each kill, complete runs, and problems that need manual intervention so far."""
 
     lost_s: list[float] = field(default_factory=list)
-    lost_cpu_s: list[float] = field(default_factory=list)
     faults: dict[str, int] = field(default_factory=dict)
     finished: int = 0
     problems: list[str] = field(default_factory=list)
@@ -53,27 +52,24 @@ class Tally:
         """Number of kills so far."""
         return len(self.lost_s) + len(self.waiting)
 
-    def settle(self, again: tuple[float, float] | None) -> None:
+    def settle(self, again_s: float | None) -> None:
         """Count the kills since the last start.
 
-        `again` are the wall and processor seconds until the new start began a job, a cost of the last kill.
+        `again_s` is the time until the new start began a job, a cost of the last kill.
         """
         for victims in self.waiting:
-            again_s, again_cpu_s = (again or (0.0, 0.0)) if victims is self.waiting[-1] else (0.0, 0.0)
-            # Victims ran in parallel, so the lost wall time is the largest of theirs.
-            self.lost_s.append(again_s + max((victim.lost_s for victim in victims), default=0.0))
-            self.lost_cpu_s.append(again_cpu_s + sum(victim.lost_cpu_s for victim in victims))
+            start_s = (again_s or 0.0) if victims is self.waiting[-1] else 0.0
+            # Victims ran in parallel, so the lost time is the largest of theirs.
+            self.lost_s.append(start_s + max((victim.lost_s for victim in victims), default=0.0))
         self.waiting = []
 
     def report(self) -> str:
         """Return the final lines of output."""
-        lines = [f"{len(self.lost_s)} kills, {self.finished} runs that got to their end"]
+        lines = [f"{len(self.lost_s)} kills, {self.finished} complete runs"]
         lines += [f"  {name}: {count}" for name, count in sorted(self.faults.items())]
-        for what, values in (("seconds", self.lost_s), ("processor seconds", self.lost_cpu_s)):
-            if values:
-                lines.append(
-                    f"{what} lost per kill: median {statistics.median(values):.1f}, largest {max(values):.1f}"
-                )
+        if self.lost_s:
+            median = statistics.median(self.lost_s)
+            lines.append(f"seconds lost per kill: median {median:.1f}, largest {max(self.lost_s):.1f}")
         lines += [f"PROBLEM {problem}" for problem in self.problems]
         whole = "no manual intervention was needed, and no table differs"
         lines.append("manual intervention was needed" if self.problems else whole)
@@ -140,7 +136,7 @@ def torment(
         over = tally.kills >= options.kills or time.monotonic() > deadline
         tally.problems += run.problems
         if code != 0 and not may_fail:
-            tally.problems.append(f"a start that nothing hit ended with {code}:\n{run.said()}")
+            tally.problems.append(f"a start without a fault ended with {code}:\n{run.said()}")
             return tally
         if code == 0:
             tally.finished += 1
@@ -171,7 +167,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=30, help="number of kills")
     parser.add_argument("--seed", type=int, default=0, help="seed of times and faults")
     parser.add_argument("--minutes", type=float, default=120, help="no fault begins later than this")
-    parser.add_argument("--work", type=Path, help="folder; its undisturbed run is used again")
+    parser.add_argument("--work", type=Path, help="working folder; its undisturbed run is reused")
     options = parser.parse_args()
     work = options.work or Path(tempfile.mkdtemp(prefix="hilsplat-chaos-"))
     work.mkdir(parents=True, exist_ok=True)
@@ -190,7 +186,7 @@ def main() -> None:
         kept = bool(tally.problems)
         if kept:
             shutil.copytree(results, root / "results-kept", symlinks=True)
-            print(f"kept for a look: {root}")
+            print(f"kept for inspection: {root}")
     finally:
         if disk:
             subprocess.run(["umount", "--lazy", str(results)], check=False)

@@ -55,11 +55,7 @@ def started(project: Path, *words: str) -> subprocess.Popen[str]:
 def kill_command(
     project: Path, name: str, whole_s: float, expected: dict[str, bytes], chance: random.Random
 ) -> Iterator[str]:
-    """Kill a command at a random time, then run it to completion.
-
-    Yields:
-        Problems that need manual intervention.
-    """
+    """Kill a command at a random time, then run it to completion; yield problems that need manual help."""
     before = snapshot(project)
     running = started(project, *COMMANDS[name])
     try:
@@ -86,11 +82,7 @@ def kill_command(
 
 
 def kill_commands(root: Path, kills: int, chance: random.Random) -> list[str]:
-    """Kill each command several times.
-
-    Returns:
-        Problems that need manual intervention.
-    """
+    """Kill each command several times, and return problems that need manual intervention."""
     project, problems = prepare(root / "desk"), []
     for name in COMMANDS:
         copy = root / "whole"

@@ -1,4 +1,4 @@
-"""Runs of Snakemake, faults to inject into them, and the cost of these faults."""
+"""Runs of Snakemake, faults to inject into them, and the work that a fault destroys."""
 
 import contextlib
 import os
@@ -12,11 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilsplat.base.processes import is_alive
 from tests.workflow.conftest import Project
 
 POLL_S = 0.25
-TICKS = os.sysconf("SC_CLK_TCK")
 LEFT_KIB = 64
 """Space left on a full disk."""
 WAKE_S = 60
@@ -25,14 +23,13 @@ WAKE_S = 60
 
 @dataclass
 class Victim:
-    """A job, and the amount of its work that is not stored yet.
+    """A job, and how much of its work is not stored yet.
 
     Attributes:
         cache: folder in which the stage stores finished views or a checkpoint.
-        begun_s: monotonic time at which it was first observed.
-        kept_s: monotonic time of its last change of the cache; `kept_cpu_s` were used up to then.
-        first_s: duration up to its first stored view, which a new start repeats (also `first_cpu_s`).
-        seen_s: monotonic time at which it was last observed; `cpu_s` were used up to then.
+        begun_s, seen_s: monotonic times at which it was first and last observed.
+        kept_s: monotonic time of its last change of the cache.
+        first_s: duration up to its first stored view, which a new start repeats.
     """
 
     pid: int
@@ -40,37 +37,26 @@ class Victim:
     cache: Path
     begun_s: float
     kept_s: float
-    kept_cpu_s: float = 0.0
     first_s: float | None = None
-    first_cpu_s: float = 0.0
     seen_s: float = 0.0
-    cpu_s: float = 0.0
     entries: frozenset[tuple[str, int]] | None = None
 
     def look(self) -> bool:
-        """Update processor time and cache entries; return False if the job has ended."""
-        cpu_s = cpu_seconds(self.pid)
-        if cpu_s is None:
+        """Update the cache entries; return False if the job has ended."""
+        if has_ended(self.pid):
             return False
-        self.cpu_s, self.seen_s = cpu_s, time.monotonic()
-        entries = kept_files(self.cache)
+        self.seen_s, entries = time.monotonic(), kept_files(self.cache)
         if self.entries is not None and entries != self.entries:
             if self.first_s is None:
-                self.first_s, self.first_cpu_s = self.seen_s - self.begun_s, self.cpu_s
-            self.kept_s, self.kept_cpu_s = self.seen_s, self.cpu_s
+                self.first_s = self.seen_s - self.begun_s
+            self.kept_s = self.seen_s
         self.entries = entries
         return True
 
     @property
     def lost_s(self) -> float:
         """Upper limit of repeated work: the time since the last stored view, plus that up to the first."""
-        whole = self.seen_s - self.begun_s
-        return min(whole, self.seen_s - self.kept_s + (self.first_s if self.first_s is not None else 0.0))
-
-    @property
-    def lost_cpu_s(self) -> float:
-        """The upper limit in processor seconds."""
-        return min(self.cpu_s, self.cpu_s - self.kept_cpu_s + self.first_cpu_s)
+        return min(self.seen_s - self.begun_s, self.seen_s - self.kept_s + (self.first_s or 0.0))
 
 
 def kept_files(cache: Path) -> frozenset[tuple[str, int]]:
@@ -84,13 +70,12 @@ def kept_files(cache: Path) -> frozenset[tuple[str, int]]:
     return frozenset(found)
 
 
-def cpu_seconds(pid: int) -> float | None:
-    """Return the processor seconds of a process and its reaped children, or None if it has ended."""
+def has_ended(pid: int) -> bool:
+    """Return whether a process has ended, even if nothing has waited for it."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
     except OSError:
-        return None
-    return None if fields[0] in "ZX" else sum(map(int, fields[11:15])) / TICKS
+        return True
 
 
 def children(pid: int) -> list[int]:
@@ -142,21 +127,19 @@ class Run:
         """Return the running jobs."""
         for pid in children(self.process.pid):
             if pid not in self.jobs and (stage := stage_of(pid)) is not None:
-                now = time.monotonic()
-                self.jobs[pid] = Victim(
-                    pid, stage, self.project.root / "results/.cache" / stage, begun_s=now, kept_s=now
-                )
+                now, cache = time.monotonic(), self.project.root / "results/.cache" / stage
+                self.jobs[pid] = Victim(pid, stage, cache, begun_s=now, kept_s=now)
         return [job for job in self.jobs.values() if job.look()]
 
     def what_runs(self) -> str:
         """Return the running stages."""
         return ", ".join(job.stage for job in self.look()) or "nothing"
 
-    def wait_for_a_job(self, limit_s: float) -> tuple[float, float] | None:
-        """Return wall and processor seconds up to its first job, or None if it ends without a job."""
+    def wait_for_a_job(self, limit_s: float) -> float | None:
+        """Return the seconds up to its first job, or None if it ends without a job."""
         while self.is_running() and time.monotonic() < self.start_s + limit_s:
             if self.look():
-                return time.monotonic() - self.start_s, cpu_seconds(self.process.pid) or 0.0
+                return time.monotonic() - self.start_s
             time.sleep(POLL_S)
         return None
 
@@ -179,17 +162,15 @@ class Run:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
         until = time.monotonic() + WAKE_S
-        while any(cpu_seconds(pid) is not None for pid in self.jobs) and time.monotonic() < until:
+        while not all(map(has_ended, self.jobs)) and time.monotonic() < until:
             time.sleep(POLL_S)
         for job in self.jobs.values():
-            if is_alive(job.pid) and cpu_seconds(job.pid) is not None:
+            if not has_ended(job.pid):
                 self.problems.append(f"{job.stage} (process {job.pid}) outlived its Snakemake")
                 os.kill(job.pid, signal.SIGKILL)
         remounted(self.project.root / "results", "rw")
         self._filler.unlink(missing_ok=True)
         return code
-
-    # ---- faults: each returns the jobs whose work was lost --------------------------------------------
 
     def kill_snakemake(self, chance: random.Random) -> list[Victim]:
         """Kill only Snakemake, as the kernel does when memory runs out."""
@@ -281,6 +262,7 @@ class Fault:
     """A fault to inject into a run.
 
     Attributes:
+        strike: injects it, and returns the jobs whose work is lost.
         kills: whether it counts as a kill.
         needs_disk: whether results must be on a separate disk.
         may_fail: whether the run may end with an error.

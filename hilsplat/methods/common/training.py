@@ -1,7 +1,7 @@
 """Train features of Gaussians on rendered pixels of masks, with frozen geometry, for grouping methods.
 
-A step renders random labelled pixels of one random view. Rendering is a product with fixed compositing
-weights, which are computed once per view; losses are written in torch and differentiated by it.
+A step renders random labelled pixels of one random view: a product with compositing weights that are computed
+once per view. Losses are written in torch and differentiated by it.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.progress import track
-from hilsplat.methods.common.pixels import LabelledView, in_random_order
+from hilsplat.methods.method import LabelledView, in_random_order
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096
@@ -73,7 +73,7 @@ Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
 
 def train(
     views: list[LabelledView],
-    groups: list[dict[str, Any]],
+    parameters: list[Any],
     loss: Loss,
     settings: MethodSettings,
     seed: int,
@@ -82,18 +82,17 @@ def train(
     """Minimise in place by Adam: each step uses one view, each view once before any is repeated.
 
     Args:
-        groups: parameter groups of `torch.optim.Adam`, each with its rate.
-        settings: number of steps.
+        parameters: tensors, or parameter groups of `torch.optim.Adam`; groups may have their own rate.
         seed: seed of the order of views and the pixels.
         pixels: maximum pixels per step.
     """
     random = np.random.default_rng(seed)
     with one_torch_thread():
-        optimiser = torch.optim.Adam(groups, eps=1e-15)
+        optimiser = torch.optim.Adam(parameters, settings.rate, eps=1e-15)
         order = in_random_order(views, random)
         for step in track(range(settings.steps), "steps"):
             view = next(order)
-            chosen = random.permutation(len(view))[:pixels]
+            chosen = random.permutation(len(view.labels))[:pixels]
             optimiser.zero_grad()
             loss(view.chosen(chosen), random, step / settings.steps).backward()
             optimiser.step()

@@ -10,10 +10,22 @@ from torch import nn
 from hilsplat.base.artifacts import read_index, read_npy, write_npy
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.autoencoder import mask_targets, run_autoencoder
-from hilsplat.field.code import autoencoder_file, load_code, load_latents
-from hilsplat.field.network_code import Autoencoder, PackedLayers, torch_generator
-from hilsplat.field.network_training import loss_gradients, statistics, torch_order, train_autoencoder
+from hilsplat.field.autoencoder import (
+    loss_gradients,
+    mask_targets,
+    run_autoencoder,
+    statistics,
+    torch_order,
+    train_autoencoder,
+)
+from hilsplat.field.code import (
+    Autoencoder,
+    PackedLayers,
+    autoencoder_file,
+    load_code,
+    load_latents,
+    torch_generator,
+)
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, SemanticTreeSettings

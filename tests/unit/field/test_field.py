@@ -12,12 +12,12 @@ from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.contributions.view_matrices import painted_indicator
+from hilsplat.contributions.stage import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
-from hilsplat.field.literal_trainer import Shares, ViewTargets, view_losses
+from hilsplat.field.literal_trainer import ViewTargets, view_losses
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.methods.method import MethodInputs
@@ -72,8 +72,7 @@ class Toy:
             np.arange(9),
             np.zeros((9, 9), np.int64),
             self.level.astype(np.int64),
-            (np.array([3, 4, 5]), np.array([6, 7, 8])),
-            (parent[3:6], parent[6:9]),
+            ((np.array([3, 4, 5]), parent[3:6]), (np.array([6, 7, 8]), parent[6:9])),
         )
         half = MaskOperator.of(sp.csr_matrix(self.A_half), self.level)
         return Contrast(self.problem.masks, half, self.pixels, self.half_pixels, [relations], settings)
@@ -240,7 +239,7 @@ def test_the_literal_trainer_takes_the_solver_s_objective_on_rendered_maps(readi
     settings = FieldSettings(**readings, **weights)
     toy = Toy((0.7, 0.4, 0.0))
     contrast = toy.contrast(settings)
-    shares = Shares(1, toy.problem.total_pixels, *compared(contrast.relations))
+    shares = 1, toy.problem.total_pixels, *compared(contrast.relations)
     W = toy.W.astype(np.float64)
     maps = np.einsum("pg,gld->pld", W, toy.features)
     losses, by_maps = view_losses(maps, toy.view(settings), toy.latents, settings, shares)
@@ -256,7 +255,7 @@ def test_langsplats_l1_is_a_mean_over_all_pixels():
     toy = Toy((1.0, 0.0, 0.0))
     settings = FieldSettings(language="l1", trainer="literal", weight_part=0.0)
     maps = np.einsum("pg,gld->pld", toy.W.astype(np.float64), toy.features)
-    losses, gradient = view_losses(maps, toy.view(settings), toy.latents, settings, Shares(1, 1.0, 1, 1))
+    losses, gradient = view_losses(maps, toy.view(settings), toy.latents, settings, (1, 1.0, 1, 1))
     apart = np.abs(maps - toy.latents[toy.labels])[toy.labels >= 0]
     assert losses["language"] == pytest.approx(apart.sum() / (PIXELS * CHANNELS))
     assert not gradient[toy.labels < 0].any()

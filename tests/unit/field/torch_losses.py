@@ -119,7 +119,7 @@ def part_term(
 ) -> Tensor:
     losses = []
     for view in relations:
-        for rows, own in zip(view.part_rows, view.part_parent, strict=True):
+        for rows, own in view.parts:
             parent = torch.from_numpy(own)
             has_parent = parent != NONE
             if len(rows) < 2 or not has_parent.any():

@@ -8,7 +8,7 @@ import pytest
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.rows import Contributions
-from hilsplat.methods.feature_tree import farthest_alike, joined_clusters, nested_clusters, run_feature_tree
+from hilsplat.methods.feature_tree import farthest_alike, nested_clusters, run_feature_tree
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 from tests.unit.two_boxes_world import reverse_masks
@@ -24,15 +24,15 @@ def blobs(*centres, each=50, spread=0.02):
 
 
 def test_clusters_join_below_the_distance_and_stay_apart_above_it():
-    rows = blobs((0, 0), (0.3, 0), (3, 0))
-    found = joined_clusters(rows, 0.5, 0).reshape(3, 50)
-    assert [len(set(each)) for each in found] == [1, 1, 1]
-    assert found[0, 0] == found[1, 0] != found[2, 0]
-    assert len(set(joined_clusters(rows, 0.1, 0))) == 3
-    assert joined_clusters(rows[:1], 0.5, 0).tolist() == [0]
+    rows = np.repeat(blobs((0, 0), (0.3, 0), (3, 0))[:, None], 3, axis=1)
+    found = nested_clusters(rows, (0.5, 0.1, 0.1), 0).reshape(3, 50, 3)
+    assert [len(np.unique(each[:, 0])) for each in found] == [1, 1, 1]
+    assert found[0, 0, 0] == found[1, 0, 0] != found[2, 0, 0]
+    assert len(np.unique(found[:, :, 1])) == 3
+    assert nested_clusters(rows[:1], (0.5, 0.1, 0.1), 0).tolist() == [[0, 0, 0]]
 
 
-def test_the_distance_is_half_of_what_lies_between_masks_of_one_parent():
+def test_the_distance_is_half_the_median_between_masks_of_one_parent():
     sizes = np.full(6, 5)
     view, mask = np.array([0, 0, 0, 0, 0, 1], np.int32), np.array([0, 1, 2, 3, 4, 0], np.int32)
     level = np.array([1, 1, 2, 2, 2, 1], np.uint8)
@@ -42,7 +42,7 @@ def test_the_distance_is_half_of_what_lies_between_masks_of_one_parent():
     assert farthest_alike(means, contributions, parents) == (2.0, 0.5, np.inf)
 
 
-def test_finer_clusters_lie_inside_coarser_ones_and_unseen_gaussians_have_none():
+def test_finer_clusters_are_inside_coarser_ones_and_unseen_gaussians_have_none():
     whole = blobs((0, 0), (3, 0))
     part = np.concatenate([blobs((0, 0), (0, 2), each=25), blobs((0, 0), (0, 2), each=25)])
     features = np.stack([whole, part, np.full_like(part, np.nan)], axis=1)
@@ -50,7 +50,9 @@ def test_finer_clusters_lie_inside_coarser_ones_and_unseen_gaussians_have_none()
     found = nested_clusters(features, (0.5, 0.5, 0.5), 0)
     assert found[0].tolist() == [0, -1, -1] or found[0, 1] == -1
     assert (found[:, 2] == -1).all()
-    assert len(np.unique(found[1:, 1])) == 4  # two parts in each whole, though their features repeat
+    assert (
+        len(np.unique(found[1:, 1])) == 4
+    )  # two parts in each whole, although both wholes have the same two
     for cluster in np.unique(found[1:, 1]):
         assert len(np.unique(found[1:][found[1:, 1] == cluster, 0])) == 1
 

@@ -1,7 +1,8 @@
-"""Methods that lift language: worlds of a few pixels and Gaussians in which the right answer is known."""
+"""Methods that lift language: worlds of a few pixels and Gaussians whose results are worked out by hand."""
 
+import inspect
+import itertools
 import types
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,102 +11,162 @@ import scipy.sparse as sp
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
-from hilsplat.contributions.mask_operator import MaskOperator
-from hilsplat.contributions.view_matrices import painted_indicator
-from hilsplat.field.linear_code import LinearCode
-from hilsplat.field.network_code import Autoencoder
-from hilsplat.methods import dr_splat, occam
-from hilsplat.methods.common.quantise import ProductQuantiser
-from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares, step
-from hilsplat.methods.method import MethodInputs
-from hilsplat.methods.registry import method_of
+from hilsplat.field.adam import Adam
+from hilsplat.field.code import Autoencoder, LinearCode
+from hilsplat.methods import dr_splat, langsplat, langsplat_v2, lifted, occam
+from hilsplat.methods.langsplat import l1_gradient, train_level
+from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
+from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order
 from hilsplat.scene.cameras import Camera
 from hilsplat.settings import MethodSettings
-
-WIDTH = 8
 
 
 def unit(vectors):
     return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
-class OneRowOfPixels(MethodInputs):
-    """Views of one row of eight pixels; Gaussian i is alone in pixel i, but `weights` may say otherwise.
-
-    The left half is mask 0, the right half mask 1, both whole; parts and subparts have no mask.
-    """
-
-    def __init__(self, vectors, views=("a", "b"), weights=None):
-        super().__init__(*[Path("none")] * 5)
-        own = self.__dict__  # the class is frozen
-        own["weights"] = weights = (
-            sp.csr_matrix(np.eye(WIDTH, dtype=np.float32)) if weights is None else weights
-        )
-        labels = np.full((WIDTH, 3), -1, np.int32)
-        labels[:, Level.WHOLE.index] = np.arange(WIDTH) // (WIDTH // 2)
-        own["labels"], own["code"] = labels, LinearCode.fit(vectors, vectors.shape[1])
-        own["latents"] = self.code.encode_array(np.tile(vectors, (len(views), 1)))
-        shown = painted_indicator(labels, 2, np.ones(WIDTH, bool))
-        pixels = np.diff(shown.indptr).astype(np.int64)
-        one = sp.diags(1 / np.maximum(pixels, 1)) @ shown @ weights
-        level = np.full(2 * len(views), int(Level.WHOLE), np.uint8)
-        means = sp.vstack([one] * len(views)).tocsr().astype(np.float32)
-        own["contributions"] = types.SimpleNamespace(
-            views=views,
-            num_gaussians=weights.shape[1],
-            rows_of_views=lambda: list(np.arange(2 * len(views)).reshape(-1, 2)),
-            level=level,
-            pixels=np.tile(pixels, len(views)),
-            rows_of=lambda requested: np.flatnonzero(level == int(requested)),
-            matrix={"A": means}.get,
-            means=lambda: np.column_stack([np.arange(WIDTH), np.zeros(WIDTH), np.ones(WIDTH)]).astype(
-                np.float32
-            ),
-        )
-
-    def view_weights(self, view):
-        return self.weights
-
-    def view_labels(self, view):
-        return self.labels
-
-    def view_camera(self, view):
-        return Camera(view, np.eye(4), np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]]), (1, WIDTH))
-
-    def linear_code(self, method):
-        return self.code
+def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it():
+    # masks of 4 px and 2 px of the wholes, one of 5 px of the parts, on three Gaussians
+    means = np.array([[0.75, 0, 0], [0.5, 0.5, 0], [0, 0, 1.0]], np.float32)
+    contributions = types.SimpleNamespace(
+        matrix={"A": sp.csr_matrix(means)}.get,
+        level=np.array([1, 1, 2], np.uint8),
+        pixels=np.array([4, 2, 5]),
+    )
+    latents = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 2.0]], np.float32)
+    inputs = types.SimpleNamespace(contributions=contributions, latents=latents)
+    features = inspect.unwrap(lifted.fit)(inputs, MethodSettings(name="lifted"), 0)
+    # Gaussian 0: (4 * 0.75 * (1, 0) + 2 * 0.5 * (0, 1)) / 4; Gaussian 1 is in mask 1 alone, 2 in no whole
+    assert features[:, 0].tolist() == [[0.75, 0.25], [0.0, 1.0], [0.0, 0.0]]
+    assert features[:, 1].tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 2.0]]
+    assert not features[:, 2].any()
 
 
-TWO = unit(np.array([[1.0, 0.2, 0.0, 0.1], [0.1, 1.0, 0.3, 0.0]]))
-SETTINGS = {
-    "langsplat_v2": {"steps": 150, "rate": 0.05, "pixel_step": 1},
-    "dr_splat": {},
-    "occam": {},
-}
+# ---- LangSplat ----
 
 
-def fit_of(name, inputs, seed=0, **knobs):
-    settings = MethodSettings(name=name, **(SETTINGS[name] | knobs))
-    return method_of(name).fit(inputs, settings, seed)
+def l1_by_scipy(features, weights, targets):
+    """Gradient of the mean absolute difference of rendered and painted codes by the features, by scipy."""
+    apart = weights @ features - targets
+    scale = np.float32(1 / max(apart.size, 1))
+    return (weights.T @ (np.sign(apart) * scale)).astype(np.float32)
 
 
-@pytest.mark.parametrize("name", sorted(SETTINGS))
-def test_a_gaussian_in_one_mask_gets_its_vector_and_one_in_none_gets_zeros(name):
-    inputs = OneRowOfPixels(TWO)
-    features = fit_of(name, inputs)
-    answers = inputs.code.decode_array(features[:, Level.WHOLE.index])
-    truth = TWO[np.arange(WIDTH) // (WIDTH // 2)]
-    assert (answers * truth).sum(axis=1) == pytest.approx(1, abs=2e-3)
-    assert not features[:, Level.PART.index :].any()
+def test_l1_gradient_is_the_slope_of_the_mean_absolute_difference_of_labelled_pixels():
+    rng = np.random.default_rng(0)
+    weights = sp.csr_matrix(rng.random((5, 4)).astype(np.float32))
+    labels, codes = np.array([1, -1, 0, 2, 1], np.int32), rng.normal(size=(3, 2))
+    features = rng.random((4, 2))
+
+    def loss(features):
+        apart = (weights @ features)[labels >= 0] - codes[labels[labels >= 0]]
+        return np.abs(apart).mean()
+
+    flat = [np.pad(rows, ((0, 0), (0, 2))).ravel().astype(np.float32) for rows in (codes, features)]
+    gradient = np.full(4 * 4, 9, np.float32)  # what a step before left there
+    l1_gradient(weights.indptr, weights.indices, weights.data, labels, flat[0], 2, 4, flat[1], gradient)
+    slope = np.zeros((4, 4))
+    for place in np.ndindex(4, 2):
+        step = np.zeros_like(features)
+        step[place] = 1e-6
+        slope[place] = (loss(features + step) - loss(features - step)) / 2e-6
+    assert gradient.reshape(4, 4) == pytest.approx(slope, abs=1e-5)
+    assert (np.abs(slope[:, :2]) > 0.01).any(axis=0).all()
 
 
-@pytest.mark.parametrize("name", sorted(SETTINGS))
-def test_the_same_seed_gives_the_same_bytes(name):
-    first, again = (fit_of(name, OneRowOfPixels(TWO), seed=3) for _ in range(2))
-    assert first.tobytes() == again.tobytes()
+def adam_in_numpy(values, gradients, rate):
+    """Adam in place, a step for each gradient, which may be computed from the values of that step."""
+    first, second = np.zeros_like(values), np.zeros_like(values)
+    for step, gradient in enumerate(gradients, 1):
+        first[:] = np.float32(0.9) * first + np.float32(1 - 0.9) * gradient
+        second[:] = np.float32(0.999) * second + np.float32(1 - 0.999) * gradient * gradient
+        scale = np.float32((1 - 0.999**step) ** -0.5)
+        values -= np.float32(rate / (1 - 0.9**step)) * first / (np.sqrt(second) * scale + np.float32(1e-15))
 
 
-# ---- LangSplatV2 ----------------------------------------------------------------------------------------
+def test_adam_has_the_bytes_of_its_formula_in_numpy():
+    rng = np.random.default_rng(6)
+    gradients = rng.normal(size=(40, 7, 3)).astype(np.float32)
+    gradients[:, 0] = 0
+    expected, found = np.ones((2, 7, 3), np.float32)
+    adam_in_numpy(expected, gradients, 0.01)
+    adam = Adam(found, 0.01)
+    for gradient in gradients:
+        adam.step(gradient)
+    assert np.array_equal(found, expected) and (found[0] == 1).all() and (found[1:] != 1).all()
+
+
+def painted(weights, labels):
+    """A view whose masks are the first rows of the contributions."""
+    rows = np.arange(labels.max() + 1)
+    return LabelledView(
+        0, rows, sp.csr_matrix(weights, dtype=np.float32), labels, np.zeros((len(labels), 2), int)
+    )
+
+
+def whole_masks(num):
+    """Labels of pixels that each have a mask of the wholes."""
+    labels = np.full((num, 3), -1, np.int32)
+    labels[:, Level.WHOLE.index] = np.arange(num)
+    return labels
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 6])
+def test_training_has_the_bytes_of_products_with_the_matrix_and_of_adam_in_numpy(channels):
+    rng = np.random.default_rng(channels)
+    latents = rng.normal(size=(5, channels)).astype(np.float32)
+    views = [
+        painted(sp.random(40, 9, 0.4, "csr", np.float32, rng), rng.integers(-1, 5, (40, 3)).astype(np.int32))
+        for _ in range(3)
+    ]
+    settings = MethodSettings(name="langsplat", steps=50)
+    features, order = np.zeros((9, channels), np.float32), np.random.default_rng(4)
+    drawn = np.concatenate([order.permutation(3)[::-1] for _ in range(17)])[: settings.steps]
+
+    def gradients():
+        for view in (views[number] for number in drawn):
+            pixels = view.at(Level.PART)
+            yield l1_by_scipy(features, view.weights[pixels], latents[view.labels[pixels, Level.PART.index]])
+
+    adam_in_numpy(features, gradients(), settings.rate)
+    assert np.array_equal(train_level(views, latents, Level.PART, 9, settings, seed=4), features)
+
+
+def test_a_code_that_is_no_number_is_not_trained_on_in_silence():
+    view, latents = painted(np.ones((1, 1)), whole_masks(1)), np.float32([[np.nan]])
+    settings = MethodSettings(name="langsplat", steps=2)
+    assert np.isnan(train_level([view], latents, Level.WHOLE, 1, settings, seed=0)).all()
+
+
+def test_views_come_in_random_order_each_once_before_any_is_repeated():
+    first, again, other = (in_random_order(range(4), np.random.default_rng(seed)) for seed in (0, 0, 3))
+    drawn = list(itertools.islice(first, 40))
+    assert all(sorted(drawn[start : start + 4]) == [0, 1, 2, 3] for start in range(0, 40, 4))
+    assert drawn == list(itertools.islice(again, 40)) != list(itertools.islice(other, 40))
+
+
+def test_langsplat_trains_every_level_on_the_pixels_of_the_grid():
+    # one row of five pixels, every second one compared: 0, 2 and 4; pixel 4 is not covered
+    weights = sp.csr_matrix(np.array([[1, 0], [1, 0], [0, 1], [0, 1], [0, 0]], np.float32))
+    labels = np.array([[0, 2, -1], [1, 2, -1], [0, -1, -1], [1, 2, 1], [1, 1, 1]], np.int32)
+    inputs = MethodInputs(*[Path("none")] * 5)
+    inputs.__dict__.update(
+        contributions=types.SimpleNamespace(
+            views=("a", "b"), num_gaussians=2, rows_of_views=lambda: [np.array([0]), np.array([1, 2, 3])]
+        ),
+        latents=np.array([[9.0], [0.3], [5.0], [0.6]], np.float32),  # view b has the last three
+        view_weights=lambda view: weights,
+        view_labels=lambda view: labels if view == "b" else np.full((5, 3), -1, np.int32),
+        view_camera=lambda view: types.SimpleNamespace(size_hw=(1, 5)),
+    )
+    settings = MethodSettings(name="langsplat", steps=900, rate=0.002, pixel_step=2)
+    features = langsplat.fit(inputs, settings, 0)[..., 0]
+    assert features[:, Level.WHOLE.index] == pytest.approx([0.3, 0.3], abs=0.01)
+    assert features[:, Level.PART.index] == pytest.approx([0.6, 0.0], abs=0.01)
+    assert features[:, Level.SUBPART.index].tolist() == [0, 0]
+
+
+# ---- LangSplatV2 ----
 
 
 def test_the_largest_shares_are_those_of_a_softmax_and_of_equal_logits_the_first():
@@ -139,7 +200,7 @@ def test_gradients_of_a_step_match_finite_differences():
     weights = sp.csr_matrix((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32))
     pixels = weights, code.encode_array(unit(rng.normal(size=(5, 6))))
     logits, codebook = (rng.normal(size=shape).astype(np.float32) for shape in [(3, 6), (6, 4)])
-    _, by_logits, by_codebook = step(logits, codebook, *pixels, code)
+    _, by_logits, by_codebook = langsplat_v2.step(logits, codebook, *pixels, code)
     chosen, _ = largest_shares(logits)
     for which, values, gradient, place in [
         (0, logits, by_logits, (0, chosen[0, 1])),
@@ -150,11 +211,41 @@ def test_gradients_of_a_step_match_finite_differences():
         for sign in (1, -1):
             moved = values.copy()
             moved[place] += sign * 1e-2
-            sides.append(step(*((moved, codebook) if which == 0 else (logits, moved)), *pixels, code)[0])
+            sides.append(
+                langsplat_v2.step(*((moved, codebook) if which == 0 else (logits, moved)), *pixels, code)[0]
+            )
         assert gradient[place] == pytest.approx((sides[0] - sides[1]) / 2e-2, abs=1e-3)
 
 
-# ---- Dr. Splat ------------------------------------------------------------------------------------------
+# ---- Dr. Splat and Occam's LGS ----
+
+
+AHEAD, BEHIND = np.eye(4), np.diag([1.0, -1, -1, 1])
+
+
+def one_row_of_pixels(weights, views=("a", "b"), second=AHEAD):
+    """Stand-in inputs: a row of eight pixels per view; its left half is whole mask 0, its right half mask 1.
+
+    Gaussian i is centred in pixel i; the camera of a second view has the pose `second`.
+    """
+    labels = np.full((8, 3), -1, np.int32)
+    labels[:, Level.WHOLE.index] = np.arange(8) // 4
+    weights, K = sp.csr_matrix(weights, dtype=np.float32), np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    contributions = types.SimpleNamespace(
+        views=views,
+        num_gaussians=weights.shape[1],
+        level=np.ones(2 * len(views), np.uint8),
+        rows_of_views=lambda: list(np.arange(2 * len(views)).reshape(-1, 2)),
+        means=lambda: np.float32([[x, 0, 1] for x in range(8)]),
+    )
+    return types.SimpleNamespace(
+        contributions=contributions,
+        latents=np.tile(np.eye(2, dtype=np.float32), (len(views), 1)),
+        no_features=lambda: np.zeros((weights.shape[1], 3, 2), np.float32),
+        view_weights=lambda view: weights,
+        view_labels=lambda view: labels,
+        view_camera=lambda view: Camera(view, AHEAD if view == "a" else second, K, (1, 8)),
+    )
 
 
 def test_the_heaviest_weights_of_a_pixel_stay_and_of_equal_ones_the_first():
@@ -165,37 +256,26 @@ def test_the_heaviest_weights_of_a_pixel_stay_and_of_equal_ones_the_first():
 
 
 def test_only_gaussians_that_lead_a_pixel_take_its_vector():
-    weights = np.zeros((WIDTH, 2), np.float32)
-    weights[:4] = [0.9, 0.1]  # Gaussian 0 leads the left mask,
-    weights[4:] = [0.4, 0.6]  # Gaussian 1 the right one
-    inputs = OneRowOfPixels(TWO, weights=sp.csr_matrix(weights))
-    leaders = dr_splat.register(inputs, inputs.code.decode_array(inputs.latents), 1)[:, 0]
-    assert leaders == pytest.approx(TWO, abs=1e-5)
-    both = dr_splat.register(inputs, inputs.code.decode_array(inputs.latents), 45)[:, 0]
-    assert both[0] == pytest.approx(unit([0.9 * TWO[0] + 0.4 * TWO[1]])[0], abs=1e-5)
+    # Gaussian 0 leads the left mask, Gaussian 1 the right one
+    inputs = one_row_of_pixels([[0.9, 0.1]] * 4 + [[0.4, 0.6]] * 4)
+    vectors = unit(np.array([[1.0, 0.2, 0.0, 0.1], [0.1, 1.0, 0.3, 0.0]] * 2))
+    register = inspect.unwrap(dr_splat.register)
+    assert register(inputs, vectors, 1)[:, 0] == pytest.approx(vectors[:2], abs=1e-5)
+    both = register(inputs, vectors, 45)[:, 0]
+    assert both[0] == pytest.approx(unit([0.9 * vectors[0] + 0.4 * vectors[1]])[0], abs=1e-5)
 
 
-def test_a_quantised_vector_is_the_nearest_centroid_of_each_part():
-    codebooks = np.float32([[[0, 0], [1, 1]], [[0, 0], [5, 0]]])
-    quantiser = ProductQuantiser(codebooks)
-    codes = quantiser.encode(
-        np.float32([[0.9, 0.8, 4.0], [0.1, 0.2, 0.0]])
-    )  # the fourth number is missing: 0
-    assert codes.dtype == np.uint8 and codes.tolist() == [[1, 1], [0, 0]]
-    assert quantiser.decode(codes, 3).tolist() == [[1, 1, 5], [0, 0, 0]]
+def test_a_quantised_vector_is_the_nearest_entry_of_each_part():
+    books = [np.float32([[0] * 4, [1] * 4]), np.float32([[0] * 4, [5, 0, 0, 0]])]
+    rows = np.float32([[0.9, 0.8, 1, 1, 4.0], [0.1, 0.2, 0, 0, 0.0]])  # the last three numbers are missing: 0
+    assert dr_splat.quantised(rows, books).tolist() == [[1, 1, 1, 1, 5], [0, 0, 0, 0, 0]]
 
 
 def test_few_vectors_are_quantised_without_loss_and_many_to_less_than_their_spread():
     rng = np.random.default_rng(0)
-    few = rng.normal(size=(200, 6)).astype(np.float32)
-    quantiser = ProductQuantiser.fit(few, 4, seed=0)
-    assert quantiser.decode(quantiser.encode(few), 6) == pytest.approx(few, abs=1e-6)
-    many = rng.normal(size=(3000, 6)).astype(np.float32)
-    quantiser = ProductQuantiser.fit(many, 4, seed=0)
-    assert np.square(quantiser.decode(quantiser.encode(many), 6) - many).mean() < 0.15
-
-
-# ---- Occam's LGS ----------------------------------------------------------------------------------------
+    few, many = (rng.normal(size=(count, 6)).astype(np.float32) for count in (200, 3000))
+    assert dr_splat.quantised(few, dr_splat.codebooks(few, 0)) == pytest.approx(few, abs=1e-6)
+    assert np.square(dr_splat.quantised(many, dr_splat.codebooks(many, 0)) - many).mean() < 0.15
 
 
 def test_centres_fall_into_pixels_unless_they_are_behind_or_outside():
@@ -205,30 +285,22 @@ def test_centres_fall_into_pixels_unless_they_are_behind_or_outside():
     assert occam.centre_pixels(means, camera).tolist() == [12, 3, -1, -1, -1]
 
 
-def test_a_gaussian_across_a_border_takes_the_mask_at_its_centre_and_a_hidden_one_nothing():
-    weights = np.eye(WIDTH, dtype=np.float32)
-    weights[3], weights[4] = 0, 0
-    weights[3:5, 3] = 1  # Gaussian 3 covers pixel 4 as well, and hides Gaussian 4 there
-    inputs = OneRowOfPixels(TWO, weights=sp.csr_matrix(weights))
-    features = fit_of("occam", inputs)[:, Level.WHOLE.index]
-    assert inputs.code.decode_array(features[3:4])[0] == pytest.approx(TWO[0], abs=1e-5)
-    assert not features[4].any()
-    masks = MaskOperator.of(inputs.contributions.matrix("A"), inputs.contributions.level)
-    assert (
-        masks.spread(np.ones((4, 1), np.float32))[3] > 0
-    ).any()  # which `lifted` would divide between both
+def test_occam_uses_the_mask_at_the_centre_of_a_gaussian_and_ignores_hidden_ones():
+    weights = np.eye(8)
+    weights[3:5, 3:5] = [[1, 0], [1, 0]]  # Gaussian 3 also covers pixel 4, and hides Gaussian 4 there
+    features = inspect.unwrap(occam.fit)(one_row_of_pixels(weights), MethodSettings(name="occam"), 0)
+    assert features[3:5, Level.WHOLE.index].tolist() == [[1, 0], [0, 0]]
+    assert not features[:, Level.PART.index :].any()
 
 
-def test_a_view_in_which_no_centre_lies_adds_nothing():
-    class LooksAway(OneRowOfPixels):
-        def view_camera(self, view):
-            camera = super().view_camera(view)
-            return replace(camera, cam_from_world=np.diag([1.0, -1, -1, 1])) if view == "b" else camera
-
-    assert np.array_equal(fit_of("occam", LooksAway(TWO)), fit_of("occam", OneRowOfPixels(TWO, views=("a",))))
-
-
-# ---- what they need -------------------------------------------------------------------------------------
+def test_occam_ignores_views_that_contain_no_centre():
+    one, both = (
+        inspect.unwrap(occam.fit)(
+            one_row_of_pixels(np.eye(8), views, BEHIND), MethodSettings(name="occam"), 0
+        )
+        for views in ("a", "ab")
+    )
+    assert one.any() and np.array_equal(one, both)
 
 
 def test_methods_of_vectors_refuse_a_code_that_is_a_network(tmp_path, monkeypatch):
@@ -237,8 +309,3 @@ def test_methods_of_vectors_refuse_a_code_that_is_a_network(tmp_path, monkeypatc
     inputs = MethodInputs(*[tmp_path] * 5)
     with pytest.raises(SettingsError, match="method dr_splat needs a linear code"):
         inputs.linear_code("dr_splat")
-
-
-def test_training_free_lifting_is_not_random():
-    assert [name for name in ("hilsplat", "lifted", "occam") if MethodSettings(name=name).is_random] == []
-    assert MethodSettings(name="dr_splat").is_random and MethodSettings(name="langsplat_v2").is_random

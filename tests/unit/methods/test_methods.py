@@ -1,195 +1,135 @@
-"""Baselines: small matrices worked by hand, and the example in the documentation, run from its text."""
+"""Every baseline on small scenes: what it finds, repeated fits, the settings it reads; registry and stage."""
 
+import csv
 import inspect
-import itertools
 import re
 import sys
 import types
-from pathlib import Path
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
+import torch
+import yaml
 
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.field.adam import Adam
-from hilsplat.methods import langsplat, lifted, registry, stage
-from hilsplat.methods.common.pixels import LabelledView, grid_pixels, in_random_order
-from hilsplat.methods.langsplat import l1_gradient, train_level
-from hilsplat.methods.method import Method, MethodInputs
+from hilsplat.configuration import parse_run
+from hilsplat.methods import laga, method, registry
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.settings import MethodSettings
 from tests.conftest import PROJECT
+from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
+from tests.unit.two_boxes_world import ONE_DROPPED, REGIONS, build_contributions, build_two_boxes, region_mask
 
-EXTENDING = PROJECT / "docs" / "extending.md"
-
-
-def fit_of(method, inputs, settings):
-    """The field of a method, from stand-ins for MethodInputs."""
-    return inspect.unwrap(method.fit)(inputs, settings, 0)
-
-
-def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it():
-    # masks of 4 px and 2 px of the wholes, one of 5 px of the parts, on three Gaussians
-    means = np.array([[0.75, 0, 0], [0.5, 0.5, 0], [0, 0, 1.0]], np.float32)
-    contributions = types.SimpleNamespace(
-        matrix={"A": sp.csr_matrix(means)}.get,
-        level=np.array([1, 1, 2], np.uint8),
-        pixels=np.array([4, 2, 5]),
-    )
-    latents = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 2.0]], np.float32)
-    inputs = types.SimpleNamespace(contributions=contributions, latents=latents)
-    features = fit_of(lifted.METHOD, inputs, MethodSettings(name="lifted"))
-    # Gaussian 0: (4 * 0.75 * (1, 0) + 2 * 0.5 * (0, 1)) / 4; Gaussian 1 is in mask 1 alone, 2 in no whole
-    assert features[:, 0].tolist() == [[0.75, 0.25], [0.0, 1.0], [0.0, 0.0]]
-    assert features[:, 1].tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 2.0]]
-    assert not features[:, 2].any()
+pytestmark = pytest.mark.filterwarnings("error")  # such as the mean of an empty array
+EVERY, LARGE = tuple(range(len(REGIONS))), (0, 1, 2, 3, 5, 6)
+"""LARGE lacks part "B top", which covers too little of its box to be distinguished from the rest."""
+FITS = {
+    # method: settings, regions that it finds, least share of a region's Gaussians with its code
+    "dr_splat": ({}, EVERY, 0.8),
+    "gaussian_grouping": ({"steps": 100}, EVERY, 0.8),
+    "laga": ({}, EVERY, 0.8),
+    "langsplat": ({}, EVERY, 0.8),
+    "langsplat_v2": ({}, EVERY, 0.8),
+    "legaussians": ({"rate": 0.02}, EVERY, 0.8),
+    "lifted": ({}, EVERY, 0.8),
+    "occam": ({}, EVERY, 0.8),
+    "omniseg3d": ({"thresholds": (0.05, 0.4, 0.7)}, LARGE, 0.6),
+    "opengaussian": ({}, EVERY, 0.8),
+    "saga": ({}, (0, 1, 2, 3), 0.6),
+    "vch": ({"steps": 100, "thresholds": (0.8, 0.5, 0.3)}, LARGE, 0.6),  # a third of "A top" is a subpart
+}
 
 
-def l1_by_scipy(features, weights, targets):
-    """Gradient of the mean absolute difference of rendered and painted codes by the features, by scipy."""
-    apart = weights @ features - targets
-    scale = np.float32(1 / max(apart.size, 1))
-    return (weights.T @ (np.sign(apart) * scale)).astype(np.float32)
+@pytest.fixture(scope="module")
+def inputs_of(tmp_path_factory):
+    """A cached function that builds inputs with masks of the given regions in each view."""
+
+    @cache
+    def inputs_of(regions=ONE_DROPPED):
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            world = build_two_boxes(tmp_path_factory.mktemp("boxes"), monkeypatch, regions)
+            return two_boxes_inputs(world, build_contributions(world))
+
+    return inputs_of
 
 
-def test_l1_gradient_is_the_slope_of_the_mean_absolute_difference_of_labelled_pixels():
-    rng = np.random.default_rng(0)
-    weights = sp.csr_matrix(rng.random((5, 4)).astype(np.float32))
-    labels, codes = np.array([1, -1, 0, 2, 1], np.int32), rng.normal(size=(3, 2))
-    features = rng.random((4, 2))
-
-    def loss(features):
-        apart = (weights @ features)[labels >= 0] - codes[labels[labels >= 0]]
-        return np.abs(apart).mean()
-
-    flat = [np.pad(rows, ((0, 0), (0, 2))).ravel().astype(np.float32) for rows in (codes, features)]
-    gradient = np.full(4 * 4, 9, np.float32)  # what a step before left there
-    l1_gradient(weights.indptr, weights.indices, weights.data, labels, flat[0], 2, 4, flat[1], gradient)
-    slope = np.zeros((4, 4))
-    for place in np.ndindex(4, 2):
-        step = np.zeros_like(features)
-        step[place] = 1e-6
-        slope[place] = (loss(features + step) - loss(features - step)) / 2e-6
-    assert gradient.reshape(4, 4) == pytest.approx(slope, abs=1e-5)
-    assert (np.abs(slope[:, :2]) > 0.01).any(axis=0).all()
+def fit_of(name, inputs, kind=MethodSettings, **changed):
+    """Return the features of a method."""
+    settings = {"steps": 150, "rate": 0.05, "pixel_step": 1, "codebook": (2, 2), **FITS[name][0], **changed}
+    features = method_of(name)(inputs, kind(name=name, **settings), 0)
+    assert features.dtype == np.float32 and np.isfinite(features).all()
+    return features
 
 
-def adam_in_numpy(values, gradients, rate):
-    """Adam in place, a step for each gradient, which may be computed from the values of that step."""
-    first, second = np.zeros_like(values), np.zeros_like(values)
-    for step, gradient in enumerate(gradients, 1):
-        first[:] = np.float32(0.9) * first + np.float32(1 - 0.9) * gradient
-        second[:] = np.float32(0.999) * second + np.float32(1 - 0.999) * gradient * gradient
-        scale = np.float32((1 - 0.999**step) ** -0.5)
-        values -= np.float32(rate / (1 - 0.9**step)) * first / (np.sqrt(second) * scale + np.float32(1e-15))
+@pytest.mark.parametrize("name", METHODS)
+def test_regions_of_every_level_get_their_own_code(inputs_of, monkeypatch, name):
+    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # some regions have masks in three of the four views
+    features = fit_of(name, inputs_of())
+    _, rows, least = FITS[name]
+    for row in rows:
+        inside = np.flatnonzero(region_mask(row).ravel())
+        own = features[inside, Level(REGIONS[row][1]).index]
+        right = (own.argmax(axis=1) == row) & (own.max(axis=1) > 0.5)
+        assert np.mean(right) > least, REGIONS[row][0]
 
 
-def test_adam_has_the_bytes_of_its_formula_in_numpy():
-    rng = np.random.default_rng(6)
-    gradients = rng.normal(size=(40, 7, 3)).astype(np.float32)
-    gradients[:, 0] = 0
-    expected, found = np.ones((2, 7, 3), np.float32)
-    adam_in_numpy(expected, gradients, 0.01)
-    adam = Adam(found, 0.01)
-    for gradient in gradients:
-        adam.step(gradient)
-    assert np.array_equal(found, expected) and (found[0] == 1).all() and (found[1:] != 1).all()
+@pytest.mark.parametrize("name", METHODS)
+def test_fits_are_identical_on_any_number_of_threads(inputs_of, name):
+    before, made = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            made.append(fit_of(name, replace(inputs_of(), threads=threads), steps=5))
+    finally:
+        torch.set_num_threads(before)
+    assert made[0].tobytes() == made[1].tobytes()
 
 
-def painted(weights, labels):
-    """A view whose masks are the first rows of the contributions."""
-    rows = np.arange(labels.max() + 1)
-    return LabelledView(
-        0, rows, sp.csr_matrix(weights, dtype=np.float32), labels, np.zeros((len(labels), 2), int)
-    )
+THIN = {
+    **{
+        f"no {level.label}": (tuple(row for row in EVERY if REGIONS[row][1] != int(level)),) * 6
+        for level in LEVELS
+    },
+    "a single view": (EVERY,),
+    "a single mask of each level": ((0, 2, 5),) * 6,
+    "a single mask of a single view": ((0,),),
+}
 
 
-def whole_masks(num):
-    """Labels of pixels that each have a mask of the wholes."""
-    labels = np.full((num, 3), -1, np.int32)
-    labels[:, Level.WHOLE.index] = np.arange(num)
-    return labels
+@pytest.mark.parametrize("regions", THIN.values(), ids=THIN)
+@pytest.mark.parametrize("name", METHODS)
+def test_levels_with_masks_get_features_and_the_others_zeros(inputs_of, name, regions):
+    present = {REGIONS[row][1] for view in regions for row in view}
+    features = fit_of(name, inputs_of(regions), steps=30, thresholds="auto")
+    assert features.any(axis=(0, 2)).tolist() == [int(level) in present for level in LEVELS]
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4, 6])
-def test_training_has_the_bytes_of_products_with_the_matrix_and_of_adam_in_numpy(channels):
-    rng = np.random.default_rng(channels)
-    latents = rng.normal(size=(5, channels)).astype(np.float32)
-    views = [
-        painted(sp.random(40, 9, 0.4, "csr", np.float32, rng), rng.integers(-1, 5, (40, 3)).astype(np.int32))
-        for _ in range(3)
-    ]
-    settings = MethodSettings(name="langsplat", steps=50)
-    features, order = np.zeros((9, channels), np.float32), np.random.default_rng(4)
-    drawn = np.concatenate([order.permutation(3)[::-1] for _ in range(17)])[: settings.steps]
-
-    def gradients():
-        for view in (views[number] for number in drawn):
-            pixels = view.at(Level.PART)
-            yield l1_by_scipy(features, view.weights[pixels], latents[view.labels[pixels, Level.PART.index]])
-
-    adam_in_numpy(features, gradients(), settings.rate)
-    assert np.array_equal(train_level(views, latents, Level.PART, 9, settings, seed=4), features)
+def readers(description):
+    """Return the methods named in a setting's description, or all but those before its colon."""
+    if description.startswith("all but "):
+        spared = description.removeprefix("all but ").partition(":")[0].split(", ")
+        assert set(spared) <= {OURS, *METHODS}
+        return set(METHODS) - set(spared)
+    return {name for name in METHODS if re.search(rf"\b{name}\b", description)}
 
 
-def test_a_code_that_is_no_number_is_not_trained_on_in_silence():
-    view, latents = painted(np.ones((1, 1)), whole_masks(1)), np.float32([[np.nan]])
-    settings = MethodSettings(name="langsplat", steps=2)
-    assert np.isnan(train_level([view], latents, Level.WHOLE, 1, settings, seed=0)).all()
+@pytest.mark.parametrize("name", METHODS)
+def test_descriptions_of_settings_name_the_methods_that_read_them(inputs_of, name):
+    read = set()
 
+    class Watched(MethodSettings):
+        def __getattribute__(self, key):
+            read.add(key)
+            return super().__getattribute__(key)
 
-def test_l1_finds_the_median_of_what_a_gaussian_shows():
-    # one Gaussian alone in three pixels with codes 0, 1 and 10: the squared optimum would be 11/3
-    view, latents = painted(np.ones((3, 1)), whole_masks(3)), np.float32([[0], [1], [10]])
-    settings = MethodSettings(name="langsplat", steps=2000, rate=0.005)
-    found = train_level([view], latents, Level.WHOLE, 1, settings, seed=0)
-    assert found[0, 0] == pytest.approx(1.0, abs=0.02)
-
-
-def test_views_come_in_random_order_each_once_before_any_is_repeated():
-    first, again, other = (in_random_order(range(4), np.random.default_rng(seed)) for seed in (0, 0, 3))
-    drawn = list(itertools.islice(first, 40))
-    assert all(sorted(drawn[start : start + 4]) == [0, 1, 2, 3] for start in range(0, 40, 4))
-    assert drawn == list(itertools.islice(again, 40)) != list(itertools.islice(other, 40))
-
-
-def test_the_pixels_of_a_level_are_those_that_it_labels():
-    view = painted(np.eye(3), np.array([[1, -1, -1], [0, 2, -1], [-1, 0, -1]], np.int32))
-    assert [view.at(level).tolist() for level in LEVELS] == [[0, 1], [1, 2], []]
-
-
-def test_langsplat_trains_every_level_on_the_pixels_of_the_grid():
-    # one row of five pixels, every second one compared: 0, 2 and 4; pixel 4 is not covered
-    weights = sp.csr_matrix(np.array([[1, 0], [1, 0], [0, 1], [0, 1], [0, 0]], np.float32))
-    labels = np.array([[0, 2, -1], [1, 2, -1], [0, -1, -1], [1, 2, 1], [1, 1, 1]], np.int32)
-    inputs = MethodInputs(*[Path("none")] * 5)
-    inputs.__dict__.update(
-        contributions=types.SimpleNamespace(
-            views=("a", "b"), num_gaussians=2, rows_of_views=lambda: [np.array([0]), np.array([1, 2, 3])]
-        ),
-        latents=np.array([[9.0], [0.3], [5.0], [0.6]], np.float32),  # view b has the last three
-        view_weights=lambda view: weights,
-        view_labels=lambda view: labels if view == "b" else np.full((5, 3), -1, np.int32),
-        view_camera=lambda view: types.SimpleNamespace(size_hw=(1, 5)),
-    )
-    settings = MethodSettings(name="langsplat", steps=900, rate=0.002, pixel_step=2)
-    features = fit_of(langsplat.METHOD, inputs, settings)[..., 0]
-    assert features[:, Level.WHOLE.index] == pytest.approx([0.3, 0.3], abs=0.01)
-    assert features[:, Level.PART.index] == pytest.approx([0.6, 0.0], abs=0.01)
-    assert features[:, Level.SUBPART.index].tolist() == [0, 0]
-
-
-def test_grid_takes_every_second_pixel_of_every_second_row():
-    assert grid_pixels((3, 4), 2).tolist() == [0, 2, 8, 10]
-
-
-@pytest.mark.parametrize("name", sorted(METHODS))
-def test_every_baseline_is_named_after_its_file_and_says_where_it_comes_from(name):
-    method = method_of(name)
-    assert METHODS.places[name] == f"hilsplat.methods.{name}:METHOD" and method.name == name
-    assert method.source
+    fit_of(name, inputs_of((EVERY,) * 6), Watched, steps=3)
+    fields = MethodSettings.model_fields
+    own = {key for key, field in fields.items() if key != "name" and name in readers(field.description)}
+    assert (read & fields.keys()) - {"name"} == own
 
 
 def test_unknown_methods_name_those_that_exist():
@@ -202,38 +142,57 @@ def test_unknown_methods_name_those_that_exist():
 
 @pytest.mark.parametrize("features", [np.zeros((2, 3, 2)), np.full((2, 3, 1), np.nan)])
 def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, features):
-    broken = Method("lifted", "broken", "none", lambda inputs, settings, seed: features)
-    monkeypatch.setattr(stage, "method_of", lambda name: broken)
+    monkeypatch.setattr(method, "method_of", lambda name: lambda inputs, settings, seed: features)
     inputs = types.SimpleNamespace(
         scene_folder=tmp_path / "scene",
         contributions=types.SimpleNamespace(num_gaussians=2),
         latents=np.zeros((3, 1), np.float32),
     )
+    run_method = inspect.unwrap(method.run_method)  # the inputs here are no MethodInputs
     with pytest.raises(ArtifactError, match="method lifted did not return a language field"):
-        run_method = inspect.unwrap(stage.run_method)  # the inputs here are no MethodInputs
         run_method(inputs, tmp_path / "field.safetensors", MethodSettings(name="lifted"), 0)
 
 
-def test_the_method_of_the_documentation_runs_as_it_is_written(tmp_path, monkeypatch):
-    """The code block of docs/extending.md becomes a module, one line the registry, and it writes a field."""
-    code = re.search(r"```python\n(# hilsplat/methods/nearest_mask\.py.*?)```", EXTENDING.read_text(), re.S)
-    line = re.search(r'```python\n(    "nearest_mask": .*?)\n```', EXTENDING.read_text(), re.S)
+def test_the_example_in_the_documentation_runs_as_written(monkeypatch):
+    page = (PROJECT / "docs" / "extending.md").read_text()
+    code = re.search(r"```python\n(# hilsplat/methods/nearest_mask\.py.*?)```", page, re.S)
+    line = re.search(r'```python\n(    "nearest_mask": .*?)\n```', page, re.S)
     module = types.ModuleType("hilsplat.methods.nearest_mask")
     exec(compile(code[1], "nearest_mask.py", "exec"), module.__dict__)
     monkeypatch.setitem(sys.modules, module.__name__, module)
     name, place = (part.strip(' ",') for part in line[1].split(":", 1))
     monkeypatch.setitem(registry.METHODS.places, name, place)
 
-    means = sp.csr_matrix(np.array([[0.9, 0.1], [0.2, 0.3]], np.float32))
     contributions = types.SimpleNamespace(
         num_gaussians=2,
-        matrix=lambda _: means,
+        matrix=lambda _: sp.csr_matrix(np.array([[0.9, 0.1], [0.2, 0.3]], np.float32)),
         pixels=np.array([1, 4]),
         rows_of=lambda level: np.array([0, 1]),
     )
-    inputs = types.SimpleNamespace(
-        contributions=contributions, latents=np.array([[1.0, 0.0], [0.0, 1.0]], np.float32)
-    )
-    features = method_of("nearest_mask").fit(inputs, MethodSettings(name="nearest_mask"), 0)
+    inputs = types.SimpleNamespace(contributions=contributions, latents=np.eye(2, dtype=np.float32))
+    features = method_of("nearest_mask")(inputs, MethodSettings(name="nearest_mask"), 0)
     # Gaussian 0: 0.9 px in mask 0, 0.8 px in mask 1; Gaussian 1: 0.1 px and 1.2 px
     assert features[:, 0].tolist() == [[1.0, 0.0], [0.0, 1.0]]
+
+
+def test_methods_of_the_papers_tables_run_or_are_explained_in_the_documentation():
+    page = (PROJECT / "docs" / "methods.md").read_text().partition("## Every method of the tables")[2]
+    cells = [line.split("|")[1] for line in page.splitlines() if line.startswith("| ")]
+    explained = {name.partition(" (")[0].strip() for cell in cells for name in cell.split(",")}
+    rows = set()
+    for path in sorted((PROJECT / "config" / "published").glob("*.csv")):
+        if path.stem not in ("ablation", "omega", "theta", "pruning") and not path.stem.startswith("frames-"):
+            with path.open(newline="") as file:
+                rows |= {row["method"].rstrip("*").replace("Lseg", "LSeg") for row in csv.DictReader(file)}
+    assert rows - {"Hi-LSplat"} - explained == set()
+
+
+def test_methods_yaml_has_a_variant_of_every_method():
+    own, more = (
+        yaml.safe_load((PROJECT / f"config/{name}.yaml").read_text()) for name in ("config", "methods")
+    )
+    names = {**own["variants"], **more["variants"]}
+    variants = {name: own["variants"].get(name, {}) | more["variants"].get(name, {}) for name in names}
+    listed = {variants.get(name, {}).get("method", {}).get("name", OURS) for name in more["main_variants"]}
+    assert listed == {OURS, *METHODS}
+    parse_run(own | more | {"variants": variants, "labels": own["labels"] | more["labels"]})

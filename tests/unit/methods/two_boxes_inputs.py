@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.field.linear_code import LinearCode
+from hilsplat.field.code import LinearCode
 from hilsplat.methods.method import MethodInputs
 from hilsplat.scene.cameras import Camera
 from tests.unit.two_boxes_world import HEIGHT, REGIONS, WIDTH, TwoBoxes, two_boxes_weights
