@@ -18,9 +18,9 @@ from benchmarks.scenes import random_scene
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
+from hilsplat.field.autoencoder import train_autoencoder
+from hilsplat.field.code import LinearCode
 from hilsplat.field.language_field import LanguageField
-from hilsplat.field.linear_code import LinearCode
-from hilsplat.field.network_training import train_autoencoder
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
@@ -106,10 +106,10 @@ def open_scene(code_name: str, threads: int = 1) -> LanguageScene:
         scene,
         gaussians,
         tree,
+        lambda view: weights,
         LanguageField(features, "", ""),
         code,
         encode,
-        lambda view: weights,
         threads=threads,
     )
     opened.node_relevancy_map(["mug handle"], VIEW)
@@ -133,7 +133,7 @@ def test_path_query_on_the_tree(benchmark):
 @one_thread
 def test_mask_of_an_answer(benchmark):
     scene = open_scene("network")
-    ids = scene.find("mug handle", "subpart", threshold=0.5).ids
+    ids = scene.select("mug handle", level="subpart", threshold=0.5).ids
     benchmark.extra_info |= {"case": MASK, "count": SIZE_HW[0] * SIZE_HW[1], "of": "px"}
     assert benchmark(lambda: scene.node_masks(VIEW, ids)).shape == SIZE_HW
 

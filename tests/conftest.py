@@ -41,6 +41,14 @@ def project() -> Path:
     return PROJECT
 
 
+@pytest.fixture(scope="session")
+def desk_project(tmp_path_factory) -> Path:
+    """A project folder with models/colours and the finished results/photos/desk; change only copies of it."""
+    from tests.unit.finished_desk import build_finished_desk
+
+    return build_finished_desk(tmp_path_factory.mktemp("project"))
+
+
 @pytest.fixture(autouse=True)
 def own_log() -> Iterator[None]:
     """Handlers that a command adds write to the terminal of its test, which is gone after it."""

@@ -6,47 +6,112 @@ All geometry is computed here, with the polygon filling that evaluation uses; th
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 import cv2
 import numpy as np
+from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hilsplat.annotate import wire
 from hilsplat.annotate.exporting import Kind, exported
-from hilsplat.annotate.importing import imported
+from hilsplat.annotate.importing import imported, merged
 from hilsplat.annotate.labels import (
-    StaleLabelsError,
+    Label,
+    Place,
+    Rings,
     cut_to_parents,
     fill_rings,
     label_path,
     traced,
     write_labels,
 )
-from hilsplat.annotate.merging import merged
 from hilsplat.annotate.opened_scene import OpenedScene
 from hilsplat.base.errors import SettingsError
-from hilsplat.query.names import version_of
+from hilsplat.web.file_changes import version_of
 from hilsplat.web.guard import Guard
+from hilsplat.web.messages import Message
 from hilsplat.web.scene_thread import SceneThread
 from hilsplat.web.server import (
     BYTES,
     Pages,
     answer,
     guarded,
-    photograph,
     plain,
     read,
     serve,
-    thumbnail,
     version_sent,
     view_name,
 )
 
 MAX_BODY_BYTES = 16 << 20
 """Maximum size of a request, enough for a COCO file of a whole scene."""
+
+
+# -- requests -------------------------------------------------------------------------------------
+
+
+class Stroke(Message):
+    """A brush stroke: discs of one radius along points, px."""
+
+    points: Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_000)]
+    radius: Annotated[float, Field(ge=0.5, le=500)]
+    erase: bool = False
+
+
+class Shape(Message):
+    """A region composed of polygons and a stroke, inside its parent."""
+
+    view: int
+    add: Rings
+    stroke: Stroke | None = None
+    inside: Rings | None = None
+
+
+class At(Message):
+    """A pixel of a photograph."""
+
+    view: int
+    x: int
+    y: int
+
+
+class Segment(Message):
+    """Clicks on one thing in a photograph (x, y, inside), or a box around it (left, top, right, bottom)."""
+
+    view: int
+    clicks: Annotated[tuple[tuple[int, int, bool], ...], Field(max_length=64)] = ()
+    box: tuple[int, int, int, int] | None = None
+
+
+class Carry(Message):
+    """Ids of things, and the view to transfer them to."""
+
+    ids: Annotated[list[int], Field(min_length=1, max_length=2000)]
+    view: int
+
+
+class Labels(Message):
+    """All annotations of a view."""
+
+    labels: Annotated[list[Label], Field(max_length=2000)]
+
+
+class File(Message):
+    """A file of annotations."""
+
+    name: Annotated[str, Field(max_length=300)]
+    text: str
+
+
+class Given(Message):
+    """Files of annotations."""
+
+    files: Annotated[list[File], Field(min_length=1, max_length=5000)]
+
+
+# -- the server -----------------------------------------------------------------------------------
 
 
 class Annotator:
@@ -62,37 +127,21 @@ class Annotator:
         get, post = self.thread.get, self.thread.post
         routes = [
             *self.pages.routes(),
-            Route("/api/scene", self.described),
-            Route("/api/changes", self.changes),
-            Route("/api/photo/{number:int}", get(photo)),
-            Route("/api/thumb/{number:int}", get(thumb)),
-            Route("/api/labels", get(all_labels)),
-            Route("/api/labels/{number:int}", self.save, methods=["PUT"]),
-            Route("/api/shape", post(wire.Shape, shape), methods=["POST"]),
-            Route("/api/at", post(wire.At, at, self.drawing), methods=["POST"]),
-            Route("/api/segment", post(wire.Segment, segment, self.drawing), methods=["POST"]),
-            Route("/api/carry", post(wire.Carry, carry, self.drawing), methods=["POST"]),
-            Route("/api/import", post(wire.Given, take_in), methods=["POST"]),
-            Route("/api/export/{kind}", get(export)),
+            *self.thread.routes(),
+            Route("/api/labels", get(_all_labels)),
+            Route("/api/labels/{number:int}", self._save, methods=["PUT"]),
+            Route("/api/shape", post(Shape, _shape), methods=["POST"]),
+            Route("/api/at", post(At, _at, self.drawing), methods=["POST"]),
+            Route("/api/segment", post(Segment, _segment, self.drawing), methods=["POST"]),
+            Route("/api/carry", post(Carry, _carry, self.drawing), methods=["POST"]),
+            Route("/api/import", post(Given, _import), methods=["POST"]),
+            Route("/api/export/{kind}", get(_export)),
         ]
-        return guarded(routes, token, StaleLabelsError, MAX_BODY_BYTES)
+        return guarded(routes, token, MAX_BODY_BYTES)
 
-    async def described(self, request: Request) -> Response:
-        """Send the photographs and available proposals to a new page, after reopening a changed scene."""
-        return answer(await self.thread.opened_anew())
-
-    async def changes(self, request: Request) -> Response:
-        """Send which parts of the scene changed on disk since they were opened."""
-
-        def find() -> dict[str, Any]:
-            opened = self.thread.shown
-            return {"of": opened.state, "changed": opened.changed()}
-
-        return answer(await self.thread.run(find))
-
-    async def save(self, request: Request) -> Response:
+    async def _save(self, request: Request) -> Response:
         """Replace the annotations of a view; `If-Match` is the version that was read."""
-        asked = await read(request, wire.Labels)
+        asked = await read(request, Labels)
 
         def write(opened: OpenedScene) -> dict[str, Any]:
             view = view_name(opened.scene, request.path_params["number"])
@@ -106,19 +155,7 @@ class Annotator:
         return answer(await self.thread.do(request, write))
 
 
-def photo(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
-    """Return an undistorted photograph."""
-    with opened.same_photographs():
-        return photograph(opened.scene, of["number"])
-
-
-def thumb(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
-    """Return a thumbnail of a photograph."""
-    with opened.same_photographs():
-        return thumbnail(opened.scene, of["number"])
-
-
-def all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the annotations of every view with their versions, in view order."""
     known = opened.known()
     return [
@@ -130,12 +167,10 @@ def all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any
     ]
 
 
-def shape(opened: OpenedScene, asked: wire.Shape) -> dict[str, Any]:
+def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
     """Return polygons and area of a region: polygons, plus or minus a stroke, inside another region."""
-    scene = opened.scene
-    size_hw = scene.cameras[view_name(scene, asked.view)].size_hw
-    drawn = fill_rings(asked.add, size_hw)
-    mask = drawn
+    size_hw = opened.scene.cameras[view_name(opened.scene, asked.view)].size_hw
+    mask = drawn = fill_rings(asked.add, size_hw)
     if asked.stroke is not None:
         painted = np.zeros(size_hw, np.uint8)
         points, radius = np.array(asked.stroke.points, np.int32), asked.stroke.radius
@@ -149,24 +184,21 @@ def shape(opened: OpenedScene, asked: wire.Shape) -> dict[str, Any]:
     return {"polygons": asked.add if is_drawn else traced(mask), "area_px": int(np.count_nonzero(mask))}
 
 
-# -- proposals ------------------------------------------------------------------------------------
-
-
-def at(opened: OpenedScene, asked: wire.At) -> list[dict[str, Any]]:
+def _at(opened: OpenedScene, asked: At) -> list[dict[str, Any]]:
     """Return the outlines of the nodes or masks that contain a pixel."""
     with opened.unchanged():
         view = view_name(opened.scene, asked.view)
         return [vars(proposal) for proposal in opened.proposals.at(view, asked.x, asked.y)]
 
 
-def segment(opened: OpenedScene, asked: wire.Segment) -> list[dict[str, Any]]:
+def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
     """Return the outlines that the scene's SAM finds around clicks or in a box."""
     with opened.same_photographs():
         view = view_name(opened.scene, asked.view)
         return [vars(found) for found in opened.clicks.outlines(view, asked.clicks, asked.box)]
 
 
-def carry(opened: OpenedScene, asked: wire.Carry) -> list[dict[str, Any]]:
+def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
     """Return things of other views, transferred to a view, as proposals; nothing is written."""
     with opened.unchanged():
         view = view_name(opened.scene, asked.view)
@@ -174,22 +206,19 @@ def carry(opened: OpenedScene, asked: wire.Carry) -> list[dict[str, Any]]:
     return [{**label.model_dump(), "polygons": polygons, "origin": "proposed"} for label, polygons in found]
 
 
-# -- other programs -------------------------------------------------------------------------------
-
-
-def take_in(opened: OpenedScene, asked: wire.Given) -> dict[str, Any]:
+def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
     """Return the annotations merged with those of files, by view number; nothing is written."""
     cameras = opened.scene.cameras
     files = [imported(file.name, file.text, cameras) for file in asked.files]
-    found = merged(opened.known(), files, {view: cameras[view].size_hw for view in cameras.names})
+    sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
+    found, added, known = merged(opened.known(), files, sizes_hw)
     views = {
-        cameras.names.index(view): [label.model_dump() for label in labels]
-        for view, labels in found.views.items()
+        cameras.names.index(view): [label.model_dump() for label in labels] for view, labels in found.items()
     }
-    return {"views": views, "added": found.added, "known": found.known}
+    return {"views": views, "added": added, "known": known}
 
 
-def export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
+def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
     """Return all annotations in the format of another program."""
     kind = of["kind"]
     if kind not in get_args(Kind):

@@ -1,7 +1,6 @@
 """Annotations for other programs: ISAT (the labels of LERF-OVS), labelme, COCO.
 
-Only our own format has levels and parents; in the others they are extra keys, which their programs ignore
-or keep.
+In these formats, levels and parents are extra keys, which other programs ignore or keep.
 """
 
 import io
@@ -41,6 +40,8 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
     """Write a scene's annotations, or the true labels of a synthetic scene, as LERF-OVS's labels to `out`.
 
+    `out`, such as `label/teatime`, is replaced; it gets `<view>.json` and the image of each labelled view.
+    Each polygon is an object, as LangSplat's evaluation requires; it ignores the keys for levels and parents.
     Annotations are in `annotated/<dataset>/<scene>` below `data_root`. Return the number of labelled views.
 
     Raises:
@@ -57,21 +58,12 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
         raise SceneError(
             f"{scene.name} has no labels", expected=f"files in {annotated}", fix=f"hilsplat annotate {folder}"
         )
-    write_lerf_labels(out, known, scene)
-    return len(known)
-
-
-def write_lerf_labels(out: Path, known: Mapping[str, Sequence[Label]], scene: Scene) -> None:
-    """Write the annotations of a scene as LERF-OVS's labels: `<view>.json` and the view's image.
-
-    Each polygon is an object, as LangSplat's evaluation requires; it ignores the keys for levels and parents.
-    The folder `out`, such as `label/teatime`, is replaced.
-    """
-    with atomic_folder(out) as folder:
+    with atomic_folder(out) as temporary:
         for view, labels in known.items():
             text = _isat(view, scene.cameras[view].size_hw, labels)
-            write_text(folder / f"{Path(view).stem}.json", text + "\n")
-            shutil.copyfile(scene.image_path(view), folder / view)
+            write_text(temporary / f"{Path(view).stem}.json", text + "\n")
+            shutil.copyfile(scene.image_path(view), temporary / view)
+    return len(known)
 
 
 def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[str, list[Label]]:
@@ -98,53 +90,32 @@ def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[s
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     """Format labels as ISAT, which has one polygon per object; pieces of a thing share their group."""
     size = {"width": size_hw[1], "height": size_hw[0]}
-    info: dict[str, object] = {
-        "description": "ISAT",
-        "folder": "",
-        "name": view,
-        **size,
-        "depth": 3,
-        "note": "",
-    }
+    info = {"description": "ISAT", "folder": "", "name": view, **size, "depth": 3, "note": ""}
     objects = []
     for label in labels:
         for ring in label.polygons:
             points = np.array(ring)
-            box = [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
-            area = int(label.model_copy(update={"polygons": [ring]}).mask(size_hw).sum())
-            objects.append(
-                {
-                    "category": label.text,
-                    "group": label.id,
-                    "segmentation": ring,
-                    "area": area,
-                    "layer": float(label.level),
-                    "bbox": box,
-                    "iscrowd": 0,
-                    "note": "",
-                    **_ours(label),
-                }
-            )
+            described = {
+                "category": label.text,
+                "group": label.id,
+                "segmentation": ring,
+                "area": int(label.model_copy(update={"polygons": [ring]}).mask(size_hw).sum()),
+                "layer": float(label.level),
+                "bbox": [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()],
+                "iscrowd": 0,
+                "note": "",
+            }
+            objects.append({**described, **_ours(label)})
     return _json({"info": info, "objects": objects})
 
 
 def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
-    shapes = [
-        {
-            "label": label.text,
-            "points": ring,
-            "group_id": label.id,
-            "shape_type": "polygon",
-            "flags": {},
-            **_ours(label),
-        }
-        for label in labels
-        for ring in label.polygons
-    ]
-    size = {"imageHeight": size_hw[0], "imageWidth": size_hw[1]}
-    return _json(
-        {"version": "5.5.0", "flags": {}, "shapes": shapes, "imagePath": view, "imageData": None, **size}
-    )
+    shapes = []
+    for label in labels:
+        about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **_ours(label)}
+        shapes += [{"label": label.text, "points": ring, **about} for ring in label.polygons]
+    image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
+    return _json({"version": "5.5.0", "flags": {}, "shapes": shapes, **image})
 
 
 def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
@@ -160,16 +131,14 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
         height, width = cameras[view].size_hw
         content["images"].append({"id": number, "file_name": view, "height": height, "width": width})
         for label in labels:
-            content["annotations"].append(
-                {
-                    "id": len(content["annotations"]) + 1,
-                    "image_id": number,
-                    "category_id": 1 + texts.index(label.text),
-                    **coco_region(label.mask((height, width))),
-                    "thing": label.id,
-                    **_ours(label),
-                }
-            )
+            described = {
+                "id": len(content["annotations"]) + 1,
+                "image_id": number,
+                "category_id": 1 + texts.index(label.text),
+                **coco_region(label.mask((height, width))),
+                "thing": label.id,
+            }
+            content["annotations"].append({**described, **_ours(label)})
     return content
 
 

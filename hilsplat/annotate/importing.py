@@ -1,4 +1,4 @@
-"""Annotations from other programs: ISAT (the labels of LERF-OVS), labelme, COCO, and our own format.
+"""Import of annotations: ISAT (the labels of LERF-OVS), labelme, COCO and our own format.
 
 Things without our keys for level and parent are imported as wholes.
 """
@@ -28,40 +28,21 @@ def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
         SceneError: the format is none of these, or the file does not fit the scene.
     """
     try:
-        return _imported(name, parse_json(text), cameras)
+        content = parse_json(text)
+        if isinstance(content, dict) and isinstance(content.get("shapes"), list):
+            return _from_labelme(name, content, cameras)
+        if isinstance(content, dict) and isinstance(content.get("annotations"), list):
+            return _from_coco(name, content, cameras)
+        if isinstance(content, dict) and isinstance(content.get("objects"), list):
+            return _from_isat(name, content, cameras)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
         # Any value may have an unexpected type or be invalid: a list for an id, an infinite number.
         raise SceneError(f"{name} cannot be read: {error}", expected="a whole JSON file") from error
-
-
-def _imported(name: str, content: Any, cameras: Cameras) -> dict[str, list[Label]]:
-    found: dict[str, list[Label]] = {}
-    if isinstance(content, dict) and isinstance(content.get("shapes"), list):
-        image = str(content.get("imagePath") or name)
-        view = _view(name, image, cameras, content.get("imageHeight"), content.get("imageWidth"))
-        shapes = enumerate(content["shapes"])
-        found[view] = _joined(name, [_labelme_piece(f"{name}, shape {row}", shape) for row, shape in shapes])
-    elif isinstance(content, dict) and isinstance(content.get("annotations"), list):
-        found = _from_coco(name, content, cameras)
-    elif isinstance(content, dict) and isinstance(content.get("objects"), list):
-        labels = parse_isat(Path(name), content)
-        view = _view(name, str(content["info"].get("name") or name), cameras, *labels.size_hw)
-        if labels.objects and all("id" in thing.keys for thing in labels.objects):
-            found[view] = labels_of(labels)
-        else:
-            pieces = []
-            for thing in labels.objects:
-                # Without our keys, groups are ignored: in LERF's files they repeat and identify nothing.
-                group = thing.keys.get("group") if "level" in thing.keys else None
-                pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
-            found[view] = _joined(name, pieces)
-    else:
-        raise SceneError(
-            f"{name} is of no known format",
-            expected="objects (ISAT, LERF-OVS, hilsplat), shapes (labelme) or annotations (COCO)",
-            found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
-        )
-    return found
+    raise SceneError(
+        f"{name} is of no known format",
+        expected="objects (ISAT, LERF-OVS, hilsplat), shapes (labelme) or annotations (COCO)",
+        found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
+    )
 
 
 Piece = tuple[str, Any, np.ndarray, Mapping[str, Any]]
@@ -92,19 +73,39 @@ def _label(name: str, number: int, pieces: Sequence[Piece], has_ids: bool) -> La
     )
 
 
-def _labelme_piece(where: str, shape: Any) -> Piece:
-    try:
-        points = np.array(shape["points"], np.float64).reshape(-1, 2)
-        kind = shape.get("shape_type", "polygon")
+def _from_isat(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
+    labels = parse_isat(Path(name), content)
+    view = _view(name, str(content["info"].get("name") or name), cameras, *labels.size_hw)
+    if labels.objects and all("id" in thing.keys for thing in labels.objects):
+        return {view: labels_of(labels)}
+    pieces: list[Piece] = []
+    for thing in labels.objects:
+        # Without our keys, groups are ignored: in LERF's files they repeat and identify nothing.
+        group = thing.keys.get("group") if "level" in thing.keys else None
+        pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
+    return {view: _joined(name, pieces)}
+
+
+def _from_labelme(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
+    image = str(content.get("imagePath") or name)
+    view = _view(name, image, cameras, content.get("imageHeight"), content.get("imageWidth"))
+    pieces: list[Piece] = []
+    for row, shape in enumerate(content["shapes"]):
+        where = f"{name}, shape {row}"
+        try:
+            points = np.array(shape["points"], np.float64).reshape(-1, 2)
+            kind, text = shape.get("shape_type", "polygon"), str(shape["label"])
+        except (TypeError, KeyError, ValueError) as error:
+            raise SceneError(f"{where} cannot be read: {error!r}", expected="label and points") from error
         if kind == "rectangle" and len(points) == 2:
             (x0, y0), (x1, y1) = points
-            points, kind = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), "polygon"
-        text = str(shape["label"])
-    except (TypeError, KeyError, ValueError) as error:
-        raise SceneError(f"{where} cannot be read: {error!r}", expected="label and points") from error
-    if kind != "polygon":
-        raise SceneError(f"{where} ({text}) is a {kind}", expected="polygon or rectangle", fix="redraw it")
-    return text, shape.get("group_id"), points, shape
+            points = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        elif kind != "polygon":
+            raise SceneError(
+                f"{where} ({text}) is a {kind}", expected="polygon or rectangle", fix="redraw it"
+            )
+        pieces.append((text, shape.get("group_id"), points, shape))
+    return {view: _joined(name, pieces)}
 
 
 def _from_coco(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[str, list[Label]]:
@@ -141,13 +142,8 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
     runs = unpacked_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
     if sum(runs) != size_hw[0] * size_hw[1] or min(runs, default=0) < 0:
         raise SceneError(f"{where}: its run lengths do not fill the photograph", found=f"{sum(runs)} px")
-    return trace_polygons(_from_counts(runs, size_hw))
-
-
-def _from_counts(runs: Sequence[int], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Return the mask of run lengths: the inverse of `web.coco.coco_counts`."""
-    values = np.arange(len(runs)) % 2 == 1
-    return np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T)
+    values = np.arange(len(runs)) % 2 == 1  # the inverse of `web.coco.coco_counts`
+    return trace_polygons(np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T))
 
 
 def unpacked_counts(text: str) -> list[int]:
@@ -171,11 +167,7 @@ def unpacked_counts(text: str) -> list[int]:
 
 
 def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> str:
-    """Return the view of a file, by the name of its photograph without folder and suffix.
-
-    Raises:
-        SceneError: the scene has no such view, or the file was made for another size.
-    """
+    """Return the view whose photograph has the name and size in a file; folder and suffix are ignored."""
     stem = Path(image.replace("\\", "/")).stem
     view = next((each for each in cameras.names if Path(each).stem == stem), None)
     if view is None:
@@ -192,3 +184,77 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
             found=f"{width} x {height} px",
         )
     return view
+
+
+# -- merging with existing annotations ------------------------------------------------------------
+
+SAME_THING = 0.5
+"""Labels of a photograph with the same text and level are the same thing if their IoU is at least this."""
+
+
+def merged(
+    known: Mapping[str, Sequence[Label]],
+    files: Sequence[Mapping[str, Sequence[Label]]],
+    sizes_hw: Mapping[str, tuple[int, int]],
+) -> tuple[dict[str, list[Label]], int, int]:
+    """Add the labels of files to those of a scene.
+
+    A file's ids are used only together with text and level, because programs without ids number the shapes
+    of every photograph from 1. Among the scene's things with the same text and level, a label is matched to
+    the one that it overlaps, else to the one with its id, else to one that the photograph does not show yet;
+    otherwise it is a new thing.
+
+    Returns:
+        all labels of each photograph that changes; the number of labels that are new or have another region;
+        and the number of labels that already existed.
+    """
+    views = {view: list(labels) for view, labels in known.items()}
+    things = {label.id: _kind(label) for labels in views.values() for label in labels}
+    changed: set[str] = set()
+    added = same = 0
+    for found in files:
+        for view, labels in found.items():
+            here = views.setdefault(view, [])
+            number_of: dict[int, int] = {}
+            for label in sorted(labels, key=lambda label: label.level):
+                parent = number_of.get(label.parent) if label.parent is not None else None
+                mask = label.mask(sizes_hw[view])
+                row = _row_of(label, mask, here, sizes_hw[view])
+                number = here[row].id if row is not None else _number(label, here, things)
+                number_of[label.id], things[number] = number, _kind(label)
+                label = label.model_copy(update={"id": number, "parent": parent})
+                if row is None:
+                    here.append(label)
+                elif np.array_equal(mask, here[row].mask(sizes_hw[view])):
+                    same += 1
+                    continue
+                else:
+                    here[row] = label
+                added += 1
+                changed.add(view)
+    return {view: views[view] for view in views if view in changed}, added, same
+
+
+def _kind(label: Label) -> tuple[str, int]:
+    return label.text.casefold(), label.level
+
+
+def _row_of(
+    label: Label, mask: Bool[np.ndarray, "H W"], here: Sequence[Label], size_hw: tuple[int, int]
+) -> int | None:
+    """Return the row of a photograph's label that is the same thing; None if there is none."""
+    for row, other in enumerate(here):
+        if _kind(other) == _kind(label):
+            region = other.mask(size_hw)
+            if (mask & region).sum() >= SAME_THING * max(1, (mask | region).sum()):
+                return row
+    return None
+
+
+def _number(label: Label, here: Sequence[Label], things: Mapping[int, tuple[str, int]]) -> int:
+    """Return the id for a label that overlaps no label of its kind in the photograph."""
+    taken = {other.id for other in here}
+    alike = [number for number, kind in things.items() if kind == _kind(label) and number not in taken]
+    if label.id in alike or label.id not in things:
+        return label.id
+    return min(alike, default=1 + max(things))

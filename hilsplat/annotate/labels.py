@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Bool
 from pydantic import AfterValidator, Field, ValidationError
 
-from hilsplat.base.artifacts import output_lock, write_text
-from hilsplat.base.errors import ArtifactError, SceneError, SettingsError
+from hilsplat.base.artifacts import write_text
+from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, read_isat
 from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
-from hilsplat.query.names import version_of
+from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
 
 Origin = Literal["drawn", "edited", "accepted", "proposed"]
@@ -32,7 +32,7 @@ Rings = Annotated[list[Ring], Field(max_length=2000)]
 def _plain_text(text: str) -> str:
     plain = " ".join(text.split())
     if not plain or not plain.isprintable():
-        raise ValueError("it needs a letter, and none that cannot be printed")
+        raise ValueError("it needs at least one character, and only printable ones")
     return plain
 
 
@@ -43,7 +43,6 @@ class Label(Message):
         id: the same in all views that show the thing.
         level: 1 whole, 2 part, 3 subpart.
         parent: id of a thing one level up in the same view; None if it has none.
-        text: text of a query for the thing.
         polygons: vertices in whole pixels; the region is the union of the filled polygons.
         origin: drawn by hand; proposed by a node, a mask or another view; accepted as proposed; or a proposal
             that was edited by hand. Labels that are only proposed are not scored.
@@ -58,11 +57,7 @@ class Label(Message):
 
     @staticmethod
     def read(where: str, **values: object) -> "Label":
-        """Create a label from values in a file.
-
-        Raises:
-            SceneError: a value is invalid; `where` names the file.
-        """
+        """Create a label from values in a file, named by `where`; raise SceneError if one is invalid."""
         try:
             return Label.model_validate(values)
         except ValidationError as error:
@@ -79,10 +74,6 @@ class Label(Message):
     def with_mask(self, mask: Bool[np.ndarray, "H W"]) -> "Label":
         """Return the same thing with other pixels."""
         return self.model_copy(update={"polygons": traced(mask)})
-
-
-class StaleLabelsError(ArtifactError):
-    """The annotations of a view changed since they were read."""
 
 
 def fill_rings(
@@ -106,7 +97,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     """
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
     if twice:
-        raise SettingsError(f"id {twice[0]} is there twice", fix="reload the page")
+        raise SettingsError(f"id {twice[0]} occurs twice", fix="reload the page")
     own = {label.id: label for label in labels}
     masks: dict[int, np.ndarray] = {}
     cut: dict[int, Label] = {}
@@ -129,7 +120,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
         inside = mask & masks[parent.id]
         if not inside.any():
             raise SettingsError(
-                f"{label.text!r} lies wholly outside {parent.text!r}",
+                f"{label.text!r} is entirely outside {parent.text!r}",
                 fix="draw it inside, or choose another parent",
             )
         if not np.array_equal(inside, mask):
@@ -165,11 +156,7 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
 
 
 def labels_of(found: IsatFile) -> list[Label]:
-    """Return the objects of a file in our format as labels.
-
-    Raises:
-        SceneError: an id or a level is invalid.
-    """
+    """Return the objects of a file in our format as labels; raise SceneError if an id or level is invalid."""
     objects = by_id(found)
     parents = parents_of(found, objects, [])
     return [
@@ -194,22 +181,12 @@ def whole_pixels(points: np.ndarray) -> list[tuple[int, int]]:
 def write_labels(
     path: Path, view: str, size_hw: tuple[int, int], labels: Sequence[Label], version: str
 ) -> str:
-    """Replace the annotations of a view, unless the file has changed since `version` was read.
-
-    A view without annotations has no file.
-
-    Returns:
-        the new version.
+    """Replace the annotations of a view, and return the new version; without annotations there is no file.
 
     Raises:
-        StaleLabelsError: the file changed since `version` was read.
+        StaleFileError: the file changed since `version` was read.
     """
-    with output_lock(path):
-        if version_of(path) != version:
-            raise StaleLabelsError(
-                f"the annotations of {view} have changed since they were read",
-                fix="reload the page, then change them",
-            )
+    with replacing(path, version, f"the annotations of {view}"):
         if labels:
             write_text(path, as_file(view, size_hw, labels))
         else:
@@ -220,19 +197,18 @@ def write_labels(
 def as_file(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     """Format a view's annotations in our format, one object per line for short files and readable diffs."""
     info = {"name": view, "width": size_hw[1], "height": size_hw[0]}
-    lines = [_compact(_as_object(label)) for label in sorted(labels, key=lambda label: label.id)]
-    return f'{{"info":{_compact(info)},\n"objects":[\n' + ",\n".join(lines) + "\n]}\n"
-
-
-def _as_object(label: Label) -> dict[str, object]:
-    return {
-        "id": label.id,
-        "level": label.level,
-        "parent": label.parent,
-        "category": label.text,
-        "origin": label.origin,
-        "segmentation": label.polygons,
-    }
+    objects = [
+        {
+            "id": label.id,
+            "level": label.level,
+            "parent": label.parent,
+            "category": label.text,
+            "origin": label.origin,
+            "segmentation": label.polygons,
+        }
+        for label in sorted(labels, key=lambda label: label.id)
+    ]
+    return f'{{"info":{_compact(info)},\n"objects":[\n' + ",\n".join(map(_compact, objects)) + "\n]}\n"
 
 
 def _compact(value: object) -> str:

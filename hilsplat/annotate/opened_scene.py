@@ -1,32 +1,30 @@
 """The parts of a scene that the annotation page opened: photographs and sources of proposals."""
 
-import secrets
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from hilsplat.annotate.clicks import Clicks
 from hilsplat.annotate.labels import Label, label_path, read_labels
-from hilsplat.annotate.proposals import Proposals
+from hilsplat.annotate.proposals import Clicks, Proposals
 from hilsplat.base.errors import ArtifactError
 from hilsplat.scene.scene import Scene
-from hilsplat.web.file_changes import FileChanges
+from hilsplat.web.scene_thread import ShownScene
 
 
-class OpenedScene:
+class OpenedScene(ShownScene):
     """The parts of a scene that existed when it was opened.
 
     Args:
         folder: the scene's folder, such as results/photos/desk.
         labels: folder of its label files; created when the first one is written.
         variant: variant whose masks and tree are proposed.
-        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.
     """
 
     def __init__(self, folder: Path, labels: Path, variant: str, threads: int) -> None:
+        super().__init__()
         self.folder, self.labels, self.variant, self.threads = folder, labels, variant, threads
         self.photographs = folder / "scene"
         if not (self.photographs / "index.json").is_file():
@@ -35,28 +33,18 @@ class OpenedScene:
                 expected="results/<dataset>/<scene> of a run, or a copy of it",
                 fix=f"hilsplat run {self.photographs}",
             )
-        self.state, self._changes = secrets.token_hex(4), FileChanges()
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
-        self._changes.note((self.photographs, folder / "gaussians.ply", *proposing))
+        self.changes.note((self.photographs, folder / "gaussians.ply", *proposing))
         self.scene = Scene.load(self.photographs)
         self.proposals = Proposals(self.scene, folder, variant, threads)
         self.clicks = Clicks(self.scene, folder / variant / "masks")
 
-    def changed(self) -> list[str]:
-        """Return the parts that were rewritten, created or deleted since the scene was opened."""
-        return sorted(path.name for path in self._changes.changed())
-
     def opened_again(self) -> "OpenedScene":
-        """Open the scene as it is on disk now."""
         return OpenedScene(self.folder, self.labels, self.variant, self.threads)
-
-    def unchanged(self) -> AbstractContextManager[None]:
-        """Guard proposals: raise StaleSceneError if any part changed before or during the read."""
-        return self._changes.unchanged(self.scene.name)
 
     def same_photographs(self) -> AbstractContextManager[None]:
         """Guard photographs and drawing: as `unchanged`, but parts other than photographs may change."""
-        return self._changes.unchanged(self.scene.name, self.photographs)
+        return self.changes.unchanged(self.scene.name, self.photographs)
 
     def described(self) -> dict[str, Any]:
         """Describe the photographs and available proposals."""

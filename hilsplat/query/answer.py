@@ -37,21 +37,16 @@ def answer(
 ) -> Iterator[str]:
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
 
-    The answer takes milliseconds. The picture takes one to two seconds, including imports and rendering.
-
-    Other arguments as in `LanguageScene.open` and `LanguageScene.query`.
+    The answer takes milliseconds, the picture one to two seconds, including imports and rendering. Other
+    arguments and errors as in `LanguageScene.open` and `LanguageScene.query`.
 
     Args:
         views: number of views in the panel; a given `view` is the first.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
-
-    Raises:
-        ArtifactError: the scene is not finished.
-        SettingsError: as in `LanguageScene.query`.
     """
     found = FinishedScene.locate(Path(folder), variant)
     scene = LanguageScene.of(found, threads=threads)
-    nodes = scene.find(text, level, answerer=answerer, view=view, threshold=threshold)
+    nodes = scene.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
     hits = scene.hits_of(nodes, LISTED)
     label = masks_label(found.parts.masks)
     note = f"; a diagnostic, masks made from the true labels: {label}" if made_from_truth(label) else ""

@@ -1,12 +1,13 @@
 """Answers from a scene's decoded language field, as in the paper."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import rendered_latents
@@ -18,26 +19,60 @@ from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.settings import EvaluateSettings
 
+TextEncoder = Callable[[list[str]], np.ndarray]
+
 
 @dataclass(frozen=True)
-class FieldAnswers:
-    """Query results from a language field; `text_vectors` returns the unit CLIP vectors of texts."""
+class FieldAnswers(SceneViews):
+    """A scene whose language field can be queried.
 
-    language: LanguageField
-    code: Code
-    views: SceneViews
-    text_vectors: Callable[[Sequence[str]], np.ndarray]
-    settings: EvaluateSettings
-    threads: int
+    Attributes:
+        language: the field; None, like `autoencoder`, if the run has not computed it yet.
+        encode_texts: returns the unit CLIP vectors of texts.
+    """
 
-    def relevancy(
+    language: LanguageField | None
+    autoencoder: Code | None
+    encode_texts: TextEncoder
+    settings: EvaluateSettings = field(default_factory=EvaluateSettings)
+    threads: int = 1
+    _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False, kw_only=True)
+
+    def trained(self) -> tuple[LanguageField, Code]:
+        """Return the language field and the code that decodes it.
+
+        Raises:
+            ArtifactError: the run has not computed them yet.
+        """
+        if self.language is None or self.autoencoder is None:
+            raise ArtifactError(
+                f"{self.scene.name} has no language field yet",
+                fix="query its tree, or wait for the run to end",
+            )
+        return self.language, self.autoencoder
+
+    def text_vectors(self, texts: Sequence[str]) -> Float32[np.ndarray, "T C"]:
+        """Return the unit CLIP vectors of texts; each text is encoded once."""
+        new = [text for text in dict.fromkeys(texts) if text not in self._texts]
+        if new:
+            self._texts.update(zip(new, np.asarray(self.encode_texts(new), np.float32), strict=True))
+        return np.stack([self._texts[text] for text in texts])
+
+    def field_relevancy(
         self, texts: Sequence[str], view: str, *, exact: bool = True
     ) -> Float32[np.ndarray, "T 3 H W"]:
-        """Compute relevancy from decoded rendered latents; see `LanguageScene.field_relevancy`."""
+        """Compute relevancy from decoded rendered latents at every pixel and level, as in the paper.
+
+        Pixels that show mostly Gaussians without a latent at the level get the lowest value of the others.
+
+        Args:
+            exact: whether a network decodes every pixel at every call; otherwise a view is decoded once, and
+                results differ by at most 2e-3 (see `LatentRelevancy`). No difference for a linear code.
+        """
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)
         placed = self._placed_latents(view) if answer.is_linear or not exact else None
-        height, width = self.views.camera(view).size_hw
+        height, width = self.camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(shown):
             if not len(pixels):
@@ -46,26 +81,31 @@ class FieldAnswers:
             fill_maps(found, found.min(axis=1), pixels, index, maps)
         return maps.reshape(len(texts), len(LEVELS), height, width)
 
-    def cosine(
+    def field_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Return cosines of texts with the decoded latents of pixels; see `LanguageScene.field_cosine`."""
+        """Return the cosines of texts with the rendered, decoded latents of pixels, at each level.
+
+        Pixels (row * width + column) that show mostly Gaussians without a latent have -inf.
+        """
         vectors = self.text_vectors(texts)
-        height, width = self.views.camera(view).size_hw
+        height, width = self.camera(view).size_hw
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
         for index, (shown, latents) in enumerate(self.latents(view)):
             row_of_pixel = np.full(height * width, -1)
             row_of_pixel[shown] = np.arange(len(shown))
             rows = row_of_pixel[pixels]
-            spoken = np.flatnonzero(rows >= 0)
-            if len(spoken):
-                decoded = self.code.decode_array(np.ascontiguousarray(latents[rows[spoken]], np.float32))
-                found[:, index, spoken] = vectors @ decoded.T
+            has_latent = np.flatnonzero(rows >= 0)
+            if len(has_latent):
+                decoded = self.trained()[1].decode_array(
+                    np.ascontiguousarray(latents[rows[has_latent]], np.float32)
+                )
+                found[:, index, has_latent] = vectors @ decoded.T
         return found
 
-    def of_gaussians(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
-        """Return each Gaussian's relevancy at a level, or the maximum over levels; 0 without a latent."""
-        features = self.language.features
+    def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
+        """Return each Gaussian's field relevancy at a level, or its maximum over levels; 0 if no latent."""
+        features = self.trained()[0].features
         out = np.zeros(len(features), np.float32)
         vector = self.text_vectors([text])
         for each in (each for each in LEVELS if level in ("auto", each.label)):
@@ -76,30 +116,29 @@ class FieldAnswers:
                 out[has] = np.maximum(out[has], own)
         return out
 
-    def image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
+    def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
         """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
-        weights = self.views.weights(view)
-        colours = field_colours(self.language.features[:, level.index])
-        return to_uint8((weights @ colours).reshape(*self.views.camera(view).size_hw, 3))
+        weights = self.view_weights(view)
+        colours = field_colours(self.trained()[0].features[:, level.index])
+        return to_uint8((weights @ colours).reshape(*self.camera(view).size_hw, 3))
 
     @cached_property
-    def node_vectors(self) -> Float32[np.ndarray, "n C"]:
+    def _decoded_nodes(self) -> Float32[np.ndarray, "n C"]:
         """Decoded mean latent of each node's Gaussians at its level."""
-        tree = self.views.tree
-        means = node_means(tree.node_of_gaussian, tree.level, self.language.features)
-        return self.code.decode_array(means)
+        language, code = self.trained()
+        return code.decode_array(node_means(self.tree.node_of_gaussian, self.tree.level, language.features))
 
     def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
         """Return, per level, the pixels that show mostly Gaussians with a latent, and their latents."""
-        return self.views.store.get(
+        return self._views.get(
             ("latents", view),
-            lambda: rendered_latents(self.views.weights(view), self.language.features),
+            lambda: rendered_latents(self.view_weights(view), self.trained()[0].features),
             lambda kept: sum(a.nbytes + b.nbytes for a, b in kept),
         )
 
     def _placed_latents(self, view: str) -> list:
         """Return the look-up data of a view for each level, created at the first look-up."""
-        return self.views.store.get(
+        return self._views.get(
             ("placed", view),
             lambda: [self._latent_relevancy.prepare(latents) for _, latents in self.latents(view)],
             lambda kept: sum(each.nbytes for each in kept),
@@ -108,7 +147,7 @@ class FieldAnswers:
     @cached_property
     def _latent_relevancy(self) -> LatentRelevancy:
         canonical = self.text_vectors(self.settings.canonical)
-        return LatentRelevancy(self.code, canonical, self.settings.relevancy_scale, self.threads)
+        return LatentRelevancy(self.trained()[1], canonical, self.settings.relevancy_scale, self.threads)
 
 
 def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "N 3"]:

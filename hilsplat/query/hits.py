@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int64
 
 from hilsplat.base.levels import Level
 from hilsplat.query.node_search import NodeHits
-from hilsplat.query.scene_views import SceneViews, members_of
+from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.boxes import OrientedBox
 
 LIKELY_CHANCE = 0.05
@@ -44,16 +44,14 @@ class Doubt:
 
 @dataclass(frozen=True)
 class Hit:
-    """One ranked answer.
+    """One ranked answer; lengths are in scene units.
 
     Attributes:
         node: row of the semantic tree.
-        level: its level.
         score: relevancy in (0, 1) of the node and, with a lower weight, of its ancestors; answers are sorted
             by it, and 0.5 is no better than a generic word. With route "like", the cosine with a node or
             picture.
-        centroid: scene units.
-        box: axis-aligned, lower and upper corner, scene units.
+        box: axis-aligned, lower and upper corner.
         oriented_box: the box along the node's own axes.
         best_views: up to three training views that show it largest.
         route: as in `NodeHits`, or "like".
@@ -71,12 +69,12 @@ class Hit:
     route: str
     doubts: tuple[Doubt, ...]
     name: str
-    _views: SceneViews = field(repr=False, compare=False)
+    _scene: SceneViews = field(repr=False, compare=False)
 
     @property
     def gaussians(self) -> Int64[np.ndarray, " g"]:
         """Rows of `gaussians.ply` that belong to the node."""
-        return members_of(self._views.tree, [self.node])
+        return self._scene.gaussians_of([self.node])
 
     def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
         """Return the pixels of a view in which the node's Gaussians have a share above 0.5.
@@ -84,7 +82,7 @@ class Hit:
         Raises:
             SettingsError: the scene has no such view.
         """
-        return self._views.masks(view, [self.node])
+        return self._scene.node_masks(view, [self.node])
 
 
 def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:

@@ -7,34 +7,30 @@ text, `select` searches the tree by cosine margins (`node_search.search`), and e
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sp
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.field.code import Code, autoencoder_file, load_code
+from hilsplat.field.code import autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.models.store import is_embedded, meaningless
-from hilsplat.query.caches import Opened, ViewStore
+from hilsplat.query.caches import Opened
 from hilsplat.query.field_answers import FieldAnswers
 from hilsplat.query.hits import Doubt, Hit, doubts_of
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_search import NodeHits, TextAnswer, search
 from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
-from hilsplat.query.scene_views import SceneViews, members_of
 from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.boxes import OrientedBox
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
-from hilsplat.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from hilsplat.viewer.embedded import EmbeddedViewer
@@ -47,21 +43,14 @@ NAMED = 2.0
 BEST_VIEWS = 3
 """Maximum number of views of an answer."""
 
-TextEncoder = Callable[[list[str]], np.ndarray]
-PictureEncoder = Callable[[np.ndarray], np.ndarray]
-Answerer = Literal["tree", "field"]
+ANSWERERS = ("tree", "field")
 
 
 @dataclass(frozen=True)
-class LanguageScene:
+class LanguageScene(FieldAnswers):
     """A finished scene that accepts text queries.
 
     Attributes:
-        language: the field; None if the run has not computed it yet, and only the tree accepts queries.
-        autoencoder: decodes the field; None if there is no field.
-        encode_texts: returns the unit CLIP vectors of texts.
-        pixel_weights: returns the compositing weights of a view (pixels x Gaussians).
-        settings: canonical phrases, relevancy scale, and selection of nodes.
         caution: sentence that explains why CLIP's answers are meaningless here; empty if they are not.
         names: the user's names for nodes, which are matched first.
         naming: vocabulary names of the nodes, and words for absent things; None if the stage has not run.
@@ -70,24 +59,14 @@ class LanguageScene:
         finished: location and variant of the scene; None if it was assembled from parts.
     """
 
-    scene: Scene
-    gaussians: Gaussians
-    tree: SemanticTree
-    language: LanguageField | None
-    autoencoder: Code | None
-    encode_texts: TextEncoder
-    pixel_weights: Callable[[str], sp.csr_matrix]
-    settings: EvaluateSettings = field(default_factory=EvaluateSettings)
-    threads: int = 1
     caution: str = ""
     names: NodeNames = field(default_factory=NodeNames)
     naming: NodeNaming | None = field(default=None, repr=False)
     unknown_words: Callable[[str], list[str]] = field(default=lambda text: [], repr=False)
-    encode_picture: PictureEncoder | None = field(default=None, repr=False)
+    encode_picture: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
     finished: FinishedScene | None = field(default=None, repr=False)
-    _views: ViewStore = field(default_factory=ViewStore, repr=False)
-    _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
-    _by_chance: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    _by_chance: dict[str, np.ndarray] = field(default_factory=dict, repr=False, kw_only=True)
+    """Margins of all nodes for `naming.rivals`, by answerer, (W, n)."""
 
     @staticmethod
     def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
@@ -95,11 +74,6 @@ class LanguageScene:
 
         Canonical phrases, template, scale and node selection are read from the provenance of the variant's
         evaluation, or of its panel if the scene has no labels.
-
-        Args:
-            folder: a finished scene.
-            variant: named set of settings whose files are queried.
-            threads: number of threads for rasterising and look-ups.
 
         Raises:
             ArtifactError: the scene is not finished.
@@ -137,12 +111,8 @@ class LanguageScene:
         """Read a scene's artifacts, each once, and check that they belong together.
 
         Args:
-            parts: paths of the artifacts.
-            settings: canonical phrases, template, relevancy scale and selection of nodes.
-            threads: number of threads for rasterising and look-ups; results do not depend on it.
             opened: artifacts that other variants of the scene have already opened.
-            names: the user's names for nodes; None in evaluation, which scores only the models.
-            naming: vocabulary names of the nodes; None in evaluation, which then reports no chance.
+            names, naming: None in evaluation, which scores only the models and reports no chance.
 
         Raises:
             MisalignedArtifactError: the tree or field was made for other Gaussians or cameras, or the field
@@ -177,27 +147,26 @@ class LanguageScene:
             scene,
             gaussians,
             tree,
-            language,
-            code,
-            clip.embed_texts,
             lambda view: pixel_weights(
                 gaussians, scene.cameras[view], min_weight=tree.min_weight, threads=threads
             ),
+            language,
+            code,
+            clip.embed_texts,
             settings,
             threads,
             meaningless(clip.model.folder.name) if is_embedded(clip.model.config) and not drawn else "",
-            names=names or NodeNames(),
-            naming=naming,
-            unknown_words=clip.unknown_words,
-            encode_picture=clip.embed_picture,
+            names or NodeNames(),
+            naming,
+            clip.unknown_words,
+            clip.embed_picture,
         )
 
     def show(self, text: str = "", *, height: int = 640, proxy: str = "") -> "EmbeddedViewer":
         """Show the scene in a notebook: the page of `hilsplat view` in a frame, served by this process.
 
         Args:
-            text: the first query; "" for none.
-            height: height of the frame, px.
+            height: px.
             proxy: address, containing `{port}`, under which the browser reaches a port of this machine, if
                 the browser runs on another machine: "/user/me/proxy/{port}/" on a JupyterHub.
 
@@ -209,19 +178,6 @@ class LanguageScene:
         if self.finished is None:
             raise ArtifactError("the scene was put together from parts", fix="open it with hilsplat.open")
         return EmbeddedViewer(self.finished, text=text, height=height, proxy=proxy, threads=self.threads)
-
-    def trained(self) -> tuple[LanguageField, Code]:
-        """Return the language field and the code that decodes it.
-
-        Raises:
-            ArtifactError: the run has not computed them yet.
-        """
-        if self.language is None or self.autoencoder is None:
-            raise ArtifactError(
-                f"{self.scene.name} has no language field yet",
-                fix="let its tree answer, or wait for the run to end",
-            )
-        return self.language, self.autoencoder
 
     # -- answers ----------------------------------------------------------------------------------
 
@@ -252,12 +208,11 @@ class LanguageScene:
             SettingsError: the text is empty, the level, answerer or view is unknown, a path has more texts
                 than levels, or the threshold is not between 0 and 1.
         """
-        return self.hits_of(self.find(text, level, answerer=answerer, view=view, threshold=threshold), limit)
+        found = self.select(text, level=level, answerer=answerer, view=view, threshold=threshold)
+        return self.hits_of(found, limit)
 
     def like_node(self, node: int, *, limit: int = 10) -> list[Hit]:
         """Return the nodes of a node's own level that look most like it, best first; scores are cosines.
-
-        This compares averaged CLIP vectors of masks, so it needs no text.
 
         Raises:
             SettingsError: there is no such node.
@@ -286,9 +241,11 @@ class LanguageScene:
 
     def hits_of(self, found: NodeHits, limit: int) -> list[Hit]:
         """Return the best nodes, at most `limit`, as answers."""
-        doubts = doubts_of(found)
-        best = zip(found.ids[:limit].tolist(), found.values[:limit], strict=True)
-        return [self._hit(node, self._score(value), found.route, doubts) for node, value in best]
+        doubts, hits = doubts_of(found), []
+        for node, value in zip(found.ids[:limit].tolist(), found.values[:limit], strict=True):
+            score = relevancy_of_margins(np.array([value]), self.settings.relevancy_scale)[0]
+            hits.append(self._hit(node, float(score), found.route, doubts))
+        return hits
 
     def _hit(self, node: int, score: float, route: str, doubts: tuple[Doubt, ...]) -> Hit:
         area = self.tree.view_area_px[node]
@@ -305,53 +262,40 @@ class LanguageScene:
             route,
             doubts,
             self.name_of(node),
-            self._shown,
+            self,
         )
 
-    def find(
+    def select(
         self,
-        text: str,
-        level: str = "auto",
+        path: str | Sequence[str],
         *,
+        level: Level | str | None = None,
         answerer: str = "tree",
         view: str | None = None,
         threshold: float | None = None,
     ) -> NodeHits:
-        """Return the answers of `query` as rows of the tree."""
-        path = path_of(text)
-        if answerer not in get_args(Answerer):
-            raise SettingsError(
-                f"answerer {answerer!r} is unknown",
-                expected=" or ".join(get_args(Answerer)),
-                found=answerer,
-            )
-        names = {each.label: each for each in LEVELS}
-        if level != "auto" and level not in names:
-            raise SettingsError(
-                f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
-            )
-        chosen = cast(Answerer, answerer)
-        return self.select(path, level=names.get(level), answerer=chosen, view=view, threshold=threshold)
+        """Return the answers of `query` as rows of the tree; the path may also be a sequence of texts.
 
-    def select(
-        self,
-        path: Sequence[str],
-        *,
-        level: Level | None = None,
-        answerer: Answerer = "tree",
-        view: str | None = None,
-        threshold: float | None = None,
-    ) -> NodeHits:
-        """Search the nodes for the texts of a path, coarse to fine; `query` and `find` call this.
-
-        Arguments and errors as in `query`, but with the last text's level as a `Level`, or None for any.
+        Arguments and errors as in `query`; a level of None is "auto".
         """
+        path = path_of(path) if isinstance(path, str) else tuple(path)
+        if answerer not in ANSWERERS:
+            raise SettingsError(
+                f"answerer {answerer!r} is unknown", expected=" or ".join(ANSWERERS), found=answerer
+            )
+        if isinstance(level, str):
+            names = {each.label: each for each in LEVELS}
+            if level != "auto" and level not in names:
+                raise SettingsError(
+                    f"level {level!r} is unknown", expected=f"auto, {', '.join(names)}", found=level
+                )
+            level = names.get(level)
         shown = None if view is None else self.nodes_shown(view)
         found = search(
             self.tree,
             self.node_margins(path, answerer),
             self.node_vectors(answerer),
-            tuple(path),
+            path,
             threshold=self.settings.node_select if threshold is None else 0.0,  # 0: the whole level
             ancestors=self.settings.ancestors,
             level=level,
@@ -362,9 +306,7 @@ class LanguageScene:
             found = replace(found, ids=found.ids[kept], values=found.values[kept])
         return replace(found, texts=tuple(self._doubted(each, answerer, shown) for each in found.texts))
 
-    def _doubted(
-        self, answer: TextAnswer, answerer: Answerer, shown: Bool[np.ndarray, " n"] | None
-    ) -> TextAnswer:
+    def _doubted(self, answer: TextAnswer, answerer: str, shown: Bool[np.ndarray, " n"] | None) -> TextAnswer:
         """Return a text's answer with the share of words for absent things that score as high."""
         if self.names.nodes_of(answer.text):
             return answer
@@ -373,16 +315,12 @@ class LanguageScene:
             rivals = np.ones(len(self.tree), np.bool_) if shown is None else shown.copy()
             if answer.margin < answer.anywhere:  # only one level was searched
                 rivals &= self.tree.level == int(answer.level)
-            best = self._margins_by_chance(answerer, self.naming)[:, rivals].max(axis=1, initial=-np.inf)
+            if answerer not in self._by_chance:
+                vectors, canonical = self.node_vectors(answerer), self.text_vectors(self.settings.canonical)
+                self._by_chance[answerer] = margins(vectors, self.naming.rivals, canonical)
+            best = self._by_chance[answerer][:, rivals].max(axis=1, initial=-np.inf)
             chance = (1 + int((best >= answer.margin).sum())) / (1 + len(best))
         return replace(answer, chance=chance, unknown=tuple(self.unknown_words(answer.text)))
-
-    def _margins_by_chance(self, answerer: Answerer, naming: NodeNaming) -> Float32[np.ndarray, "W n"]:
-        """Return each node's cosine margin for the words for absent things (`NodeNaming.rivals`)."""
-        if answerer not in self._by_chance:
-            canonical = self.text_vectors(self.settings.canonical)
-            self._by_chance[answerer] = margins(self.node_vectors(answerer), naming.rivals, canonical)
-        return self._by_chance[answerer]
 
     def name_of(self, node: int) -> str:
         """Return the user's name for a node, otherwise its vocabulary name; empty if nothing fits.
@@ -402,43 +340,9 @@ class LanguageScene:
         called = self.naming.of_node[node] if self.naming is not None else ""
         return self.names.of_node.get(node, "") or called
 
-    def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
-        """Return which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
-        return self._shown.shown(view)
-
-    def gaussians_of(self, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
-        """Return the rows of `gaussians.ply` that belong to any of the nodes."""
-        return members_of(self.tree, ids)
-
-    def node_masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
-        """Return the pixels in which the nodes' Gaussians have a share above 0.5."""
-        return self._shown.masks(view, ids)
-
-    # -- views ------------------------------------------------------------------------------------
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """Names of all views, in camera order."""
-        return self.scene.cameras.names
-
-    def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Return a view's undistorted photograph; it is cached and read-only, so copy it to draw on it."""
-        return self._shown.image(view)
-
-    def forget(self, view: str) -> None:
-        """Free the cached results of a view; later queries recompute them."""
-        self._views.forget(view)
-
     # -- relevancy --------------------------------------------------------------------------------
 
-    def text_vectors(self, texts: Sequence[str]) -> Float32[np.ndarray, "T C"]:
-        """Return the unit CLIP vectors of texts; each text is encoded once."""
-        new = [text for text in dict.fromkeys(texts) if text not in self._texts]
-        if new:
-            self._texts.update(zip(new, np.asarray(self.encode_texts(new), np.float32), strict=True))
-        return np.stack([self._texts[text] for text in texts])
-
-    def node_margins(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
+    def node_margins(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
         """Return each node's cosine margin for each text, relative to this scene's canonical phrases.
 
         A node has the margin `NAMED` for the name that the user gave it.
@@ -455,39 +359,17 @@ class LanguageScene:
         """Return `caution`, or "" if every text of a query is a user-given name, so that CLIP is not used."""
         return "" if all(self.names.nodes_of(part) for part in path_of(text)) else self.caution
 
-    def node_relevancy(self, texts: Sequence[str], answerer: Answerer = "tree") -> Float32[np.ndarray, "T n"]:
+    def node_relevancy(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
         """Return the relevancy of each node to each text."""
         return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
 
-    def _score(self, margin: float) -> float:
-        return float(relevancy_of_margins(np.array([margin]), self.settings.relevancy_scale)[0])
-
-    def node_vectors(self, answerer: Answerer = "tree") -> Float32[np.ndarray, "n C"]:
+    def node_vectors(self, answerer: str = "tree") -> Float32[np.ndarray, "n C"]:
         """Return the nodes' unit vectors: their own, or decoded from the field of their Gaussians."""
-        return self.tree.clip if answerer == "tree" else self._field.node_vectors
+        return self.tree.clip if answerer == "tree" else self._decoded_nodes
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
-        """Blend the relevancy of the nodes that each pixel shows by its weights, at each level.
-
-        For Gaussians without a node and for uncovered pixels, see `SceneViews.blended`.
-        """
-        return self._shown.blended(view, self.node_relevancy(texts))
-
-    def field_relevancy(
-        self, texts: Sequence[str], view: str, *, exact: bool = True
-    ) -> Float32[np.ndarray, "T 3 H W"]:
-        """Compute relevancy from decoded rendered latents at every pixel and level, as in the paper.
-
-        Pixels that show mostly Gaussians without a latent at the level count as uncovered (see
-        `node_relevancy_map`).
-
-        Args:
-            texts: queries.
-            view: name of the view.
-            exact: whether a network decodes every pixel at every call; otherwise a view is decoded once, and
-                results differ by at most 2e-3 (see `LatentRelevancy`). No difference for a linear code.
-        """
-        return self._field.relevancy(texts, view, exact=exact)
+        """Blend the relevancy of the nodes that each pixel shows, as `SceneViews.blended`."""
+        return self.blended(view, self.node_relevancy(texts))
 
     def node_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
@@ -503,41 +385,11 @@ class LanguageScene:
             nodes = self.tree.nodes_of(level)
             if not len(nodes):
                 continue
-            shown = self._shown.nodes(view, level)
+            shown = self.view_nodes(view, level)
             for row, values in enumerate(cosines):
                 blended = shown.blend(values, float(values[nodes].min()))
                 found[row, level.index] = np.where(shown.covered, blended, -np.inf)[pixels]
         return found
-
-    def field_cosine(
-        self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
-    ) -> Float32[np.ndarray, "T 3 P"]:
-        """Return the cosines of texts with the rendered, decoded latents of pixels, at each level.
-
-        Pixels that show mostly Gaussians without a latent have -inf. Arguments as in `node_cosine`.
-        """
-        return self._field.cosine(texts, view, pixels)
-
-    def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
-        """Return each Gaussian's field relevancy at a level, or its maximum over levels; 0 if no latent."""
-        return self._field.of_gaussians(text, level)
-
-    def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:
-        """Render the field of a level as colours (see `field_colours`); uncovered pixels are black."""
-        return self._field.image(view, level)
-
-    def view_weights(self, view: str) -> sp.csr_matrix:
-        """Return W of a view with rows divided by alpha; rows with an alpha below 0.5 are empty."""
-        return self._shown.weights(view)
-
-    @cached_property
-    def _shown(self) -> SceneViews:
-        return SceneViews(self.scene, self.tree, self.pixel_weights, self._views)
-
-    @cached_property
-    def _field(self) -> FieldAnswers:
-        language, code = self.trained()
-        return FieldAnswers(language, code, self._shown, self.text_vectors, self.settings, self.threads)
 
 
 def path_of(text: str) -> tuple[str, ...]:

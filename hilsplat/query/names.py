@@ -12,41 +12,27 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from hilsplat.base.artifacts import (
-    output_lock,
-    read_json,
-    read_npz,
-    sha256_of_bytes,
-    sha256_of_file,
-    write_json,
-)
+from hilsplat.base.artifacts import read_json, read_npz, sha256_of_file, write_json
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.web.file_changes import NO_FILE, replacing, version_of
 
 FILE = "names.json"
 PATH_SEPARATOR = ">"
 LONGEST = 80
 """Maximum number of characters in a name."""
 
-NO_FILE = "none"
-"""Version of a file that does not exist."""
-
 
 @dataclass(frozen=True)
 class NodeNames:
-    """Names of nodes of one semantic tree.
-
-    Attributes:
-        of_node: row of the tree -> its name.
-        version: version of the file they were read from; `write_names` requires it.
-    """
+    """Names of nodes of one semantic tree, by row, and the version of the file they were read from."""
 
     of_node: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}))
     version: str = NO_FILE
 
     def nodes_of(self, text: str) -> list[int]:
         """Return the nodes with this name, ignoring case and extra spaces."""
-        plain = _plain(text)
-        return [node for node, name in self.of_node.items() if _plain(name) == plain]
+        plain = " ".join(text.split()).casefold()
+        return [node for node, name in self.of_node.items() if " ".join(name.split()).casefold() == plain]
 
 
 def tree_digest(semantic_tree: Path) -> str:
@@ -76,17 +62,10 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
 def write_names(
     folder: Path, semantic_tree: Path, names: Mapping[int, str], num_nodes: int, version: str
 ) -> NodeNames:
-    """Replace the names of a tree, unless the file has changed since `version` was read.
-
-    Args:
-        folder: the scene's folder.
-        semantic_tree: the artifact whose nodes are named.
-        names: row of the tree -> name, for all named nodes; empty names are removed.
-        num_nodes: number of nodes in the tree.
-        version: as in `NodeNames`.
+    """Replace the names of a tree in its scene's folder; empty names are removed.
 
     Raises:
-        StaleNamesError: the file changed since `version` was read.
+        StaleFileError: the file changed since `version` was read.
         SettingsError: a name is too long, contains `PATH_SEPARATOR` or is not printable, or a row is invalid.
     """
     path = Path(folder) / FILE
@@ -99,12 +78,7 @@ def write_names(
                 f"{name!r} cannot be a name",
                 expected=f"at most {LONGEST} letters, without {PATH_SEPARATOR!r}, which separates a path",
             )
-    with output_lock(path):
-        if version_of(path) != version:
-            raise StaleNamesError(
-                f"the names in {path} have changed since they were read",
-                fix="read them again, then change them",
-            )
+    with replacing(path, version, f"the names in {path}"):
         found = _kept(path)
         found.trees[tree_digest(semantic_tree)] = {node: name for node, name in sorted(given.items()) if name}
         write_json(path, found.model_dump(mode="json"))
@@ -118,19 +92,6 @@ class NamesFile(BaseModel):
 
     format: Literal["hilsplat-names-1"]
     trees: dict[str, dict[NonNegativeInt, Annotated[str, Field(max_length=LONGEST)]]]
-
-
-class StaleNamesError(ArtifactError):
-    """The names file changed since it was read."""
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.split()).casefold()
-
-
-def version_of(path: Path) -> str:
-    """Return the digest of a file, which a page must send to replace it."""
-    return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
 
 
 def _kept(path: Path) -> NamesFile:

@@ -57,14 +57,7 @@ SECTIONS = ("things", "parts", "surfaces", "absent")
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Distinct texts by kind.
-
-    Attributes:
-        things: names of objects.
-        parts: names of parts; a text such as "car wheel" names the whole too.
-        surfaces: floors, walls and similar surfaces, which are listed after the things.
-        absent: words for things that few scenes contain; empty if the file has none.
-    """
+    """Distinct texts by kind; `absent` has words for things that few scenes contain, or is empty."""
 
     things: tuple[str, ...]
     parts: tuple[str, ...] = ()
@@ -136,7 +129,6 @@ class NodeNaming:
         Raises:
             ArtifactError: the artifact is damaged.
         """
-        folder = Path(folder)
         if not folder.is_dir():
             return None
         index = read_full_index(folder, "tree_sha256", "clip_sha256", "nodes")
@@ -174,13 +166,9 @@ def run_names(
     """Name the nodes of a tree.
 
     Args:
-        semantic_tree: the nodes.
-        clip_folder: CLIP vectors of their masks.
+        clip_folder: CLIP vectors of the masks.
         out: folder to write: `names.json`, `rivals.npy` and an index.
         cache: cache folder of text vectors, shared by all scenes of a model.
-        settings: the vocabulary.
-        evaluate: prompt template and canonical phrases.
-        threads: number of threads for CLIP.
 
     Raises:
         SettingsError: the vocabulary cannot be read.
@@ -206,15 +194,11 @@ def run_names(
             known = [text for row, text in enumerate(texts) if row not in nearest]
         rivals = known if len(known) >= FEWEST_ABSENT else []
         naming = named(tree, vocabulary, margin, of(rivals))
-        rows = zip(naming.of_node, naming.surfaces, naming.candidates, strict=True)
-        described = [
-            {
-                "name": name,
-                "surface": surface,
-                "candidates": [[text, round(value, 4)] for text, value in best],
-            }
-            for name, surface, best in rows
-        ]
+        described = []
+        for row in zip(naming.of_node, naming.surfaces, naming.candidates, strict=True):
+            name, surface, best = row
+            candidates = [[text, round(value, 4)] for text, value in best]
+            described.append({"name": name, "surface": surface, "candidates": candidates})
         write_json(folder / "names.json", described)
         write_npy(folder / "rivals.npy", naming.rivals.astype(np.float16))
         write_index(
@@ -228,8 +212,8 @@ def run_names(
             texts=len(texts),
             rivals=len(rivals),
         )
-        counts["nodes"], counts["named"] = len(tree), sum(bool(name) for name in naming.of_node)
-        counts["texts"] = len(texts)
+        named_nodes = sum(bool(name) for name in naming.of_node)
+        counts |= {"nodes": len(tree), "named": named_nodes, "texts": len(texts)}
 
 
 def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32[np.ndarray, "T C"]:

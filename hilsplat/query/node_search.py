@@ -1,6 +1,6 @@
 """Selection of semantic tree nodes by cosine margins: level, multiple hits and paths."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -34,8 +34,7 @@ class TextAnswer:
     """The best match of one text of a query.
 
     Attributes:
-        level: the level at which the text was searched.
-        margin: cosine margin of the best node that competed there; -inf if none did.
+        margin: cosine margin of the best node that competed at `level`; -inf if none did.
         anywhere: cosine margin of the best node of any level.
         chance: share of words for absent things whose best margin is as high; None if unknown.
         unknown: words of the text that are not in the model's vocabulary.
@@ -93,10 +92,8 @@ def search(
     """Find the nodes that answer a text, or the last text of a path such as ("bear", "head", "nose").
 
     Args:
-        tree: the nodes.
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
-        path: the texts, coarse to fine.
         threshold: see `best_nodes`.
         ancestors: share of the mean margin of a node's ancestors that is added to its own; ignored for a path
             of several texts, which names the ancestors itself.
@@ -232,32 +229,12 @@ def _search_path(
             found=f"{len(path)}",
             fix="name the object, then its part, then the part of the part",
         )
-    ancestors = tree.ancestors()
-    found = [_search_way(tree, margin, ancestors, vectors, way, threshold, shown) for way in ways]
-    best = max(found, key=lambda way: (way.complete, way.total))
-    texts = tuple(map(TextAnswer, path, best.levels, best.margins, anywhere))
-    return NodeHits(best.ids, best.values, best.route, texts)
-
-
-@dataclass(frozen=True)
-class _Way:
-    """The result of a path at one combination of levels; other attributes as in `NodeHits`.
-
-    Attributes:
-        levels: level of each text.
-        margins: margin of the best node that competed for each text.
-        total: sum of the margins of the best answer and its ancestors.
-        complete: whether the best answer is part of a plausible answer to the first text, and has an ancestor
-            for every text.
-    """
-
-    ids: Int64[np.ndarray, " h"]
-    values: Float64[np.ndarray, " h"]
-    levels: tuple[Level, ...]
-    margins: tuple[float, ...]
-    route: str
-    total: float
-    complete: bool
+    ancestors, found = tree.ancestors(), []
+    for way in ways:
+        complete, total, margins, hits = _search_way(tree, margin, ancestors, vectors, way, threshold, shown)
+        texts = tuple(map(TextAnswer, path, way, margins, anywhere))
+        found.append((complete, total, replace(hits, texts=texts)))
+    return max(found, key=lambda each: each[:2])[2]
 
 
 def _search_way(
@@ -268,8 +245,14 @@ def _search_way(
     levels: tuple[Level, ...],
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None,
-) -> _Way:
-    """Search the last text at the last level, and each earlier text among the ancestors at its level."""
+) -> tuple[bool, float, list[float], NodeHits]:
+    """Search the last text at the last level, and each earlier text among the ancestors at its level.
+
+    Returns:
+        whether the best answer is part of a plausible answer to the first text and has an ancestor for every
+        text; the sum of the margins of the best answer and its ancestors; the margin of the best node that
+        competed for each text; and the answers, without their texts.
+    """
     nodes, last = tree.nodes_of(levels[-1]), margin[-1]
     may = nodes if shown is None else nodes[shown[nodes]]
     value, total = last.copy(), last.copy()
@@ -290,19 +273,15 @@ def _search_way(
             likely = below <= PLAUSIBLE * spread
     margins.append(float(last[may].max(initial=-np.inf)))
     if not len(may):
-        return _Way(may, value[may], levels, tuple(margins), "fallback", -np.inf, False)
+        return False, -np.inf, margins, NodeHits(may, value[may], "fallback", ())
     inside = bool(likely[may].any())
     reach = (1 - threshold) * np.ptp(last[nodes])
     chosen = _near_best(value, may[likely[may]] if inside else may, vectors, reach)
-    best_one = chosen[0]
-    holders = ancestors[best_one, [level.index for level in levels[:-1]]]
+    holders = ancestors[chosen[0], [level.index for level in levels[:-1]]]
     complete = inside and bool((holders != NONE).all())
-    route = _route(holders, int(tree.parent[best_one]), inside)
-    return _Way(chosen, value[chosen], levels, tuple(margins), route, float(total[best_one]), complete)
-
-
-def _route(holders: Int32[np.ndarray, " a"], parent: int, inside: bool) -> str:
-    """Return the route (see `NodeHits`); `inside`: a node is part of a plausible answer to the first text."""
+    route = "descendant"
     if not inside or (holders == NONE).all():
-        return "fallback"
-    return "child" if (holders != NONE).all() and holders[-1] == parent else "descendant"
+        route = "fallback"
+    elif complete and holders[-1] == tree.parent[chosen[0]]:
+        route = "child"
+    return complete, float(total[chosen[0]]), margins, NodeHits(chosen, value[chosen], route, ())

@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int16
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.field.code import CHUNK_ROWS, Code
-from hilsplat.field.linear_code import LinearCode
+from hilsplat.field.code import CHUNK_ROWS, Code, LinearCode
 from hilsplat.query.relevancy_kernels import (
     by_channel,
     lengths_and_generic,
@@ -58,15 +57,7 @@ def margins(
     """Return the cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
 
     0 means as close to the text as to the nearest generic phrase. Embeddings are ranked and compared by
-    margins, because relevancies saturate and margins do not.
-
-    Args:
-        embeddings: unit vectors.
-        texts: unit vectors of the queries.
-        canonical: unit vectors of the generic phrases, at least one.
-
-    Example:
-        cosines 0.30 with the text and 0.25, 0.28, 0.20, 0.22 with the phrases: 0.02.
+    margins, because relevancies saturate and margins do not. All vectors have unit length.
     """
     found = np.empty((len(texts), len(embeddings)), np.float32)
     for start in range(0, len(embeddings), EMBEDDINGS_AT_A_TIME):
@@ -103,7 +94,7 @@ def relevancy(
     rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)), which is the logistic function of the
     scaled margin: an embedding at margin 0 scores exactly 0.5, no better than generic.
 
-    Source: LERF; LangSplat, `eval/openclip_encoder.py`; both use a scale of 10. Vectors as in `margins`.
+    Source: LERF; LangSplat, `eval/openclip_encoder.py`; both use a scale of 10.
 
     Example:
         cosines 0.30 with the text and 0.25, 0.28, 0.20, 0.22 with the phrases: the nearest phrase
@@ -112,8 +103,15 @@ def relevancy(
     return relevancy_of_margins(margins(embeddings, texts, canonical), scale)
 
 
+class _PreparedView:
+    @property
+    def nbytes(self) -> int:
+        """Memory used, bytes."""
+        return sum(array.nbytes for array in vars(self).values())
+
+
 @dataclass(frozen=True)
-class LinearView:
+class LinearView(_PreparedView):
     """Latents of a view, prepared for look-ups.
 
     Attributes:
@@ -126,18 +124,13 @@ class LinearView:
     length: Float32[np.ndarray, " P"]
     generic: Float32[np.ndarray, " P"]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory used, bytes."""
-        return self.channels.nbytes + self.length.nbytes + self.generic.nbytes
-
 
 @dataclass(frozen=True)
-class ProjectedView:
+class ProjectedView(_PreparedView):
     """Decoded vectors of a view, prepared for look-ups.
 
     Attributes:
-        coordinates: along each direction, in units of 1 / `STEPS`; one row per direction.
+        coordinates: along each direction, in units of 1 / `STEPS`.
         directions: orthonormal rows.
         generic: cosine with the nearest canonical phrase.
     """
@@ -146,21 +139,9 @@ class ProjectedView:
     directions: Float32[np.ndarray, "R C"]
     generic: Float32[np.ndarray, " P"]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory used, bytes."""
-        return self.coordinates.nbytes + self.directions.nbytes + self.generic.nbytes
-
 
 class LatentRelevancy:
-    """Relevancy of latents to texts, against fixed canonical phrases.
-
-    Args:
-        code: decodes latents.
-        canonical: unit vectors of the generic phrases.
-        scale: scale of the cosines.
-        threads: number of threads; results do not depend on it.
-    """
+    """Relevancy of latents to texts, against fixed canonical phrases; it does not depend on `threads`."""
 
     def __init__(
         self, code: Code, canonical: Float32[np.ndarray, "K C"], scale: float, threads: int = 1

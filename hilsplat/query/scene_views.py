@@ -1,7 +1,7 @@
 """Nodes and pixels that a scene's views show; slow results are cached per view."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,9 +15,12 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.splat.gaussians import Gaussians
 
 MIN_SHOWN_SHARE = 1e-4
 """Minimum share of a view that shows a node: 14 px of 384 x 384 are too few."""
+
+Nodes = Sequence[int] | Int64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -25,27 +28,28 @@ class SceneViews:
     """The views of a scene with a semantic tree; `pixel_weights` returns W of a view (pixels x Gaussians)."""
 
     scene: Scene
+    gaussians: Gaussians
     tree: SemanticTree
     pixel_weights: Callable[[str], sp.csr_matrix]
-    store: ViewStore
+    _views: ViewStore = field(default_factory=ViewStore, repr=False, kw_only=True)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of all views, in camera order."""
+        return self.scene.cameras.names
 
     def camera(self, view: str) -> Camera:
-        """Return the camera of a view.
-
-        Raises:
-            SettingsError: the scene has no such view.
-        """
-        names = self.scene.cameras.names
-        if view not in names:
+        """Return the camera of a view; raise SettingsError if the scene has no such view."""
+        if view not in self.views:
             raise SettingsError(
                 f"{self.scene.name} has no view {view!r}",
-                expected=f"one of {', '.join(names[:3])}, ... ({len(names)} views)",
+                expected=f"one of {', '.join(self.views[:3])}, ... ({len(self.views)} views)",
                 found=view,
             )
         return self.scene.cameras[view]
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Return the undistorted photograph of a view, read-only."""
+        """Return a view's undistorted photograph; it is cached and read-only, so copy it to draw on it."""
         self.camera(view)
 
         def read() -> np.ndarray:
@@ -53,49 +57,57 @@ class SceneViews:
             pixels.setflags(write=False)
             return pixels
 
-        return self.store.get(("image", view), read, lambda kept: kept.nbytes)
+        return self._views.get(("image", view), read, lambda kept: kept.nbytes)
 
-    def weights(self, view: str) -> sp.csr_matrix:
+    def forget(self, view: str) -> None:
+        """Free the cached results of a view; later queries recompute them."""
+        self._views.forget(view)
+
+    def view_weights(self, view: str) -> sp.csr_matrix:
         """Return W of a view with rows divided by alpha; rows with an alpha below 0.5 are empty."""
-        return self.store.get(
+        return self._views.get(
             ("weights", view),
             lambda: normalised_weights(self.pixel_weights(view)),
             lambda kept: kept.data.nbytes + kept.indices.nbytes + kept.indptr.nbytes,
         )
 
-    def nodes(self, view: str, level: Level) -> ViewNodes:
+    def view_nodes(self, view: str, level: Level) -> ViewNodes:
         """Return the nodes of a level in each pixel of a view."""
-        return self.store.get(
+        return self._views.get(
             ("nodes", view, level),
-            lambda: ViewNodes.of(self.weights(view), self.tree.node_of_gaussian[:, level.index]),
+            lambda: ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index]),
             lambda kept: kept.nbytes,
         )
 
-    def shown(self, view: str) -> Bool[np.ndarray, " n"]:
+    def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
         """Return which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
         height, width = self.camera(view).size_hw
 
         def measure() -> np.ndarray:
             num = len(self.tree)
-            area_px = np.sum([self.nodes(view, level).area_px(num) for level in LEVELS], axis=0)
+            area_px = np.sum([self.view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
             return np.asarray(area_px >= MIN_SHOWN_SHARE * height * width)
 
-        return self.store.get(("shown", view), measure, lambda kept: kept.nbytes)
+        return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
 
-    def masks(self, view: str, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Bool[np.ndarray, "H W"]:
+    def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
+        """Return the rows of `gaussians.ply` that belong to any of the nodes."""
+        return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
+
+    def node_masks(self, view: str, ids: Nodes) -> Bool[np.ndarray, "H W"]:
         """Return the pixels in which the nodes' Gaussians have a share above 0.5."""
         ids = np.asarray(ids, np.int64)
-        height, width = self.camera(view).size_hw
+        size_hw = self.camera(view).size_hw
         if not len(ids):
-            return np.zeros((height, width), np.bool_)
-        chosen = np.zeros(len(self.tree), np.bool_)
-        chosen[ids] = True
+            return np.zeros(size_hw, np.bool_)
         levels = np.unique(self.tree.level[ids])
         if len(levels) == 1:
-            return self.nodes(view, Level(int(levels[0]))).mask(chosen).reshape(height, width)
+            chosen = np.zeros(len(self.tree), np.bool_)
+            chosen[ids] = True
+            return self.view_nodes(view, Level(int(levels[0]))).mask(chosen).reshape(size_hw)
         member = np.zeros(len(self.tree.node_of_gaussian), np.float32)
-        member[members_of(self.tree, ids)] = 1
-        return (self.weights(view) @ member > 0.5).reshape(height, width)
+        member[self.gaussians_of(ids)] = 1
+        return (self.view_weights(view) @ member > 0.5).reshape(size_hw)
 
     def blended(self, view: str, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
         """Blend the scores of the nodes that each pixel shows by its weights, at each level.
@@ -109,12 +121,7 @@ class SceneViews:
             nodes = self.tree.nodes_of(level)
             if not len(nodes):
                 continue
-            shown = self.nodes(view, level)
+            shown = self.view_nodes(view, level)
             for row, values in enumerate(scores):
                 shown.blend(values, float(values[nodes].min()), maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
-
-
-def members_of(tree: SemanticTree, ids: Sequence[int] | Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " g"]:
-    """Return the Gaussians that belong to any of the nodes."""
-    return np.flatnonzero(np.isin(tree.node_of_gaussian, np.asarray(ids)).any(axis=1))

@@ -53,15 +53,16 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
     """
     begin = time.perf_counter()
     view = None if asked.view is None else view_name(scene.scene, asked.view)
-    found = scene.find(asked.text, asked.level, answerer=answerer, view=view, threshold=asked.threshold)
+    found = scene.select(
+        asked.text, level=asked.level, answerer=answerer, view=view, threshold=asked.threshold
+    )
     hits, path = scene.hits_of(found, LISTED), path_of(asked.text)
-    relevancy = scene.node_relevancy([path[-1]], "field" if answerer == "field" else "tree")[0]
+    relevancy = scene.node_relevancy([path[-1]], answerer)[0]
+    made = _answer(scene, asked.text, hits, relevancy)
     return {
-        "text": asked.text,
+        **made,
         "level": found.level.label,
-        "hits": [described_hit(scene, hit) for hit in hits],
         "total": len(found.ids),
-        "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [str(doubt) for doubt in doubts_of(found)],
         "caution": scene.caution_about(asked.text),
         "route": found.route,
@@ -74,27 +75,30 @@ def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[i
     relevancy = np.zeros(len(scene.tree))
     relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
     relevancy[list(also)] = 1
+    return _answer(scene, what, hits, relevancy)
+
+
+def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.ndarray) -> Answer:
+    found: list[FoundNode] = [
+        {
+            "node": hit.node,
+            "level": hit.level.label,
+            "score": round(hit.score, 4),
+            "name": hit.name,
+            "best_views": [scene.views.index(view) for view in hit.best_views],
+        }
+        for hit in hits
+    ]
     return {
-        "text": what,
+        "text": text,
         "level": hits[0].level.label if hits else "",
-        "hits": [described_hit(scene, hit) for hit in hits],
+        "hits": found,
         "total": len(hits),
         "relevancy": np.round(relevancy, 4).tolist(),
         "doubts": [],
         "caution": "",
         "route": "like",
         "ms": 0,
-    }
-
-
-def described_hit(scene: LanguageScene, hit: Hit) -> FoundNode:
-    """Return one answer in the format of the page."""
-    return {
-        "node": hit.node,
-        "level": hit.level.label,
-        "score": round(hit.score, 4),
-        "name": hit.name,
-        "best_views": [scene.views.index(view) for view in hit.best_views],
     }
 
 

@@ -11,28 +11,16 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.query.names import StaleNamesError, write_names
+from hilsplat.query.names import write_names
 from hilsplat.viewer import answers, exports, wire
-from hilsplat.viewer.frames import painted
+from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.openapi import description
 from hilsplat.viewer.payload import packed_nodes
-from hilsplat.viewer.picking import pick
 from hilsplat.viewer.saved_files import SavedFiles, node_of
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.guard import Guard
 from hilsplat.web.scene_thread import SceneThread
-from hilsplat.web.server import (
-    Pages,
-    answer,
-    encoded,
-    guarded,
-    photograph,
-    plain,
-    read,
-    serve,
-    thumbnail,
-    version_sent,
-)
+from hilsplat.web.server import Pages, answer, encoded, guarded, plain, read, serve, version_sent
 
 
 class Viewer:
@@ -47,43 +35,23 @@ class Viewer:
         get, post = self.thread.get, self.thread.post
         routes = [
             *self.pages.routes(),
-            Route("/openapi.json", self.described),
-            Route("/api/scene", self.scene),
-            Route("/api/changes", self.changes),
+            *self.thread.routes(),
+            Route("/openapi.json", get(lambda shown, of: description())),
             Route("/api/variant/{variant}", get(lambda shown, of: shown.described_variant(of["variant"]))),
-            Route("/api/splats/{chunk:int}", self.splats),
-            Route("/api/nodes/{variant}", get(nodes)),
-            Route("/api/photo/{number:int}", get(photo, behind=True)),
-            Route("/api/thumb/{number:int}", get(thumb, behind=True)),
-            Route("/api/crop/{variant}/{node:int}", get(crop, behind=True)),
-            Route("/api/query", post(wire.Query, query), methods=["POST"]),
-            Route("/api/like", post(wire.Like, like), methods=["POST"]),
-            Route("/api/field", post(wire.FieldRelevancy, field), methods=["POST"]),
-            Route("/api/pick", post(wire.Pick, picked), methods=["POST"]),
-            Route("/api/frame", post(wire.Frame, frame), methods=["POST"]),
-            Route("/api/names", self.names, methods=["PUT"]),
+            Route("/api/splats/{chunk:int}", self._splats),
+            Route("/api/nodes/{variant}", get(_nodes)),
+            Route("/api/crop/{variant}/{node:int}", get(_crop, behind=True)),
+            Route("/api/query", post(wire.Query, _query), methods=["POST"]),
+            Route("/api/like", post(wire.Like, _like), methods=["POST"]),
+            Route("/api/field", post(wire.FieldRelevancy, _field), methods=["POST"]),
+            Route("/api/pick", post(wire.Pick, _picked), methods=["POST"]),
+            Route("/api/frame", post(wire.Frame, _frame), methods=["POST"]),
+            Route("/api/names", self._names, methods=["PUT"]),
             *SavedFiles(self.thread, self.pages.static).routes(),
         ]
-        return guarded(routes, token, StaleNamesError, embedded=embedded)
+        return guarded(routes, token, embedded=embedded)
 
-    async def described(self, request: Request) -> Response:
-        """Send the OpenAPI description."""
-        return answer(description())
-
-    async def scene(self, request: Request) -> Response:
-        """Send the views, counts, and the variants that can be queried now."""
-        return answer(await self.thread.opened_anew())
-
-    async def changes(self, request: Request) -> Response:
-        """Send which parts of the scene changed on disk since they were opened."""
-
-        def find() -> dict[str, Any]:
-            shown = self.thread.shown
-            return {"of": shown.state, "changed": shown.changed(), "variants": shown.variants}
-
-        return answer(await self.thread.run(find))
-
-    async def splats(self, request: Request) -> Response:
+    async def _splats(self, request: Request) -> Response:
         """Send a chunk of the Gaussians as SPZ."""
         chunk = request.path_params["chunk"]
         tag = f'"{await self.thread.do(request, lambda shown: shown.splats_tag)}"'
@@ -92,7 +60,7 @@ class Viewer:
         data = await self.thread.do(request, lambda shown: shown.chunk(chunk))
         return Response(data, headers={"etag": tag, "cache-control": "no-cache"})
 
-    async def names(self, request: Request) -> Response:
+    async def _names(self, request: Request) -> Response:
         """Replace the names of a tree's nodes; `If-Match` is the version that was read."""
         asked = await read(request, wire.Names)
 
@@ -107,44 +75,22 @@ class Viewer:
         return answer(await self.thread.do(request, write))
 
 
-# -- the scene ------------------------------------------------------------------------------------
-
-
-def nodes(shown: ViewerScene, of: Mapping[str, Any]) -> bytes:
-    """Return the packed nodes of the Gaussians."""
+def _nodes(shown: ViewerScene, of: Mapping[str, Any]) -> bytes:
     return packed_nodes(shown.answering(of["variant"]).tree, shown.order)
 
 
-def photo(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
-    """Return an undistorted photograph."""
-    with shown.unchanged():
-        return photograph(shown.scene, of["number"])
-
-
-def thumb(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
-    """Return a thumbnail of a photograph."""
-    with shown.unchanged():
-        return thumbnail(shown.scene, of["number"])
-
-
-def crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
-    """Return a crop of a node from the photograph that shows it largest."""
+def _crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
     scene = shown.answering(of["variant"])
     node = node_of(scene, of["node"])
     with shown.unchanged():
         return plain(encoded(exports.crop(scene, node, shown.threads)), "image/jpeg", cached=True)
 
 
-# -- answers --------------------------------------------------------------------------------------
-
-
-def query(shown: ViewerScene, asked: wire.Query) -> answers.Answer:
-    """Return the answers to a text or a path."""
+def _query(shown: ViewerScene, asked: wire.Query) -> answers.Answer:
     return answers.answer(shown.answering(asked.variant), asked, asked.answerer)
 
 
-def like(shown: ViewerScene, asked: wire.Like) -> answers.Answer:
-    """Return the nodes that look like a node or a picture."""
+def _like(shown: ViewerScene, asked: wire.Like) -> answers.Answer:
     scene = shown.answering(asked.variant)
     if asked.node is not None:
         hits = scene.like_node(asked.node, limit=answers.LISTED)
@@ -154,24 +100,20 @@ def like(shown: ViewerScene, asked: wire.Like) -> answers.Answer:
     return answers.alike(scene, hits, "like the picture")
 
 
-def field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
+def _field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
     """Return the field's relevancy of each Gaussian, one byte each."""
     found = shown.field_relevancy(asked.variant, asked.text, asked.level)
     return (found[shown.order] if asked.order == "page" else found).tobytes()
 
 
-def picked(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
-    """Return the nodes and the 3D point that a pixel shows."""
+def _picked(shown: ViewerScene, asked: wire.Pick) -> dict[str, Any]:
     has = asked.variant in shown.variants
     of_gaussian = shown.answering(asked.variant).tree.node_of_gaussian if has else None
     found = pick(shown.gaussians, of_gaussian, asked.camera.camera(), asked.x, asked.y, shown.threads)
-    if found is None:
-        return {"nodes": [], "alpha": 0}
-    return {"nodes": found.nodes, "alpha": found.alpha, "point": found.point}
+    return found or {"nodes": [], "alpha": 0}
 
 
-def frame(shown: ViewerScene, asked: wire.Frame) -> Response:
-    """Return a rendered picture of the scene."""
+def _frame(shown: ViewerScene, asked: wire.Frame) -> Response:
     paint = shown.paint(asked.variant, asked.style)
     pixels = painted(shown.gaussians, asked.camera.camera(), paint, shown.threads)
     return plain(encoded(pixels, asked.image, asked.quality), f"image/{asked.image}")

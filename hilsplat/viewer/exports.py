@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Int32, Int64, UInt8
 from PIL import Image
 
 from hilsplat.query.language_scene import LanguageScene
@@ -41,30 +41,27 @@ Between steps, the scene thread can handle interactive requests.
 """
 
 
-class Groups:
-    """The Gaussians of groups of nodes.
+def labelled(
+    scene: LanguageScene, groups: Sequence[Group]
+) -> tuple[Int64[np.ndarray, " g"], Int32[np.ndarray, " g"]]:
+    """Return the rows of the Gaussians of any group, ascending, and the group of each, counted from 1.
 
-    Attributes:
-        rows: rows of the Gaussians of any group, ascending.
-        labels: group of each of these Gaussians, from 1; the smallest group if it is in several.
-        names: names of the groups.
+    A Gaussian of several groups belongs to the one with the fewest Gaussians.
     """
-
-    def __init__(self, scene: LanguageScene, groups: Sequence[Group]) -> None:
-        members = [scene.gaussians_of(group.nodes) for group in groups]
-        label = np.zeros(len(scene.gaussians), np.int32)
-        for number in sorted(range(len(groups)), key=lambda number: -len(members[number])):
-            label[members[number]] = number + 1
-        self.rows = np.flatnonzero(label)
-        self.labels = label[self.rows]
-        self.names = [group.name for group in groups]
+    members = [scene.gaussians_of(group.nodes) for group in groups]
+    label = np.zeros(len(scene.gaussians), np.int32)
+    for number in sorted(range(len(groups)), key=lambda number: -len(members[number])):
+        label[members[number]] = number + 1
+    rows = np.flatnonzero(label)
+    return rows, label[rows]
 
 
-def selection_ply(gaussians_ply: Path, groups: Groups) -> bytes:
+def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Group]) -> bytes:
     """Return the Gaussians of groups as a 3DGS PLY, with their labels."""
+    rows, labels = labelled(scene, groups)
     with TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
-        write_selection_ply(gaussians_ply, groups.rows, out, groups.labels, groups.names)
+        write_selection_ply(gaussians_ply, rows, out, labels, [group.name for group in groups])
         return out.read_bytes()
 
 
@@ -93,8 +90,10 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
                 mask = scene.node_masks(view, [node])
                 if not mask.any():
                     continue
-                png = f"masks/{Path(view).stem}/{node}.png"
-                archive.writestr(png, _png(mask), compress_type=zipfile.ZIP_STORED)
+                png = io.BytesIO()
+                Image.fromarray(mask).save(png, format="PNG")
+                name = f"masks/{Path(view).stem}/{node}.png"
+                archive.writestr(name, png.getvalue(), compress_type=zipfile.ZIP_STORED)
                 described = {"image_id": number, "node": node, **coco_region(mask)}
                 for category, group in enumerate(groups):
                     if node in group.nodes:
@@ -102,12 +101,6 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
                         coco["annotations"].append({**found, **described})
             yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
-    return held.getvalue()
-
-
-def _png(mask: Bool[np.ndarray, "H W"]) -> bytes:
-    held = io.BytesIO()
-    Image.fromarray(mask).save(held, format="PNG")
     return held.getvalue()
 
 
@@ -193,11 +186,8 @@ def film(
     """Render a film in the colours of a style.
 
     Args:
-        gaussians: the Gaussians to render.
-        cameras: one per frame, of even sizes.
+        cameras: one per frame, of even sizes; a GIF has every second one.
         paint: the style; None: the scene's own colours.
-        kind: "mp4", or "gif", which has every second frame.
-        threads: number of threads for rendering.
         on_frame: called after each frame with the frames so far; an exception from it ends the film.
     """
 
@@ -227,11 +217,5 @@ def write_gif(path: Path, frames: Iterator[np.ndarray]) -> None:
         sheet.paste(kept[number * len(kept) // min(len(kept), 8)], (0, number * kept[0].height))
     palette = sheet.quantize(256)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
-    first.save(
-        path,
-        save_all=True,
-        append_images=others,
-        duration=round(1000 * STEP["gif"] / FRAMES_PER_S),
-        loop=0,
-        optimize=False,
-    )
+    duration_ms = round(1000 * STEP["gif"] / FRAMES_PER_S)
+    first.save(path, save_all=True, append_images=others, duration=duration_ms, loop=0, optimize=False)

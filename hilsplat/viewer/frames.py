@@ -1,17 +1,17 @@
-"""Pictures rendered by the pipeline's own rasteriser, for browsers without usable WebGL.
-
-Films and stills use it too, and a test compares the page's WebGL with it.
-"""
+"""Pictures and picked pixels, computed by the pipeline's own rasteriser."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.images import to_uint8
+from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
+from hilsplat.splat.rasterise.project import MIN_ALPHA
 from hilsplat.viewer.wire import Style
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
@@ -21,15 +21,15 @@ GHOST = np.float32(0.08)
 """Share of their opacity that `ghost` leaves to unselected Gaussians."""
 
 
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+SEEN = 0.05
+"""Minimum alpha of a pixel that shows something."""
+
+
 @dataclass(frozen=True)
 class Paint:
-    """A style, resolved for each Gaussian.
-
-    Attributes:
-        rgb: colour that is mixed in.
-        share: share of that colour, in [0, 1]; 0 means unselected.
-        mode: how unselected Gaussians are painted.
-    """
+    """A style, resolved for each Gaussian: the share of `rgb` in its colour; 0 means unselected."""
 
     rgb: Float32[np.ndarray, "N 3"]
     share: Float32[np.ndarray, " N"]
@@ -88,3 +88,59 @@ def painted(
     share = paint.share[:, None]
     colours = np.ascontiguousarray(colours * (1 - share) + paint.rgb * share, np.float32)
     return to_uint8(blend_forward(view, colours, threads)[0])
+
+
+def weights_at(
+    gaussians: Gaussians, camera: Camera, x: int, y: int, threads: int = 1
+) -> tuple[Int64[np.ndarray, " g"], Float64[np.ndarray, " g"]]:
+    """Return the Gaussians of one pixel, nearest first, and their blending weights: a row of `pixel_weights`.
+
+    The whole view is projected, because the Jacobian depends on the picture's borders; only this pixel is
+    blended.
+    """
+    view = project_gaussians(gaussians, camera, 0, threads)
+    first_x, last_x, first_y, last_y = view.box.T
+    rows = np.flatnonzero((first_x <= x) & (x <= last_x) & (first_y <= y) & (y <= last_y))
+    mean_x, mean_y, a, b, c, peak, depth, _ = view.geometry[rows, :8].astype(np.float64).T
+    dx, dy = mean_x - (x + 0.5), mean_y - (y + 0.5)
+    alpha = np.exp2(peak - (a * dx * dx + b * dx * dy + c * dy * dy))
+    kept = np.flatnonzero(alpha >= MIN_ALPHA)
+    kept = kept[np.lexsort((rows[kept], depth[kept]))]
+    alpha = np.minimum(alpha[kept], MAX_ALPHA)
+    left = np.cumprod(1 - alpha)
+    seen = left >= MIN_TRANSMITTANCE
+    before = np.concatenate([[1.0], left[:-1]]) if len(left) else left
+    return rows[kept[seen]], (alpha * before)[seen]
+
+
+def pick(
+    gaussians: Gaussians,
+    node_of_gaussian: Int32[np.ndarray, "N 3"] | None,
+    camera: Camera,
+    x: float,
+    y: float,
+    threads: int = 1,
+) -> dict[str, Any] | None:
+    """Return the content of the pixel at (x, y); None outside the picture or if alpha is below `SEEN`.
+
+    `nodes` has, per level, the node with the largest share of the pixel (-1 for none) and its share of alpha;
+    `point` is the mean position of the Gaussians, weighted by their blending weights, in scene units.
+    """
+    height, width = camera.size_hw
+    if not (0 <= x < width and 0 <= y < height):
+        return None
+    rows, weights = weights_at(gaussians, camera, int(x), int(y), threads)
+    alpha = float(weights.sum())
+    if alpha < SEEN:
+        return None
+    nodes = []
+    for level in LEVELS:
+        if node_of_gaussian is None:
+            nodes.append((NONE, 0.0))
+            continue
+        own = node_of_gaussian[rows, level.index]
+        share = np.bincount(own + 1, weights)  # entry 0: without a node
+        share[0] = 0
+        best = int(share.argmax())
+        nodes.append((best - 1 if share[best] > 0 else NONE, float(share[best]) / alpha))
+    return {"nodes": nodes, "alpha": alpha, "point": (weights @ gaussians.means[rows] / alpha).tolist()}

@@ -46,6 +46,9 @@ def description() -> dict[str, Any]:
     for method, path, summary, sent, given in SENT:
         names = [part.strip("{}") for part in path.split("/") if part.startswith("{")]
         content = {"schema": schema_of(Answer)} if path in ANSWERS else {}
+        body = {}
+        if sent:
+            body = {"requestBody": {"required": True, "content": {JSON: {"schema": schema_of(sent)}}}}
         paths.setdefault(path, {})[method] = {
             "summary": summary,
             "parameters": [
@@ -57,7 +60,7 @@ def description() -> dict[str, Any]:
                 }
                 for name in names
             ],
-            **({"requestBody": _body(schema_of(sent))} if sent else {}),
+            **body,
             "responses": {
                 "200": {"description": summary, "content": {given: content}},
                 "400": {"description": "what was sent is malformed: {error}"},
@@ -76,7 +79,3 @@ def description() -> dict[str, Any]:
         "paths": paths,
         "components": {"schemas": schemas},
     }
-
-
-def _body(schema: dict[str, Any]) -> dict[str, Any]:
-    return {"required": True, "content": {JSON: {"schema": schema}}}

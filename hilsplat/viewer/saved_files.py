@@ -37,21 +37,23 @@ class SavedFiles:
         """Return the routes of the files."""
         post = self.thread.post
         return [
-            Route("/api/export/ply", post(wire.Selection, ply), methods=["POST"]),
-            Route("/api/export/spz", post(wire.Selection, spz), methods=["POST"]),
-            Route("/api/export/boxes", post(wire.Selection, boxes), methods=["POST"]),
-            Route("/api/export/masks", self.masks, methods=["POST"]),
-            Route("/api/export/film", self.film, methods=["POST"]),
-            Route("/api/export/page", self.page, methods=["POST"]),
+            Route("/api/export/ply", post(wire.Selection, _ply), methods=["POST"]),
+            Route("/api/export/spz", post(wire.Selection, _spz), methods=["POST"]),
+            Route("/api/export/boxes", post(wire.Selection, _boxes), methods=["POST"]),
+            Route("/api/export/masks", self._masks, methods=["POST"]),
+            Route("/api/export/film", self._film, methods=["POST"]),
+            Route("/api/export/page", self._page, methods=["POST"]),
         ]
 
-    async def masks(self, request: Request) -> Response:
-        """Send the masks of nodes in all views."""
+    async def _masks(self, request: Request) -> Response:
         asked = await read(request, wire.Selection)
-        return await self._in_steps(request, lambda shown: exports.masks_zip(*selected(shown, asked)))
+        return await self._in_steps(request, lambda shown: exports.masks_zip(*_selected(shown, asked)))
 
-    async def film(self, request: Request) -> Response:
-        """Send a film in the colours of the page."""
+    async def _page(self, request: Request) -> Response:
+        asked = await read(request, wire.Page)
+        return await self._in_steps(request, lambda shown: html_page(shown, asked, self.static))
+
+    async def _film(self, request: Request) -> Response:
         asked = await read(request, wire.Film)
 
         def prepared(shown: ViewerScene) -> Callable[..., bytes]:
@@ -92,11 +94,6 @@ class SavedFiles:
             left.set()
             making.cancel()
 
-    async def page(self, request: Request) -> Response:
-        """Send the scene as one HTML file, with its answers to some queries."""
-        asked = await read(request, wire.Page)
-        return await self._in_steps(request, lambda shown: html_page(shown, asked, self.static))
-
     async def _in_steps(self, request: Request, begin: Callable[[ViewerScene], exports.Steps]) -> Response:
         def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
             steps = begin(shown)
@@ -117,25 +114,22 @@ class SavedFiles:
         yield found
 
 
-def ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
-    """Return the Gaussians of nodes as PLY."""
-    groups = exports.Groups(*selected(shown, asked))
+def _ply(shown: ViewerScene, asked: wire.Selection) -> bytes:
+    selected = _selected(shown, asked)
     with shown.unchanged():
-        return exports.selection_ply(shown.folder / "gaussians.ply", groups)
+        return exports.selection_ply(shown.folder / "gaussians.ply", *selected)
 
 
-def spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
-    """Return the Gaussians of nodes as SPZ."""
-    rows = exports.Groups(*selected(shown, asked)).rows
+def _spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
+    rows, _ = exports.labelled(*_selected(shown, asked))
     return shown.spz(rows[morton_order(shown.gaussians.means[rows])])
 
 
-def boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
-    """Return the boxes of nodes."""
-    return answers.boxes(*selected(shown, asked))
+def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
+    return answers.boxes(*_selected(shown, asked))
 
 
-def selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
+def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
     """Return the variant and the groups of nodes, or raise SettingsError if a node does not exist."""
     scene = shown.answering(asked.variant)
     for group in asked.groups:
@@ -162,11 +156,7 @@ def _line(**values: int | str) -> bytes:
 
 
 def node_of(scene: LanguageScene, node: int) -> int:
-    """Return a node that the page requested.
-
-    Raises:
-        SettingsError: it does not exist.
-    """
+    """Return a node that the page requested; raise SettingsError if it does not exist."""
     if node >= len(scene.tree):
         raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
     return node

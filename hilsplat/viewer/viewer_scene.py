@@ -1,8 +1,6 @@
 """A scene's folder as the page shows it: Gaussians at once, and each variant once it can be queried."""
 
 import logging
-import secrets
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -25,10 +23,9 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 from hilsplat.splat.spz import fractional_bits, spz_bytes
 from hilsplat.viewer import payload
-from hilsplat.viewer.frames import Paint, painted
-from hilsplat.viewer.picking import pick
+from hilsplat.viewer.frames import Paint, painted, pick
 from hilsplat.viewer.wire import Style
-from hilsplat.web.file_changes import FileChanges
+from hilsplat.web.scene_thread import ShownScene
 
 VIEWS_MIB = 256.0
 """Memory limit for cached results of views, such as their compositing weights."""
@@ -42,23 +39,21 @@ MAX_GAUSSIANS = 4_000_000
 logger = logging.getLogger(__name__)
 
 
-class ViewerScene:
+class ViewerScene(ShownScene):
     """The existing parts of a scene. Not thread-safe: use it and all objects it returns on one thread.
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
         variant: the initially selected variant; it may not exist yet.
-        threads: number of threads for rendering.
 
     Raises:
         ArtifactError: the scene has no poses or no Gaussians yet, or too many to show.
     """
 
     def __init__(self, folder: Path, variant: str = "default", threads: int = 1) -> None:
+        super().__init__()
         self.folder, self.first, self.threads = Path(folder), variant, threads
-        self.opened, self.changes = Opened(), FileChanges()
-        self.state = secrets.token_hex(4)
-        """Identifier of this opening of the scene."""
+        self.opened = Opened()
         ply = self.folder / "gaussians.ply"
         if not self.folder.is_dir():
             raise ArtifactError(
@@ -72,7 +67,7 @@ class ViewerScene:
                 f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"hilsplat run {ply}"
             )
         self.changes.note((self.folder / "scene", ply))
-        self.scene: Scene = self.opened.get(Scene.load, self.folder / "scene")
+        self.scene = self.opened.get(Scene.load, self.folder / "scene")
         self.gaussians: Gaussians = self.opened.get(load_ply, ply)
         if len(self.gaussians) > MAX_GAUSSIANS:
             raise ArtifactError(
@@ -85,19 +80,11 @@ class ViewerScene:
         self._relevancy: dict[tuple[str, str, str], np.ndarray] = {}
         self._painted: tuple[Any, Paint] | None = None
 
-    # -- changes on disk --------------------------------------------------------------------------
-
-    def changed(self) -> list[str]:
-        """Return opened parts that were rewritten or deleted; the page still shows what was opened."""
-        return sorted({path.name for path in self.changes.changed()})
-
-    def unchanged(self) -> AbstractContextManager[None]:
-        """Guard disk reads: raise StaleSceneError if a part was rewritten before or during the read."""
-        return self.changes.unchanged(self.scene.name)
-
     def opened_again(self) -> "ViewerScene":
-        """Open the scene as it is on disk now."""
         return ViewerScene(self.folder, self.first, self.threads)
+
+    def news(self) -> dict[str, Any]:
+        return {**super().news(), "variants": self.variants}
 
     # -- variants ---------------------------------------------------------------------------------
 
@@ -116,7 +103,8 @@ class ViewerScene:
             HilsplatError: its parts cannot be opened.
         """
         before = self._variants.get(variant)
-        if before is None or (before.language is None and self._has_field(variant)):
+        field = self.folder / variant / "field.safetensors"
+        if before is None or (before.language is None and field.exists()):
             if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
                     f"variant {variant!r} cannot answer here",
@@ -130,9 +118,6 @@ class ViewerScene:
                 raise ArtifactError(f"the tree of {variant} has {len(opened.tree)} nodes, too many to show")
             self._variants[variant] = replace(opened, _views=ViewStore(VIEWS_MIB))
         return self._variants[variant]
-
-    def _has_field(self, variant: str) -> bool:
-        return (self.folder / variant / "field.safetensors").exists()
 
     def parts(self, variant: str) -> SceneParts:
         """Return the paths of the parts of a variant."""
@@ -150,28 +135,17 @@ class ViewerScene:
     # -- descriptions -----------------------------------------------------------------------------
 
     def described(self) -> dict[str, Any]:
-        """Describe the scene and the variants that can be queried now."""
-        return {
-            **payload.described_scene(self.scene, self.gaussians),
-            "variants": self.variants,
-            "of": self.state,
-            "folder": self.folder.name,
-        }
+        own = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
+        return payload.described_scene(self.scene, self.gaussians) | own
 
     def described_variant(self, variant: str) -> dict[str, Any]:
         """Describe the outline of a variant, and the models of its masks and vectors."""
         scene, parts = self.answering(variant), self.parts(variant)
         with self.unchanged():
-            clip, masks = Path(read_index(parts.clip)["model"]).name, masks_label(parts.masks)
+            models = {"clip": Path(read_index(parts.clip)["model"]).name, "masks": masks_label(parts.masks)}
             tree = tree_digest(parts.semantic_tree)[:16]
-        return {
-            "variant": variant,
-            "tree": tree,
-            **payload.described_nodes(scene),
-            "clip": clip,
-            "masks": masks,
-            "caution": scene.caution,
-        }
+        outline = {"variant": variant, "tree": tree, **payload.described_nodes(scene)}
+        return {**outline, **models, "caution": scene.caution}
 
     @cached_property
     def order(self) -> np.ndarray:
@@ -182,21 +156,12 @@ class ViewerScene:
     def _bits(self) -> int:
         return fractional_bits(self.gaussians)
 
-    @property
-    def num_chunks(self) -> int:
-        """Number of chunks in which the page loads the Gaussians."""
-        return -(-len(self.gaussians) // payload.CHUNK)
-
     def chunk(self, number: int) -> bytes:
-        """Return a chunk of the Gaussians as SPZ.
-
-        Raises:
-            SettingsError: it does not exist.
-        """
-        if number >= self.num_chunks:
-            raise SettingsError(f"chunk {number} does not exist", expected=f"0 to {self.num_chunks - 1}")
-        rows = self.order[number * payload.CHUNK : (number + 1) * payload.CHUNK]
-        return self.spz(rows)
+        """Return a chunk of the Gaussians as SPZ; raise SettingsError if it does not exist."""
+        num_chunks = -(-len(self.gaussians) // payload.CHUNK)
+        if number >= num_chunks:
+            raise SettingsError(f"chunk {number} does not exist", expected=f"0 to {num_chunks - 1}")
+        return self.spz(self.order[number * payload.CHUNK : (number + 1) * payload.CHUNK])
 
     def spz(self, rows: np.ndarray) -> bytes:
         """Return Gaussians as SPZ."""

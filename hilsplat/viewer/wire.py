@@ -69,11 +69,7 @@ class Style(Message):
         return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
-        """Return the table, (nodes + 1, 4); an empty one leaves every Gaussian unchanged.
-
-        Raises:
-            ValueError: it has another number of rows.
-        """
+        """Return the table; an empty one leaves every Gaussian unchanged."""
         return _rows(self.table, 4, num_nodes + 1)
 
     def colours(self) -> UInt8[np.ndarray, "256 3"]:

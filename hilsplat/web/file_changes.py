@@ -1,10 +1,10 @@
-"""Detection of artifacts that changed on disk since they were opened."""
+"""Detection of files that changed on disk since they were opened or read."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hilsplat.base.artifacts import INDEX
+from hilsplat.base.artifacts import INDEX, output_lock, sha256_of_bytes
 from hilsplat.base.errors import ArtifactError
 
 State = tuple[int, int, int] | None
@@ -12,6 +12,34 @@ State = tuple[int, int, int] | None
 
 class StaleSceneError(ArtifactError):
     """A part of the scene was rewritten since it was opened."""
+
+
+class StaleFileError(ArtifactError):
+    """A file changed since the version that is to be replaced was read."""
+
+
+NO_FILE = "none"
+"""Version of a file that does not exist."""
+
+
+def version_of(path: Path) -> str:
+    """Return the digest of a file, which a page must send to replace it."""
+    return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
+
+
+@contextmanager
+def replacing(path: Path, version: str, what: str) -> Iterator[None]:
+    """Lock a file while its user-given content, named by `what`, is replaced.
+
+    Raises:
+        StaleFileError: the file changed since `version` was read.
+    """
+    with output_lock(path):
+        if version_of(path) != version:
+            raise StaleFileError(
+                f"{what} have changed since they were read", fix="reload the page, then change them"
+            )
+        yield
 
 
 class FileChanges:
@@ -35,25 +63,19 @@ class FileChanges:
 
     @contextmanager
     def unchanged(self, scene: str, *parts: Path) -> Iterator[None]:
-        """Guard disk reads: fail if files changed since the scene was opened.
-
-        Args:
-            scene: name of the scene, for the error.
-            parts: artifacts that must be unchanged; by default, all recorded ones.
+        """Guard disk reads: fail if parts of a scene, by default all recorded ones, were rewritten.
 
         Raises:
             StaleSceneError: a part was rewritten before or during the read.
         """
-        self._require_unchanged(scene, parts)
-        yield
-        self._require_unchanged(scene, parts)
-
-    def _require_unchanged(self, scene: str, parts: tuple[Path, ...]) -> None:
-        if changed := sorted(path.name for path in self.changed() if not parts or path in parts):
-            raise StaleSceneError(
-                f"{', '.join(changed)} of {scene} changed on the disk since the page was loaded",
-                fix="reload the page",
-            )
+        for is_after in (False, True):
+            if changed := sorted(path.name for path in self.changed() if not parts or path in parts):
+                raise StaleSceneError(
+                    f"{', '.join(changed)} of {scene} changed on the disk since the page was loaded",
+                    fix="reload the page",
+                )
+            if not is_after:
+                yield
 
 
 def _state(path: Path) -> State:

@@ -1,4 +1,4 @@
-"""Shared code of the page servers: static files, responses, errors, photographs, a local socket."""
+"""Shared code of the page servers: static files, responses, errors, a local socket."""
 
 import json
 import secrets
@@ -19,24 +19,17 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from hilsplat.base.errors import HilsplatError, SettingsError
-from hilsplat.base.images import resize_to_fit
 from hilsplat.scene.scene import Scene
-from hilsplat.web.file_changes import StaleSceneError
+from hilsplat.web.file_changes import StaleFileError, StaleSceneError
 from hilsplat.web.guard import MAX_BODY_BYTES, Guard
 
 TYPES = {"html": "text/html; charset=utf-8", "js": "text/javascript", "css": "text/css"}
 BYTES = "application/octet-stream"
-THUMB_PX = 160
 Sent = TypeVar("Sent", bound=BaseModel)
 
 
 class Pages:
-    """A page and its static files; no other file can be requested.
-
-    Args:
-        page: name of the page's file.
-        package: package with the page's own files; those of `hilsplat.web` belong to every page.
-    """
+    """A page's HTML file and the static files of its package and of `hilsplat.web`; no others are sent."""
 
     def __init__(self, page: str, package: str) -> None:
         found = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
@@ -45,34 +38,21 @@ class Pages:
 
     def routes(self) -> list[Route]:
         """Return the routes of the page and its files."""
-        return [Route("/", self.page), Route("/static/{name}", self.static_file)]
+        return [Route("/", self._file), Route("/static/{name}", self._file)]
 
-    async def page(self, request: Request) -> Response:
-        """Send the page."""
-        return plain(self.static[self.first], TYPES["html"])
-
-    async def static_file(self, request: Request) -> Response:
-        """Send a script or style of the page."""
-        name = request.path_params["name"]
+    async def _file(self, request: Request) -> Response:
+        name = request.path_params.get("name", self.first)
         if name not in self.static:
             return plain(b"no such file", "text/plain", 404)
         return plain(self.static[name], TYPES[name.rpartition(".")[2]])
 
 
 def guarded(
-    routes: list[Route],
-    token: str,
-    stale_version: type[HilsplatError],
-    max_body: int = MAX_BODY_BYTES,
-    *,
-    embedded: bool = False,
+    routes: list[Route], token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
 ) -> Guard:
-    """Return the guarded application, which sends errors as text.
-
-    `stale_version` is the error that a file changed since the version that the page sent in `If-Match`.
-    """
+    """Return the guarded application, which sends errors as text."""
     handlers: dict[Any, Any] = {
-        stale_version: _told(412),
+        StaleFileError: _told(412),
         StaleSceneError: _told(409),
         HilsplatError: _told(422),
         ValidationError: _told(400),
@@ -125,32 +105,12 @@ def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
     return tell
 
 
-# -- photographs ----------------------------------------------------------------------------------
-
-
 def view_name(scene: Scene, number: int) -> str:
-    """Return the view with this number; the page sends numbers instead of file names.
-
-    Raises:
-        SettingsError: it does not exist.
-    """
+    """Return a view by its number, which the page sends instead of a name; raise SettingsError if none."""
     names = scene.cameras.names
     if not 0 <= number < len(names):
         raise SettingsError(f"view {number} does not exist", expected=f"0 to {len(names) - 1}")
     return names[number]
-
-
-def photograph(scene: Scene, number: int) -> Response:
-    """Return an undistorted photograph as a response."""
-    path = scene.image_path(view_name(scene, number))
-    kind = "image/png" if path.suffix.lower() == ".png" else "image/jpeg"
-    return plain(path.read_bytes(), kind, cached=True)
-
-
-def thumbnail(scene: Scene, number: int) -> Response:
-    """Return a small photograph as a response."""
-    small = resize_to_fit(scene.image(view_name(scene, number)), THUMB_PX)
-    return plain(encoded(small), "image/jpeg", cached=True)
 
 
 def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int = 80) -> bytes:

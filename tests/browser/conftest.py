@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import hilsplat
+from hilsplat.base.images import write_png
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
 from tests.conftest import PROJECT
-from tests.unit.finished_desk import SCENE, build_finished_desk
+from tests.unit.finished_desk import SCENE
 
 HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[browser-tests]'"
 ARGUMENTS = ["--use-angle=gl-egl", "--ignore-gpu-blocklist", "--no-sandbox", "--disable-dev-shm-usage"]
@@ -44,7 +46,7 @@ def browser():
 
 @contextmanager
 def serving(folder: Path, *words: str) -> Iterator[str]:
-    """Address of the page of a scene, served by `hilsplat view` or the command of the words."""
+    """Address of the page of a scene, served by `hilsplat view` or another command."""
     code = "from hilsplat.cli.main import main; main()"
     command = [sys.executable, "-u", "-c", code, *(words or ("view",)), str(folder), "--no-browser"]
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
@@ -57,9 +59,14 @@ def serving(folder: Path, *words: str) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def desk(tmp_path_factory) -> Path:
+def desk(desk_project) -> Path:
     """The folder of a finished scene."""
-    return build_finished_desk(tmp_path_factory.mktemp("project")) / SCENE
+    return desk_project / SCENE
+
+
+@pytest.fixture
+def scene(desk):
+    return hilsplat.open(desk)
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +77,7 @@ def desk_address(browser, desk) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def cloud(tmp_path_factory) -> Path:
-    """A scene whose run has come as far as the Gaussians: 3,000 of degree 3, of every shape and opacity."""
+    """A scene that has only Gaussians so far: 3,000 of degree 3, of every shape and opacity."""
     folder = tmp_path_factory.mktemp("results") / "photos/cloud"
     rng = np.random.default_rng(5)
     n = 3000
@@ -93,8 +100,6 @@ def cloud(tmp_path_factory) -> Path:
     scene = folder / "scene"
     (scene / "images").mkdir(parents=True)
     for name in names:
-        from hilsplat.base.images import write_png
-
         write_png(scene / "images" / name, np.full((300, 400, 3), 90, np.uint8))
     Scene(scene, "photos/cloud", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4)).save()
     return folder
@@ -108,7 +113,7 @@ def cloud_address(browser, cloud) -> Iterator[str]:
 
 @pytest.fixture
 def opened(browser) -> Iterator[Callable]:
-    """Opens an address, waits until everything is loaded, and checks at the end that nothing went wrong.
+    """Opens an address, waits until everything is loaded, and checks for errors at the end.
 
     A console error, an uncaught exception or a request to another address fails the test, except for what
     the test has put into `opened.expected`.
@@ -143,7 +148,7 @@ def opened(browser) -> Iterator[Callable]:
 
 
 def drawn(page, act: Callable[[], object]) -> None:
-    """Do something and wait until the picture was drawn anew."""
+    """Do something and wait until the picture is drawn again."""
     view = page.locator("#view")
     before = int(view.get_attribute("data-drawn"))
     act()
@@ -155,7 +160,7 @@ def drawn(page, act: Callable[[], object]) -> None:
 
 
 def pixels(page) -> np.ndarray:
-    """What WebGL draws now, (height, width, 3) uint8."""
+    """The present WebGL picture, (height, width, 3) uint8."""
     found = page.evaluate("hilsplat.pixels()")
     values = np.array(found["data"], np.uint8).reshape(found["height"], found["width"], 4)
     return values[::-1, :, :3]
@@ -165,3 +170,23 @@ def wire_camera(page) -> dict:
     """The page's camera, as the server reads it."""
     code = "(() => { const v = document.getElementById('view'); "
     return page.evaluate(code + "return hilsplat.camera.wire(v.clientWidth, v.clientHeight); })()")
+
+
+def ask(page, text: str) -> None:
+    page.locator("#text").fill(text)
+    page.keyboard.press("Enter")
+
+
+def answers(page):
+    return page.get_by_role("region", name="Answers").get_by_role("button")
+
+
+def ask_and_wait(page, text: str) -> None:
+    """Ask, and wait for the answers."""
+    ask(page, text)
+    answers(page).first.wait_for()
+
+
+def choose_row(page, node: int) -> None:
+    """Click a node in the outline."""
+    page.locator(f"[role=treeitem][data-node='{node}'] > .row .label").click()

@@ -1,11 +1,10 @@
-"""Both pages for everybody: axe-core's rules, the reader's own colours, large type."""
+"""Accessibility of both pages: axe-core's rules, the user's colours, large text."""
 
 from pathlib import Path
 
 import pytest
 
-from tests.browser.conftest import serving
-from tests.browser.test_ask import answers, ask
+from tests.browser.conftest import answers, ask, serving
 
 SERIOUS = ("serious", "critical")
 

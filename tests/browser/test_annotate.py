@@ -1,4 +1,4 @@
-"""Annotating by hand in a real browser, by role and label as people find things."""
+"""The annotation page in a real browser; elements are found by role and label."""
 
 import json
 import shutil
@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
-from hilsplat.base.artifacts import atomic_folder
+from hilsplat.annotate.labels import Label, label_path, read_labels, traced, write_labels
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.query.names import version_of
+from hilsplat.web.file_changes import version_of
 from tests.browser.conftest import serving
 from tests.conftest import PROJECT
-from tests.unit.artifact_changes import change_index
+from tests.unit.artifact_changes import change_index, write_again
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
 
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
@@ -31,7 +30,7 @@ def page(opened, browser, desk, root) -> Iterator:
     with serving(desk, "annotate", "--data-root", str(root)) as address:
         page = opened(address)
         yield page
-        page.close()  # before its server ends, which it may just be asking
+        page.close()  # before its server ends, because the page polls it
 
 
 def saved(page) -> None:
@@ -46,7 +45,7 @@ def kept(root: Path, view: str = "000.png") -> list[Label]:
 
 
 def place(page, x: float, y: float) -> tuple[float, float]:
-    """Where a pixel of the photograph is on the page."""
+    """Position on the page of a pixel of the photograph."""
     box = page.locator("#view").bounding_box()
     sheet = page.evaluate("({s: hilsplat.sheet.scale, x: hilsplat.sheet.x, y: hilsplat.sheet.y})")
     return box["x"] + sheet["x"] + (x + 0.5) * sheet["s"], box["y"] + sheet["y"] + (y + 0.5) * sheet["s"]
@@ -68,6 +67,15 @@ def name(page, text: str) -> None:
 def draw_mug(page) -> None:
     name(page, "mug")
     polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
+
+
+def drag(page, start: tuple[int, int], *path: tuple[int, int]) -> None:
+    """Drag with the mouse over pixels of the photograph."""
+    page.mouse.move(*place(page, *start))
+    page.mouse.down()
+    for pixel in path:
+        page.mouse.move(*place(page, *pixel), steps=4)
+    page.mouse.up()
 
 
 def items(page):
@@ -95,10 +103,8 @@ def test_a_brush_adds_and_an_eraser_takes_away(page, root):
     page.get_by_role("slider", name="Radius of the brush, pixels").fill("2")
     for key, changes in (("b", (1, 0)), ("e", (0, 1))):
         page.locator("#view").press(key)
-        page.mouse.move(*place(page, 10, 22 if key == "b" else 10))
-        page.mouse.down()
-        page.mouse.move(*place(page, 18, 22 if key == "b" else 10), steps=3)
-        page.mouse.up()
+        row = 22 if key == "b" else 10
+        drag(page, (10, row), (18, row))
         saved(page)
         assert page.evaluate("getSelection().type") != "Range"  # or the photograph turns blue
         after = kept(root)[0].mask(SIZE)
@@ -135,8 +141,7 @@ def test_a_node_is_proposed_stays_a_proposal_and_is_accepted(page, root):
     assert offers.count() == 3
     offers.nth(0).click()
     saved(page)
-    page.get_by_role("combobox", name="Text").or_(page.get_by_role("textbox", name="Text")).fill("mug")
-    page.keyboard.press("Enter")
+    name(page, "mug")
     saved(page)
     (mug,) = kept(root)
     assert mug.origin == "proposed" and mug.text == "mug"
@@ -166,7 +171,7 @@ def test_the_next_thing_does_not_inherit_a_name(page, root):
 
 def test_things_are_carried_into_the_next_photograph(page, root):
     mug = region_mask("mug") | region_mask("handle")
-    label = Label(id=4, level=1, text="mug", polygons=[[(0, 0), (1, 0), (1, 1)]]).with_mask(mug)
+    label = Label(id=4, level=1, text="mug", polygons=traced(mug))
     page.evaluate(f"hilsplat.store.change([[0, [{label.model_dump_json()}]]])")
     saved(page)
     page.locator("#view").press("]")
@@ -217,7 +222,7 @@ def test_files_are_exported_and_imported_again(page, root, tmp_path):
     assert items(page).count() == 1
 
 
-def test_a_refused_change_goes_and_takes_only_what_came_after_it_along(page, opened, root):
+def test_a_refused_change_and_later_ones_are_undone(page, opened, root):
     opened.expected.append("422")
     draw_mug(page)
     first = kept(root)
@@ -231,7 +236,7 @@ def test_a_refused_change_goes_and_takes_only_what_came_after_it_along(page, ope
     free.append(True)
     for route in held:
         route.continue_()
-    page.get_by_text("lies wholly outside").wait_for()
+    page.get_by_text("is entirely outside").wait_for()
     saved(page)
     assert kept(root) == first
     assert [item.get_attribute("aria-label") for item in items(page).all()] == ["mug, whole"]
@@ -264,10 +269,6 @@ def test_a_subpart_proposed_under_a_whole_says_that_it_is_part_of_nothing(page, 
     assert [label.parent for label in kept(root)] == [None, None]
 
 
-def choosing(page) -> None:
-    page.locator("#view").press("v")
-
-
 def area(root: Path) -> int:
     (mug,) = kept(root)
     return int(np.count_nonzero(mug.mask(SIZE)))
@@ -276,19 +277,12 @@ def area(root: Path) -> int:
 def test_corners_of_the_chosen_outline_are_moved_added_and_taken_out(page, root):
     draw_mug(page)
     before = area(root)
-    choosing(page)
-    page.mouse.move(*place(page, 15, 20))
-    page.mouse.down()
-    page.mouse.move(*place(page, 20, 22), steps=4)
-    page.mouse.move(*place(page, 25, 20), steps=4)
-    page.mouse.up()
+    page.locator("#view").press("v")
+    drag(page, (15, 20), (20, 22), (25, 20))
     saved(page)
     wider = area(root)
     assert wider > before + 60 and kept(root)[0].mask(SIZE)[19, 21]
-    page.mouse.move(*place(page, 1, 10))  # the left side gets a corner
-    page.mouse.down()
-    page.mouse.move(*place(page, 6, 10), steps=4)
-    page.mouse.up()
+    drag(page, (1, 10), (6, 10))  # the left side gets a corner
     saved(page)
     assert area(root) < wider - 20 and not kept(root)[0].mask(SIZE)[10, 2]
     page.keyboard.down("Alt")
@@ -322,12 +316,8 @@ def test_sam_outlines_what_is_clicked(opened, browser, desk, tmp_path):
         saved(page)
         (found,) = kept(tmp_path)
         assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
-        # a box, drawn by dragging
         page.locator("#view").press("s")
-        page.mouse.move(*place(page, 1, 2))
-        page.mouse.down()
-        page.mouse.move(*place(page, 14, 21), steps=4)
-        page.mouse.up()
+        drag(page, (1, 2), (14, 21))  # a box
         page.get_by_text("Enter takes this outline").wait_for()
         page.keyboard.press("Escape")
         page.locator("#drawing .offer").wait_for(state="detached")
@@ -352,8 +342,7 @@ def test_a_scene_that_was_rewritten_is_reported(opened, desk, root, tmp_path_fac
     with serving(folder, "annotate", "--data-root", str(root)) as address:
         page = opened(address)
         assert not page.get_by_role("alert").is_visible()
-        with atomic_folder(folder / "default/semantic_tree") as new:
-            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
+        write_again(folder / "default/semantic_tree")
         page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
         name(page, "rim")  # the photographs are the same
         polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))

@@ -1,4 +1,4 @@
-"""Asking, choosing, naming and saving by hand, in both painters, by role and label as people find them."""
+"""Queries, choices, names and saved files in both painters; elements are found by role and label."""
 
 import shutil
 
@@ -9,25 +9,10 @@ from PIL import Image
 import hilsplat
 from hilsplat.base.artifacts import atomic_folder, read_json
 from hilsplat.base.images import write_png
-from tests.browser.conftest import drawn, pixels, serving, wire_camera
+from tests.browser.conftest import answers, ask, ask_and_wait, choose_row, drawn, pixels, serving, wire_camera
 from tests.unit.artifact_changes import change_index
 
 both = pytest.mark.parametrize("painter", ["gl", "server"])
-
-
-@pytest.fixture
-def scene(desk):
-    return hilsplat.open(desk)
-
-
-def ask(page, text: str) -> None:
-    page.locator("body").press("/")
-    page.keyboard.type(text)
-    page.keyboard.press("Enter")
-
-
-def answers(page):
-    return page.get_by_role("region", name="Answers").get_by_role("button")
 
 
 @both
@@ -35,7 +20,9 @@ def test_a_text_is_asked_by_keyboard_and_lights_up(opened, desk_address, scene, 
     page = opened(desk_address, painter)
     assert page.evaluate("document.activeElement.id") == "text"  # the text box is first
     page.locator("#view").focus()
-    drawn(page, lambda: ask(page, "mug > handle"))
+    page.keyboard.press("/")
+    page.keyboard.type("mug > handle")
+    drawn(page, lambda: page.keyboard.press("Enter"))
     answers(page).first.wait_for()
     (hit,) = scene.query("mug > handle")
     assert f"1 answer, best {hit.score:.2f}, part" in page.get_by_role("status").inner_text()
@@ -55,8 +42,7 @@ def test_a_query_typed_before_the_tree_is_loaded_runs_when_it_is(opened, desk_ad
     page.route("**/api/nodes/**", lambda route: held.append(route))
     page.reload()
     page.locator("body[data-ready=yes]").wait_for()
-    page.locator("#text").fill("mug > handle")
-    page.keyboard.press("Enter")
+    ask(page, "mug > handle")
     page.get_by_text("Your query runs as soon as the semantic tree is loaded").wait_for()
     assert held and not answers(page).count()
     held[0].continue_()
@@ -67,9 +53,7 @@ def test_a_query_typed_before_the_tree_is_loaded_runs_when_it_is(opened, desk_ad
 @both
 def test_doubts_are_reported(opened, desk_address, painter):
     page = opened(desk_address, painter)
-    page.locator("#text").fill("unicorn")
-    page.keyboard.press("Enter")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "unicorn")
     status = page.get_by_role("status").inner_text()
     assert "'unicorn' may not be in the scene: the model does not know 'unicorn'." in status
 
@@ -158,10 +142,7 @@ def test_an_image_or_a_frame_drawn_over_the_view_is_requested(opened, desk_addre
 
 def test_two_answerers_stand_side_by_side(opened, desk_address):
     page = opened(desk_address)
-    ask_box = page.locator("#text")
-    ask_box.fill("mug")
-    ask_box.press("Enter")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "mug")
     drawn(page, lambda: page.get_by_label("Beside").select_option("default|field"))
     right = page.get_by_role("list", name="On the right, by default, field: 1 of 1 are on the left too")
     assert right.get_by_role("button").count() == 1
@@ -175,9 +156,7 @@ def test_two_answerers_stand_side_by_side(opened, desk_address):
 
 def test_an_address_opens_the_same_view(opened, desk_address, scene):
     page = opened(desk_address)
-    page.locator("#text").fill("mug > handle")
-    page.keyboard.press("Enter")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "mug > handle")
     page.locator("#view").focus()
     for key in ("ArrowLeft", "ArrowUp", "+"):
         page.keyboard.press(key)
@@ -221,11 +200,12 @@ def test_a_film_tells_how_far_it_is_and_a_gif_has_the_chosen_size(opened, desk_a
     assert page.get_by_role("button", name="Film, MP4").is_enabled()
 
 
-def test_an_exported_page_opens_from_a_file_and_answers(opened, browser, desk_address, tmp_path, scene):
+def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, desk_address, tmp_path, scene):
     page = opened(desk_address)
-    page.locator("#text").fill("mug > handle")
-    page.keyboard.press("Enter")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "book")
+    page.get_by_role("button", name="Keep").click()
+    page.get_by_text("Kept “book”").wait_for()
+    ask_and_wait(page, "mug > handle")
     page.locator("#view").press("ArrowLeft")
     page.locator("#save summary").click()
     with page.expect_download() as started:
@@ -238,15 +218,17 @@ def test_an_exported_page_opens_from_a_file_and_answers(opened, browser, desk_ad
     alone.on("console", lambda said: said.type == "error" and wrong.append(said.text))
     alone.goto(file.as_uri())
     alone.locator("body[data-ready=yes]").wait_for()
-    answers(alone).first.wait_for()  # it begins with its answer, and where the camera was
+    answers(alone).first.wait_for()  # the page opens with its answer and the last camera
     assert alone.locator("#text").input_value() == "mug > handle"
     found, expected = wire_camera(alone), wire_camera(page)
     np.testing.assert_allclose(found["cam_from_world"], expected["cam_from_world"], atol=1e-3)
     (hit,) = scene.query("mug > handle")
     assert alone.locator("#answers li").get_attribute("data-node") == str(hit.node)
-    alone.locator("#text").fill("spoon")
-    alone.keyboard.press("Enter")
-    alone.get_by_text("This page was made with the answers to: mug > handle").wait_for()
+    ask(alone, "spoon")
+    alone.get_by_text("This page was made with the answers to: book, mug > handle").wait_for()
+    chips = alone.get_by_label("Kept queries").get_by_role("listitem")
+    assert [chip.inner_text().split("\n")[0] for chip in chips.all()] == ["book"]
+    assert alone.locator("#overlay path.kept").count() == 1
     assert not wrong
     context.close()
 
@@ -304,7 +286,7 @@ def test_a_scene_that_was_rewritten_is_reported_and_loaded_again_without_the_old
 def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, desk, scene):
     page = opened(desk_address)
     book = scene.query("book")[0].node
-    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
+    choose_row(page, book)
     name = page.get_by_role("textbox", name="Name")
     name.fill("Atlas <b")
     name.press("Enter")
@@ -314,7 +296,7 @@ def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, de
     assert list(read_json(desk / "names.json")["trees"].values()) == [{str(book): "Atlas <b"}]
     assert [hit.node for hit in hilsplat.open(desk).query("atlas <b")] == [book]
     page.locator("#view").press("Escape")
-    page.locator(f"[role=treeitem][data-node='{book}'] > .row .label").click()
+    choose_row(page, book)
     name.fill("")
     name.press("Enter")
     page.get_by_text("The name is taken away.").wait_for()
@@ -324,7 +306,7 @@ def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, de
 def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
     page = opened(desk_address)
     handle = scene.query("mug > handle")[0].node
-    page.locator(f"[role=treeitem][data-node='{handle}'] > .row .label").click()
+    choose_row(page, handle)
     page.get_by_role("button", name="More like this").click()
     answers(page).first.wait_for()
     expected = scene.like_node(handle)[0].node

@@ -1,10 +1,9 @@
-"""Camera, history, pictures under way and refusals: what the page does with hands, keys and a slow server."""
+"""Camera, history, pending pictures and refused queries of the viewer."""
 
 import numpy as np
 import pytest
 
-from tests.browser.conftest import wire_camera
-from tests.browser.test_ask import answers, ask
+from tests.browser.conftest import answers, ask, ask_and_wait, wire_camera
 
 
 def distance(page) -> float:
@@ -15,10 +14,8 @@ def distance(page) -> float:
 def test_a_refused_query_takes_the_answers_of_the_one_before_away(opened, desk_address):
     opened.expected.append("422")
     page = opened(desk_address)
-    ask(page, "mug > handle")
-    answers(page).first.wait_for()
-    page.locator("#text").fill("mug > ")
-    page.keyboard.press("Enter")
+    ask_and_wait(page, "mug > handle")
+    ask(page, "mug > ")
     page.locator("#status.error").wait_for()
     assert not answers(page).count() and not page.locator("#overlay path.answer").count()
     assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
@@ -104,9 +101,7 @@ def test_back_goes_to_the_query_before(opened, desk_address):
     page = opened(desk_address)
     page.wait_for_timeout(800)
     for text in ("mug > handle", "book"):
-        page.locator("#text").fill(text)
-        page.keyboard.press("Enter")
-        answers(page).first.wait_for()
+        ask_and_wait(page, text)
         page.wait_for_timeout(1200)  # the address follows
     page.go_back()
     page.wait_for_function("document.getElementById('text').value === 'mug > handle'")
@@ -126,8 +121,7 @@ def test_back_goes_to_the_query_before(opened, desk_address):
 @pytest.mark.parametrize("colour", ["relevancy", "field"])
 def test_a_threshold_cuts_the_colours_and_counts_what_reaches_it(opened, desk_address, painter, colour):
     page = opened(desk_address, painter)
-    ask(page, "mug")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "mug")
     page.locator("#colour").select_option(colour)
     scale = page.get_by_role("group", name="Colours of relevancy")
     scale.wait_for()

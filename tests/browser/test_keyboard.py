@@ -1,4 +1,4 @@
-"""Both pages by the keyboard alone: no test here has a pointer."""
+"""Both pages used by the keyboard alone."""
 
 import shutil
 
@@ -28,11 +28,12 @@ def test_the_viewer_asks_walks_names_and_saves(opened, desk, tmp_path):
     folder = tmp_path / "project" / desk.relative_to(desk.parents[2])
     shutil.copytree(desk.parents[2], tmp_path / "project")  # the names of this test are its own
     with serving(folder) as address:
-        walk(opened(address), folder, tmp_path)
+        page = opened(address)
+        walk(page, folder, tmp_path)
+        page.close()
 
 
 def walk(page, desk, tmp_path) -> None:
-    """Ask, choose, name and save with the keyboard."""
     page.keyboard.type("mug > handle")  # the text box has the focus
     press(page, "Enter")
     page.locator("#answers button").first.wait_for()
@@ -52,7 +53,6 @@ def walk(page, desk, tmp_path) -> None:
         press(page, "Enter")
     started.value.save_as(tmp_path / "boxes.json")
     assert read_json(tmp_path / "boxes.json")
-    page.close()
 
 
 def test_the_annotator_names_draws_corrects_and_saves(opened, desk, tmp_path):

@@ -1,19 +1,11 @@
-"""What a person sees: labels, colours and words that say no more than is there."""
+"""Visible details of the viewer: labels, colours and messages."""
 
 import re
 
 import numpy as np
-import pytest
 
-import hilsplat
 from hilsplat.base.images import write_png
-from tests.browser.conftest import wire_camera
-from tests.browser.test_ask import answers, ask
-
-
-@pytest.fixture
-def scene(desk):
-    return hilsplat.open(desk)
+from tests.browser.conftest import answers, ask, ask_and_wait, wire_camera
 
 
 def painted_nodes(page) -> set[int]:
@@ -23,7 +15,6 @@ def painted_nodes(page) -> set[int]:
 
 def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tools(opened, desk_address):
     page = opened(desk_address, "server")
-    page.locator("#view").focus()
     ask(page, "mug > handle")
     label = page.locator("#overlay text")
     label.first.wait_for(state="attached")
@@ -84,9 +75,7 @@ def test_names_and_likeness_get_no_caution_about_words(opened, desk_address):
 
 def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened, desk_address, scene):
     page = opened(desk_address, "server", color_scheme="dark")
-    page.locator("#view").focus()
-    ask(page, "mug > handle")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "mug > handle")
     best = scene.views.index(scene.query("mug > handle")[0].best_views[0])
     page.locator("#views button").nth(best).click()
     button = page.locator("#views button[aria-selected=true].shows")
@@ -97,9 +86,7 @@ def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened,
 
 def test_masks_are_saved_step_by_step_and_the_size_is_reported(opened, desk_address):
     page = opened(desk_address, "server")
-    page.locator("#view").focus()
-    ask(page, "mug > handle")
-    answers(page).first.wait_for()
+    ask_and_wait(page, "mug > handle")
     page.locator("#save summary").click()
     with page.expect_download() as started:
         page.get_by_role("button", name=re.compile("Masks in all photographs")).click()

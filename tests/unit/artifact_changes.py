@@ -1,9 +1,10 @@
 """Changes of artifacts as another run would have made them: with a record, and with a seal that fits."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
-from hilsplat.base.artifacts import provenance_path, read_index, write_index, write_json
+from hilsplat.base.artifacts import atomic_folder, provenance_path, read_index, write_index, write_json
 
 
 def write_record(artifact: Path, **parts: Any) -> None:
@@ -18,6 +19,16 @@ def write_record(artifact: Path, **parts: Any) -> None:
         "outputs": {},
     }
     write_json(provenance_path(artifact), {**empty, **parts})
+
+
+def write_again(artifact: Path) -> None:
+    """Replace an artifact by an equal one, as a stage that was rerun does."""
+    if artifact.is_dir():
+        with atomic_folder(artifact) as new:
+            shutil.copytree(artifact, new, dirs_exist_ok=True)
+    else:
+        shutil.copy(artifact, artifact.with_name("new"))
+        artifact.with_name("new").replace(artifact)
 
 
 def change_index(folder: Path, **entries: Any) -> None:

@@ -1,4 +1,4 @@
-// The annotation page: which photograph, tool and thing; the server computes every region.
+// The annotation page: photograph, tool and thing; the server computes all regions.
 
 import { ask, exportUrl, scene as described, watch } from "./api.js";
 import { $, counted, LEVELS, make } from "./elements.js";
@@ -19,7 +19,7 @@ const labels = () => store.labels(number);
 const own = () => labels().find((label) => label.id === chosen) ?? null;
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
-// One after the other: a region is made from the one before.
+// Requests run one after the other, because each region is computed from the previous one.
 let waiting = 0;   // requests after which something may have to be saved
 const soon = (work) => {
   waiting++;
@@ -88,7 +88,7 @@ function setTool(name) {
 const edited = (label) => label.origin === "drawn" ? "drawn" : "edited";
 const ringsOf = (id) => labels().find((label) => label.id === id)?.polygons ?? null;
 
-// The same thing as in another photograph keeps its id.
+// A thing has the same id in all photographs.
 function idFor(thing) {
   const same = (label) => label.text.toLowerCase() === thing.text.toLowerCase() && label.level === thing.level && label.parent === thing.parent;
   for (const [id, label] of store.things) if (thing.text !== UNNAMED && same(label) && !store.has(number, id)) return id;
@@ -171,7 +171,7 @@ function cornerAt(at) {
   return best && { ...best, rings: rings.map((ring) => ring.map((point) => [...point])) };
 }
 
-// The new outline is drawn by the server, inside its parent.
+// The server draws the new outline, inside its parent.
 function reshape(rings) {
   const label = own(), view = number;
   soon(async () => {
@@ -182,7 +182,7 @@ function reshape(rings) {
   });
 }
 
-// A press on a side makes a corner there.
+// Pressing on a side adds a corner there.
 function sideAt(at) {
   const rings = own()?.polygons ?? [];
   let best = null, least = NEAR_PX;
@@ -214,7 +214,7 @@ async function carry() {
 
 // -- things ----------------------------------------------------------------------------------------
 
-// A thing is one in all photographs: its text, level and parent change everywhere.
+// The text, level and parent of a thing change in all photographs.
 function edit(patch) {
   if (!own()) { Object.assign(next, patch); refresh(); return; }
   const id = chosen, after = [];
@@ -265,7 +265,7 @@ async function take_in(files) {
   tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; here already: ${known}` : ""}.`);
 }
 
-// -- hands -----------------------------------------------------------------------------------------
+// -- input -----------------------------------------------------------------------------------------
 
 function down(at, event) {
   $("view").focus({ preventScroll: true });
@@ -308,7 +308,7 @@ function up() {
   if (done) soon(async () => { await region(null, done); if (stroke === done) stroke = null; draw(); });
 }
 
-// In the choosing tool, a press on the chosen outline moves a corner of it; any other moves the photograph.
+// With the choosing tool, dragging the chosen outline moves a corner; dragging elsewhere moves the photograph.
 function grabbed(event) {
   if (tool() !== "choose" || !own() || event.altKey) return false;
   const at = sheet.pixel(event);
@@ -353,7 +353,7 @@ document.addEventListener("keydown", (event) => {
 
 const resize = (by) => { $("radius").value = radius() + by; draw(); };
 const pickLevel = (value) => { setLevel(value); levelChanged(); };
-// A level keeps its parent only where one of that level can be it.
+// The parent is kept only if it is one level above the new level.
 const levelChanged = () => edit({ level: level(), parent: null });
 
 $("thing").addEventListener("submit", (event) => event.preventDefault());

@@ -1,4 +1,4 @@
-// The server's answers. Every question names the state of the scene that this page was loaded with; another state's answers are refused.
+// Requests to the server. Each has the state of the scene that this page was loaded with; the server refuses any other.
 
 import { $ } from "./elements.js";
 import { get, send } from "./http.js";
@@ -20,7 +20,7 @@ export const photoUrl = (number) => at(`/api/photo/${number}`);
 export const thumbUrl = (number) => at(`/api/thumb/${number}`);
 export const exportUrl = (kind) => at(`/api/export/${kind}`);
 
-// While the page is open: is what it shows still what lies on the disk? Another state comes with a reload and never in parts.
+// Check regularly whether files of the scene changed; the page keeps showing its state until a reload.
 export async function watch() {
   while ($("changed").hidden) {
     await new Promise((done) => setTimeout(done, POLL_MS));

@@ -1,4 +1,4 @@
-// The photograph and what is drawn on it: zoom, places in its pixels, outlines.
+// The photograph with its outlines: zoom and pixel coordinates.
 
 import { photoUrl } from "./api.js";
 import { $ } from "./elements.js";
@@ -57,7 +57,7 @@ export class Sheet {
     this.place();
   }
 
-  // Pixel of the photograph under a place of the page, kept inside.
+  // Pixel of the photograph at a position on the page, clamped to the photograph.
   pixel(event) {
     const box = this.host.getBoundingClientRect();
     return this.inside([(event.clientX - box.left - this.x) / this.scale, (event.clientY - box.top - this.y) / this.scale]);
@@ -71,7 +71,7 @@ export class Sheet {
       class: `thing ${label.origin === "proposed" ? "proposed" : ""} ${label.id === chosen ? "chosen" : ""}`, fill: colour(label.id), stroke: colour(label.id) })));
   }
 
-  // What a hand is doing, at most once a frame.
+  // The shape being drawn, at most once per frame.
   hand(state) {
     if (!this.waiting) requestAnimationFrame(() => { const last = this.waiting; this.waiting = null; this.drawHand(last); });
     this.waiting = state;

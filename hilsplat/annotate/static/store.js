@@ -1,4 +1,4 @@
-// Annotations of all photographs: every change can be undone, and is saved at once under the version that was read.
+// Annotations of all photographs: each change can be undone, and is saved at once with the version that was read.
 
 import * as api from "./api.js";
 
@@ -18,7 +18,7 @@ export class Store {
     this.handlers.changed();
   }
 
-  // What can be undone outlives a reload, as long as nobody else has changed the annotations since.
+  // The undo history survives a reload unless another program changed the annotations.
   get versions() { return this.views.map((view) => view.version).join(); }
 
   remember(key) {
@@ -43,7 +43,7 @@ export class Store {
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }
 
-  // Things of all photographs by id: the label of the first that shows each.
+  // Things of all photographs by id, with the label of the first photograph that shows each.
   get things() {
     const found = new Map();
     for (const view of this.views) for (const label of view.labels) if (!found.has(label.id)) found.set(label.id, label);
@@ -60,7 +60,7 @@ export class Store {
   redo() { this.step(this.future, this.past); }
   step(from, to) { if (from.length) to.push(this.swap(from.pop().before)); }
 
-  // An entry of the history: what was there before, and photographs whose change the server has not accepted yet.
+  // An entry of the history: the previous labels, and photographs whose change the server has not accepted yet.
   swap(after) {
     const before = after.map(([number]) => [number, this.labels(number)]);
     for (const [number, labels] of after) { this.views[number].labels = labels; this.save(number); }
@@ -88,7 +88,7 @@ export class Store {
     }
   }
 
-  // The server refused a change: it goes, with what was changed after it.
+  // The server refused a change: undo it and all later ones.
   takeBack(number) {
     const first = this.past.findIndex((entry) => entry.unsaved.has(number));
     if (first < 0) return;

@@ -1,4 +1,4 @@
-// The list of answers, and what is doubtful about them.
+// The list of answers and their doubts.
 
 import * as api from "./api.js";
 import { $, counted, make, nameOf } from "./elements.js";
@@ -21,7 +21,7 @@ export function showAnswers(outline, answer, acts, beside) {
   $("answers-beside").replaceChildren(...theirs.map((hit, rank) => item(beside.outline, hit, rank, sameTree ? acts : null, only(hit, own) ? ", only on the right" : "")));
 }
 
-// Nodes of another tree than the left one's cannot be chosen.
+// Nodes of a tree other than the left one's cannot be chosen.
 function item(outline, hit, rank, acts, note) {
   const look = acts && { onclick: () => acts.choose(hit.node), onpointerenter: () => acts.hover(hit.node), onpointerleave: () => acts.hover(-1), onfocus: () => acts.hover(hit.node), onblur: () => acts.hover(-1) };
   return make("li", { "data-node": hit.node }, make("button", { type: "button", disabled: !acts, ...look },

@@ -1,14 +1,14 @@
-// The server's answers. The exported page has offline.js in this file's place, with the same names.
+// Requests to the server. An exported page has offline.js instead, with the same exports.
 
 import { get, send, streamed } from "./http.js";
 
 export const offline = false;
 export const texts = [], kept = [], first = "", opening = "";   // what an exported page can answer, and where its camera begins
 
-// Every question names the state of the scene that this page was loaded with; another state's answers are refused.
+// Each request has the state of the scene that this page was loaded with; the server refuses any other.
 let state = "";
-// In a notebook the page is a frame of another site, which gets no cookie: its address has the token instead. Paths are
-// relative, because a proxy may have put the page anywhere.
+// In a notebook, the page is a frame in another site and gets no cookie, so its address has the token. Paths are
+// relative, because a proxy may serve the page under any path.
 const token = new URLSearchParams(location.search).has("embedded") ? new URLSearchParams(location.search).get("token") : "";
 const at = (path, of = `of=${state}`) => `${path}?${of}${token ? `&token=${token}` : ""}`;
 

@@ -1,4 +1,4 @@
-// Questions: a text, a node, a picture, or a part of what is seen; every pane gets each of them.
+// Queries by a text, a node, a picture or a part of the view; each is sent for every pane.
 
 import { markChosen, showAnswers, summary } from "./answers.js";
 import * as api from "./api.js";
@@ -30,7 +30,7 @@ async function askAll(what, work) {
   await fillField(signal);
 }
 
-// What was listed and painted before would be taken for the answer.
+// The previous answer is removed, so that it isn't mistaken for this query's.
 function refused(error) {
   if (error.name === "AbortError") return;
   showNothing();
@@ -81,7 +81,7 @@ export async function ask(keepChoice = false) {
   await askAll({ text, query: asked }, (pane, signal) => api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...asked }, signal));
 }
 
-// The present answer stays in a colour of its own, and the text box is free for another.
+// Keep the present answer in its own colour and empty the text box.
 export async function keepAnswer() {
   const asked = page.asked?.query;
   if (!asked || !panes[0].answer?.hits.length) { tell("Ask something to keep its answer."); return; }
@@ -127,7 +127,7 @@ export async function askPicture(source, part = null) {
   } catch (error) { failed(error); }
 }
 
-// A frame drawn over the view: its part of the photograph, or of what is drawn.
+// Query with the framed part of the photograph, or of the rendered picture.
 export async function framed(from, to, done) {
   const [x0, x1] = [from[0], to[0]].sort((a, b) => a - b), [y0, y1] = [from[1], to[1]].sort((a, b) => a - b);
   overlay();

@@ -6,7 +6,7 @@ export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * 
 export const norm = (a) => Math.hypot(a[0], a[1], a[2]);
 export const unit = (a) => { const n = norm(a) || 1; return [a[0] / n, a[1] / n, a[2] / n]; };
 
-// Rodrigues: v turned about the unit axis k.
+// Rotate v about the unit axis k (Rodrigues).
 export function turned(v, k, angle) {
   const c = Math.cos(angle), s = Math.sin(angle), x = cross(k, v), d = dot(k, v) * (1 - c);
   return [v[0] * c + x[0] * s + k[0] * d, v[1] * c + x[1] * s + k[1] * d, v[2] * c + x[2] * s + k[2] * d];
@@ -24,7 +24,7 @@ export class Camera {
     this.standAt(scene.views[this.first], this.first);
   }
 
-  // Stand where a photograph was taken, with its lens.
+  // Use the pose and lens of a photograph.
   standAt(view, number) {
     const m = view.cam_from_world, t = [m[0][3], m[1][3], m[2][3]];
     this.R = [0, 1, 2].map((row) => m[row].slice(0, 3));
@@ -34,7 +34,7 @@ export class Camera {
     this.view = number;
   }
 
-  // Orbit about the point ahead that is nearest to what the cameras look at.
+  // Orbit about the point ahead that is nearest to the cameras' focus.
   aimAhead() {
     const ahead = dot(add(this.focus, this.c, -1), this.R[2]);
     this.target = add(this.c, this.R[2], ahead > 0.05 * this.reach ? ahead : this.reach);
@@ -104,7 +104,7 @@ export class Camera {
     return next;
   }
 
-  // Place of the photograph's frame in a canvas: scaled to fit and centred.
+  // Position of the photograph's frame in a canvas, scaled to fit and centred.
   frame(width, height) {
     const s = Math.min(width / this.lens.w, height / this.lens.h);
     return { s, x: (width - s * this.lens.w) / 2, y: (height - s * this.lens.h) / 2 };
@@ -122,7 +122,7 @@ export class Camera {
     return z < 0.01 ? null : [k.fx * dot(this.R[0], d) / z + k.cx, k.fy * dot(this.R[1], d) / z + k.cy];
   }
 
-  // As the server reads it.
+  // Format of the server's requests.
   wire(width, height) {
     const k = this.intrinsics(width, height), t = this.translation;
     return {
@@ -132,7 +132,7 @@ export class Camera {
     };
   }
 
-  // For the address: the number of a photograph, or numbers that restore it.
+  // Format of the address: the number of a photograph, or numbers that restore the camera.
   toText() {
     if (this.view >= 0) return `v${this.view}`;
     const l = this.lens, short = (v) => +v.toPrecision(6);

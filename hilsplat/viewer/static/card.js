@@ -1,4 +1,4 @@
-// The chosen node: its picture, name, what it is part of and made of, and what can be done with it.
+// The card of the chosen node: picture, name, parents, children and actions.
 
 import * as api from "./api.js";
 import { $, counted, inOrder, LEVELS, make, nameOf } from "./elements.js";

@@ -1,4 +1,4 @@
-// The chosen node and the one under the pointer, and the names that a person gives.
+// The chosen node, the node under the pointer, and names given by the user.
 
 import * as api from "./api.js";
 import { markChosen } from "./answers.js";
@@ -9,7 +9,7 @@ import { flyTo } from "./flights.js";
 import { latest } from "./latest.js";
 import { failed, host, level, loadVariant, main, outlines, page, panes, tell, variantOf } from "./state.js";
 
-// What lists and cards of nodes do; asking adds `like`.
+// Actions of lists and cards of nodes; asking.js adds `like`.
 export const acts = { choose, hover: setHover, fly: () => flyTo(page.chosen), name: rename };
 
 export function choose(node) {
@@ -38,7 +38,7 @@ const exactPick = async (at, y) => {
 };
 export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));
 
-// A click chooses the whole; a click on what is chosen goes one level down, and from the finest up again.
+// A click chooses the whole; clicks on the chosen node go one level down, and from the finest back to the whole.
 function deeper(nodes) {
   const fixed = LEVELS.indexOf(level());
   if (fixed >= 0) return [...nodes.slice(0, fixed + 1)].reverse().find((node) => node >= 0) ?? -1;

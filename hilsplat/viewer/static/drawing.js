@@ -1,4 +1,4 @@
-// When something changes: the picture, what lies over it, and the address that opens the same view.
+// Redraw the picture and its overlay after a change, and update the address that opens the same view.
 
 import * as api from "./api.js";
 import { $, nameOf } from "./elements.js";
@@ -74,7 +74,7 @@ export function drawn() {
   remember();
 }
 
-// A new query is a step of the browser's history, so Back goes to the one before.
+// A new query is an entry in the browser's history, so Back returns to the previous one.
 let remembering = 0, remembered = null;
 export const rememberedAs = (text) => { remembered = text; };
 function remember() {

@@ -1,4 +1,4 @@
-// Where the camera goes: to a photograph, to a node, in a short flight where the painter keeps up.
+// Camera moves to a photograph or a node, as a short flight if the painter is fast enough.
 
 import { redraw, restyle } from "./drawing.js";
 import { main, page } from "./state.js";

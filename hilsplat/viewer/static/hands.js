@@ -1,4 +1,4 @@
-// What hands do: mouse and touch on the view, keys, and every control of the page.
+// Input handlers: mouse and touch on the view, keys, and all controls of the page.
 
 import * as api from "./api.js";
 import { ask, askPicture, clear, clearAnswer, fillField, framed, keepAnswer, like } from "./asking.js";
@@ -14,7 +14,7 @@ import { save } from "./saves.js";
 import { failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
-// The path of a film: views in the order in which they were added.
+// The path of a film: its views, in the order in which they were added.
 function showPath() {
   const count = page.path.length, flies = $("path").querySelector("[value=path]");
   flies.disabled = count < 2;

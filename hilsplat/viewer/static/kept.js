@@ -1,4 +1,4 @@
-// Queries that stay while others are asked: each has a colour, and can be hidden, changed or dropped.
+// Kept queries: each has a colour, and can be hidden, edited or removed.
 
 import * as api from "./api.js";
 import { restyle } from "./drawing.js";
@@ -8,7 +8,7 @@ import { KEPT, shownHits } from "./styles.js";
 
 const MOST = 12;
 
-// What a query asks, but for who answers it.
+// A query's settings without its answerer.
 export const asking = (text) => ({ text, level: level(), ...(threshold() === null ? {} : { threshold: threshold() }),
   ...($("here").checked && page.camera.view >= 0 ? { view: page.camera.view } : {}) });
 
@@ -17,7 +17,7 @@ async function answered(query) {
   for (const pane of panes) query.answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
 }
 
-// The colour that the fewest kept queries have.
+// The colour of the fewest kept queries.
 function freeColour() {
   const used = KEPT.map((_, k) => page.kept.filter((query) => query.colour === k).length);
   return used.indexOf(Math.min(...used));
@@ -32,20 +32,20 @@ export async function keep(asked) {
   return true;
 }
 
-// Those of the address, or of an exported page.
+// Kept queries in the address, or of an exported page.
 export async function keepFromStart() {
   const kept = api.offline ? api.kept : start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
   for (const asked of kept) if (asked?.text) await keep(asked);
 }
 
-// Other answerers, or another tree: everything is asked again.
+// After a change of answerer or tree, all kept queries are sent again.
 export async function askKeptAgain() {
   if (!page.kept.length) return;
   for (const query of page.kept) await answered(query);
   showKept();
 }
 
-// The nodes of every query that is shown, for files.
+// The nodes of all shown queries, for saved files.
 export function groups() {
   const found = keptIn(0).map(({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node) }));
   const answer = panes[0].answer;
@@ -77,7 +77,7 @@ function drop(query) {
   showKept();
 }
 
-// Nodes that several queries have in common, and those inside another query's.
+// Count nodes in several queries, and nodes inside those of another query.
 function overlaps() {
   const shown = [...keptIn(0).map(({ answer }) => answer), ...(page.kept.length && panes[0].answer ? [panes[0].answer] : [])], times = new Map();
   if (!main() || shown.length < 2) return "";

@@ -1,4 +1,4 @@
-// Latest wins: one request of a kind under way; a new one takes the place of the one that waits.
+// At most one request of a kind is pending; a new one replaces the one that waits.
 export function latest(work) {
   let busy = false, waiting = null;
   return async function ask(...args) {

@@ -1,4 +1,4 @@
-// The page begins: the scene, a painter that this browser can run, and whoever answers by now.
+// Start of the page: load the scene, choose a painter for this browser, and load the present variants.
 
 import * as api from "./api.js";
 import { Camera } from "./camera.js";
@@ -64,7 +64,7 @@ async function begin() {
 
 function arriving(here, chunks) { Object.assign($("arriving"), { value: here, max: chunks, hidden: here === chunks }); }
 
-// An exported page has no server: it answers the texts that it was made with.
+// An exported page has no server, only the answers that it was made with.
 function onlyWhatIsHere() {
   for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement]) element.hidden = true;
   for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;
@@ -80,7 +80,7 @@ function onlyWhatIsHere() {
 attachHands();
 const begun = begin().catch((error) => { $("loading").textContent = error.message; $("loading").dataset.kept = "yes"; document.body.dataset.ready = "failed"; });
 
-// What tests and benchmarks read.
+// For tests and benchmarks.
 globalThis.hilsplat = {
   begun,
   get camera() { return page.camera; }, get painter() { return page.painter; }, painted, redraw, quickPick: (x, y) => quickPick(paneAt(x), y),

@@ -1,4 +1,4 @@
-// What takes the place of api.js in an exported page: everything is in the page itself.
+// Replacement of api.js in an exported page, which contains all data.
 
 export const offline = true;
 

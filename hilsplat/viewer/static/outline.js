@@ -1,4 +1,4 @@
-// The semantic tree as a tree of the page: keys as in the ARIA practices, names and crops, folded when large.
+// The semantic tree as a tree widget: keys as in the ARIA practices, names and crops, folded if large.
 
 import * as api from "./api.js";
 import { $, counted, inOrder, LEVELS, make, nameOf } from "./elements.js";

@@ -1,4 +1,4 @@
-// Boxes and labels over the picture, as SVG: always on top, crisp, and readable by tests.
+// Boxes and labels over the picture, as SVG.
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const NS = "http://www.w3.org/2000/svg";

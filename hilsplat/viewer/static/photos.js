@@ -1,4 +1,4 @@
-// The strip of photographs, and the photograph laid over the view where the camera stands at it.
+// The strip of photographs, and the photograph shown over the view if the camera has its pose.
 
 import * as api from "./api.js";
 import { $, make } from "./elements.js";
@@ -23,7 +23,7 @@ export class Photos {
 
   cycle() { this.opacity = (this.opacity + 1) % 3; }
 
-  // Put the photograph's frame exactly where the camera draws it.
+  // Align the photograph with the camera's frame.
   place(camera, width, height, panes) {
     const photo = $("photo"), number = camera.view;
     const each = width / panes, { s, x, y } = camera.frame(each, height);

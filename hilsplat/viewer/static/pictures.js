@@ -1,4 +1,4 @@
-// Small pictures, when they come into sight and a few at a time: a browser has six connections to a server, and
+// Small pictures, loaded when visible and a few at a time: a browser has six connections to a server, and
 // the picture of the scene must not wait for a hundred crops.
 
 import { make } from "./elements.js";

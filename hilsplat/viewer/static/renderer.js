@@ -1,4 +1,4 @@
-// The painter in the browser: WebGL2, one instanced quad per Gaussian, blended from back to front.
+// WebGL2 painter: one instanced quad per Gaussian, blended from back to front.
 
 import * as api from "./api.js";
 import { fragment, vertex } from "./shaders.js";
@@ -31,7 +31,7 @@ export class Renderer {
     this.worker.onmessage = ({ data }) => this.ordered(data);
   }
 
-  // Gaussians come in chunks of whole rows of texels: what is here is drawn while the rest arrives.
+  // Gaussians arrive in chunks of whole rows of texels; received ones are drawn at once.
   async load({ gaussians, chunk }, chunkOf, told) {
     const gl = this.gl, first = await readChunk(await chunkOf(0)), { bases, texels } = first;
     if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians do not fit the textures of this browser`);
@@ -111,7 +111,7 @@ export class Renderer {
     return texture;
   }
 
-  // Texels from `first`, which begins a row; the last row may not be full.
+  // Write texels from `first`, which starts a row; the last row may be incomplete.
   fill(texture, data, first, format, type) {
     const gl = this.gl, texels = data.length / 4, full = Math.floor(texels / WIDTH), rest = texels - full * WIDTH, row = first / WIDTH;
     gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -140,7 +140,7 @@ export class Renderer {
     gl.vertexAttribDivisor(1, 1);
   }
 
-  // Ask for the order of this camera; `ordered` draws again when it is there.
+  // Request the order for this camera; `ordered` redraws when it arrives.
   order(camera) {
     const [x, y, z] = camera.R[2], row = [x, -y, -z, camera.translation[2]], s = this.sorted;   // in the axes of SPZ
     s.wanted = row;
@@ -258,7 +258,7 @@ export class Renderer {
     return values && gaussian >= 0 ? [0, 1, 2].map((level) => values[4 * gaussian + level] - 1) : [-1, -1, -1];
   }
 
-  // A picture must be drawn and read in one task: the canvas is not kept.
+  // A picture must be drawn and read in one task, because the canvas is not preserved.
   capture(camera, panes, width, height) {
     this.draw(camera, panes, width, height);
     return new Promise((done) => this.canvas.toBlob(done, "image/png"));

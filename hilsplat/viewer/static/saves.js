@@ -1,4 +1,4 @@
-// Files that the page gives away.
+// Saved files.
 
 import * as api from "./api.js";
 import { $ } from "./elements.js";
@@ -29,7 +29,7 @@ export async function save(kind, { variant, groups, style, capture, flown, kept,
   told(`Saved ${name}-${KINDS[kind]}, ${sized(blob.size)}.`);
 }
 
-// One at a time: how far it is, and a button that ends it. Nothing if it was ended.
+// Save one file at a time, with progress and Cancel; return null if cancelled.
 async function inSteps(kind, asked, told) {
   const ending = new AbortController(), buttons = $("save").querySelectorAll("[data-long]"), [what, things] = IN_STEPS[kind];
   const progress = (made, of) => { Object.assign($("saving-made"), { value: made, max: of }); $("saving-told").textContent = made < of ? `${what}: ${made} of ${of} ${things}` : `${what}: packing`; };

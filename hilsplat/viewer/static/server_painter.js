@@ -1,4 +1,4 @@
-// The painter on the server: JPEG frames by hilsplat's rasteriser, where WebGL is software or missing.
+// Server painter: JPEG frames from hilsplat's rasteriser, if WebGL is in software or missing.
 
 import * as api from "./api.js";
 import { latest } from "./latest.js";

@@ -1,4 +1,4 @@
-// What `hilsplat.splat.rasterise.api.render` documents, as shaders: EWA projection with the ray clamped to
+// Shaders equivalent to `hilsplat.splat.rasterise.api.render`: EWA projection with the ray clamped to
 // 30 % beyond the image, 0.3 px^2 added, alpha below 1/255 dropped and cut at 0.999, colour max(0, 0.5 + SH).
 
 export const vertex = (bases, texels) => `#version 300 es

@@ -1,4 +1,4 @@
-// Orders Gaussians from back to front: two passes of a radix sort over the upper 24 bits of their depths.
+// Sort Gaussians from back to front: two passes of a radix sort over the upper 24 bits of their depths.
 
 const NEAR = 0.01;
 let means = null, keys, rows, other, otherKeys, here = 0;

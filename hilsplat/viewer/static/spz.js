@@ -1,4 +1,4 @@
-// Gaussians as they arrive: SPZ, version 2. Columns become the texels that the shader reads; it unpacks the bytes.
+// Read Gaussians in SPZ version 2. Columns become the texels that the shader reads; it unpacks the bytes.
 
 export async function unzipped(buffer) {
   return new Response(new Blob([buffer]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();

@@ -1,4 +1,4 @@
-// What the page knows: what is asked, what is chosen, where the camera is. Everything else is drawn from that.
+// State of the page: query, choice, camera. Everything else is derived from it.
 
 import * as api from "./api.js";
 import { $, LEVELS } from "./elements.js";
@@ -14,10 +14,10 @@ export const panes = [{ by: "", answer: null, field: null }]; // one, or two sid
 export const variantOf = (pane) => pane.by.split("|")[0];
 export const answererOf = (pane) => pane.by.split("|")[1] || "tree";
 export const level = () => document.querySelector("[name=level]:checked").value;
-// Least score of an answer, or null for those near the best.
+// Minimum score of an answer, or null for answers near the best.
 export const threshold = () => $("threshold-on").checked ? Number($("threshold-at").value) : null;
 export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "auto" ? answer?.level ?? "whole" : level()));
-// Kept queries in a pane: what is painted, and in which colour.
+// Kept queries of a pane that are painted, with their colours.
 export const keptIn = (pane) => page.kept.filter((query) => query.shown && query.answers[pane]).map((query) => ({ answer: query.answers[pane], rgb: KEPT[query.colour], text: query.asked.text }));
 export const main = () => outlines.get(variantOf(panes[0]));
 
@@ -27,7 +27,7 @@ export const failed = (error) => {
   if (error.name !== "AbortError") tell(error.message, true);
 };
 
-// The page goes on to show what it was loaded with; another state comes with a reload and never in parts.
+// The page keeps showing the state that it was loaded with until a reload.
 export function sceneChanged(parts = []) {
   $("changed").hidden = false;
   $("changed-what").textContent = `The scene has changed${parts.length ? ` (${parts.join(", ")})` : ""}. You still see it as it was.`;

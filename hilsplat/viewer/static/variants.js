@@ -1,4 +1,4 @@
-// Who answers: variants of the scene, one or two of them side by side, as they come to exist and change.
+// Variants of the scene, one or two side by side, including those that appear during a run.
 
 import * as api from "./api.js";
 import { ask, listAnswers } from "./asking.js";
@@ -58,7 +58,7 @@ export async function choosePanes() {
   } catch (error) { failed(error); }
 }
 
-// While the page is open: is what it shows still what lies on the disk, and does somebody else answer by now?
+// Check regularly whether files of the scene changed and whether there are new variants.
 export async function watch() {
   while ($("changed").hidden) {
     await new Promise((done) => setTimeout(done, POLL_MS));

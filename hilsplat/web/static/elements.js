@@ -1,4 +1,4 @@
-// Elements from tags, attributes and children; text is always text, never markup.
+// Create elements from tags, attributes and children; text is never parsed as markup.
 
 export const $ = (id) => document.getElementById(id);
 
@@ -15,11 +15,11 @@ export function make(tag, attributes = {}, ...children) {
 
 export const counted = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
 export const LEVELS = ["whole", "part", "subpart"];
-// The name that a person gave, else what the vocabulary calls it; "?" where nothing of it fits.
+// The user's name, else the vocabulary name, else "?".
 export function nameOf(outline, node) {
   const { name, called, level } = outline.nodes[node], numbered = `${LEVELS[level]} ${node}`;
   return name || (called === "?" ? `? (${numbered})` : called || numbered);
 }
 
-// Things before surfaces, large before small.
+// Sort things before surfaces, and large before small.
 export const inOrder = (outline) => (a, b) => outline.nodes[a].surface - outline.nodes[b].surface || outline.nodes[b].gaussians - outline.nodes[a].gaussians;

@@ -1,4 +1,4 @@
-// Questions to the server of the page; what it refuses comes back as its own sentence.
+// Requests to the page's server; a refused one throws the server's message.
 
 export class Refused extends Error {
   constructor(message, status) { super(message); this.status = status; }
@@ -16,7 +16,7 @@ export const send = async (path, value, { method = "POST", headers = {}, signal 
   method, signal, headers: { "content-type": "application/json", ...headers }, body: JSON.stringify(value),
 }));
 
-// A file after lines that tell how far it is: {"made", "of"} many times, then {"bytes"}, then as many bytes; or {"error"}.
+// Read progress lines {"made", "of"}, then {"bytes"} and the file of that many bytes; or {"error"}.
 export async function streamed(response, told) {
   const reader = response.body.getReader(), decoder = new TextDecoder(), parts = [];
   let head = new Uint8Array(0), wanted = -1, got = 0;

@@ -1,7 +1,7 @@
-// One function decides how every node is painted, for both painters.
+// The colours of all nodes, for both painters.
 
 export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
-// Of kept queries; style.css has the same for their chips.
+// Colours of kept queries; style.css has the same ones for their chips.
 export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
 
@@ -14,7 +14,7 @@ export const RAMP = (() => {
   return ramp;
 })();
 
-// The ramp with what is below a threshold in dark grey.
+// The ramp, dark grey below a threshold.
 const cut = new Map();
 function rampFrom(threshold) {
   if (threshold === null) return RAMP;
@@ -22,7 +22,7 @@ function rampFrom(threshold) {
   return cut.get(threshold);
 }
 
-// A colour that neighbours in the table do not share.
+// Colours that differ between neighbouring rows of the table.
 export function colourOf(node) {
   const hue = (node * 0.61803398875) % 1, value = (n) => {
     const k = (n + hue * 12) % 12;
@@ -31,7 +31,7 @@ export function colourOf(node) {
   return [value(0), value(8), value(4)];
 }
 
-// Hits that are painted and boxed. What is alike is a ranking of all nodes: painted whole, it would leave nothing unpainted.
+// Hits that are painted and boxed; of similar nodes only the first, because their ranking has all nodes.
 const PAINTED_ALIKE = 5;
 export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slice(0, PAINTED_ALIKE) : answer?.hits ?? [];
 
@@ -79,7 +79,7 @@ const base64 = (bytes) => {
 };
 const sent = new WeakMap();
 
-// A style as the server reads it; one that leaves everything as it is, is empty.
+// A style in the server's format; empty if nothing is changed.
 export function wireStyle(style) {
   if (!sent.has(style)) {
     const plain = !style.ramp && style.mode === "plain" && style.table.every((v, k) => k % 4 !== 3 || v === 0);

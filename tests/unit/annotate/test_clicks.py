@@ -1,4 +1,4 @@
-"""Clicks and boxes become outlines by the SAM that made the masks of a scene."""
+"""Outlines around clicks and boxes, by the SAM that made the masks of a scene."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hilsplat.annotate.clicks import KEPT_VIEWS, Clicks
 from hilsplat.annotate.labels import fill_rings
+from hilsplat.annotate.proposals import KEPT_VIEWS, Clicks
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import write_png
@@ -59,7 +59,7 @@ def clicks(scene, tmp_path_factory) -> Clicks:
     return Clicks(scene, masks)
 
 
-def test_a_click_outlines_the_thing_under_it(clicks):
+def test_a_click_outlines_the_thing_at_it(clicks):
     best, *others = clicks.outlines("000.png", [(*LEFT[0], True)], None)
     assert iou(fill_rings(best.polygons, SIZE), disc(*LEFT)) > 0.8
     assert best.what == "by sam-tiny" and best.level == Level.WHOLE  # the three heads agree
@@ -72,7 +72,7 @@ def test_a_box_outlines_the_thing_that_fills_it(clicks):
     assert iou(fill_rings(best.polygons, SIZE), disc(*RIGHT)) > 0.8
 
 
-def test_a_click_outside_leaves_it_out(clicks):
+def test_things_at_clicks_outside_are_not_outlined(clicks):
     asked = [(*LEFT[0], True), (*RIGHT[0], False), (10, 10, False)]
     best, *_ = clicks.outlines("000.png", asked, None)
     found = fill_rings(best.polygons, SIZE)
@@ -88,14 +88,14 @@ def test_something_must_be_clicked_inside_the_photograph(clicks):
 def test_features_of_the_last_photographs_are_kept(clicks, scene):
     for view in scene.views():
         clicks.encoded(view)
-    assert list(clicks._encoded) == list(scene.views())[-KEPT_VIEWS:]
+    assert clicks.encoded.cache_info().currsize == KEPT_VIEWS < len(scene.views())
 
 
 @pytest.mark.parametrize("segmenter", ["graph", None])
-def test_a_scene_without_a_sam_says_so(scene, tmp_path, segmenter):
+def test_a_scene_without_sam_masks_reports_it(scene, tmp_path, segmenter):
     if segmenter:
         write_index(tmp_path / "masks", {}, segmenter=segmenter, model=None)
     without = Clicks(scene, Path(tmp_path / "masks"))
     assert without.name == ""
-    with pytest.raises(SettingsError, match="without a SAM"):
+    with pytest.raises(SettingsError, match="without SAM"):
         without.outlines("000.png", [(60, 90, True)], None)

@@ -1,4 +1,4 @@
-"""Files of other programs, there and back, and against pycocotools."""
+"""Files of other programs: export and import, compared with pycocotools."""
 
 import io
 import json
@@ -9,9 +9,8 @@ import pytest
 from pycocotools import mask as coco_masks
 
 from hilsplat.annotate.exporting import exported
-from hilsplat.annotate.importing import imported, unpacked_counts
+from hilsplat.annotate.importing import imported, merged, unpacked_counts
 from hilsplat.annotate.labels import Label
-from hilsplat.annotate.merging import merged
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.cameras import Cameras
 
@@ -45,7 +44,7 @@ def files_of(data: bytes) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("kind", ["hilsplat", "isat", "labelme", "coco"])
-def test_what_is_exported_comes_back_with_levels_and_parents(kind, known, cameras):
+def test_exported_files_are_read_back_with_levels_and_parents(kind, known, cameras):
     found: dict[str, list[Label]] = {}
     for name, text in files_of(exported(kind, known, cameras)).items():
         found |= imported(name, text, cameras)
@@ -84,7 +83,7 @@ def test_compressed_run_lengths_are_those_of_pycocotools(seed, cameras):
     np.testing.assert_array_equal(label.mask(SIZE), mask)
 
 
-def test_labels_of_lerf_come_in_as_wholes_whose_groups_mean_nothing(cameras):
+def test_labels_of_lerf_are_imported_as_wholes_regardless_of_groups(cameras):
     square = [[2.7, 2.2], [9.9, 2.2], [9.9, 9.1], [2.7, 9.1]]
     objects = [
         {"category": text, "group": 1, "segmentation": square, "iscrowd": False}
@@ -111,6 +110,10 @@ def test_labelme_rectangles_and_groups(cameras):
     assert mug.mask(SIZE).sum() == 64 and len(cup.polygons) == 2
 
 
+def shapes(shape: str) -> str:
+    return f'{{"shapes": [{shape}], "imagePath": "DSC_1"}}'
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -118,18 +121,15 @@ def test_labelme_rectangles_and_groups(cameras):
         ("[]", "of no known format"),
         ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "belongs to no photograph"),
         ('{"shapes": [], "imagePath": "DSC_1.jpg", "imageHeight": 60, "imageWidth": 80}', "80 x 60 px"),
-        (
-            '{"shapes": [{"label": "a", "points": [[1, 1]], "shape_type": "circle"}], "imagePath": "DSC_1"}',
-            "circle",
-        ),
-        ('{"shapes": [{"label": "", "points": [[1, 1], [5, 5]]}], "imagePath": "DSC_1"}', "text: "),
-        ('{"shapes": [{"label": "  ", "points": [[1, 1], [5, 5]]}], "imagePath": "DSC_1"}', "text: "),
-        ('{"shapes": [{"label": "a\\u0007", "points": [[1, 1], [5, 5]]}], "imagePath": "DSC_1"}', "text: "),
+        (shapes('{"label": "a", "points": [[1, 1]], "shape_type": "circle"}'), "circle"),
+        (shapes('{"label": "", "points": [[1, 1], [5, 5]]}'), "text: "),
+        (shapes('{"label": "  ", "points": [[1, 1], [5, 5]]}'), "text: "),
+        (shapes('{"label": "a\\u0007", "points": [[1, 1], [5, 5]]}'), "text: "),
         (200_000 * "[" + 200_000 * "]", "nested too deeply"),
-        ('{"shapes": [{"label": "a", "points": [[1, 1e999], [5, 5]]}], "imagePath": "DSC_1"}', "read"),
-        ('{"shapes": [{"label": "a", "points": [[1, NaN], [5, 5]]}], "imagePath": "DSC_1"}', "read"),
-        ('{"shapes": [{"label": "a", "points": [[1, 1]], "group_id": [1]}], "imagePath": "DSC_1"}', "read"),
-        ('{"shapes": [7], "imagePath": "DSC_1"}', "read"),
+        (shapes('{"label": "a", "points": [[1, 1e999], [5, 5]]}'), "read"),
+        (shapes('{"label": "a", "points": [[1, NaN], [5, 5]]}'), "read"),
+        (shapes('{"label": "a", "points": [[1, 1]], "group_id": [1]}'), "read"),
+        (shapes("7"), "read"),
         ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "does not fit"),
         ('{"annotations": [7], "images": [], "categories": []}', "COCO"),
         ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
@@ -138,7 +138,7 @@ def test_labelme_rectangles_and_groups(cameras):
         ('{"annotations": [{}], "images": []}', "'categories'"),
     ],
 )
-def test_a_file_that_does_not_fit_says_why(content, message, cameras):
+def test_invalid_files_are_refused(content, message, cameras):
     with pytest.raises(SceneError, match=message):
         imported("file.json", content, cameras)
 
@@ -159,48 +159,47 @@ def labelme(view: str, *things: tuple[str, int, int]) -> str:
 
 
 def ids(found, view: str) -> dict[str, int]:
-    return {label.text: label.id for label in found.views[view]}
+    return {label.text: label.id for label in found[view]}
 
 
-def test_shapes_without_ids_are_one_thing_only_if_their_texts_say_so(cameras):
+def test_shapes_without_ids_are_one_thing_only_if_their_texts_are_equal(cameras):
     files = [
         imported("DSC_1.json", labelme("DSC_1.png", ("mug", 2, 2), ("cup", 20, 2)), cameras),
         imported("DSC_2.json", labelme("DSC_2.png", ("lamp", 2, 2), ("mug", 20, 2)), cameras),
     ]
     turtle = Label(id=1, level=1, text="turtle", polygons=square(2, 15))
-    found = merged({"DSC_1.png": [turtle]}, files, SIZES)
+    found, added, known = merged({"DSC_1.png": [turtle]}, files, SIZES)
     first, second = ids(found, "DSC_1.png"), ids(found, "DSC_2.png")
-    assert first["turtle"] == 1 and found.added == 4 and found.known == 0
+    assert (first["turtle"], added, known) == (1, 4, 0)
     assert first["mug"] == second["mug"]
     assert len({first["turtle"], first["mug"], first["cup"], second["lamp"]}) == 4
 
 
-def test_two_of_a_kind_stay_two(cameras):
+def test_two_things_with_one_text_stay_separate(cameras):
     text = labelme("DSC_1.png", ("mug", 2, 2), ("mug", 20, 2))
     other = labelme("DSC_2.png", ("mug", 2, 2), ("mug", 20, 2))
-    found = merged({}, [imported("a", text, cameras), imported("b", other, cameras)], SIZES)
-    assert [[label.id for label in found.views[view]] for view in SIZES] == [[1, 2], [1, 2]]
+    found, _, _ = merged({}, [imported("a", text, cameras), imported("b", other, cameras)], SIZES)
+    assert [[label.id for label in found[view]] for view in SIZES] == [[1, 2], [1, 2]]
 
 
 @pytest.mark.parametrize("kind", ["hilsplat", "isat", "labelme", "coco"])
-def test_our_own_export_changes_nothing_when_it_comes_in_again(kind, known, cameras):
+def test_importing_our_own_export_changes_nothing(kind, known, cameras):
     files = [imported(name, text, cameras) for name, text in files_of(exported(kind, known, cameras)).items()]
-    found = merged(known, files, SIZES)
-    assert (found.views, found.added, found.known) == ({}, 0, 4)
+    assert merged(known, files, SIZES) == ({}, 0, 4)
 
 
-def test_a_region_that_was_corrected_elsewhere_replaces_the_one_of_the_same_thing(known, cameras):
+def test_a_corrected_region_replaces_that_of_the_same_thing(known, cameras):
     polygons = [[(4, 4), (35, 4), (35, 11), (4, 11)], RING[1]]
     corrected = known["DSC_1.png"][0].model_copy(update={"polygons": polygons, "id": 77})
-    found = merged(known, [{"DSC_1.png": [corrected]}], SIZES)
-    mug = next(label for label in found.views["DSC_1.png"] if label.id == 3)
-    assert (len(found.views["DSC_1.png"]), found.added, mug.polygons) == (3, 1, corrected.polygons)
+    found, added, _ = merged(known, [{"DSC_1.png": [corrected]}], SIZES)
+    mug = next(label for label in found["DSC_1.png"] if label.id == 3)
+    assert (len(found["DSC_1.png"]), added, mug.polygons) == (3, 1, corrected.polygons)
 
 
-def test_parts_follow_their_whole_to_its_new_number():
+def test_parts_refer_to_the_new_id_of_their_whole():
     lamp = Label(id=1, level=1, text="lamp", polygons=square(2, 2, 20))
     mug = Label(id=1, level=1, text="mug", polygons=square(2, 2, 20))
     handle = Label(id=2, level=2, parent=1, text="handle", polygons=square(4, 4))
-    found = merged({"DSC_1.png": [lamp]}, [{"DSC_1.png": [mug, handle]}], SIZES)
-    _, new_mug, new_handle = found.views["DSC_1.png"]
+    found, _, _ = merged({"DSC_1.png": [lamp]}, [{"DSC_1.png": [mug, handle]}], SIZES)
+    _, new_mug, new_handle = found["DSC_1.png"]
     assert new_mug.id != 1 and new_handle.parent == new_mug.id

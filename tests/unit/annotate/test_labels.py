@@ -1,11 +1,10 @@
-"""Annotations of a view: children are cut to their parents, files are replaced only by who has read them."""
+"""Annotations of a view: children are cut to their parents, and only the last version is replaced."""
 
 import numpy as np
 import pytest
 
 from hilsplat.annotate.labels import (
     Label,
-    StaleLabelsError,
     cut_to_parents,
     read_labels,
     traced,
@@ -14,7 +13,7 @@ from hilsplat.annotate.labels import (
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.datasets.images.hi import regions_of
 from hilsplat.datasets.images.isat import read_isat
-from hilsplat.query.names import NO_FILE, version_of
+from hilsplat.web.file_changes import NO_FILE, StaleFileError, version_of
 
 SIZE = (30, 40)
 
@@ -41,7 +40,7 @@ def test_children_are_cut_to_their_parents_down_to_subparts():
     np.testing.assert_array_equal(whole_mask, whole.mask(SIZE))
 
 
-def test_what_fits_keeps_its_vertices():
+def test_children_inside_their_parents_keep_their_vertices():
     given = [label(1, 1, None, [[(3, 3), (20, 4), (9, 22)]]), label(2, 2, 1, [[(8, 6), (10, 6), (9, 9)]])]
     assert cut_to_parents(given, SIZE) == given
     once = cut_to_parents([label(1, 1, None, box(5, 5, 9, 9)), label(2, 2, 1, box(0, 0, 7, 7))], SIZE)
@@ -59,15 +58,15 @@ def test_a_child_around_a_hole_of_its_parent_is_cut_exactly():
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 2, 1, box(6, 6, 9, 9))], "wholly outside 'thing 1'"),
+        ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 2, 1, box(6, 6, 9, 9))], "entirely outside 'thing 1'"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 3, 1, box(0, 0, 4, 4))], "expected  a part"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 1, 1, box(0, 0, 4, 4))], "none: it is a whole"),
         ([label(2, 2, 7, box(0, 0, 4, 4))], "nothing of this photograph"),
-        ([label(1, 1, None, box(0, 0, 4, 4)), label(1, 1, None, box(0, 0, 4, 4))], "id 1 is there twice"),
+        ([label(1, 1, None, box(0, 0, 4, 4)), label(1, 1, None, box(0, 0, 4, 4))], "id 1 occurs twice"),
         ([label(1, 1, None, box(50, 50, 60, 60))], "no pixel inside the photograph"),
     ],
 )
-def test_what_makes_no_sense_is_refused(labels, message):
+def test_invalid_labels_are_refused(labels, message):
     with pytest.raises(SettingsError, match=message):
         cut_to_parents(labels, SIZE)
 
@@ -87,16 +86,16 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     assert warnings == ["DSC_1.json: proposals not accepted, left out: 1"]
     first = path.read_bytes()
     write_labels(path, "DSC_1.png", SIZE, given[::-1], version)
-    assert path.read_bytes() == first  # whatever the order of drawing
+    assert path.read_bytes() == first  # the order of drawing does not matter
 
 
-def test_a_file_that_somebody_else_changed_is_not_replaced(tmp_path):
+def test_a_file_changed_by_another_program_is_not_replaced(tmp_path):
     path = tmp_path / "DSC_1.json"
     mine = write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 4, 4))], NO_FILE)
     theirs = write_labels(path, "DSC_1.png", SIZE, [label(1, 1, None, box(0, 0, 5, 5))], mine)
     kept = path.read_bytes()
     for old in (mine, NO_FILE, ""):
-        with pytest.raises(StaleLabelsError, match="reload"):
+        with pytest.raises(StaleFileError, match="reload"):
             write_labels(path, "DSC_1.png", SIZE, [], old)
     assert path.read_bytes() == kept
     assert write_labels(path, "DSC_1.png", SIZE, [], theirs) == NO_FILE and not path.exists()

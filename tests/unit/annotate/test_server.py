@@ -1,4 +1,4 @@
-"""The annotation page's server: who may talk to it, saving under a version, shapes, proposals, carrying."""
+"""Server of the annotation page: access, versions of saved files, shapes, proposals, transfer to views."""
 
 import shutil
 from pathlib import Path
@@ -8,30 +8,25 @@ import pytest
 from starlette.testclient import TestClient
 
 from hilsplat.annotate.app import Annotator
-from hilsplat.annotate.labels import Label
+from hilsplat.annotate.labels import Label, traced
 from hilsplat.annotate.opened_scene import OpenedScene
-from hilsplat.base.artifacts import atomic_folder
 from hilsplat.base.errors import ArtifactError
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.segment.masks import HierarchicalMasks
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
+from tests.unit.artifact_changes import write_again
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
 
 TOKEN, ADDRESS = "secret-of-the-test", "http://127.0.0.1:4000"
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 MUG = {"id": 1, "level": 1, "text": "mug", "polygons": [[[1, 1], [12, 1], [12, 20], [1, 20]]]}
-HANDLE = {
-    "id": 2,
-    "level": 2,
-    "parent": 1,
-    "text": "handle",
-    "polygons": [[[8, 4], [30, 4], [30, 9], [8, 9]]],
-}
+HANDLE = {"id": 2, "level": 2, "parent": 1, "text": "handle"}
+HANDLE["polygons"] = [[[8, 4], [30, 4], [30, 9], [8, 9]]]
 
 
-@pytest.fixture(scope="session")
-def desk(tmp_path_factory) -> Path:
+@pytest.fixture
+def desk(desk_project) -> Path:
     """The folder of a finished scene."""
-    return build_finished_desk(tmp_path_factory.mktemp("project")) / SCENE
+    return desk_project / SCENE
 
 
 @pytest.fixture
@@ -65,7 +60,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return np.count_nonzero(a & b) / np.count_nonzero(a | b)
 
 
-# -- who --------------------------------------------------------------------------------------------
+# -- access -----------------------------------------------------------------------------------------
 
 
 def test_strangers_foreign_hosts_and_other_sites_are_refused(desk, labels, client):
@@ -85,12 +80,12 @@ def test_strangers_foreign_hosts_and_other_sites_are_refused(desk, labels, clien
 
 
 @pytest.mark.parametrize("path", ["/api/labels/99", "/api/labels/-1", "/api/labels/..%2f..%2fx"])
-def test_no_name_from_the_page_becomes_a_path(client, labels, path):
+def test_views_are_numbers_and_never_paths(client, labels, path):
     sent = client.put(path, json={"labels": [MUG]}, headers={"if-match": '"none"'})
     assert sent.status_code in (404, 405, 422) and not labels.exists()
 
 
-def test_the_page_gets_its_own_files_and_those_of_every_page(client):
+def test_static_files_are_those_of_this_page_and_of_all_pages(client):
     for name in ("annotate.js", "annotate.css", "style.css", "http.js"):
         assert client.get(f"/static/{name}").status_code == 200
     assert client.get("/static/main.js").status_code == 404  # of the other page
@@ -99,14 +94,18 @@ def test_the_page_gets_its_own_files_and_those_of_every_page(client):
 # -- saving -----------------------------------------------------------------------------------------
 
 
-def test_what_is_saved_is_cut_to_its_parent_and_a_data_set(client, labels, tmp_path):
+def test_saved_labels_are_cut_to_their_parents_versioned_and_a_data_set(client, labels, tmp_path):
     saved = put(client, 2, [MUG, HANDLE], "none").json()
     parent, child = (mask_of(each["polygons"]) for each in saved["labels"])
     np.testing.assert_array_equal(child, mask_of(HANDLE["polygons"]) & parent)
     assert client.get("/api/labels").json()[2] == saved
-    for old in ("none", ""):
+    again = put(client, 2, [MUG, HANDLE], saved["version"])
+    assert again.status_code == 200
+    for old in ("none", "", "another"):
         stale = put(client, 2, [], old)
         assert stale.status_code == 412 and "reload" in stale.json()["error"]
+    assert client.put("/api/labels/2", json={"labels": []}).status_code == 412
+    assert client.get("/api/labels").json()[2] == saved
     scene = open_labelled("annotated/photos/desk", tmp_path)
     assert [region.path for region in scene.views["002.png"]] == [("mug",), ("mug", "handle")]
     np.testing.assert_array_equal(scene.views["002.png"][1].mask(), child)
@@ -126,7 +125,7 @@ def test_what_is_saved_is_cut_to_its_parent_and_a_data_set(client, labels, tmp_p
         ({"polygons": [[[900, 900], [910, 900], [910, 910]]]}, 422),
     ],
 )
-def test_what_cannot_be_is_refused_with_a_reason(client, labels, change, status):
+def test_invalid_labels_are_refused(client, labels, change, status):
     sent = put(client, 0, [{**MUG, **change}], "none")
     assert sent.status_code == status and sent.json()["error"] and not labels.exists()
 
@@ -160,9 +159,8 @@ def test_a_brush_adds_discs_erases_and_stays_inside_the_parent(client):
 
 def test_nodes_are_proposed_at_a_pixel_from_whole_to_subpart(client):
     view, shift = 3, 3
-    offers = client.post(
-        "/api/at", json={"view": view, "x": 6 + shift, "y": 6}
-    ).json()  # the rim of the handle
+    rim = {"view": view, "x": 6 + shift, "y": 6}
+    offers = client.post("/api/at", json=rim).json()
     assert [offer["level"] for offer in offers] == [1, 2, 3]
     assert all(offer["what"].startswith("node ") for offer in offers)
     for offer, name in zip(offers, ("mug", "handle", "rim"), strict=True):
@@ -191,14 +189,12 @@ def test_masks_are_proposed_while_there_is_no_tree(desk, labels, tmp_path):
     assert client.post("/api/carry", json={"ids": [1], "view": 0}).status_code == 422
 
 
-def test_things_are_carried_by_their_gaussians_with_their_parts_inside(client):
+def test_things_are_transferred_by_their_gaussians_with_their_parts_inside(client):
     view, shift = 1, 1
     mug = region_mask("mug", shift) | region_mask("handle", shift)
     things = [
-        Label(id=5, level=1, text="mug", polygons=[[(0, 0), (1, 0), (1, 1)]]).with_mask(mug),
-        Label(id=6, level=2, parent=5, text="handle", polygons=[[(0, 0), (1, 0), (1, 1)]]).with_mask(
-            region_mask("handle", shift)
-        ),
+        Label(id=5, level=1, text="mug", polygons=traced(mug)),
+        Label(id=6, level=2, parent=5, text="handle", polygons=traced(region_mask("handle", shift))),
         Label(id=7, level=1, text="guess", polygons=[[(20, 5), (30, 5), (30, 9)]], origin="proposed"),
     ]
     put(client, view, [thing.model_dump() for thing in things], "none")
@@ -212,33 +208,27 @@ def test_things_are_carried_by_their_gaussians_with_their_parts_inside(client):
     assert client.post("/api/carry", json={"ids": [5, 6], "view": 4}).json() == []  # they are there now
 
 
-def test_a_scene_without_poses_says_what_to_run(tmp_path):
+def test_a_scene_without_poses_is_refused(tmp_path):
     with pytest.raises(ArtifactError, match="has no photographs to annotate yet"):
         OpenedScene(tmp_path, tmp_path / "labels", "default", 1)
 
 
-# -- a scene that is written anew meanwhile ---------------------------------------------------------
-
-
-def made_again(artifact: Path) -> None:
-    """As a stage that was rerun leaves it."""
-    with atomic_folder(artifact) as new:
-        shutil.copytree(artifact, new, dirs_exist_ok=True)
+# -- a scene that is rebuilt ------------------------------------------------------------------------
 
 
 @pytest.fixture
 def copied(desk, tmp_path) -> Path:
-    """A copy of the scene, to be written to."""
+    """A copy of the scene, to change."""
     return shutil.copytree(desk, tmp_path / "results/photos/desk")
 
 
-def test_a_tree_that_was_rewritten_is_reported_and_proposes_nothing_until_a_reload(copied, labels):
+def test_a_rewritten_tree_is_reported_and_not_used_until_a_reload(copied, labels):
     client = opened(copied, labels)
     of = {"of": client.get("/api/scene").json()["of"]}
     assert client.get("/api/changes").json() == {**of, "changed": []}
     pixel = {"view": 0, "x": 6, "y": 6}
     assert client.post("/api/at", json=pixel, params=of).status_code == 200
-    made_again(copied / "default/semantic_tree")
+    write_again(copied / "default/semantic_tree")
     assert client.get("/api/changes").json() == {**of, "changed": ["semantic_tree"]}
     for path, sent in (("at", pixel), ("carry", {"ids": [1], "view": 1})):
         refused = client.post(f"/api/{path}", json=sent, params=of)
@@ -253,9 +243,9 @@ def test_a_tree_that_was_rewritten_is_reported_and_proposes_nothing_until_a_relo
         assert client.get(f"/api/{path}", params={"of": again}).status_code == 200
 
 
-def test_nothing_is_drawn_on_photographs_of_before(copied, labels):
+def test_labels_of_rewritten_photographs_are_not_saved(copied, labels):
     client = opened(copied, labels)
-    made_again(copied / "scene")
+    write_again(copied / "scene")
     assert put(client, 0, [MUG], "none").status_code == 409
     assert client.get("/api/photo/0").status_code == 409
     assert not labels.exists() or not list(labels.glob("*.json"))
@@ -271,14 +261,3 @@ def test_a_running_workflow_adds_proposals_after_a_reload(copied, labels):
     shutil.move(copied / "later", tree)
     assert client.get("/api/changes").json()["changed"] == ["semantic_tree"]
     assert client.get("/api/scene").json()["proposes"] == "nodes"
-
-
-def test_a_version_that_is_not_the_last_is_refused(client):
-    first = put(client, 0, [MUG], "none").json()["version"]
-    second = put(client, 0, [{**MUG, "text": "cup"}], first)
-    assert second.status_code == 200
-    for old in ("none", first, ""):
-        stale = put(client, 0, [], old)
-        assert stale.status_code == 412 and "reload" in stale.json()["error"]
-    assert client.put("/api/labels/0", json={"labels": []}).status_code == 412
-    assert client.get("/api/labels").json()[0]["labels"][0]["text"] == "cup"

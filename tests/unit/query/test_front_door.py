@@ -1,4 +1,4 @@
-"""`hilsplat.open` and the commands that ask a finished scene, from other folders and after a move."""
+"""`hilsplat.open` and the commands that query a finished scene, from other folders and after a move."""
 
 import json
 import os
@@ -15,27 +15,26 @@ import pytest
 
 import hilsplat
 from hilsplat.annotate.labels import Label, label_path, write_labels
-from hilsplat.base.artifacts import provenance_path, read_npy
+from hilsplat.base.artifacts import read_npy
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
-from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.cli.user_commands import scene_folder
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.figures.comparison import open_variants
 from hilsplat.evaluate.figures.panel import run_figures
 from hilsplat.field.code import autoencoder_file
 from hilsplat.models.folder import open_model_folder
+from hilsplat.query.answer import answer
 from hilsplat.query.names import NO_FILE, NodeNames
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
-from tests.unit.artifact_changes import change_index
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
+from tests.unit.artifact_changes import change_index, write_record
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
 
 
-@pytest.fixture(scope="module")
-def desk(tmp_path_factory) -> Path:
-    """A project folder with models/colours and the finished results/photos/desk."""
-    return build_finished_desk(tmp_path_factory.mktemp("project"))
+@pytest.fixture
+def desk(desk_project) -> Path:
+    return desk_project
 
 
 @pytest.fixture
@@ -75,7 +74,7 @@ def test_public_names_are_the_types_that_open_returns(desk):
         hilsplat.shut  # noqa: B018
 
 
-def test_a_hit_knows_its_gaussians_and_its_pixels(desk):
+def test_a_hit_has_its_gaussians_and_its_pixels(desk):
     scene = hilsplat.open(desk / SCENE)
     (hit,) = scene.query("mug > handle > rim")
     true = np.flatnonzero(region_mask("rim")[:, :WIDTH])
@@ -115,7 +114,7 @@ def test_another_clip_is_refused(desk, elsewhere):
     assert "rerun the clip stage" in message
 
 
-def test_a_copy_without_any_clip_names_the_places(desk, elsewhere, monkeypatch):
+def test_a_missing_clip_is_reported_with_the_searched_folders(desk, elsewhere, monkeypatch):
     monkeypatch.setattr("hilsplat.embed.clip.INSTALLED", elsewhere)
     shutil.copytree(desk / SCENE, elsewhere / "desk")
     (elsewhere / "models").mkdir()
@@ -123,51 +122,36 @@ def test_a_copy_without_any_clip_names_the_places(desk, elsewhere, monkeypatch):
         hilsplat.open("desk")
 
 
-def test_answers_about_photographs_by_the_embedded_clip_are_called_meaningless(
-    desk, elsewhere, project, caplog
-):
+def test_the_embedded_clip_warns_that_it_does_not_know_photographs(desk, elsewhere, caplog):
     shutil.copytree(desk, elsewhere / "copy")
     with caplog.at_level("WARNING"):
         assert hilsplat.open(Path("copy") / SCENE).caution == ""  # colours is a CLIP of its own
-    assert "mean nothing" not in caplog.text
+    assert "meaningless" not in caplog.text
     card = elsewhere / "copy/models/colours/config.json"
     card.write_text(json.dumps({**json.loads(card.read_text()), "world_only": True}))
     digest = open_model_folder(card.parent).digest
     change_index(elsewhere / "copy" / SCENE / "default/clip", model_sha256=digest)
     with caplog.at_level("WARNING"):
         caution = hilsplat.open(Path("copy") / SCENE).caution
-    assert caution.startswith("colours knows the synthetic world alone: its answers about photographs mean")
+    assert caution.startswith("colours was trained only on the synthetic world: its answers")
     assert f"photos/desk: {caution}" in caplog.text
-    told = run_command(project, "query", str(Path("copy") / SCENE), "mug")
-    assert told.returncode == 0 and caution in told.stdout and "hilsplat models get" in caution
-    # a name that a person gave is no answer of CLIP
+    assert caution in next(answer(Path("copy") / SCENE, "mug")) and "hilsplat models get" in caution
+    # CLIP isn't used for a name that the user gave
     named = replace(hilsplat.open(Path("copy") / SCENE), names=NodeNames({0: "the frog"}))
     assert named.caution_about("The frog") == "" and named.caution_about("the frog > nose") == caution
-    # a synthetic scene is what the embedded models know
-    write_provenance(
-        elsewhere / "copy" / SCENE / "scene",
-        stage="poses",
-        code="",
-        command=(),
-        settings={},
-        seed=None,
-        inputs=Inputs("poses", {"images": desk / SCENE / "scene"}),
-    )
-    record = provenance_path(elsewhere / "copy" / SCENE / "scene")
-    text = record.read_text()
-    assert hilsplat.open(Path("copy") / SCENE).caution == caution
-    record.write_text(text.replace(str(desk / SCENE / "scene"), "results/synthetic/x/world/images"))
-    assert hilsplat.open(Path("copy") / SCENE).caution == ""
+    # the embedded models were trained on synthetic scenes
+    place = elsewhere / "copy" / SCENE / "scene"
+    for images, expected in ((str(place), caution), ("results/synthetic/x/world/images", "")):
+        write_record(place, inputs={"images": {"path": images}})
+        assert hilsplat.open(Path("copy") / SCENE).caution == expected
 
 
-def test_a_scene_that_is_not_there_is_named(elsewhere):
+def test_a_missing_scene_is_reported(elsewhere):
     with pytest.raises(ArtifactError, match="scene folder results/photos/desk is missing"):
         hilsplat.open("results/photos/desk")
-    with pytest.raises(hilsplat.HilsplatError):
-        hilsplat.open("results/photos/desk")
 
 
-def test_a_copy_that_lost_its_settings_says_so(desk, elsewhere, caplog):
+def test_a_copy_without_recorded_settings_warns(desk, elsewhere, caplog):
     shutil.copytree(desk / SCENE, elsewhere / "desk")
     shutil.copytree(desk / "models", elsewhere / "models")
     hilsplat.open("desk")
@@ -191,7 +175,7 @@ def test_the_example_of_the_docs_runs(desk, project, monkeypatch, capsys):
     assert "has no view 'no such view'" in printed
 
 
-# -- commands, as a person types them ----------------------------------------------------------------
+# -- commands -----------------------------------------------------------------------------------------
 
 
 def test_query_takes_a_path_from_any_folder(desk, elsewhere, project):
@@ -216,7 +200,7 @@ def test_a_scene_is_found_by_its_name_alone(desk, tmp_path):
         scene_folder("desk", tmp_path)
 
 
-def test_export_writes_the_tree_from_any_folder(desk, elsewhere, project):
+def test_export_writes_the_tree_to_any_folder(desk, elsewhere, project):
     done = run_command(project, "export", str(desk / SCENE), "--out", "tree")
     assert done.returncode == 0, done.stderr
     assert "2 whole, 2 part, 1 subpart" in done.stdout
@@ -226,7 +210,7 @@ def test_export_writes_the_tree_from_any_folder(desk, elsewhere, project):
     assert (elsewhere / "tree/tree.ply").stat().st_size > (desk / SCENE / "gaussians.ply").stat().st_size
 
 
-def test_an_export_replaces_no_folder_that_holds_something(desk, elsewhere, project):
+def test_an_export_does_not_replace_a_folder_with_files(desk, elsewhere, project):
     (elsewhere / "mine").mkdir()
     (elsewhere / "mine/thesis.txt").write_text("years of work")
     done = run_command(project, "export", str(desk / SCENE), "--as", "colmap", "--out", "mine")
@@ -234,7 +218,7 @@ def test_an_export_replaces_no_folder_that_holds_something(desk, elsewhere, proj
     assert (elsewhere / "mine/thesis.txt").read_text() == "years of work"
 
 
-def test_labels_go_out_in_lerfs_layout_and_come_back(desk, elsewhere, project):
+def test_labels_exported_in_the_layout_of_lerf_are_read_back(desk, elsewhere, project):
     shutil.copytree(desk, elsewhere / "copy")
     scene = Scene.load(elsewhere / "copy" / SCENE / "scene")
     (view,), size_hw = scene.views()[:1], scene.cameras[scene.views()[0]].size_hw
@@ -257,7 +241,7 @@ def test_labels_go_out_in_lerfs_layout_and_come_back(desk, elsewhere, project):
         assert np.array_equal(one.boxes(), other.boxes())
 
 
-def test_langsplat_files_go_out_and_come_back(desk, elsewhere, project):
+def test_exported_langsplat_files_are_read_back(desk, elsewhere, project):
     default = desk / SCENE / "default"
     written = run_command(project, "export", str(desk / SCENE), "--as", "langsplat", "--out", "theirs")
     assert written.returncode == 0, written.stderr
@@ -315,7 +299,7 @@ def test_the_panel_opens_no_artifact_twice(desk, tmp_path, monkeypatch):
     assert twice == {}
 
 
-def test_variants_share_what_they_share(desk, tmp_path):
+def test_variants_open_shared_artifacts_once(desk, tmp_path):
     shutil.copytree(desk, tmp_path / "copy")
     scene = tmp_path / "copy" / SCENE
     (scene / "omega-2").mkdir()
@@ -330,7 +314,7 @@ def test_variants_share_what_they_share(desk, tmp_path):
     assert first.language is not second.language
 
 
-def test_key_views_answer_until_the_vectors_of_all_views_exist(desk, tmp_path, caplog):
+def test_key_views_are_queried_until_the_vectors_of_all_views_exist(desk, tmp_path, caplog):
     growing = tmp_path / "photos/desk"
     shutil.copytree(desk / SCENE, growing, ignore=shutil.ignore_patterns("field.safetensors*", "scores.csv*"))
     key = growing / "key-views"

@@ -1,13 +1,29 @@
-"""Look-ups of relevancy against decoding every latent, and the linear code by its algebra."""
+"""Relevancy by hand, look-ups of it against decoding every latent, and the linear code by its algebra."""
 
 import numpy as np
 import pytest
 
-from hilsplat.field.linear_code import LinearCode
-from hilsplat.field.network_code import Autoencoder, torch_generator
-from hilsplat.field.network_training import train_autoencoder
-from hilsplat.query.relevancy import STEPS, LatentRelevancy, lost_for_error
+from hilsplat.field.autoencoder import train_autoencoder
+from hilsplat.field.code import Autoencoder, LinearCode, torch_generator
+from hilsplat.query.relevancy import STEPS, LatentRelevancy, lost_for_error, relevancy
 from hilsplat.settings import AutoencoderSettings
+
+
+def test_nearest_canonical_phrase_decides():
+    # axes are chosen so that the cosines are 0.30 with the text and 0.25, 0.28, 0.20, 0.22
+    embedding = np.array([[0.30, 0.25, 0.28, 0.20, 0.22]])
+    score = relevancy(embedding, np.eye(5)[:1], np.eye(5)[1:])
+    assert score == pytest.approx(np.array([[0.549834]]), abs=1e-6)
+
+
+def test_as_close_as_the_nearest_phrase_scores_one_half():
+    embedding = np.array([[0.3, 0.3, 0.1]])
+    assert relevancy(embedding, np.eye(3)[:1], np.eye(3)[1:])[0, 0] == 0.5
+
+
+def test_rows_are_texts_and_columns_embeddings():
+    assert relevancy(np.eye(3), np.eye(3)[:2], np.eye(3)[2:]).shape == (2, 3)
+    assert relevancy(np.zeros((0, 3)), np.eye(3)[:2], np.eye(3)[2:]).shape == (2, 0)
 
 
 def unit(vectors):
@@ -16,7 +32,7 @@ def unit(vectors):
 
 @pytest.fixture(scope="module")
 def vectors():
-    """Sixty vectors about six directions, as a scene's masks have them."""
+    """Sixty vectors around six directions, like those of a scene's masks."""
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(6, 32))
     return unit(np.repeat(centres, 10, axis=0) + 0.3 * rng.normal(size=(60, 32)))
@@ -28,7 +44,7 @@ def texts():
 
 
 def blends(features, count):
-    """What pixels show: averages of a few Gaussians."""
+    """Latents of pixels: averages of a few Gaussians."""
     rng = np.random.default_rng(2)
     weights = rng.dirichlet(np.full(4, 0.5), count)
     return np.einsum("pk,pkd->pd", weights, features[rng.integers(0, len(features), (count, 4))]).astype(
@@ -46,7 +62,7 @@ def pass_through(latent, channels):
 
 
 def distance_from_kept(code, latents, placed):
-    """Of decoded vectors from what is kept of them: no unit text's cosine errs by more."""
+    """Distance of decoded vectors from their stored form, which bounds the error of any text's cosine."""
     kept = (placed.coordinates.T / STEPS) @ placed.directions
     return np.linalg.norm(code.decode_array(latents) - kept, axis=1)
 
@@ -68,7 +84,7 @@ def test_look_up_of_a_network_is_within_two_thousandths_of_decoding(vectors, tex
 
 
 def view_with_an_object(height):
-    """50,000 px between two directions; 10 px, not of the sample of every 7th, rise into a third."""
+    """50,000 px between two directions; 10 px, which a sample of every 7th misses, have part of a third."""
     share = np.linspace(0, 1, 50_000, dtype=np.float32)
     latents = np.stack([share, 1 - share, np.zeros_like(share)], axis=1)
     pixels = np.array([p for p in range(100, 115) if p % 7][:10])
@@ -92,7 +108,7 @@ def test_a_small_object_that_the_sample_missed_is_found():
 
 
 @pytest.mark.parametrize(("height", "directions"), [(6e-4, 2), (7e-4, 3)])
-def test_what_may_be_lost_gets_no_direction(height, directions):
+def test_a_component_below_the_error_bound_gets_no_direction(height, directions):
     # By hand: 4 x 2e-3 / 10 - sqrt(128) / (2 x 32767) = 6.27e-4
     assert lost_for_error(10.0, 128) == pytest.approx(6.27e-4, abs=1e-6)
     latents, _ = view_with_an_object(height)
@@ -100,11 +116,11 @@ def test_what_may_be_lost_gets_no_direction(height, directions):
     fast = LatentRelevancy(code, axes[3:4], 10.0)
     placed = fast.prepare(latents)
     assert len(placed.directions) == directions
-    # At a tie with the phrase relevancy is steepest: nothing is worse than asking for what is lost.
+    # Relevancy is steepest at a tie with the phrase, and this text is the lost direction: the worst case.
     assert np.abs(fast.fast(placed, axes[2:3]) - fast.exact(latents, axes[2:3])).max() < 2e-3
 
 
-def test_objects_missed_again_are_found_and_directions_end_with_the_channels(monkeypatch):
+def test_repeatedly_missed_objects_are_found_until_all_channels_are_directions(monkeypatch):
     monkeypatch.setattr("hilsplat.query.relevancy.SAMPLE", 4)
     latents = np.zeros((4000, 8), np.float32)  # the sample takes every 1000th
     latents[:, 0] = 1
@@ -116,10 +132,10 @@ def test_objects_missed_again_are_found_and_directions_end_with_the_channels(mon
     assert distance_from_kept(code, latents, placed).max() < 8e-4
     assert placed.directions @ placed.directions.T == pytest.approx(axes, abs=1e-6)
     assert placed.nbytes == 8 * 4000 * 2 + 8 * 8 * 4 + 4000 * 4
-    assert placed.coordinates.base is None  # keeps nothing larger alive
+    assert placed.coordinates.base is None  # no larger array stays in memory
 
 
-def test_a_level_without_a_pixel_has_no_answer(vectors, texts):
+def test_a_level_without_pixels_gives_empty_maps(vectors, texts):
     code = train_autoencoder(vectors, AutoencoderSettings(code="network", latent=3, epochs=1, min_steps=1), 0)
     fast = LatentRelevancy(code, texts[:4], 10.0)
     assert fast.fast(fast.prepare(np.zeros((0, 3), np.float32)), texts[4:]).shape == (3, 0)

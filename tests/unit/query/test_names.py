@@ -1,7 +1,8 @@
-"""Names that a person gave to nodes: kept with the scene, answering texts and paths before CLIP."""
+"""Names that the user gave to nodes: stored with the scene, matched with texts and paths before CLIP."""
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +10,16 @@ import pytest
 
 import hilsplat
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.query.names import FILE, NO_FILE, StaleNamesError, read_names, tree_digest, write_names
-from tests.unit.finished_desk import SCENE, build_finished_desk
-
-
-@pytest.fixture(scope="module")
-def built(tmp_path_factory) -> Path:
-    return build_finished_desk(tmp_path_factory.mktemp("project"))
+from hilsplat.query.names import FILE, NO_FILE, read_names, tree_digest, write_names
+from hilsplat.web.file_changes import StaleFileError
+from tests.unit.finished_desk import SCENE
 
 
 @pytest.fixture
-def desk(built) -> Path:
-    """The finished desk, without names."""
-    (built / SCENE / FILE).unlink(missing_ok=True)
-    return built / SCENE
+def desk(desk_project) -> Iterator[Path]:
+    """The finished desk, without names before and after the test."""
+    yield desk_project / SCENE
+    (desk_project / SCENE / FILE).unlink(missing_ok=True)
 
 
 def nodes_by_text(scene) -> dict[str, int]:
@@ -35,7 +32,7 @@ def name_nodes(desk: Path, names: dict[int, str], version: str = NO_FILE):
     return write_names(desk, tree, names, len(hilsplat.open(desk).tree), version)
 
 
-def test_a_name_answers_alone_with_the_highest_score_and_without_doubt(desk):
+def test_a_named_node_is_the_only_answer_with_the_highest_score_and_no_doubt(desk):
     before = hilsplat.open(desk)
     (unknown, *_) = before.query("kanji guide")
     assert unknown.doubts and unknown.name == ""
@@ -46,7 +43,7 @@ def test_a_name_answers_alone_with_the_highest_score_and_without_doubt(desk):
     assert hit.score > 0.9999
 
 
-def test_a_name_in_a_path_decides_what_the_parts_belong_to(desk):
+def test_a_path_looks_for_parts_inside_the_named_node(desk):
     found = nodes_by_text(hilsplat.open(desk))
     name_nodes(desk, {found["book"]: "mug", found["mug > handle"]: "grip"})
     scene = hilsplat.open(desk)
@@ -58,13 +55,13 @@ def test_a_name_in_a_path_decides_what_the_parts_belong_to(desk):
     assert rim.node == found["mug > handle > rim"]
 
 
-def test_nodes_with_one_name_answer_together(desk):
+def test_all_nodes_with_the_name_are_answers(desk):
     found = nodes_by_text(hilsplat.open(desk))
     name_nodes(desk, {found["book"]: "thing", found["mug"]: "thing"})
     assert {hit.node for hit in hilsplat.open(desk).query("thing")} == {found["book"], found["mug"]}
 
 
-def test_other_texts_and_evaluation_do_not_know_the_names(desk):
+def test_names_change_neither_other_texts_nor_evaluation(desk):
     from hilsplat.query.language_scene import LanguageScene
     from hilsplat.scene.finished import FinishedScene
 
@@ -77,18 +74,18 @@ def test_other_texts_and_evaluation_do_not_know_the_names(desk):
     np.testing.assert_array_equal(hilsplat.open(desk).node_margins(["mug"]), before.node_margins(["mug"]))
 
 
-def test_a_change_must_know_the_version_that_it_changes(desk):
+def test_names_are_replaced_only_if_the_last_version_was_read(desk):
     first = name_nodes(desk, {0: "mug"})
     second = name_nodes(desk, {0: "cup"}, first.version)
-    with pytest.raises(StaleNamesError, match="changed since they were read"):
+    with pytest.raises(StaleFileError, match="changed since they were read"):
         name_nodes(desk, {0: "glass"}, first.version)
-    with pytest.raises(StaleNamesError):
+    with pytest.raises(StaleFileError):
         name_nodes(desk, {0: "glass"})
     assert dict(read_names(desk, desk / "default/semantic_tree").of_node) == {0: "cup"}
     assert not name_nodes(desk, {0: " "}, second.version).of_node
 
 
-def test_names_of_another_tree_wait_until_it_is_back(desk, tmp_path):
+def test_names_of_another_tree_are_kept_but_not_used(desk, tmp_path):
     tree = desk / "default/semantic_tree"
     name_nodes(desk, {0: "mug"})
     other = tmp_path / "other"
@@ -103,12 +100,7 @@ def test_names_of_another_tree_wait_until_it_is_back(desk, tmp_path):
 
 @pytest.mark.parametrize(
     ("node", "name", "message"),
-    [
-        (0, "a > b", "be a name"),
-        (0, "x" * 81, "be a name"),
-        (0, "\x07", "be a name"),
-        (99, "mug", "no node 99"),
-    ],
+    [*((0, name, "be a name") for name in ("a > b", "x" * 81, "\x07")), (99, "mug", "no node 99")],
 )
 def test_a_name_that_cannot_be_requested_is_refused(desk, node, name, message):
     with pytest.raises(SettingsError, match=message):
@@ -140,10 +132,9 @@ def test_a_damaged_file_is_refused_and_kept(desk, content):
     with pytest.raises(ArtifactError, match=r"names\.json"):
         hilsplat.open(desk)
     assert (desk / FILE).read_text() == text
-    (desk / FILE).unlink()
 
 
-def test_what_looks_like_a_node_or_a_picture_comes_first(desk):
+def test_nodes_similar_to_a_node_or_a_picture_are_ranked_by_cosine(desk):
     scene = hilsplat.open(desk)
     found = nodes_by_text(scene)
     likes = scene.like_node(found["mug > handle"])

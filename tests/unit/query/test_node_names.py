@@ -1,4 +1,4 @@
-"""Names of nodes from a vocabulary, and the doubt whether a word is for anything in the scene."""
+"""Names of nodes from a vocabulary, and doubts about words for absent things."""
 
 import json
 import shutil
@@ -18,30 +18,20 @@ from hilsplat.query.node_names import COMMON, NodeNaming, Vocabulary, named, run
 from hilsplat.query.relevancy import margins
 from hilsplat.settings import EvaluateSettings, QuerySettings
 from tests.unit.artifact_changes import change_index
-from tests.unit.finished_desk import SCENE, build_finished_desk
+from tests.unit.finished_desk import SCENE
 from tests.unit.query.test_search_scales import tree_of
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory) -> Path:
-    """The finished desk, its nodes named by the words that its CLIP knows."""
-    project = build_finished_desk(tmp_path_factory.mktemp("project"))
+def desk(desk_project, tmp_path_factory) -> Path:
+    """A copy of the finished desk whose nodes are named by the words that its CLIP knows."""
+    project = shutil.copytree(desk_project, tmp_path_factory.mktemp("named") / "project")
     words = "[things]\nmug, book\n[parts]\nhandle, rim\n"
     (project / "models/colours/vocabulary.txt").write_text(words)
-    name_desk(project / SCENE)
+    default = project / SCENE / "default"
+    places = (default / "semantic_tree", default / "clip", default / "names", project / "cache")
+    run_names(*places, QuerySettings(), EvaluateSettings(), 1)
     return project / SCENE
-
-
-def name_desk(desk: Path, vocabulary: str = "auto") -> None:
-    run_names(
-        desk / "default/semantic_tree",
-        desk / "default/clip",
-        desk / "default/names",
-        desk / "cache",
-        QuerySettings(vocabulary=vocabulary),
-        EvaluateSettings(),
-        1,
-    )
 
 
 def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):
@@ -56,20 +46,20 @@ def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):
     ("content", "message"),
     [(b"[colours]\nred", "line 1 .* unknown section"), (b"# nothing", "names nothing"), (b"\xff", "read")],
 )
-def test_a_file_that_is_no_vocabulary_is_refused(tmp_path, content, message):
+def test_invalid_vocabularies_are_refused(tmp_path, content, message):
     (tmp_path / "words.txt").write_bytes(content)
     with pytest.raises(SettingsError, match=message):
         Vocabulary.read(tmp_path / "words.txt")
 
 
-def test_the_common_vocabulary_is_large_and_its_absent_words_name_nothing_common():
+def test_absent_words_of_the_common_vocabulary_are_not_among_its_names():
     common = Vocabulary.read(COMMON)
     assert len(common.things) > 1000 and len(common.parts) > 300 and len(common.absent) >= 300
     assert not {*common.absent} & {*common.things, *common.parts, *common.surfaces} - {"tank"}
     assert vocabulary_file("auto", Path("nowhere")) == COMMON
 
 
-def test_what_stands_out_is_a_name_and_a_part_is_not_called_what_its_whole_is():
+def test_a_name_must_stand_out_and_differ_from_the_name_of_the_parent():
     texts = np.eye(24, dtype=np.float32)
     vocabulary = Vocabulary(
         tuple(f"thing {n}" for n in range(11)), tuple(f"part {n}" for n in range(11)), ("floor", "wall")
@@ -84,7 +74,7 @@ def test_what_stands_out_is_a_name_and_a_part_is_not_called_what_its_whole_is():
     assert naming.candidates[0][0] == ("thing 2", pytest.approx(0.99)) and len(naming.candidates[0]) == 5
 
 
-def test_parts_are_named_inside_their_whole_and_given_names_win(desk):
+def test_names_of_parts_include_their_whole_and_user_given_names_come_first(desk):
     scene = hilsplat.open(desk)
     naming = NodeNaming(
         ("mug", "book", "handle", "", "rim"), ((),) * 5, (False,) * 5, np.eye(3, dtype=np.float32)
@@ -100,7 +90,7 @@ def test_parts_are_named_inside_their_whole_and_given_names_win(desk):
     (desk / "names.json").unlink()
 
 
-def test_the_stage_writes_names_that_answers_show(desk, tmp_path):
+def test_answers_show_the_names_that_the_stage_wrote(desk, tmp_path):
     rows = read_json(desk / "default/names/names.json")
     scene = hilsplat.open(desk)
     assert len(rows) == len(scene.tree) and scene.naming is not None
@@ -126,7 +116,7 @@ def test_names_of_another_tree_are_not_shown_and_damaged_ones_are_refused(desk, 
             NodeNaming.load(other, tree, clip)
 
 
-def test_a_word_that_the_model_was_never_taught_is_doubted(desk):
+def test_a_word_missing_from_the_vocabulary_of_the_model_is_doubted(desk):
     scene = hilsplat.open(desk)
     assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra"]
     (doubt,) = scene.query("zebra")[0].doubts
@@ -134,7 +124,7 @@ def test_a_word_that_the_model_was_never_taught_is_doubted(desk):
     assert scene.query("mug > handle")[0].doubts == ()
 
 
-def test_a_text_that_words_for_nothing_reach_is_doubted_with_the_chance(desk):
+def test_a_text_that_words_for_absent_things_match_as_well_is_doubted(desk):
     scene = hilsplat.open(desk)
     blue, white = np.array([[0, 0, 1.0]], np.float32), np.full((1, 3), 3**-0.5, np.float32)
     rivals = np.concatenate([np.repeat(blue, 30, axis=0), np.repeat(white, 70, axis=0)])

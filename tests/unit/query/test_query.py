@@ -62,15 +62,15 @@ def scene(tmp_path_factory) -> LanguageScene:
         Scene.load(world.scene),
         round_gaussians(np.zeros((NUM_GAUSSIANS, 3))),
         SemanticTree.load(folder / "st", world.clip),
+        lambda view: two_boxes_weights(int(view[:3])),
         LanguageField.load(folder / "field.safetensors"),
         load_code(folder / "ae"),
         encode,
-        lambda view: two_boxes_weights(int(view[:3])),
     )
 
 
 def near(scene, node_select: float = 0.85) -> LanguageScene:
-    """The scene with another share of the range within which answers lie."""
+    """The scene with another `node_select`."""
     return replace(scene, settings=scene.settings.model_copy(update={"node_select": node_select}))
 
 
@@ -95,7 +95,7 @@ def test_a_threshold_keeps_the_answers_with_at_least_that_score(scene):
             scene.query("A top", threshold=wrong)
 
 
-def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(scene):
+def test_automatic_level_is_the_coarsest_level_of_the_best_nodes(scene):
     margin = np.full(7, -0.1)
     margin[[NODE["A top left"], NODE["A top"], NODE["A"]]] = 0.3, 0.2, 0.1
     assert automatic_level(scene.tree, margin) == Level.SUBPART
@@ -106,7 +106,7 @@ def test_automatic_level_is_that_of_the_best_node_and_of_equals_the_coarsest(sce
     assert automatic_level(scene.tree, margin, np.zeros(7, bool)) == Level.WHOLE
 
 
-def test_answers_are_near_the_best_in_the_range_of_their_level():
+def test_answers_are_within_a_share_of_the_range_of_the_level_below_the_best():
     every, apart = np.arange(4), np.eye(4, dtype=np.float32)
     margin = np.array([-0.22, 0.29, 0.39, 0.69])  # a range of 0.91: 0.15 of it is 0.14, a half 0.46
     assert best_nodes(margin, apart, every, 0.85).tolist() == [3]
@@ -115,7 +115,7 @@ def test_answers_are_near_the_best_in_the_range_of_their_level():
 
 
 @pytest.mark.parametrize(("cosine", "found"), [(0.91, [3, 2]), (0.89, [3])])
-def test_what_looks_like_the_best_answer_may_be_three_times_as_far_below(cosine, found):
+def test_nodes_similar_to_the_best_answer_may_be_three_times_as_far_below(cosine, found):
     margin = np.array([0.0, 7.0, 8.6, 10.0])  # of a range of 10: 0.05 is 0.5, three times that 1.5
     vectors = np.eye(5, dtype=np.float32)[:4]
     for node in (1, 2):
@@ -123,7 +123,7 @@ def test_what_looks_like_the_best_answer_may_be_three_times_as_far_below(cosine,
     assert best_nodes(margin, vectors, np.arange(4), 0.95).tolist() == found
 
 
-def test_only_what_is_shown_answers_in_the_range_of_all():
+def test_only_shown_nodes_are_answers_but_all_define_the_range():
     margin, apart = np.array([0.0, 9.4, 9.7, 10.0]), np.eye(4, dtype=np.float32)
     shown = np.array([True, True, True, False])
     # within 0.05 of the range of all four, 10
@@ -131,7 +131,7 @@ def test_only_what_is_shown_answers_in_the_range_of_all():
     assert not len(best_nodes(margin, apart, np.arange(4), 0.95, np.zeros(4, bool)))
 
 
-def test_what_is_part_of_a_likely_thing_is_ahead(scene):
+def test_parts_of_a_likely_thing_are_ranked_first(scene):
     margin = np.full(7, -1.0)
     margin[[NODE["A"], NODE["A top"], NODE["A top left"]]] = 3.0, 1.0, 1.0
     margin[[NODE["B"], NODE["B corner"]]] = 0.0, 1.1
@@ -189,7 +189,7 @@ def three_wholes(scene) -> SemanticTree:
 
 
 @pytest.mark.parametrize(("b_corner", "found"), [(2.4, "A top left"), (2.6, "B corner")])
-def test_a_node_competes_together_with_what_holds_it(scene, three_wholes, b_corner, found):
+def test_the_shortfall_of_an_ancestor_counts_half(scene, three_wholes, b_corner, found):
     # A is best, B 1 below it, which counts half: 2.0 against b_corner - 0.5
     margin = of_path({"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": b_corner})
     hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
@@ -197,21 +197,21 @@ def test_a_node_competes_together_with_what_holds_it(scene, three_wholes, b_corn
 
 
 @pytest.mark.parametrize(("b", "found"), [(2.7, "A top left"), (2.8, "B corner")])
-def test_what_holds_no_likely_first_thing_does_not_compete(scene, three_wholes, b, found):
+def test_parts_of_an_unlikely_first_thing_do_not_compete(scene, three_wholes, b, found):
     # a quarter of the range of 5 is 1.25
     margin = of_path({"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
     hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
     assert hits.ids.tolist() == [NODE[found]]
 
 
-def test_if_no_likely_node_has_an_answer_all_are_searched_and_reported(scene, three_wholes):
+def test_if_no_likely_thing_has_parts_all_nodes_compete_as_a_fallback(scene, three_wholes):
     # B top, the best whole, holds nothing, and all else is further below it than a quarter of the range
     margin = of_path({"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
     hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
     assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "fallback")
 
 
-def test_what_a_view_does_not_show_is_no_rival_of_what_it_shows(scene, three_wholes):
+def test_hidden_ancestors_do_not_compete_with_shown_ones(scene, three_wholes):
     parent = three_wholes.parent.copy()
     parent[NODE["B corner"]] = -1
     tree = replace(three_wholes, parent=parent)
@@ -248,7 +248,7 @@ def bear_with(root, folders=FINISHED, files=("gaussians.ply", "default/field.saf
     return folder
 
 
-def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
+def test_a_scene_opens_with_the_settings_of_its_evaluation(tmp_path):
     folder = bear_with(tmp_path)
     variant = folder / "default"
     (variant / "scores.csv").touch()
@@ -260,7 +260,7 @@ def test_a_scene_opens_with_the_settings_it_was_evaluated_with(tmp_path):
     assert found.node_select == 0.9
 
 
-def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_another(tmp_path):
+def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
     folder = bear_with(tmp_path)
     (folder / "lifted").mkdir()  # begun, and killed
     with pytest.raises(ArtifactError, match=r"lifted/field\.safetensors is missing"):
@@ -276,7 +276,7 @@ def test_a_variant_answers_with_the_field_it_was_scored_with_and_never_with_anot
         FinishedScene.locate(folder, "x")
 
 
-def test_a_tree_answers_before_there_is_a_field_and_no_tree_before_its_own(tmp_path):
+def test_a_tree_can_be_queried_before_there_is_a_field(tmp_path):
     folder = bear_with(tmp_path, ("scene", "default/clip", "default/masks", "omega"), ("gaussians.ply",))
     with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
         FinishedScene.locate(folder)
@@ -304,13 +304,13 @@ def test_the_field_answers_through_the_same_interface(scene):
     assert (hit.node, hit.route) == (NODE["A top"], "child")
 
 
-def test_the_look_up_of_the_field_is_what_decoding_gives(scene):
+def test_look_ups_of_the_field_agree_with_decoding(scene):
     exact = scene.field_relevancy(["B", "A top"], "004.png")
     fast = scene.field_relevancy(["B", "A top"], "004.png", exact=False)
     assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
 
 
-def test_hits_tell_gaussians_and_an_oriented_box(scene):
+def test_hits_have_gaussians_and_an_oriented_box(scene):
     (hit,) = scene.query("A top left", "subpart")
     rows = scene.gaussians_of([hit.node])
     assert rows.tolist() == np.flatnonzero(region_mask(5)).tolist()
@@ -338,7 +338,7 @@ def test_a_path_finds_its_levels_unless_one_is_given(scene, path, level, found):
     assert hits.level == Level(int(scene.tree.level[NODE[found]]))
 
 
-def test_a_way_through_the_levels_with_every_ancestor_goes_before_one_without(scene):
+def test_levels_at_which_every_ancestor_exists_are_preferred(scene):
     # B top has no subpart
     margin = of_path({"A": 0.8, "B top": 0.9}, {"A top left": 0.6, "B corner": 0.9})
     hits = search_path(scene.tree, margin, ("x", "y"), 0.95)
@@ -346,7 +346,7 @@ def test_a_way_through_the_levels_with_every_ancestor_goes_before_one_without(sc
 
 
 @pytest.mark.parametrize("text", ["A top left", "A > A top left"])
-def test_a_view_answers_with_what_it_shows(scene, text):
+def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
     assert scene.nodes_shown("000.png").all()
     hidden = np.arange(7) != NODE["A top left"]
     scene._views.get(("shown", "half"), lambda: hidden, lambda kept: 0)
@@ -359,7 +359,7 @@ def test_a_view_answers_with_what_it_shows(scene, text):
         scene.query(text, view="x")
 
 
-def test_a_view_shows_what_has_a_mask_there(scene, monkeypatch):
+def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):
     of_level = ViewNodes(
         indptr=np.array([0, 2, 3, 3, 3]),
         nodes=np.array([2, 3, 2], np.int32),
@@ -404,7 +404,7 @@ def test_query_parses_paths_and_describes_hits(scene):
         ("A", {"answerer": "tre"}, "answerer 'tre' is unknown"),
     ],
 )
-def test_impossible_queries_say_why(scene, text, options, words):
+def test_impossible_queries_are_refused(scene, text, options, words):
     with pytest.raises(SettingsError, match=words):
         scene.query(text, **options)
 
@@ -454,7 +454,7 @@ def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(scene):
     assert np.isinf(thin.node_cosine(texts, "000.png", pixels)[:, :, 0]).all()
 
 
-def test_uncovered_pixels_get_the_least_relevancy(scene):
+def test_uncovered_pixels_get_the_lowest_relevancy(scene):
     weights = two_boxes_weights(0).tolil()
     weights[0] = 0
     thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
@@ -463,30 +463,20 @@ def test_uncovered_pixels_get_the_least_relevancy(scene):
     assert not thin.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
 
 
-def test_gaussians_without_a_latent_do_not_dilute_a_pixel(scene):
+def test_latents_are_means_over_the_gaussians_that_have_one(scene):
     features = scene.language.features.copy()
     features[::7] = 0
     thin = replace(scene, language=replace(scene.language, features=features), _views=ViewStore())
-    weights = scene.view_weights("000.png").toarray()
-    has = (features[:, 0] != 0).any(axis=1)
-    share = weights[:, has].sum(axis=1)
-    pixels, latents = thin._field.latents("000.png")[0]
-    assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
-    assert (share[pixels] < 0.99).any()
-    expected = weights[pixels] @ features[:, 0] / share[pixels, None]
-    assert latents == pytest.approx(expected, abs=1e-5)
-
-
-def test_latents_rendered_at_once_have_the_bytes_of_each_level_alone(scene):
     weights = scene.view_weights("000.png")
-    for index, (pixels, latents) in enumerate(scene._field.latents("000.png")):
-        own = np.ascontiguousarray(scene.language.features[:, index])
+    for index, (pixels, latents) in enumerate(thin.latents("000.png")):
+        own = np.ascontiguousarray(features[:, index])
         share = weights @ (own != 0).any(axis=1).astype(np.float32)
-        assert len(pixels)
+        assert pixels.tolist() == np.flatnonzero(share > 0.5).tolist()
+        assert (share[pixels] < 0.99).any()
         assert latents.tobytes() == ((weights[pixels] @ own) / share[pixels, None]).tobytes()
 
 
-def test_a_view_that_is_forgotten_is_computed_again_with_the_same_answers(scene):
+def test_a_forgotten_view_is_computed_again_with_the_same_answers(scene):
     asked = []
     weights = lambda view: asked.append(view) or scene.pixel_weights(view)  # noqa: E731
     own = replace(scene, pixel_weights=weights, _views=ViewStore())
@@ -498,14 +488,11 @@ def test_a_view_that_is_forgotten_is_computed_again_with_the_same_answers(scene)
     assert asked == ["000.png", "001.png", "000.png"]
 
 
-def test_runs_of_pixels_are_copied_to_their_places():
+def test_pixels_of_a_map_without_a_latent_get_the_lowest_value_of_its_text():
     maps = np.zeros((1, 1, 9), np.float32)
     found = np.arange(1, 7, dtype=np.float32)[None]
     fill_maps(found, np.float32([9]), np.array([0, 1, 3, 4, 5, 8]), 0, maps)
     assert maps[0, 0].tolist() == [1, 2, 9, 3, 4, 5, 9, 9, 6]
-
-
-def test_pixels_of_a_map_without_a_latent_get_the_least_value_of_its_text():
     maps = np.full((2, 3, 4), 7, np.float32)
     found = np.array([[0.5, 0.25], [0.125, 1]], np.float32)
     fill_maps(found, found.min(axis=1), np.array([3, 1]), 1, maps)

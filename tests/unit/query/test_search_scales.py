@@ -1,4 +1,4 @@
-"""Searches whose scales could vanish: a single thing, saturated relevancies, texts that nothing answers."""
+"""Searches whose scales could vanish: a single thing, saturated relevancies, texts without a match."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +8,6 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.base.levels import Level
-from hilsplat.field.language_field import LanguageField
-from hilsplat.field.network_code import Autoencoder, torch_generator
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import margin_range, search
@@ -17,34 +15,14 @@ from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
+from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.query.test_query import near
 from tests.unit.round_gaussians import round_gaussians
 
 
 def tree_of(levels: list[int], parents: list[int]) -> SemanticTree:
-    """A tree of nodes that look like nothing but themselves."""
-    n = len(levels)
-    return SemanticTree(
-        level=np.array(levels, np.uint8),
-        parent=np.array(parents, np.int32),
-        clip=np.eye(n, dtype=np.float32),
-        centroid=np.zeros((n, 3), np.float32),
-        box=np.zeros((n, 2, 3), np.float32),
-        oriented_box=np.zeros((n, 5, 3), np.float32),
-        quality=np.ones(n, np.float32),
-        views=np.ones(n, np.int32),
-        node_of_gaussian=np.full((1, 3), -1, np.int32),
-        membership=np.zeros((1, 3), np.float32),
-        node_of_mask=np.zeros(0, np.int32),
-        linked_node=np.zeros(0, np.int32),
-        crop_score=np.zeros(0, np.float32),
-        crop_rank=np.zeros(0, np.int32),
-        view_area_px=np.ones((n, 1), np.float32),
-        view_names=("a.png",),
-        gaussians_sha256="",
-        cameras_sha256="",
-        min_weight=0.1,
-    )
+    """A tree whose nodes have orthogonal vectors."""
+    return plain_tree(levels, parents, [[-1, -1, -1]], clip=np.eye(len(levels), dtype=np.float32))
 
 
 def searched(tree: SemanticTree, margin: list[list[float]], *path: str, **options):
@@ -70,7 +48,7 @@ def test_twins_do_not_make_the_penalty_vanish():
     assert (hits.ids.tolist(), hits.route) == ([2], "child")
 
 
-def test_the_range_is_the_nodes_own_if_a_generic_phrase_is_among_them():
+def test_the_range_of_margins_includes_zero():
     assert margin_range(np.array([-1.0, 4.0])) == 5.0
     assert margin_range(np.array([2.0, 4.0])) == 4.0
     assert margin_range(np.array([-2.0, -1.0])) == 2.0
@@ -95,25 +73,17 @@ def three_mugs() -> LanguageScene:
         return np.eye(6, dtype=np.float32)[[axes.get(text, 1) for text in texts]]
 
     settings = EvaluateSettings(relevancy_scale=100)
-    camera = Cameras(("a.png",), np.eye(4)[None], np.eye(3)[None], np.array([[2, 2]], np.int32))
-    no_points = np.zeros((0, 3), np.float32)
+    camera = Cameras(("000.png",), np.eye(4)[None], np.eye(3)[None], np.array([[2, 2]], np.int32))
+    nothing = np.zeros((0, 3), np.float32)
+    split, colours = {"000.png": "train"}, nothing.astype(np.uint8)
     return LanguageScene(
-        Scene(
-            Path(),
-            "toy/mugs",
-            "metre",
-            camera,
-            {"a.png": "train"},
-            no_points,
-            no_points.astype(np.uint8),
-            np.eye(4),
-        ),
+        Scene(Path(), "toy/mugs", "metre", camera, split, nothing, colours, np.eye(4)),
         round_gaussians(np.zeros((1, 3))),
         replace(tree, clip=vectors),
-        LanguageField(np.zeros((1, 3, 2), np.float32), "", ""),
-        Autoencoder.drawn(6, 2, torch_generator(0)),
-        encode,
         lambda view: sp.csr_matrix((4, 1), dtype=np.float32),
+        None,
+        None,
+        encode,
         settings,
     )
 
@@ -133,7 +103,7 @@ def test_the_scale_of_relevancies_changes_no_answer(three_mugs):
         assert near(small, share).select(["mug"]).ids.tolist() == found.ids.tolist()
 
 
-def test_a_text_that_nothing_answers_is_doubtful(three_mugs):
+def test_a_text_without_a_match_is_doubtful(three_mugs):
     (doubt,) = three_mugs.query("unicorn", "whole")[0].doubts
     # cosine 0 with the text and 0.1 with the nearest phrase
     assert (doubt.text, doubt.level) == ("unicorn", None)
@@ -141,7 +111,7 @@ def test_a_text_that_nothing_answers_is_doubtful(three_mugs):
     assert three_mugs.query("mug")[0].doubts == ()
 
 
-def test_the_first_text_of_a_path_is_doubted_though_the_last_is_answered_well():
+def test_the_first_text_of_a_path_is_doubted_even_if_the_last_has_a_good_match():
     tree = tree_of([1, 1, 2], [-1, -1, 0])
     hits = searched(tree, [[-0.1, -0.2, 0.3], [-0.5, -0.5, 0.3]], "unicorn", "head")
     assert (hits.ids.tolist(), hits.route) == ([2], "child")
@@ -155,7 +125,7 @@ def test_the_first_text_of_a_path_is_doubted_though_the_last_is_answered_well():
     assert str(doubt).startswith("no whole here answers to 'unicorn' better than to a generic word")
 
 
-def test_doubts_are_about_what_competes_in_the_view():
+def test_doubts_consider_only_nodes_shown_in_the_view():
     tree = tree_of([1, 1, 2, 2], [-1, -1, 0, 1])
     margin = [[0.4, -0.1, 0, 0], [0, 0, 0.3, 0.3]]
     assert not searched(tree, margin, "mug", "handle").texts[0].is_doubtful

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -9,16 +10,15 @@ from starlette.testclient import TestClient
 
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.viewer_scene import ViewerScene
-from tests.unit.finished_desk import SCENE, build_finished_desk
+from tests.unit.finished_desk import SCENE
 
 TOKEN = "secret-of-the-test"
 ADDRESS = "http://127.0.0.1:4000"
 
 
 @pytest.fixture(scope="session")
-def built_desk(tmp_path_factory) -> Path:
-    """A project folder with models/colours and the finished results/photos/desk."""
-    return build_finished_desk(tmp_path_factory.mktemp("project"))
+def built_desk(desk_project) -> Path:
+    return desk_project
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +26,18 @@ def shown(built_desk) -> ViewerScene:
     return ViewerScene(built_desk / SCENE)
 
 
-@pytest.fixture(scope="module")
-def client(shown) -> Iterator[TestClient]:
+@contextmanager
+def browsing(shown: ViewerScene) -> Iterator[TestClient]:
     """A browser that was given the printed address, with the headers of the page."""
     headers = {"origin": ADDRESS, "sec-fetch-site": "same-origin"}
     with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS, headers=headers) as browser:
         assert browser.get(f"/?token={TOKEN}").status_code == 200
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def client(shown) -> Iterator[TestClient]:
+    with browsing(shown) as browser:
         yield browser
 
 
@@ -49,7 +55,7 @@ def wire_camera(camera) -> dict:
 
 
 def in_steps(client, kind: str, **sent) -> tuple[list[tuple[int, int]], bytes]:
-    """How far a file was, line by line, and the file."""
+    """Progress of a file, line by line, and the file."""
     progress, rest = [], client.post(f"/api/export/{kind}", json=sent).content
     while True:
         line, _, rest = rest.partition(b"\n")

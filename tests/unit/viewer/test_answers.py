@@ -1,4 +1,4 @@
-"""Questions to the server, and the files that it gives away, against `LanguageScene` itself."""
+"""Queries to the server, and the files that it exports, compared with `LanguageScene`."""
 
 import asyncio
 import base64
@@ -21,14 +21,12 @@ from PIL import Image
 from plyfile import PlyData
 from pycocotools import mask as coco_masks
 from starlette.requests import Request
-from starlette.testclient import TestClient
 
 from hilsplat.base.artifacts import read_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.query.names import FILE
 from hilsplat.splat.ply import load_ply
 from hilsplat.viewer import exports
-from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.exports import write_gif
 from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
@@ -36,11 +34,11 @@ from hilsplat.web.coco import coco_counts
 from hilsplat.web.scene_thread import SceneThread
 from tests.unit.finished_desk import SCENE
 from tests.unit.splat.spz_reader import decoded
-from tests.unit.viewer.conftest import ADDRESS, TOKEN, in_steps, wire_camera
+from tests.unit.viewer.conftest import browsing, in_steps, wire_camera
 
 
 def run_apart(work: Callable[[], Coroutine[None, None, None]]) -> None:
-    """Run a coroutine in a thread of its own: a browser's test in this process leaves a loop running."""
+    """Run a coroutine in its own thread, because browser tests in this process leave a loop running."""
     with ThreadPoolExecutor(1) as pool:
         pool.submit(lambda: asyncio.run(work())).result()
 
@@ -56,7 +54,7 @@ def ask(client, text: str, **more) -> dict:
 
 @pytest.mark.parametrize("text", ["mug", "mug > handle", "handle", "unicorn > rim"])
 @pytest.mark.parametrize("answerer", ["tree", "field"])
-def test_the_page_gets_the_answers_of_the_scene(client, scene, text, answerer):
+def test_the_server_returns_the_answers_of_the_scene(client, scene, text, answerer):
     found, hits = ask(client, text, answerer=answerer), scene.query(text, answerer=answerer, limit=24)
     assert [hit["node"] for hit in found["hits"]] == [hit.node for hit in hits]
     assert [hit["score"] for hit in found["hits"]] == pytest.approx([hit.score for hit in hits], abs=1e-4)
@@ -65,7 +63,7 @@ def test_the_page_gets_the_answers_of_the_scene(client, scene, text, answerer):
     np.testing.assert_allclose(found["relevancy"], scene.node_relevancy([last], answerer)[0], atol=1e-4)
 
 
-def test_what_a_script_may_ask_is_described_as_it_is(client):
+def test_requests_match_their_openapi_description(client):
     described = client.get("/openapi.json").json()
     bodies = {
         "/api/query": {"text": "mug > handle"},
@@ -101,12 +99,12 @@ def test_a_photograph_and_a_level_restrict_the_answers(client, scene):
 
 
 @pytest.mark.parametrize("text", ["", " ", "mug >", "x" * 201, "a > b > c > d"])
-def test_a_text_that_cannot_be_asked_gets_a_sentence(client, text):
+def test_invalid_texts_are_refused(client, text):
     sent = client.post("/api/query", json={"text": text})
     assert sent.status_code in (400, 422) and sent.json()["error"]
 
 
-def test_what_is_like_a_node_or_a_picture(client, scene):
+def test_nodes_similar_to_a_node_or_a_picture(client, scene):
     (handle,) = ask(client, "mug > handle")["hits"]
     found = client.post("/api/like", json={"node": handle["node"]}).json()
     expected = scene.like_node(handle["node"], limit=24)
@@ -121,7 +119,7 @@ def test_what_is_like_a_node_or_a_picture(client, scene):
         assert client.post("/api/like", json={"picture": bad}).status_code == 422
 
 
-def test_the_field_s_relevancy_of_every_gaussian(client, scene, shown):
+def test_field_relevancy_of_every_gaussian(client, scene, shown):
     values = np.frombuffer(
         client.post("/api/field", json={"text": "mug", "level": "whole"}).content, np.uint8
     )
@@ -133,7 +131,7 @@ def test_the_field_s_relevancy_of_every_gaussian(client, scene, shown):
     assert values[nodes == mug.node].mean() > values[nodes != mug.node].mean() + 50
 
 
-def test_names_are_kept_and_answer_and_need_the_version_that_was_read(client, scene, built_desk):
+def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, built_desk):
     names_file = built_desk / SCENE / FILE
     outline = client.get("/api/variant/default").json()
     (book,) = ask(client, "book", level="whole")["hits"]
@@ -156,7 +154,7 @@ def test_names_are_kept_and_answer_and_need_the_version_that_was_read(client, sc
     names_file.unlink()
 
 
-def test_a_saved_selection_is_the_nodes_gaussians(client, scene, shown, tmp_path):
+def test_a_saved_selection_has_the_gaussians_of_the_nodes(client, scene, shown, tmp_path):
     nodes = [hit["node"] for hit in ask(client, "mug > handle")["hits"]]
     sent = {"groups": [{"name": "mug > handle", "nodes": nodes}]}
     (tmp_path / "selection.ply").write_bytes(client.post("/api/export/ply", json=sent).content)
@@ -223,8 +221,7 @@ def test_coco_runs_begin_with_zeros(mask):
     np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), mask)
 
 
-def test_a_person_is_answered_between_the_steps_of_a_file(shown):
-    """What takes long never has the thread of the scene for longer than a step."""
+def test_queries_run_between_the_steps_of_a_file(shown):
     thread = SceneThread(shown)
     order: list[str] = []
 
@@ -247,21 +244,21 @@ def test_a_person_is_answered_between_the_steps_of_a_file(shown):
     assert order == ["step 0", "click", "step 1", "step 2"]
 
 
-def test_films_have_the_frames_that_were_requested(client, tmp_path):
+def frames_of(film: bytes) -> list[np.ndarray]:
+    with av.open(io.BytesIO(film)) as opened:
+        return [frame.to_ndarray(format="rgb24").astype(float) for frame in opened.decode(video=0)]
+
+
+def test_films_have_the_requested_frames(client):
     progress, data = in_steps(client, "film", frames=6, side_px=64)
     assert progress == [(made, 6) for made in range(7)]
-    (tmp_path / "film.mp4").write_bytes(data)
-    with av.open(str(tmp_path / "film.mp4")) as film:
-        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    frames = frames_of(data)
     assert len(frames) == 6 and frames[0].shape == (36, 64, 3) and frames[0].std() > 20
 
 
-def test_a_film_flies_along_a_path(client, camera, tmp_path):
+def test_a_film_follows_a_path(client, camera):
     views = [wire_camera(camera), {**wire_camera(camera), "cam_from_world": np.eye(4).tolist()}]
-    _, data = in_steps(client, "film", frames=5, side_px=64, path=views)
-    (tmp_path / "film.mp4").write_bytes(data)
-    with av.open(str(tmp_path / "film.mp4")) as film:
-        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in film.decode(video=0)]
+    frames = frames_of(in_steps(client, "film", frames=5, side_px=64, path=views)[1])
     still = encoded_frame(client, views[0], frames[0].shape[:2])
     assert np.abs(frames[0] - still).mean() < 8 < np.abs(frames[-1] - still).mean()
 
@@ -276,7 +273,7 @@ def encoded_frame(client, camera, size_hw) -> np.ndarray:
 
 
 @pytest.mark.parametrize("side_px", [64, 96])
-def test_a_gif_has_every_other_frame_in_the_size_that_was_requested(client, side_px):
+def test_a_gif_has_every_other_frame_in_the_requested_size(client, side_px):
     progress, data = in_steps(client, "film", frames=7, side_px=side_px, format="gif")
     assert progress == [(made, 4) for made in range(5)]
     gif = Image.open(io.BytesIO(data))
@@ -289,7 +286,7 @@ def test_a_gif_has_every_other_frame_in_the_size_that_was_requested(client, side
 
 
 @pytest.mark.parametrize("kind", ["mp4", "gif"])
-def test_a_film_on_a_full_disk_ends_with_the_reason(client, monkeypatch, kind):
+def test_a_film_on_a_full_disk_reports_the_error(client, monkeypatch, kind):
     def full(path, frames, *more) -> None:
         next(iter(frames))
         raise OSError(28, "No space left on device")
@@ -302,7 +299,6 @@ def test_a_film_on_a_full_disk_ends_with_the_reason(client, monkeypatch, kind):
 
 
 def test_a_film_ends_when_its_page_is_closed(shown):
-    """Its thread draws at most the picture that it had begun, and is free for the next film."""
     files, drawn, free = SavedFiles(SceneThread(shown), {}), [], threading.Event()
 
     def film(on_frame) -> bytes:
@@ -323,7 +319,7 @@ def test_a_film_ends_when_its_page_is_closed(shown):
     assert len(drawn) < 500
 
 
-def test_a_question_waits_for_one_crop_at_most(shown):
+def test_a_query_waits_for_at_most_one_crop(shown):
     thread, order = SceneThread(shown), []
     request = Request({"type": "http", "query_string": b""})
 
@@ -352,7 +348,7 @@ def test_a_crop_shows_the_node_and_dims_the_rest(client, scene):
     assert client.get("/api/crop/default/99").status_code == 422
 
 
-def test_photographs_are_given_by_number(client, scene):
+def test_photographs_are_requested_by_number(client, scene):
     image = Image.open(io.BytesIO(client.get("/api/photo/3").content))
     np.testing.assert_array_equal(np.asarray(image.convert("RGB")), scene.image(scene.views[3]))
     assert client.get("/api/thumb/3").headers["content-type"] == "image/jpeg"
@@ -367,7 +363,7 @@ def test_gaussians_are_sent_once(client, shown):
     assert again.status_code == 304 and not again.content
 
 
-def test_an_exported_page_holds_all_that_it_needs(client, shown):
+def test_an_exported_page_contains_everything_it_needs(client, shown):
     evil = "mug </script><script>alert(1)</script>".replace(">", "")
     progress, data = in_steps(
         client,
@@ -395,14 +391,13 @@ def test_an_exported_page_holds_all_that_it_needs(client, shown):
             assert used in imports, (name, used)
 
 
-def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_desk, tmp_path):
+def test_gaussians_are_shown_during_a_run_before_queries_work(built_desk, tmp_path):
     whole, growing = built_desk / SCENE, tmp_path / "photos/desk"
     later = ("clip", "autoencoder", "field.safetensors*", "models")
     shutil.copytree(whole, growing, ignore=shutil.ignore_patterns(*later))
     shutil.copytree(built_desk / "models", tmp_path / "models")
     shown = ViewerScene(growing)
-    with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}) as client:
-        client.get(f"/?token={TOKEN}")
+    with browsing(shown) as client:
         assert client.get("/api/scene").json()["variants"] == []
         camera = shown.scene.cameras[shown.scene.cameras.names[0]]
         view = {"cam_from_world": camera.cam_from_world.tolist(), "K": camera.K.tolist(), "size_hw": [8, 8]}
@@ -421,7 +416,7 @@ def test_gaussians_are_shown_while_the_run_goes_and_answers_come_later(built_des
         assert ask(client, "mug", answerer="field")["hits"]
 
 
-def test_a_scene_that_is_too_large_is_refused_with_advice(built_desk, monkeypatch):
+def test_a_scene_with_too_many_gaussians_is_refused(built_desk, monkeypatch):
     monkeypatch.setattr("hilsplat.viewer.viewer_scene.MAX_GAUSSIANS", 100)
     with pytest.raises(
         ArtifactError, match=r"too large for the page\n.*at most 100 Gaussians\n.*\n.*max_gaussians"
@@ -429,7 +424,7 @@ def test_a_scene_that_is_too_large_is_refused_with_advice(built_desk, monkeypatc
         ViewerScene(built_desk / SCENE)
 
 
-def test_a_scene_without_gaussians_says_what_to_run(tmp_path):
+def test_a_scene_without_gaussians_is_refused(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .* is missing"):
         ViewerScene(tmp_path / "nothing")
     (tmp_path / "scene").mkdir()

@@ -1,4 +1,4 @@
-"""A scene that is written anew while its page is open: what the page shows never mixes with what is new."""
+"""A scene that is rebuilt while its page is open: the page never mixes old and new parts."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -9,31 +9,26 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from hilsplat.base.artifacts import atomic_folder
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
-from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.file_changes import FileChanges
-from tests.unit.artifact_changes import change_index
+from tests.unit.artifact_changes import change_index, write_again
 from tests.unit.finished_desk import SCENE
-from tests.unit.viewer.conftest import ADDRESS, TOKEN
+from tests.unit.viewer.conftest import browsing
 
 
 @pytest.fixture
 def desk(built_desk, tmp_path) -> Path:
-    """A copy of the finished desk, to be written to."""
+    """A copy of the finished desk, to change."""
     shutil.copytree(built_desk, tmp_path / "project")
     return tmp_path / "project" / SCENE
 
 
 @pytest.fixture
 def page(desk) -> Iterator[TestClient]:
-    """A page that was loaded and asked something."""
-    with TestClient(
-        Viewer(ViewerScene(desk)).app(TOKEN), base_url=ADDRESS, headers={"origin": ADDRESS}
-    ) as client:
-        client.get(f"/?token={TOKEN}")
+    """A page that was loaded and has queried the scene."""
+    with browsing(ViewerScene(desk)) as client:
         client.state = load(client)
         assert ask(client).status_code == 200
         yield client
@@ -47,30 +42,20 @@ def ask(client, of: str | None = None):
     return client.post("/api/query", json={"text": "mug"}, params={"of": of or client.state})
 
 
-def made_again(artifact: Path) -> None:
-    """As a stage that was rerun leaves it."""
-    if artifact.is_dir():
-        with atomic_folder(artifact) as new:
-            shutil.copytree(artifact, new, dirs_exist_ok=True)
-    else:
-        shutil.copy(artifact, artifact.with_name("new"))
-        artifact.with_name("new").replace(artifact)
-
-
 PARTS = ("scene", "gaussians.ply", "default/semantic_tree", "default/field.safetensors", "default/clip")
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_part_that_was_rewritten_is_noticed_and_gone_after_a_reload(page, desk, part):
+def test_a_rewritten_part_is_reported_until_a_reload(page, desk, part):
     assert page.get("/api/changes").json() == {"of": page.state, "changed": [], "variants": ["default"]}
-    made_again(desk / part)
+    write_again(desk / part)
     assert page.get("/api/changes").json()["changed"] == [Path(part).name]
     again = load(page)
     assert again != page.state and ask(page, again).status_code == 200
     assert page.get("/api/changes").json() == {"of": again, "changed": [], "variants": ["default"]}
 
 
-def test_open_parts_still_answer(page, desk):
+def test_opened_parts_can_still_be_queried(page, desk):
     before = ask(page).json()["hits"]
     (desk / "gaussians.ply").unlink()
     assert page.get("/api/changes").json()["changed"] == ["gaussians.ply"]
@@ -79,7 +64,7 @@ def test_open_parts_still_answer(page, desk):
     assert ask(page).json()["hits"] == before
 
 
-def test_nothing_is_read_beside_what_was_opened_before(page, desk):
+def test_rebuilt_parts_are_not_read_together_with_opened_ones(page, desk):
     """Rows of the old tree in a new PLY, names of the old tree for a new one, a tree of other Gaussians."""
     gaussians = load_ply(desk / "gaussians.ply")
     handle = page.post("/api/query", json={"text": "handle"}).json()["hits"][0]["node"]
@@ -100,11 +85,11 @@ def test_nothing_is_read_beside_what_was_opened_before(page, desk):
     assert not (desk / "names.json").exists()
 
 
-def test_a_page_that_is_saved_while_the_scene_changes_is_refused(page, desk, monkeypatch):
+def test_an_export_of_a_page_fails_if_the_scene_changes_meanwhile(page, desk, monkeypatch):
     draw = exports.crop
 
     def crop(*of):
-        made_again(desk / "default/semantic_tree")
+        write_again(desk / "default/semantic_tree")
         return draw(*of)
 
     monkeypatch.setattr(exports, "crop", crop)
@@ -113,16 +98,16 @@ def test_a_page_that_is_saved_while_the_scene_changes_is_refused(page, desk, mon
     assert len(lines) == 2 and "semantic_tree of photos/desk changed on the disk" in lines[1]
 
 
-def test_a_variant_that_comes_later_is_not_opened_beside_old_parts(page, desk):
+def test_a_later_variant_is_not_opened_together_with_old_parts(page, desk):
     shutil.copytree(desk / "default", desk / "second")
     assert page.get("/api/changes").json()["variants"] == ["default", "second"]
-    made_again(desk / "gaussians.ply")
+    write_again(desk / "gaussians.ply")
     answer = page.post("/api/query", json={"text": "mug", "variant": "second"})
     assert answer.status_code == 409
     assert page.post("/api/query", json={"text": "mug", "variant": "second"}, params={"of": load(page)})
 
 
-def test_names_are_kept_while_another_variant_gets_a_field_that_cannot_be_read(page, desk):
+def test_names_are_saved_although_the_field_of_another_variant_cannot_be_read(page, desk):
     shutil.copytree(desk / "default", desk / "second")
     for part in (*(desk / "second").glob("field.safetensors*"), *(desk / "second").glob("scores.csv*")):
         part.unlink()
@@ -138,8 +123,8 @@ def test_names_are_kept_while_another_variant_gets_a_field_that_cannot_be_read(p
     assert page.put("/api/names", json=body, headers={"if-match": f'"{version}"'}).status_code == 200
 
 
-def test_a_page_of_before_gets_nothing_of_after(page, desk):
-    made_again(desk / "default/semantic_tree")
+def test_a_page_gets_no_data_of_a_later_state(page, desk):
+    write_again(desk / "default/semantic_tree")
     again = load(page)  # another tab
     camera = {"cam_from_world": np.eye(4).tolist(), "K": np.eye(3).tolist(), "size_hw": [4, 4]}
     for path, sent in (("query", {"text": "mug"}), ("frame", {"camera": camera}), ("export/film", {})):
@@ -150,26 +135,26 @@ def test_a_page_of_before_gets_nothing_of_after(page, desk):
         assert page.get(f"/api/{path}", params={"of": again}).status_code == 200
 
 
-def test_an_outline_names_its_tree(page, desk):
+def test_an_outline_has_the_digest_of_its_tree(page, desk):
     before = page.get("/api/variant/default").json()["tree"]
-    made_again(desk / "default/semantic_tree")
+    write_again(desk / "default/semantic_tree")
     load(page)
     assert page.get("/api/variant/default").json()["tree"] == before  # the same rows again
     with np.load(desk / "default/semantic_tree/tree.npz") as held:
         arrays = {**held, "quality": held["quality"] * 0.5}
     np.savez(desk / "default/semantic_tree/tree.npz", **arrays)
     change_index(desk / "default/semantic_tree")
-    made_again(desk / "default/semantic_tree")
+    write_again(desk / "default/semantic_tree")
     load(page)
     assert page.get("/api/variant/default").json()["tree"] != before
 
 
-def test_a_witness_sees_files_come_go_and_be_replaced(tmp_path):
+def test_created_and_replaced_files_count_as_changed(tmp_path):
     changes, file, folder = FileChanges(), tmp_path / "a.npz", tmp_path / "b"
     file.write_bytes(b"one")
     changes.note([file, folder])
     assert changes.changed() == []
-    made_again(file)
+    write_again(file)
     assert changes.changed() == [file]
     changes.note([file])  # what was opened is what counts
     assert changes.changed() == [file]

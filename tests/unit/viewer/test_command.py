@@ -1,4 +1,4 @@
-"""The command: it prints an address that opens the page, on this machine alone, and ends on Ctrl-C."""
+"""The command prints an address that opens the page on this machine only, and ends on Ctrl-C."""
 
 import asyncio
 import os
@@ -39,12 +39,12 @@ def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
         server.communicate()
 
 
-def test_a_port_that_is_taken_is_refused_with_advice():
+def test_a_taken_port_is_refused():
     with listening_at(0) as taken, pytest.raises(SettingsError, match="choose another"):
         listening_at(taken.getsockname()[1])
 
 
-def test_answers_do_not_wait_for_acknowledgements():
+def test_the_socket_sends_without_delay():
     async def nodelay() -> int:
         found = asyncio.get_running_loop().create_future()
 

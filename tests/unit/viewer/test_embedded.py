@@ -1,4 +1,4 @@
-"""The page in a notebook: a frame that has the token instead of a cookie, perhaps behind a proxy."""
+"""The page in a notebook: a frame with the token instead of a cookie, possibly behind a proxy."""
 
 import re
 import urllib.request
@@ -37,19 +37,18 @@ def test_each_request_needs_the_token_and_gets_no_cookie(framed):
     assert framed.post("/api/query", params={"token": TOKEN}, **form).status_code == 403
 
 
-def test_a_page_of_its_own_is_in_no_frame(client):
+def test_a_separate_page_cannot_be_framed(client):
     assert "frame-ancestors 'none'" in client.get("/").headers["content-security-policy"]
 
 
-def test_the_page_names_no_absolute_path(framed):
-    """A proxy may have put it anywhere."""
+def test_the_page_has_no_absolute_paths(framed):
     page = framed.get("/", params={"token": TOKEN}).text
     assert re.findall(r'(?:src|href)="(/[^"]*)', page) == []
     for name in ("api.js", "main.js", "drawing.js"):
         assert not re.findall(r'["`]/(?:api|static)/', framed.get(f"/static/{name}").text)
 
 
-def test_a_scene_shows_itself_in_a_notebook(built_desk):
+def test_a_scene_is_shown_in_a_notebook(built_desk):
     scene = hilsplat.open(built_desk / SCENE)
     shown = scene.show("mug", height=300)
     try:
@@ -67,7 +66,7 @@ def test_a_scene_shows_itself_in_a_notebook(built_desk):
     hub.close()
 
 
-def test_a_scene_of_parts_says_that_it_has_no_folder(built_desk):
+def test_a_scene_assembled_from_parts_cannot_be_shown(built_desk):
     scene = replace(hilsplat.open(built_desk / SCENE), finished=None)
     with pytest.raises(ArtifactError, match=r"hilsplat\.open"):
         scene.show()

@@ -1,4 +1,4 @@
-"""Who may talk to the server: foreign hosts, sites, pages and tokens are refused."""
+"""Requests from other hosts, sites and pages, and without the token, are refused."""
 
 import pytest
 from starlette.testclient import TestClient
@@ -10,16 +10,10 @@ from tests.unit.viewer.conftest import ADDRESS, TOKEN
 QUERY = {"text": "mug"}
 
 
-def test_nothing_is_answered_without_the_token(shown):
+def test_requests_without_the_token_are_refused(shown):
     with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS) as stranger:
-        for path in (
-            "/",
-            "/?token=",
-            "/?token=wrong",
-            "/api/scene",
-            "/static/main.js",
-            f"/api/scene?token={TOKEN}",
-        ):
+        secret = f"/api/scene?token={TOKEN}"
+        for path in ("/", "/?token=", "/?token=wrong", "/api/scene", "/static/main.js", secret):
             assert stranger.get(path).status_code == 403, path
         opened = stranger.get(f"/?token={TOKEN}")
         assert opened.status_code == 200
@@ -27,19 +21,19 @@ def test_nothing_is_answered_without_the_token(shown):
         assert stranger.get("/api/scene").status_code == 200
 
 
-def test_two_servers_of_one_browser_have_cookies_of_different_names(shown):
+def test_servers_have_cookies_with_different_names(shown):
     assert Viewer(shown).app(TOKEN).cookie != Viewer(shown).app(TOKEN).cookie
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:4000", "127.0.0.1.evil.example", "", "[::2]:80"]
 )
-def test_a_foreign_host_is_refused(client, host):
+def test_other_hosts_are_refused(client, host):
     assert client.get("/api/scene", headers={"host": host}).status_code == 403
 
 
 @pytest.mark.parametrize("host", ["localhost:9999", "127.0.0.1:1", "127.0.0.1", "[::1]:4000"])
-def test_this_machine_may_have_another_port_as_behind_a_tunnel(client, host):
+def test_other_ports_of_this_machine_are_accepted(client, host):
     assert client.get("/api/scene", headers={"host": host}).status_code == 200
     tunnelled = {"host": host, "origin": f"http://{host}"}
     assert client.post("/api/query", json=QUERY, headers=tunnelled).status_code == 200
@@ -48,23 +42,23 @@ def test_this_machine_may_have_another_port_as_behind_a_tunnel(client, host):
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://127.0.0.1:4001", "https://127.0.0.1:4000", ""]
 )
-def test_only_the_page_itself_may_send_something(client, origin):
+def test_requests_with_a_body_need_the_origin_of_the_page(client, origin):
     assert client.post("/api/query", json=QUERY, headers={"origin": origin}).status_code == 403
 
 
-def test_another_site_is_refused_even_when_it_only_reads(client):
+def test_reads_from_other_sites_are_refused(client):
     assert client.get("/api/scene", headers={"sec-fetch-site": "cross-site"}).status_code == 403
 
 
 @pytest.mark.parametrize(
     "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""]
 )
-def test_what_a_form_can_send_is_refused(client, kind):
+def test_content_types_of_forms_are_refused(client, kind):
     sent = client.post("/api/query", content='{"text": "mug"}', headers={"content-type": kind})
     assert sent.status_code == 403
 
 
-def test_too_much_is_refused_before_it_is_read(client):
+def test_large_bodies_are_refused(client):
     assert client.post("/api/query", json={"text": "x" * (1 << 20)}).status_code == 413
 
 
@@ -91,7 +85,7 @@ def test_a_number_of_thousands_of_digits_is_refused(client, start):
 
 
 @pytest.mark.parametrize("variant", ["..", "../default", "scene", "%2e%2e", "nothing"])
-def test_a_variant_is_a_name_that_the_folder_lists(client, variant):
+def test_unknown_variants_are_refused(client, variant):
     assert client.get(f"/api/nodes/{variant}").status_code in (404, 422)
     assert client.post("/api/query", json={**QUERY, "variant": variant}).status_code == 422
 
@@ -99,7 +93,7 @@ def test_a_variant_is_a_name_that_the_folder_lists(client, variant):
 @pytest.mark.parametrize(
     ("page", "package"), [("index.html", "hilsplat.viewer"), ("annotate.html", "hilsplat.annotate")]
 )
-def test_a_page_is_small_and_asks_no_other_address(page, package):
+def test_pages_are_small_and_request_no_other_address(page, package):
     texts = {name: data.decode() for name, data in Pages(page, package).static.items()}
     assert sum(len(text) for name, text in texts.items() if name.endswith(".js")) < 200_000
     for name, text in texts.items():
@@ -107,7 +101,7 @@ def test_a_page_is_small_and_asks_no_other_address(page, package):
         assert "http://" not in found and "https://" not in found and "innerHTML" not in found, name
 
 
-def test_every_answer_carries_the_policy(client):
+def test_every_response_has_the_security_headers(client):
     for path in ("/", "/api/scene", "/static/style.css", "/nothing"):
         headers = client.get(path, headers={"origin": ADDRESS}).headers
         assert "default-src 'none'" in headers["content-security-policy"]

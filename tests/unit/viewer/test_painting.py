@@ -9,8 +9,7 @@ import pytest
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import NONE
 from hilsplat.splat.rasterise.api import pixel_weights, render
-from hilsplat.viewer.frames import GHOST, GREY, TINT, Paint, painted
-from hilsplat.viewer.picking import pick, weights_at
+from hilsplat.viewer.frames import GHOST, GREY, TINT, Paint, painted, pick, weights_at
 from hilsplat.viewer.wire import Style
 from tests.unit.viewer.conftest import wire_camera
 
@@ -22,7 +21,7 @@ def table(shown, **colours: tuple[int, int, int, int]) -> str:
     return base64.b64encode(rows.tobytes()).decode()
 
 
-def test_a_frame_without_style_is_the_pipeline_s_rendering(shown, client, camera):
+def test_a_frame_without_a_style_equals_the_pipeline(shown, client, camera):
     expected = to_uint8(render(shown.gaussians, camera).color)
     np.testing.assert_array_equal(painted(shown.gaussians, camera), expected)
     sent = client.post("/api/frame", json={"camera": wire_camera(camera), "image": "png"})
@@ -34,22 +33,20 @@ def test_a_frame_without_style_is_the_pipeline_s_rendering(shown, client, camera
 def test_the_finest_used_level_with_a_colour_decides(shown):
     nodes = shown.answering("default").tree.node_of_gaussian
     whole, part = nodes[nodes[:, 1] >= 0][0, :2]
-    style = Style(
-        table=table(shown, **{f"n{whole}": (255, 0, 0, 255), f"n{part}": (0, 0, 255, 51)}), mode="tint"
-    )
-    paint = Paint.of(style, nodes, len(shown.answering("default").tree))
+    colours = {f"n{whole}": (255, 0, 0, 255), f"n{part}": (0, 0, 255, 51)}
+    style = Style(table=table(shown, **colours), mode="tint")
+    num = len(shown.answering("default").tree)
+    paint = Paint.of(style, nodes, num)
     inside_part, only_whole = nodes[:, 1] == part, (nodes[:, 0] == whole) & (nodes[:, 1] != part)
     assert np.allclose(paint.rgb[inside_part], (0, 0, 1)) and np.allclose(paint.share[inside_part], 0.2)
     assert np.allclose(paint.rgb[only_whole], (1, 0, 0)) and np.allclose(paint.share[only_whole], 1)
     assert not paint.share[nodes[:, 0] != whole].any()
-    coarse = Paint.of(
-        style.model_copy(update={"use": (True, False, False)}), nodes, len(shown.answering("default").tree)
-    )
+    coarse = Paint.of(style.model_copy(update={"use": (True, False, False)}), nodes, num)
     assert np.allclose(coarse.rgb[nodes[:, 0] == whole], (1, 0, 0))
 
 
 @pytest.mark.parametrize("mode", ["plain", "tint", "ghost", "isolate"])
-def test_others_are_unchanged_grey_faint_or_gone(shown, camera, mode):
+def test_unselected_gaussians_are_unchanged_grey_faint_or_hidden(shown, camera, mode):
     nodes = shown.answering("default").tree.node_of_gaussian
     whole = int(nodes[0, 0])
     style = Style(table=table(shown, **{f"n{whole}": (0, 255, 0, 255)}), mode=mode)
@@ -77,7 +74,7 @@ def test_a_style_that_does_not_fit_the_tree_is_refused(client, camera):
         assert sent.status_code == 422 and "reload the page" in sent.json()["error"]
 
 
-def test_a_pixel_s_weights_are_a_row_of_the_view_s(shown, camera):
+def test_the_weights_of_a_pixel_are_a_row_of_the_weights_of_its_view(shown, camera):
     every = pixel_weights(shown.gaussians, camera, min_weight=0.0)
     rng = np.random.default_rng(3)
     height, width = camera.size_hw
@@ -89,15 +86,14 @@ def test_a_pixel_s_weights_are_a_row_of_the_view_s(shown, camera):
         np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
-def test_a_pick_names_the_node_of_most_of_the_pixel_and_its_point(shown, client, camera):
+def test_a_pick_returns_the_node_with_the_largest_share_and_the_point(shown, client, camera):
     tree = shown.answering("default").tree
     every = pixel_weights(shown.gaussians, camera, min_weight=0.0)
     width = camera.size_hw[1]
     for x, y in ((6, 10), (25, 9), (10, 6), (30, 20)):
         row = every[y * width + x].toarray()[0]
-        found = client.post(
-            "/api/pick", json={"camera": wire_camera(camera), "x": x + 0.4, "y": y + 0.7}
-        ).json()
+        sent = {"camera": wire_camera(camera), "x": x + 0.4, "y": y + 0.7}
+        found = client.post("/api/pick", json=sent).json()
         assert found["alpha"] == pytest.approx(row.sum(), abs=1e-3)
         np.testing.assert_allclose(found["point"], row @ shown.gaussians.means / row.sum(), atol=1e-2)
         for level in range(3):
@@ -109,16 +105,12 @@ def test_a_pick_names_the_node_of_most_of_the_pixel_and_its_point(shown, client,
             assert share == pytest.approx(shares[best] / row.sum(), abs=1e-3)
 
 
-def test_nothing_is_picked_outside_the_picture_or_in_the_void(shown, client, camera):
+def test_nothing_is_picked_outside_the_picture_or_in_empty_space(shown, client, camera):
     height, width = camera.size_hw
     for x, y in ((-1.0, 3.0), (float(width), 3.0), (3.0, float(height))):
         assert pick(shown.gaussians, None, camera, x, y) is None
-    assert (
-        client.post("/api/pick", json={"camera": wire_camera(camera), "x": width - 0.5, "y": 0.5}).json()[
-            "nodes"
-        ]
-        == []
-    )
+    sent = {"camera": wire_camera(camera), "x": width - 0.5, "y": 0.5}
+    assert client.post("/api/pick", json=sent).json()["nodes"] == []
 
 
 @pytest.mark.parametrize(
@@ -133,22 +125,19 @@ def test_nothing_is_picked_outside_the_picture_or_in_the_void(shown, client, cam
         {"more": 1},
     ],
 )
-def test_a_camera_that_is_none_is_refused(client, camera, change):
+def test_invalid_cameras_are_refused(client, camera, change):
     sent = client.post("/api/frame", json={"camera": {**wire_camera(camera), **change}})
     assert sent.status_code == 400 and sent.json()["error"]
 
 
 def test_numbers_that_are_not_finite_are_refused(client, camera):
     text = '{"camera": {"cam_from_world": %s, "K": [[NaN,0,0],[0,1,0],[0,0,1]], "size_hw": [5, 5]}}'
-    sent = client.post(
-        "/api/frame",
-        content=text % np.eye(4).tolist(),
-        headers={"content-type": "application/json"},
-    )
+    headers = {"content-type": "application/json"}
+    sent = client.post("/api/frame", content=text % np.eye(4).tolist(), headers=headers)
     assert sent.status_code == 400
 
 
-def test_a_frame_shows_the_relevancy_to_its_own_text_whatever_another_page_asks(shown, client, camera):
+def test_a_frame_shows_relevancy_to_its_own_text_despite_queries_of_other_pages(shown, client, camera):
     ramp = base64.b64encode(np.repeat(np.arange(256, dtype=np.uint8), 3).tobytes()).decode()
 
     def frame(text: str) -> bytes:

@@ -1,4 +1,4 @@
-"""What the page gets: chunks of Gaussians, their nodes, where a visitor stands."""
+"""Data of the page: chunks of Gaussians, their nodes, the initial focus point."""
 
 import gzip
 
@@ -11,7 +11,7 @@ from hilsplat.viewer import payload
 from hilsplat.viewer.payload import arrival_order, crossing, packed_nodes, upright
 
 
-def test_gaussians_arrive_in_chunks_of_which_the_first_show_most(shown):
+def test_the_first_chunk_has_the_most_visible_gaussians():
     n = payload.CHUNK + 100
     rng = np.random.default_rng(1)
     scales = rng.uniform(-6, 0, n)
@@ -27,7 +27,7 @@ def test_gaussians_arrive_in_chunks_of_which_the_first_show_most(shown):
     assert scales[order[: payload.CHUNK]].min() >= scales[order[payload.CHUNK :]].max()
 
 
-def test_packed_nodes_are_numbered_from_one_and_zero_is_none(shown):
+def test_packed_nodes_are_numbered_from_one(shown):
     tree = shown.answering("default").tree
     data = gzip.decompress(packed_nodes(tree, shown.order))
     texels = np.frombuffer(data, np.uint16).reshape(-1, 4)
@@ -49,7 +49,7 @@ def cameras_around(focus: np.ndarray, number: int = 5) -> Cameras:
     return Cameras(names, poses, np.tile(np.diag([10.0, 10, 1]), (number, 1, 1)), sizes)
 
 
-def test_a_visitor_turns_about_what_the_cameras_look_at():
+def test_the_focus_is_the_point_that_the_cameras_look_at():
     focus = np.array([1.0, -2.0, 3.0])
     cameras = cameras_around(focus)
     np.testing.assert_allclose(crossing(cameras), focus, atol=0.02)
@@ -57,7 +57,7 @@ def test_a_visitor_turns_about_what_the_cameras_look_at():
     assert np.linalg.norm(up) == pytest.approx(1) and up @ [0, -1, 0] > 0.9
 
 
-def test_parallel_cameras_turn_about_a_point_in_front_of_them(shown):
+def test_the_focus_of_parallel_cameras_is_in_front_of_them(shown):
     cameras = shown.scene.cameras
     ahead = cameras.cam_from_world[0, 2, :3]
     assert (crossing(cameras) - cameras[cameras.names[0]].centre) @ ahead > 0

@@ -1,4 +1,4 @@
-"""Nobody waits for a compiler once the page is open."""
+"""All loops are compiled before the page opens."""
 
 import os
 import subprocess
@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from hilsplat.viewer import exports
-from hilsplat.viewer.frames import painted
-from hilsplat.viewer.picking import pick
+from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.viewer_scene import ViewerScene
 
 def loops():
@@ -27,15 +26,15 @@ before = loops()
 scene, camera = shown.answering("default"), shown.scene.cameras["001.png"]
 painted(shown.gaussians, camera, None, 1)
 pick(shown.gaussians, scene.tree.node_of_gaussian, camera, 4, 4, 1)
-scene.find("mug", view="001.png")
-scene.find("mug", answerer="field")
+scene.select("mug", view="001.png")
+scene.select("mug", answerer="field")
 scene.node_masks("001.png", [0])
 exports.crop(scene, 0)
 print(len(before), sorted(name for name, _ in loops() - before))
 """
 
 
-def test_every_loop_is_ready_before_the_address_is_printed(built_desk):
+def test_every_loop_is_compiled_by_the_warm_up(built_desk):
     run = subprocess.run(
         [sys.executable, "-c", USED, str(built_desk / SCENE)],
         cwd=built_desk,
