@@ -30,15 +30,11 @@ def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public type when it is asked for."""
-    if name == "HilsplatError":
-        from hilsplat.base.errors import HilsplatError
+    """Load a public type on first use."""
+    if name in ("HilsplatError", "Level"):
+        from hilsplat.base import errors, levels
 
-        return HilsplatError
-    if name == "Level":
-        from hilsplat.base.levels import Level
-
-        return Level
+        return errors.HilsplatError if name == "HilsplatError" else levels.Level
     if name in ("Doubt", "Hit", "LanguageScene"):
         from hilsplat.query import hits, language_scene
 

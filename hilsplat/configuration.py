@@ -11,55 +11,36 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ValidationError, field_validator
 
+import hilsplat.settings as sections
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import NAME_RULE, name_problem, project_path
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
-from hilsplat.settings import (
-    LARGEST,
-    AutoencoderSettings,
-    ClipSettings,
-    ContributionsSettings,
-    CoverageTreeSettings,
-    EvaluateSettings,
-    FieldSettings,
-    FiguresSettings,
-    GaussiansSettings,
-    MasksSettings,
-    MethodSettings,
-    PerturbSettings,
-    PosesSettings,
-    QuerySettings,
-    Section,
-    SemanticTreeSettings,
-    WorldSettings,
-    knob,
-)
+from hilsplat.settings import LARGEST, ClipSettings, MasksSettings, Section, knob
 
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
 
-LONGEST_SHOWN = 120
-"""Maximum number of characters of a value in a message."""
+LONGEST_SHOWN = 120  # characters of a value in a message
 
 
 class StageSettings(Section):
     """All sections by name."""
 
-    world: WorldSettings = WorldSettings()
-    poses: PosesSettings = PosesSettings()
-    gaussians: GaussiansSettings = GaussiansSettings()
+    world: sections.WorldSettings = sections.WorldSettings()
+    poses: sections.PosesSettings = sections.PosesSettings()
+    gaussians: sections.GaussiansSettings = sections.GaussiansSettings()
     masks: MasksSettings = MasksSettings()
-    perturb: PerturbSettings = PerturbSettings()
-    coverage_tree: CoverageTreeSettings = CoverageTreeSettings()
+    perturb: sections.PerturbSettings = sections.PerturbSettings()
+    coverage_tree: sections.CoverageTreeSettings = sections.CoverageTreeSettings()
     clip: ClipSettings = ClipSettings()
-    contributions: ContributionsSettings = ContributionsSettings()
-    semantic_tree: SemanticTreeSettings = SemanticTreeSettings()
-    autoencoder: AutoencoderSettings = AutoencoderSettings()
-    field: FieldSettings = FieldSettings()
-    method: MethodSettings = MethodSettings()
-    evaluate: EvaluateSettings = EvaluateSettings()
-    query: QuerySettings = QuerySettings()
-    figures: FiguresSettings = FiguresSettings()
+    contributions: sections.ContributionsSettings = sections.ContributionsSettings()
+    semantic_tree: sections.SemanticTreeSettings = sections.SemanticTreeSettings()
+    autoencoder: sections.AutoencoderSettings = sections.AutoencoderSettings()
+    field: sections.FieldSettings = sections.FieldSettings()
+    method: sections.MethodSettings = sections.MethodSettings()
+    evaluate: sections.EvaluateSettings = sections.EvaluateSettings()
+    query: sections.QuerySettings = sections.QuerySettings()
+    figures: sections.FiguresSettings = sections.FiguresSettings()
 
     def with_models(self) -> "StageSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
@@ -146,18 +127,8 @@ def _known_keys(model: Any, path: list[str]) -> list[str]:
     return sorted(model.model_fields)
 
 
-VARIANT_SECTIONS = (
-    "masks",
-    "perturb",
-    "coverage_tree",
-    "clip",
-    "contributions",
-    "semantic_tree",
-    "autoencoder",
-    "field",
-    "method",
-    "evaluate",
-)
+VARIANT_SECTIONS = ("masks", "perturb", "coverage_tree", "clip", "contributions", "semantic_tree")
+VARIANT_SECTIONS += ("autoencoder", "field", "method", "evaluate")
 """Sections that a variant may override; all variants share the stages before them."""
 
 UPSTREAM: dict[str, tuple[str, ...]] = {
@@ -172,9 +143,7 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 }
 """Stage -> sections on which it depends, directly or through its inputs; see `upstream`."""
 
-RESERVED = frozenset(
-    ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
-)
+RESERVED = ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
 """Names of files and folders in a scene folder, which variants cannot have."""
 
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
@@ -189,13 +158,11 @@ class RunSettings(StageSettings):
     results: str = knob("results", "results folder, relative to the working folder", pattern="^[^{}<>]+$")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
     only: tuple[str, ...] = knob(
-        (),
-        "the only scenes to run, of whatever group: table-1, or synthetic/table-1; empty: all of the groups",
+        (), "the only scenes to run, of any group: table-1, or synthetic/table-1; empty: all of the groups"
     )
+    # The report shows the data root and cannot escape it.
     data_root: str = knob(
-        "",
-        "folder of the published data sets; empty: their scenes are skipped",
-        pattern="^[^<>]*$",  # the value is shown in the report's parameters
+        "", "folder of the published data sets; empty: their scenes are skipped", pattern="^[^<>]*$"
     )
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the paper's ablation table")
@@ -206,21 +173,16 @@ class RunSettings(StageSettings):
     sweep_scenes: tuple[str, ...] = knob(
         (), "scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
     )
-    seeds: int = knob(
-        1,
-        "number of seeds for what is trained at random; with several, tables give mean and spread",
-        ge=1,
-        le=10,
-    )
+    seeds: int = knob(1, "seeds for random training; with several, tables have mean and spread", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
-        {}, "named overrides: variant -> section -> knob -> value; 'default' always exists"
+        {}, "named overrides: variant -> section -> setting -> value; 'default' always exists"
     )
     labels: dict[str, str] = knob({}, "variant -> its name in tables")
     overrides: dict[str, dict[str, dict[str, Any]]] = knob(
-        {}, "settings of a group or of one scene: group or dataset/scene -> section -> knob -> value"
+        {}, "settings of a group or of one scene: group or dataset/scene -> section -> setting -> value"
     )
     queries: dict[str, tuple[str, ...]] = knob(
-        {}, "texts in the panel of a scene without labels on its images, by dataset/scene or by data set"
+        {}, "panel queries of a scene without labels on its images, by dataset/scene or by data set"
     )
 
     @field_validator("groups", "only", "sweep_scenes", mode="before")
@@ -237,21 +199,12 @@ class RunSettings(StageSettings):
 
     def variant_names(self) -> list[str]:
         """Return the variants in the run's tables, "default" first; with several seeds, each per seed."""
-        names = (
-            *self.main_variants,
-            *self.ablation_variants,
-            *self.component_variants,
-            *self.theta_variants,
-            *self.omega_variants,
-            *self.pruning_variants,
-        )
+        names = self.main_variants + self.ablation_variants + self.component_variants
+        names += self.theta_variants + self.omega_variants + self.pruning_variants
         return [name for first in dict.fromkeys(["default", *names]) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
-        """Return the names of a variant for every seed: its own name, then `<name>.seed1`, ...
-
-        A variant without randomness has one seed, because others would give the same bytes.
-        """
+        """Return the names of a variant per seed: its own, then, if it is random, `<name>.seed1`, ..."""
         is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
         return self._all_seeds(variant) if is_random else [variant]
 
@@ -259,7 +212,6 @@ class RunSettings(StageSettings):
         return [variant, *(f"{variant}.seed{number}" for number in range(1, self.seeds))]
 
     def seed_of(self, variant: str) -> int:
-        """Return the seed of a variant."""
         return self.seed + _parts_of(variant)[1]
 
     def stages(self, variant: str = "default", scopes: tuple[str, ...] = ()) -> StageSettings:
@@ -323,11 +275,8 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
         raise settings_error(error, "", RunSettings) from error
     for name in dict.fromkeys([*run.variants, *run.groups]):
         if (problem := name_problem(name)) is not None:
-            raise SettingsError(
-                f"{name!r} cannot be the name of a variant or group: {problem}",
-                expected=NAME_RULE,
-                fix="rename it in the configuration",
-            )
+            problem = f"{name!r} cannot be the name of a variant or group: {problem}"
+            raise SettingsError(problem, expected=NAME_RULE, fix="rename it in the configuration")
     for name in run.variants:
         if _parts_of(name)[0] in RESERVED:
             raise SettingsError(
@@ -349,11 +298,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
 
 
 def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> None:
-    """Refuse unknown keys, which would have no effect.
-
-    Raises:
-        SettingsError: there is an unknown key; the message suggests a similar known key.
-    """
+    """Refuse unknown keys, which would have no effect, and suggest a known one."""
     for key in keys:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
@@ -382,7 +327,7 @@ def read_config(path: Path) -> dict[str, Any]:
     """Read a configuration file.
 
     Raises:
-        SettingsError: the file is missing or is not a YAML mapping; the message names line and column.
+        SettingsError: the file is missing or is not a YAML mapping.
     """
     try:
         found = yaml.load(Path(path).read_text(encoding="utf-8"), _UniqueKeys)
@@ -409,11 +354,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def merged_config(paths: Sequence[Path], *overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge `config/config.yaml`, further files and overrides in order, recursively as Snakemake does.
-
-    Raises:
-        SettingsError: a file is missing or is not YAML.
-    """
+    """Merge `config/config.yaml`, further files and overrides in order, recursively as Snakemake does."""
     merged = read_config(project_path(CONFIG))
     for layer in (*map(read_config, paths), *overrides):
         merged = _merge(merged, layer)

@@ -1,8 +1,6 @@
-"""Validation of an artifact's arrays against its dataclass.
+"""Validation of an artifact's arrays against its dataclass, when it is opened.
 
-Compiled loops do not check bounds, so an offset out of range crashes the process. Arrays are therefore
-checked once, when an artifact is opened: dtype and shape against the annotations of the dataclass (sizes with
-the same name must agree), values for being finite and within limits.
+Compiled loops do not check bounds, so an offset out of range would crash the process.
 """
 
 import json
@@ -26,12 +24,9 @@ Limits = Mapping[str, tuple[int | float, int | float]]
 
 
 def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
-    """Check arrays against the fields of a dataclass.
+    """Check arrays, by field name, against the jaxtyping annotations of a dataclass.
 
-    Args:
-        maker: the dataclass; its arrays are annotated with jaxtyping.
-        arrays: arrays by field name.
-        path: their file, for the error message.
+    Sizes with the same name must agree.
 
     Raises:
         ArtifactError: an array has the wrong type or shape, or a value that is not finite or is out of range.
@@ -42,8 +37,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
             declared: Any = hints.get(name)
             if not (isinstance(declared, type) and issubclass(declared, AbstractArray)):
                 continue
-            fits: bool = isinstance(array, declared)
-            if not fits:
+            if not isinstance(array, declared):
                 raise ArtifactError(
                     f"{path}: array {name} cannot be used",
                     expected=described(declared),
@@ -69,11 +63,7 @@ def described(declared: type[AbstractArray]) -> str:
 
 
 def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:
-    """Create a dataclass instance from the arrays of an .npz file.
-
-    Args:
-        maker: the dataclass; its field names are those of the arrays and of `more`.
-        more: fields that are not in the file.
+    """Create a dataclass instance from the arrays of an .npz file and further fields, `more`.
 
     Raises:
         ArtifactError: the file is missing, damaged or written by another version of the program, or an array

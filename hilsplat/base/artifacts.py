@@ -29,23 +29,13 @@ ZIP64_BYTES = 2**30
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
 
-DAMAGE = (
-    AttributeError,  # an .npy file where an .npz file is expected
-    EOFError,
-    MemoryError,
-    NotImplementedError,
-    OSError,
-    SyntaxError,
-    TokenError,
-    ValueError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+DAMAGE = (EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError)
+DAMAGE += (zipfile.BadZipFile, zlib.error, AttributeError)  # the last for .npy where .npz is expected
 """Errors that numpy and zipfile raise on damaged files."""
 
 
 def provenance_path(artifact: Path) -> Path:
-    """Return the path of an artifact's provenance record: a file beside it, with its name."""
+    """Return the path of an artifact's provenance record, which is beside it."""
     artifact = Path(artifact)
     return artifact.parent / f"{artifact.name}.provenance.json"
 
@@ -65,8 +55,7 @@ def remake(path: Path) -> str:
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary file that replaces `path` when the block ends without error.
 
-    Args:
-        durable: flush the file to the disk, so that it survives a power failure.
+    A `durable` file is flushed to the disk, to survive a power failure.
 
     Raises:
         DiskSpaceError: the disk is full.
@@ -144,7 +133,6 @@ def work_folder(path: Path) -> Iterator[Path]:
 
 
 def _flush(path: Path) -> None:
-    """Flush a file, or a folder's list of files, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -156,10 +144,8 @@ def _flush(path: Path) -> None:
 
 
 _renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-"""Linux function from <stdio.h>."""
-
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
-"""From Linux's <fcntl.h> and <linux/fs.h>."""
+"""From Linux's <stdio.h>, <fcntl.h> and <linux/fs.h>."""
 
 
 def _exchange(one: Path, other: Path) -> bool:
@@ -178,7 +164,9 @@ FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
 """Parts of the messages of C++ and Rust libraries with their own error types: safetensors, SQLite."""
 
 FULL_BELOW_MIB = 1.0
-"""Free space below which other library errors are attributed to a full disk: COLMAP does not report one."""
+LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
+"""Free space below which errors of C++ libraries, and of libraries that end their process, are attributed to
+a full disk: COLMAP does not report one."""
 
 
 @contextmanager
@@ -193,7 +181,8 @@ def explain_full_disk(path: Path) -> Iterator[None]:
     except HilsplatError:
         raise
     except Exception as error:
-        folder = _lasting_folder(path)
+        hidden = [place for place in path.parents if UNFINISHED.fullmatch(place.name)]
+        folder = existing_folder(hidden[-1].parent if hidden else path.parent)
         usage = shutil.disk_usage(folder)
         full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
         full = full or any(words in str(error) for words in FULL_DISK)
@@ -209,19 +198,9 @@ def explain_full_disk(path: Path) -> Iterator[None]:
         raise
 
 
-LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
-"""Errors from C++ libraries, and from libraries that end their process."""
-
-
-def _lasting_folder(path: Path) -> Path:
-    """Return the innermost existing folder of a path that is not part of an unfinished artifact."""
-    hidden = [place for place in path.parents if UNFINISHED.fullmatch(place.name)]
-    return _existing(hidden[-1].parent if hidden else path.parent)
-
-
-def _existing(folder: Path) -> Path:
+def existing_folder(folder: Path) -> Path:
     """Return a folder, or its innermost parent that exists."""
-    return next(place for place in (folder, *folder.parents) if place.exists())
+    return next(place for place in (folder, *folder.absolute().parents) if place.exists())
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:
@@ -230,7 +209,7 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
     Raises:
         DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
     """
-    folder = _existing(Path(folder))
+    folder = existing_folder(Path(folder))
     free_mib = shutil.disk_usage(folder).free / 2**20
     if free_mib < needed_mib:
         raise DiskSpaceError(
@@ -242,13 +221,13 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically (UTF-8)."""
+    """Write a UTF-8 file atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON atomically: indented, keys in the given order, with a final newline."""
+    """Write JSON atomically, with keys in the given order."""
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
 
 
@@ -280,7 +259,6 @@ def parse_json(text: str | bytes) -> Any:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Convert errors from a missing or damaged file into one with the command that rebuilds it."""
     try:
         yield
     except FileNotFoundError as error:
@@ -328,7 +306,7 @@ def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
 
 
 def write_npy(path: Path, array: np.ndarray) -> None:
-    """Write one array to an .npy file atomically."""
+    """Write an .npy file atomically."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, array, allow_pickle=False)
 
@@ -356,12 +334,11 @@ def sha256_of_bytes(*parts: bytes) -> str:
 
 
 def sha256_of_json(value: Any) -> str:
-    """Return the SHA-256 of a JSON value, independent of the order of keys."""
+    """Return the SHA-256 of a JSON value; the order of keys does not matter."""
     return sha256_of_bytes(json.dumps(value, sort_keys=True).encode())
 
 
 def sha256_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes."""
     with Path(path).open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -385,10 +362,7 @@ def visible_files(folder: Path) -> list[Path]:
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
-    """Complete a folder artifact by writing `index.json`, which seals the folder.
-
-    The index has one entry per view, keyed by view name, a checksum of each file, and one of itself.
-    """
+    """Complete a folder artifact by writing its index: an entry per view, and checksums of all files."""
     folder = Path(folder)
     files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
     sums = {path.relative_to(folder).as_posix(): _crc32_of_file(path) for path in files}
@@ -421,7 +395,7 @@ def _index(folder: Path) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=16)
 def _unsealed(path: Path, *_: int) -> dict[str, Any]:
-    """Read an index and compare it with its seal; the result is cached until the file changes."""
+    """Read an index and compare it with its seal; cached until the file changes."""
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
         raise ArtifactError(
@@ -485,22 +459,19 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
 
 
 class ViewCache:
-    """Finished views of a long stage, stored outside its declared output and keyed by content.
+    """Finished views of a stage, as .npz files outside its output, so that a rerun after a kill reuses them.
 
-    A rerun after a kill reuses them, and adding a photograph takes the time of one photograph. Entries are
-    .npz files. Keys must cover all inputs of the result: the digests of image, model and code, and the
-    settings.
+    Keys must cover all inputs of the result: the digests of image, model and code, and the settings.
 
     Args:
-        folder: folder of the entries, such as `results/.cache/masks`.
-        compressed: compress the entries; floating-point numbers shrink little, and compression takes time.
+        folder: such as `results/.cache/masks`.
+        compressed: floating-point numbers shrink little, and compression takes time.
     """
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:
         self.folder = Path(folder)
         self._method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
         self.hits = 0
-        self.misses = 0
 
     def path(self, key: str) -> Path:
         """Return the file of a key; it may not exist."""
@@ -514,7 +485,6 @@ class ViewCache:
             return found
         arrays = compute()
         self.put(key, arrays)
-        self.misses += 1
         return arrays
 
     def find(self, key: str) -> dict[str, np.ndarray] | None:
@@ -552,8 +522,7 @@ def output_lock(output: Path) -> Iterator[None]:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ArtifactError(
-                f"another process is writing {output}",
-                fix="wait until it ends, or end it, then run again",
+                f"another process is writing {output}", fix="wait until it ends, or end it, then run again"
             ) from error
         stream.truncate(0)
         stream.write("unfinished\n")
@@ -563,7 +532,6 @@ def output_lock(output: Path) -> Iterator[None]:
 
 
 def lock_path(output: Path) -> Path:
-    """Return the lock file of an output."""
     return output.parent / f".{output.name}.lock"
 
 

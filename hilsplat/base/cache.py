@@ -10,11 +10,8 @@ from hilsplat.base.processes import remove_leftovers
 VIEW_CACHES = ("masks", "clip", "contributions")
 """Caches of finished views: a missing entry costs time but does not change a result."""
 
-CHECKPOINTS = "gaussians"
-"""Cache of the fits' checkpoints."""
-
-FIT_DAYS = 1.0
-"""Age below which a checkpoint is kept: its fit may still be running. Fits write them far more often."""
+CHECKPOINTS, FIT_DAYS = "gaussians", 1.0
+"""Cache of the fits' checkpoints, and the age below which one is kept: its fit may still be running."""
 
 
 def caches(folder: Path) -> dict[str, list[Path]]:
@@ -24,7 +21,7 @@ def caches(folder: Path) -> dict[str, list[Path]]:
 
 
 def size_table(folder: Path) -> str:
-    """Return a text table with the size of each cache."""
+    """Return the size of each cache, as text."""
     lines, total = [f"{folder}"], 0.0
     for name, files in caches(folder).items():
         size_mib = sum(path.stat().st_size for path in files) / 2**20
@@ -39,8 +36,7 @@ def prune_cache(
     """Delete unfinished files of killed jobs, and cache entries starting with the least recently used.
 
     Args:
-        stages: caches to prune, from `VIEW_CACHES` and `CHECKPOINTS`. An empty list selects the view caches
-            and, with `days`, also the checkpoints.
+        stages: caches to prune; an empty list selects the view caches and, with `days`, the checkpoints.
         days: delete entries not used for this many days.
         max_mib: then delete entries until at most this much is left. Without limits, no entry is deleted.
 

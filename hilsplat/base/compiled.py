@@ -61,7 +61,7 @@ class _Stamp:
 
 
 class _Notice(event.Listener):
-    """Listener that logs once that loops are being compiled; loops read from the cache raise no event."""
+    """Log message, once, that loops are compiled; loops read from the cache raise no event."""
 
     given = False
 

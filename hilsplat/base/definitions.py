@@ -1,7 +1,4 @@
-"""The parts of a module's definitions that can change a result: their text and the names they look up.
-
-`identity` follows these names from definition to definition; its docstring lists what is ignored.
-"""
+"""The parts of a module's definitions that can change a result: their text and the names they look up."""
 
 import ast
 import functools
@@ -13,18 +10,8 @@ from hilsplat.base.errors import HilsplatError
 
 PACKAGE = "hilsplat"
 
-NEUTRAL_DECORATORS = frozenset(
-    [
-        "cache",
-        "cached_property",
-        "compiled",
-        "contextmanager",
-        "dataclass",
-        "lru_cache",
-        "no_type_check",
-        "overload",
-    ]
-)
+NEUTRAL_DECORATORS = {"cache", "cached_property", "compiled", "contextmanager", "dataclass", "lru_cache"}
+NEUTRAL_DECORATORS |= {"no_type_check", "overload"}
 """Decorators that do not register anything: a definition with only these counts only if it is reached."""
 
 PROSE = {
@@ -34,7 +21,7 @@ PROSE = {
 }
 """Called name -> keyword arguments that are documentation only."""
 
-LOG_METHODS = frozenset({"debug", "info", "warning", "error", "exception"})
+LOG_METHODS = {"debug", "info", "warning", "error", "exception"}
 
 
 @dataclass(frozen=True)
@@ -62,6 +49,10 @@ class Statement:
     inner: list[tuple[Import, tuple[str, ...]]] = field(default_factory=list)
     imports: dict[str, Import] = field(default_factory=dict)
     signature: list[tuple[str, ...]] = field(default_factory=list)
+
+    def __add__(self, other: "Statement") -> "Statement":
+        sums = (getattr(self, name) + getattr(other, name) for name in ("text", "names", "inner"))
+        return Statement(*sums, self.imports | other.imports, self.signature + other.signature)
 
 
 @dataclass
@@ -105,7 +96,7 @@ def _parse(text: str, package: str) -> Module:
         names = sorted(_bound_in([node]))
         for name in names:
             if (earlier := facts.bindings.get(name)) is not None:  # bound twice: both count
-                statement = _both(earlier, statement)
+                statement = earlier + statement
             facts.bindings[name] = statement
         if not names or _registers(node):
             facts.effects.append(statement)
@@ -124,25 +115,12 @@ def _statement(node: ast.stmt, package: str) -> Statement:
     return Statement(ast.dump(node).encode(), names, inner, signature=signature)
 
 
-def _both(one: Statement, other: Statement) -> Statement:
-    return Statement(
-        one.text + other.text,
-        one.names + other.names,
-        one.inner + other.inner,
-        {**one.imports, **other.imports},
-        one.signature + other.signature,
-    )
-
-
 def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
     """Return the target of each name that an import statement binds."""
     if isinstance(node, ast.Import):
-        return {
-            alias.asname or alias.name.split(".")[0]: Import(
-                alias.name if alias.asname else alias.name.split(".")[0], ""
-            )
-            for alias in node.names
-        }
+        whole = {alias.asname: alias.name for alias in node.names if alias.asname}
+        parents = {top: top for top in (alias.name.split(".")[0] for alias in node.names if not alias.asname)}
+        return {name: Import(module, "") for name, module in {**whole, **parents}.items()}
     if not isinstance(node, ast.ImportFrom):
         return {}
     base = node.module or ""
@@ -166,11 +144,8 @@ def _registers(node: ast.stmt) -> bool:
 
 
 def _is_bare_string(node: ast.AST) -> bool:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
+    value = getattr(node, "value", None) if isinstance(node, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
 
 
 def _arguments(arguments: ast.arguments) -> list[ast.arg]:
@@ -217,14 +192,9 @@ _LEAVES = (ast.expr_context, ast.operator, ast.unaryop, ast.boolop, ast.cmpop)
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
     """Yield the direct children of a node, except leaves such as operators."""
-    for name in node._fields:
-        value = getattr(node, name, None)
-        if isinstance(value, list):
-            for each in value:
-                if isinstance(each, ast.AST) and not isinstance(each, _LEAVES):
-                    yield each
-        elif isinstance(value, ast.AST) and not isinstance(value, _LEAVES):
-            yield value
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, _LEAVES):
+            yield child
 
 
 def _is_log_call(node: ast.AST) -> bool:
@@ -233,7 +203,7 @@ def _is_log_call(node: ast.AST) -> bool:
 
 
 def _chain(node: ast.AST) -> tuple[str, ...]:
-    """Return the parts of a dotted name; empty for other expressions."""
+    """Return the parts of a dotted name, or an empty tuple."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute):
         parts.append(node.attr)

@@ -8,7 +8,6 @@ from functools import cache
 
 @cache
 def is_installed(distribution: str) -> bool:
-    """Return whether a distribution is installed, such as `onnxruntime-gpu`."""
     try:
         importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:

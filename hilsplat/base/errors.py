@@ -1,4 +1,4 @@
-"""Errors that a user can fix: each reports the place, what was expected and found, and the fix."""
+"""Errors that a user can fix."""
 
 import errno
 import resource
@@ -6,30 +6,21 @@ from pathlib import Path
 
 
 class HilsplatError(Exception):
-    """Base class of all errors that a file, a setting or a user causes.
+    """Error that a file, a setting or a user causes; commands print it without a traceback and exit with 1.
 
-    The command prints `str(error)` without a traceback and exits with 1.
-
-    Args:
-        message: one sentence that names the file, scene, view or key.
+    The message is one sentence that names the file, scene, view or key.
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        expected: object | None = None,
-        found: object | None = None,
-        fix: str | None = None,
+        self, message: str, *, expected: object = None, found: object = None, fix: str | None = None
     ) -> None:
-        lines = [message]
+        super().__init__(message)
         for name, value in (("expected", expected), ("found", found), ("fix", fix)):
             if value is not None:
-                lines.append(f"  {name:<9} {value}")
-        super().__init__("\n".join(lines))
+                self.add_line(name, value)
 
     def add_line(self, name: str, value: object) -> None:
-        """Append a line, such as `found`, that only a caller can supply."""
+        """Append a line, such as `found`."""
         self.args = (f"{self}\n  {name:<9} {value}",)
 
 

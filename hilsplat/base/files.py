@@ -29,17 +29,8 @@ def project_path(path: str | Path) -> Path:
     return installed if not Path(path).exists() and installed.exists() else Path(path)
 
 
-def list_images(folder: Path) -> list[Path]:
-    """Return the image files in a folder, sorted by name, without hidden files."""
-    return _with_suffix(folder, IMAGE_SUFFIXES)
-
-
-def list_videos(folder: Path) -> list[Path]:
-    """Return the video files in a folder, sorted by name, without hidden files."""
-    return _with_suffix(folder, VIDEO_SUFFIXES)
-
-
-def _with_suffix(folder: Path, suffixes: Collection[str]) -> list[Path]:
+def list_images(folder: Path, suffixes: Collection[str] = IMAGE_SUFFIXES) -> list[Path]:
+    """Return the image files in a folder, or those with other suffixes, sorted, without hidden files."""
     return sorted(
         path
         for path in Path(folder).iterdir()

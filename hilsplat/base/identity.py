@@ -41,15 +41,14 @@ Key = tuple[str, str]
 
 
 def code_digest(*roots: Code, root: Path = ROOT) -> str:
-    """Return a digest of every definition of the package that the roots can reach.
+    """Return a digest of every definition that the roots can reach in the package, whose folder is `root`.
 
     Args:
         roots: functions or classes, as objects or as "hilsplat.field.field:run_field". A module name alone
             stands for all of its definitions.
-        root: folder of the package.
 
     Returns:
-        16 hexadecimal digits. Digests of different Python minor versions differ.
+        16 hexadecimal digits, which depend on the minor version of Python.
 
     Raises:
         HilsplatError: a root, or a name that the reached code imports, does not exist.

@@ -125,19 +125,13 @@ def _srgb_profile() -> ImageCms.ImageCmsProfile:
 def write_png(
     path: Path, pixels: np.ndarray, compression: int = 6, text: Mapping[str, str] | None = None
 ) -> None:
-    """Write an image (8-bit RGB or grey, or 16-bit grey) as PNG, atomically.
-
-    Args:
-        pixels: (H, W, 3) or (H, W).
-        compression: zlib level, 0 to 9.
-        text: text entries of the file's metadata, by key.
-    """
-    said = PngImagePlugin.PngInfo()
+    """Write an image (H W 3 or H W; 16-bit only if grey) as PNG, with text metadata by key, atomically."""
+    metadata = PngImagePlugin.PngInfo()
     for key, value in (text or {}).items():
-        said.add_text(key, value)
+        metadata.add_text(key, value)
     with atomic_path(path) as temporary:
         Image.fromarray(np.ascontiguousarray(pixels)).save(
-            temporary, format="PNG", compress_level=compression, pnginfo=said
+            temporary, format="PNG", compress_level=compression, pnginfo=metadata
         )
 
 

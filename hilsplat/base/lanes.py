@@ -5,8 +5,8 @@ temporary to memory. A value of type `LANES` is an LLVM `<16 x float>`, and one 
 `<16 x double>`: arithmetic on them is vector arithmetic, and accumulators stay in registers. LLVM splits them
 into the machine's registers (16 floats are one register with AVX-512, two with AVX2, four with NEON).
 
-Operations, for use inside `numba.njit` functions: `+ - * /` between lanes or with a float, `lanes(x)`
-(all lanes equal x), and the functions below. The order of sums is fixed.
+Operations, for use inside `numba.njit` functions: `+ - * /` between lanes or with a float, and the functions
+below. The order of sums is fixed.
 """
 
 import operator
@@ -100,7 +100,6 @@ def _pointer(
 
 
 def _is_flat(array: Any) -> bool:
-    """Return whether a numba type is a flat array of float32 or float64."""
     return isinstance(array, types.Array) and array.dtype in _OF and array.ndim == 1
 
 

@@ -28,8 +28,7 @@ logger = logging.getLogger(__name__)
 PARENT = "HILSPLAT_PARENT"
 """Environment variable with the id of the process whose jobs must end with it (rules/common.smk)."""
 
-PR_SET_PDEATHSIG = 1
-"""From Linux's <sys/prctl.h>."""
+PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 
 
 def end_with_parent(parent: int) -> None:
@@ -67,11 +66,8 @@ def end_with_workflow() -> None:
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
 """Name of a folder of unfinished files; it is hidden, so digests ignore it."""
 
-LOCK = ".lock"
-"""File in such a folder; its writer locks it."""
-
-FORMER = ".former"
-"""Folder in it for the previous version of an artifact while the new one replaces it."""
+LOCK, FORMER = ".lock", ".former"
+"""In such a folder, the file that its writer locks, and a folder for the version that is being replaced."""
 
 
 @functools.cache
@@ -121,13 +117,10 @@ def _discard(folder: Path, lock: IO[bytes]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete the unfinished files below a folder that dead processes of this host left.
+    """Delete the unfinished files below a folder that dead processes of this host left; return their folders.
 
     Files of live processes, including those in other containers, are kept. So are files of other hosts that
     share the folder, because their locks may be invisible here.
-
-    Returns:
-        The deleted folders.
     """
     removed = []
     for place, folders, _ in os.walk(folder):
@@ -148,7 +141,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process with this id exists in this process namespace."""
+    """Return whether a process with this id exists."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -164,12 +157,8 @@ def in_processes(
     """Yield the results of `work(*item)` in the order of `items`, computed in several processes.
 
     Use this for work that holds the GIL. Processes are spawned, because forking a process with threads may
-    hang. With one worker or one item, no process is started.
-
-    Args:
-        work: a module-level function, or a `functools.partial` of one.
-        items: arguments of each call.
-        chunk: number of items that a process takes at a time.
+    hang; `work` must be a module-level function or a `functools.partial` of one. A process takes `chunk`
+    items at a time. With one worker or one item, no process is started.
     """
     if workers <= 1 or len(items) <= 1:
         for item in items:
@@ -180,7 +169,6 @@ def in_processes(
 
 
 def _pool(workers: int, initializer: Callable[..., None], *given: Any) -> Any:
-    """Return a pool of spawned processes that each begin with `initializer(*given)`."""
     from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need none
     from multiprocessing import get_context
 
@@ -188,15 +176,11 @@ def _pool(workers: int, initializer: Callable[..., None], *given: Any) -> Any:
 
 
 def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
-    """Return `work(*given)`, computed in a separate process, for libraries that may end their process.
-
-    Their stderr is not shown; the error ends with its last 2000 characters.
-
-    Args:
-        work: a module-level function.
+    """Return `work(*given)`, a module-level function, from a process that its libraries may end.
 
     Raises:
-        ChildProcessError: the process ended without a result.
+        ChildProcessError: the process ended without a result; the message has the last 2000 characters of
+            its stderr, which is not shown otherwise.
     """
     from concurrent.futures.process import BrokenProcessPool
     from tempfile import TemporaryDirectory

@@ -58,12 +58,7 @@ def _bar() -> "Progress":
 
 
 def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
-    """Yield the items and show how many are done.
-
-    Args:
-        what: label of a few words, such as "masks of views".
-        total: number of items, if `len(items)` is not available.
-    """
+    """Yield the items and show how many are done; `what` is a label such as "masks of views"."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else None
     if sys.stderr.isatty():
@@ -84,10 +79,7 @@ def track(items: Iterable[Item], what: str, total: int | None = None) -> Iterato
 
 @contextmanager
 def stage_log(stage: str, scene: str) -> Iterator[dict[str, object]]:
-    """Log one line when a stage starts and one with its counts when it ends.
-
-    Yields a dict to which the stage adds these counts.
-    """
+    """Yield a dict for a stage's counts; log a line when the stage starts, and one with them when it ends."""
     counts: dict[str, object] = {}
     logger.info("%s %s: start", stage, scene)
     start = time.monotonic()

@@ -23,29 +23,16 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError
 
-LIBRARIES = (
-    "hilsplat",
-    "numpy",
-    "scipy",
-    "torch",
-    "numba",
-    "pycolmap",
-    "onnxruntime",
-    "opencv-contrib-python-headless",
-    "pandas",
-    "snakemake",
-)
+LIBRARIES = ("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime")
+LIBRARIES += ("opencv-contrib-python-headless", "pandas", "snakemake")
+"""Libraries that affect results."""
 
 SOFTWARE = {"Software": "hilsplat"}
 """Metadata of the PNGs that commands draw for users; these files have no provenance."""
 
 
 class Inputs:
-    """Inputs of a stage, with their digests from before it ran.
-
-    Args:
-        stage: name of the stage, for messages.
-        paths: files and folders that it reads, or lists of files, by name.
+    """Inputs of a stage, by name, with their digests from before it ran.
 
     Raises:
         HilsplatError: an input is missing.
@@ -63,9 +50,7 @@ class Inputs:
         self.records = {name: self._record(path) for name, path in paths.items()}
 
     def require_unchanged(self) -> None:
-        """Check that no input changed since the digests were computed.
-
-        Files are compared by size, time and inode; only inputs that differ are read again.
+        """Check that no input changed; only files with another size, time or inode are read again.
 
         Raises:
             HilsplatError: an input changed; the message names the file.
@@ -73,9 +58,7 @@ class Inputs:
         now = self._signatures()
         for name, path in self._paths.items():
             before, after = self._files[name], now[name]
-            changed = sorted(
-                file for file in before.keys() | after.keys() if before.get(file) != after.get(file)
-            )
+            changed = sorted({file for file, _ in before.items() ^ after.items()})
             if changed and self._record(path) != self.records[name]:
                 raise HilsplatError(
                     f"{self.stage}: input {name} changed while the stage ran: {changed[0]}",
@@ -85,9 +68,13 @@ class Inputs:
                 )
 
     def _signatures(self) -> dict[str, dict[Path, tuple[int, ...]]]:
-        return {
-            name: {file: _signature(file) for file in files_of(path)} for name, path in self._paths.items()
-        }
+        signatures: dict[str, dict[Path, tuple[int, ...]]] = {}
+        for name, path in self._paths.items():
+            stats = {file: file.stat() for file in files_of(path)}
+            signatures[name] = {
+                file: (stat.st_size, stat.st_mtime_ns, stat.st_ino) for file, stat in stats.items()
+            }
+        return signatures
 
     @staticmethod
     def _record(path: Path | Sequence[Path]) -> dict[str, Any]:
@@ -104,11 +91,6 @@ def files_of(path: Path | Sequence[Path]) -> list[Path]:
     if not path.is_dir():
         return [path] if path.exists() else []
     return visible_files(path)
-
-
-def _signature(file: Path) -> tuple[int, ...]:
-    found = file.stat()
-    return found.st_size, found.st_mtime_ns, found.st_ino
 
 
 def write_provenance(
@@ -129,7 +111,6 @@ def write_provenance(
     Args:
         stage: key of `STAGES`.
         code: digest of the stage's code.
-        inputs: inputs with their digests from before the stage ran.
         beside: further outputs.
         plugins: import paths of the readers or baselines that the stage used.
         device: device that the setting `device` resolves to, if the stage has this setting.
@@ -166,12 +147,7 @@ class Written(BaseModel):
 
 
 class Read(BaseModel):
-    """An input as a stage read it.
-
-    Attributes:
-        sha256: digest from `sha256_of_path`, or None if the path did not exist or was empty.
-        files: for a list of files, the digest of each.
-    """
+    """An input as a stage read it: its digest, or that of each file of a list; None if empty or missing."""
 
     path: str
     sha256: str | None = None
@@ -191,7 +167,7 @@ class Provenance(BaseModel):
 
 
 def read_provenance(artifact: Path) -> Provenance | None:
-    """Read the provenance of an artifact, or return None if it has none.
+    """Read the provenance of an artifact; None if it has none.
 
     Raises:
         ArtifactError: the record is damaged.
@@ -216,7 +192,6 @@ def sizes_of(path: Path) -> dict[str, int]:
 
 @functools.cache
 def library_versions() -> dict[str, str]:
-    """Return the versions of the libraries that affect results."""
     versions = {}
     for name in LIBRARIES:
         try:
@@ -228,7 +203,7 @@ def library_versions() -> dict[str, str]:
 
 @functools.cache
 def git_commit() -> str:
-    """Return the commit of the checkout, with "+edits" if the tree has changes, or "unknown" outside one."""
+    """Return the checkout's commit, with "+edits" if files were changed, or "unknown" outside a checkout."""
     folder = Path(__file__).resolve().parent
 
     def git(*words: str) -> str:
@@ -248,10 +223,6 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
     An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
     provenance of the first output, or if a writer of it was killed.
-
-    Args:
-        outputs: the artifact, whose provenance lists all of them, and further outputs.
-        stage: key of `STAGES`.
 
     Raises:
         ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
@@ -276,10 +247,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Check that a picture replaces only an earlier picture by this program.
-
-    Args:
-        beside: a file that is always written with it.
+    """Check that a picture, and a file always written `beside` it, replace only earlier ones of this program.
 
     Raises:
         ArtifactError: the name does not end in .png, or an unrelated file exists at `path` or `beside`.
@@ -301,7 +269,7 @@ def _is_own_picture(path: Path) -> bool:
 
 
 def require_beginning(path: Path, line: str) -> None:
-    """Check that a table replaces only an earlier table, which begins with the same line.
+    """Check that a table replaces only one that begins with the same line.
 
     Raises:
         ArtifactError: an unrelated file exists at this path.

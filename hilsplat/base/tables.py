@@ -19,12 +19,8 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object
 def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str]]:
     """Read the rows of a CSV file as dicts keyed by column.
 
-    Args:
-        columns: the required columns, in order.
-        fix: what to do if the file is missing or has other columns.
-
     Raises:
-        ArtifactError: the file is missing or has other columns.
+        ArtifactError: the file is missing or has other columns; `fix` is what to do then.
     """
     try:
         with Path(path).open(encoding="utf-8", newline="") as stream:

@@ -20,12 +20,9 @@ from hilsplat.cli.stage import (
 )
 
 Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
-LabelledScene = Annotated[
-    str, typer.Option(help="or a scene of a published data set that has labels, such as lerf_ovs/figurines")
-]
-EvaluateSection = Annotated[
-    str, typer.Option(help="section evaluate as JSON; missing keys take their defaults")
-]
+LabelledScene = Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")]
+EvaluateSection = Annotated[str, typer.Option(help="section evaluate as JSON")]
+Kind = Annotated[str, typer.Option(help="kind of a synthetic scene: tabletop, room or street")]
 Queries = Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")]
 
 
@@ -58,12 +55,7 @@ def evaluate(
         list[str] | None, typer.Option(help="or labels of published data sets, such as lerf_ovs/figurines")
     ] = None,
     data_root: DataRoot = Path(),
-    kind: Annotated[
-        str,
-        typer.Option(
-            help="kind of a synthetic scene: tabletop, room or street; decides which data sets it replaces"
-        ),
-    ] = "",
+    kind: Kind = "",
     variant: Annotated[str, typer.Option(help="variant to name in the scores")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
@@ -97,14 +89,11 @@ def evaluate_files(
     scene: Annotated[
         Path | None, typer.Option(help="posed scene of a synthetic scene, which has the list of test views")
     ] = None,
-    kind: Annotated[str, typer.Option(help="kind of a synthetic scene: tabletop, room or street")] = "",
+    kind: Kind = "",
     dataset: Annotated[str, typer.Option(help="data set of a synthetic scene in the scores")] = "synthetic",
     name: Annotated[str, typer.Option(help="name of a synthetic scene in the scores")] = "",
     min_region_px: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="smaller true regions of a synthetic scene are not scored, as in its settings"
-        ),
+        int | None, typer.Option(min=1, help="smaller regions of a synthetic scene are not scored")
     ] = None,
 ) -> None:
     """Score masks or point labels written by any program, under the same protocols."""
@@ -121,13 +110,9 @@ def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,
     out: Annotated[Path, typer.Option(help="CSV to write, with .md, .tex and .html beside it")],
-    scores: Annotated[
-        list[Path] | None, typer.Argument(help="scores.csv files of the scenes and variants")
-    ] = None,
+    scores: Annotated[list[Path] | None, typer.Argument(help="scores.csv of each scene and variant")] = None,
     labels: Annotated[str, typer.Option(help="JSON: variant -> its name in the table")] = "{}",
-    absent: Annotated[
-        list[str] | None, typer.Option(help="a sentence about what was not measured, and why")
-    ] = None,
+    absent: Annotated[list[str] | None, typer.Option(help="what was not measured, and why")] = None,
 ) -> None:
     """Build one table of the paper, with reported, measured and stand-in rows."""
     scores = scores or []
@@ -174,9 +159,7 @@ def figures(
 
 @app.command()
 def comparison(
-    folder: Annotated[
-        Path, typer.Option(help="finished scene, results/<dataset>/<scene>", show_default=False)
-    ],
+    folder: Annotated[Path, typer.Option(help="finished scene, results/<dataset>/<scene>")],
     variants: Annotated[str, typer.Option(help="JSON list of the variants to compare")],
     out: Annotated[Path, typer.Option(help="PNG to write, with views.png, features.png and PDFs beside it")],
     names: Annotated[str, typer.Option(help="JSON: variant -> its name in figures")] = "{}",
@@ -216,11 +199,9 @@ def sweep(
 @app.command()
 def efficiency(
     results: Results = Path("results"),
-    out: Annotated[Path, typer.Option(help="CSV to write, with .md beside it")] = Path(
-        "results/efficiency.csv"
-    ),
+    out: Annotated[Path, typer.Option(help="CSV, with .md beside it")] = Path("results/efficiency.csv"),
 ) -> None:
     """Print the time of each stage, from the benchmark files of a run."""
-    from hilsplat.evaluate.tables.efficiency import run_efficiency
+    from hilsplat.evaluate.tables.costs import run_efficiency
 
     typer.echo(run_efficiency(results, out))

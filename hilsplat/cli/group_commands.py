@@ -20,8 +20,7 @@ from hilsplat.cli.stage import (
 
 SceneWithMasks = Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")]
 MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks to measure")]
-NEIGHBOURS = 2
-"""Number of nearest views that each view is compared with."""
+NEIGHBOURS = 2  # nearest views that each view is compared with
 
 
 @world_app.command("make")
@@ -52,9 +51,7 @@ def world_show(
 
 
 @world_app.command("classes")
-def world_classes(
-    out: Annotated[Path, typer.Option(help="PNG to write")] = Path("world_classes.png"),
-) -> None:
+def world_classes(out: Annotated[Path, typer.Option(help="PNG")] = Path("world_classes.png")) -> None:
     """Draw one object of each class."""
     from hilsplat.world.gallery import draw_classes
 
@@ -96,8 +93,7 @@ def world_masks(
     variant: MeasuredMasks = "default",
     results: Results = Path("results"),
     out: Annotated[
-        Path | None,
-        typer.Option(help="PNG to write, with a CSV and a PDF beside it; default: beside the masks"),
+        Path | None, typer.Option(help="PNG, with a CSV and a PDF beside it; default: beside the masks")
     ] = None,
 ) -> None:
     """Measure masks against the true regions by level, and draw where they fail."""
@@ -124,14 +120,10 @@ def world_tree(
     folder = results / scene
     semantic_tree, truth = folder / variant / "semantic_tree", folder / "world" / "truth"
     target = semantic_tree.with_name("tree_truth.csv")
-    inputs = {
-        "scene": folder / "scene",
-        "gaussians": folder / "gaussians.ply",
-        "truth": truth,
-        "semantic_tree": semantic_tree,
-    }
+    posed, ply = folder / "scene", folder / "gaussians.ply"
+    inputs = {"scene": posed, "gaussians": ply, "truth": truth, "semantic_tree": semantic_tree}
     with stage("tree_truth", target, inputs=inputs) as run:
-        table = run(inputs["scene"], inputs["gaussians"], semantic_tree, truth, target, threads)
+        table = run(posed, ply, semantic_tree, truth, target, threads)
     typer.echo(table)
 
 
@@ -140,8 +132,7 @@ def models_get(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="names of `hilsplat models list`, or owner/name on the hub; default: the recommended pair",
-            show_default=False,
+            help="names of `hilsplat models list`, or owner/name on the hub; default: recommended"
         ),
     ] = None,
     revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
@@ -149,12 +140,7 @@ def models_get(
         str, typer.Option(help="networks of another precision: quantized, fp16, int8, ...; default: full")
     ] = "",
     out: Annotated[
-        Path | None,
-        typer.Option(
-            help="folder of the models; default: HILSPLAT_MODELS, or the data folder of the user, which all "
-            "projects share",
-            show_default=False,
-        ),
+        Path | None, typer.Option(help="models folder; default: HILSPLAT_MODELS, or the user's data folder")
     ] = None,
 ) -> None:
     """Fetch released models from the model hub and check them.
@@ -201,8 +187,7 @@ def models_split(folder: Annotated[Path, typer.Argument(help="folder of an expor
 
 @cache_app.callback()
 def cache_show(
-    context: typer.Context,
-    folder: Annotated[Path, typer.Option(help="cache folder")] = DEFAULT_CACHE,
+    context: typer.Context, folder: Annotated[Path, typer.Option(help="cache folder")] = DEFAULT_CACHE
 ) -> None:
     """Show the size of each cache."""
     from hilsplat.base.cache import size_table
@@ -215,12 +200,9 @@ def cache_show(
 @cache_app.command("prune")
 def cache_prune(
     context: typer.Context,
-    days: Annotated[
-        float | None, typer.Option(min=0, help="delete entries not used for this many days")
-    ] = None,
+    days: Annotated[float | None, typer.Option(min=0, help="delete entries unused for so many days")] = None,
     max_mib: Annotated[
-        float | None,
-        typer.Option(min=0, help="delete the least recently used entries until this much is left"),
+        float | None, typer.Option(min=0, help="delete the least recently used until this much is left")
     ] = None,
     stage: Annotated[
         list[str] | None,

@@ -8,10 +8,7 @@ import typer
 
 from hilsplat.cli.stage import app
 
-POSES_HELP = (
-    "a COLMAP model, a transforms.json, or a folder with either; none: structure from motion; default: the "
-    "poses in the folder"
-)
+POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute; default: those in the folder"
 
 
 @app.command()
@@ -52,26 +49,18 @@ def run_command(
 @app.command()
 def new(
     name: Annotated[str, typer.Argument(help="name of the scene: letters, digits, . _ -")],
-    photos: Annotated[
-        Path, typer.Argument(help="folder of photographs or videos, a video, or a zip of photographs")
-    ],
+    photos: Annotated[Path, typer.Argument(help="folder of photographs or videos, a video, or a zip file")],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
     frames: Annotated[int, typer.Option(min=3, max=1000, help="most frames taken from videos")] = 60,
     poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     gaussians: Annotated[
-        Path | None,
-        typer.Option(help="a 3DGS PLY instead of a fit; none: fit; default: what 3DGS left in the folder"),
+        Path | None, typer.Option(help="3DGS PLY; none: fit; default: the output of 3DGS in the folder")
     ] = None,
     features: Annotated[
-        Path | None,
-        typer.Option(
-            help="LangSplat's language_features instead of SAM and CLIP; none: compute them; default: "
-            "those in the folder"
-        ),
+        Path | None, typer.Option(help="LangSplat's features; none: SAM, CLIP; default: those in the folder")
     ] = None,
     labels: Annotated[
-        Path | None,
-        typer.Option(help="LERF-OVS's label files, for scores; none; default: those beside the scene"),
+        Path | None, typer.Option(help="LERF-OVS labels, for scores; none; default: those beside the scene")
     ] = None,
 ) -> None:
     """Add photographs, a video, or a scene of COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.

@@ -23,6 +23,8 @@ from hilsplat.cli.stage import (
 )
 from hilsplat.models.store import AUTO
 
+Features = Annotated[Path | None, typer.Option(help="LangSplat's folder of _s.npy and _f.npy, to import")]
+
 
 @app.command("poses")
 def find_poses(
@@ -49,17 +51,12 @@ def gaussians(
     out: PathOut,
     report: Annotated[Path, typer.Option(help="folder for the fit's report")],
     settings: Settings = "{}",
-    existing: Annotated[
-        Path | None,
-        typer.Option(help="a 3DGS PLY of your own, in the source's coordinates; replaces the fit"),
-    ] = None,
+    existing: Annotated[Path | None, typer.Option(help="3DGS PLY, in the source's coordinates")] = None,
     dataparser: Annotated[
         Path | None,
         typer.Option(help="nerfstudio's dataparser_transforms.json, if that PLY is in its coordinates"),
     ] = None,
-    transforms: Annotated[
-        Path | None, typer.Option(help="the transforms.json with the source's poses, for --dataparser")
-    ] = None,
+    transforms: Annotated[Path | None, typer.Option(help="transforms.json, for --dataparser")] = None,
     cache: Cache = DEFAULT_CACHE,
     seed: Seed = 0,
     threads: Threads = 1,
@@ -79,22 +76,12 @@ def masks(
     scene: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    truth: Annotated[
-        Path | None, typer.Option(help="truth folder, for the segmenter truth-perturbed only")
-    ] = None,
-    gaussians: Annotated[
-        Path | None, typer.Option(help="PLY for key views (masks.key_views below 1) or guided prompts")
-    ] = None,
-    key_masks: Annotated[
-        Path | None, typer.Option(help="masks of the key views, for masks.prompts: guided")
-    ] = None,
-    semantic_tree: Annotated[
-        Path | None, typer.Option(help="tree of the key views, for masks.prompts: guided")
-    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="truth folder, only for truth-perturbed")] = None,
+    gaussians: Annotated[Path | None, typer.Option(help="PLY, for key views and guided prompts")] = None,
+    key_masks: Annotated[Path | None, typer.Option(help="masks of the key views, for guided prompts")] = None,
+    semantic_tree: Annotated[Path | None, typer.Option(help="their tree, for guided prompts")] = None,
     perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
-    features: Annotated[
-        Path | None, typer.Option(help="LangSplat's folder of _s.npy and _f.npy: take its masks instead")
-    ] = None,
+    features: Features = None,
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,
@@ -157,9 +144,7 @@ def show_masks(
     scene: PathIn,
     masks: PathIn,
     out: Annotated[Path, typer.Option(help="PNG to write, with the trees beside it")] = Path("masks.png"),
-    coverage_tree: Annotated[
-        Path | None, typer.Option(help="output of the coverage_tree stage, to draw the trees too")
-    ] = None,
+    coverage_tree: Annotated[Path | None, typer.Option(help="coverage trees to draw too")] = None,
     view: Annotated[str | None, typer.Option(help="name of the view; default: the middle one")] = None,
 ) -> None:
     """Draw a view's masks at three levels, and its coverage trees."""
@@ -193,12 +178,10 @@ def clip(
     masks: PathIn,
     out: PathOut,
     semantic_tree: Annotated[
-        Path | None, typer.Option(help="embed only the crops that show its nodes best; default: every mask")
+        Path | None, typer.Option(help="embed the crops that show its nodes best; default: every mask")
     ] = None,
     settings: Settings = "{}",
-    features: Annotated[
-        Path | None, typer.Option(help="LangSplat's folder of _s.npy and _f.npy: take its vectors instead")
-    ] = None,
+    features: Features = None,
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
     memory: Memory = None,

@@ -14,8 +14,7 @@ from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.cli.stage import DataRoot, Results, Threads, app
 
 SceneName = Annotated[
-    str,
-    typer.Argument(help="scene in the results folder, such as desk or photos/desk, or a path to its folder"),
+    str, typer.Argument(help="scene in the results folder, such as desk or photos/desk, or its path")
 ]
 
 
@@ -23,32 +22,23 @@ SceneName = Annotated[
 def query(
     scene: SceneName,
     text: Annotated[
-        str,
-        typer.Argument(
-            help="what to look for; 'mug > handle' finds handles of mugs, 'bear > head > nose' the nose on a "
-            "bear's head"
-        ),
+        str, typer.Argument(help="what to look for; 'bear > head > nose' finds noses on heads of bears")
     ],
     level: Annotated[
-        str,
-        typer.Option(help="level of the answers (of a path: of its last text): auto, whole, part, subpart"),
+        str, typer.Option(help="level of the answers (of a path's last text): auto, whole, part, subpart")
     ] = "auto",
-    variant: Annotated[str, typer.Option(help="variant whose files answer")] = "default",
+    variant: Annotated[str, typer.Option(help="variant to query")] = "default",
     results: Results = Path("results"),
     views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
     answerer: Annotated[
-        str, typer.Option(help="tree: nodes of the semantic tree answer; field: the paper's language field")
+        str, typer.Option(help="tree: nodes of the semantic tree; field: the paper's language field")
     ] = "tree",
     view: Annotated[str | None, typer.Option(help="find only what this view shows, such as 000.png")] = None,
     threshold: Annotated[
-        float | None,
-        typer.Option(help="least score of an answer, between 0 and 1; default: the answers near the best"),
+        float | None, typer.Option(help="least score of an answer, 0 to 1; default: answers near the best")
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            help="folder for panel.png and selection.ply; default: queries/TEXT in the scene's folder"
-        ),
+        Path | None, typer.Option(help="folder for the files; default: queries/TEXT in the scene's folder")
     ] = None,
     threads: Threads = 2,
 ) -> None:
@@ -79,7 +69,7 @@ def query(
 
 
 def scene_folder(scene: str, results: Path) -> Path:
-    """Return the folder of a scene, given as a name, as dataset/scene, or as a path.
+    """Return the folder of a scene, given as name, dataset/scene, or path.
 
     Raises:
         SettingsError: several data sets have a scene of this name.
@@ -132,9 +122,7 @@ def doctor(
 
 @app.command()
 def settings(
-    schema: Annotated[
-        bool, typer.Option(help="print the JSON schema of the configuration, for editors")
-    ] = False,
+    schema: Annotated[bool, typer.Option(help="print the configuration's JSON schema, for editors")] = False,
 ) -> None:
     """Print every setting: default, choices or range, unit, origin, meaning."""
     from hilsplat.configuration import config_schema, knob_table
@@ -195,8 +183,8 @@ def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, t
     if form is Form.PLY:
         from hilsplat.splat.coordinates import write_source_ply
 
-        number = write_source_ply(folder / "gaussians.ply", out / "point_cloud.ply")
-        return f"wrote {number} Gaussians to {out / 'point_cloud.ply'}"
+        ply = out / "point_cloud.ply"
+        return f"wrote {write_source_ply(folder / 'gaussians.ply', ply)} Gaussians to {ply}"
     opened = Scene.load(folder / "scene")
     views = len(opened.cameras)
     if form is Form.COLMAP:
@@ -218,8 +206,7 @@ def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, t
         return f"wrote images, sparse/0, point_cloud.ply and language_features of {views} views to {out}"
     from hilsplat.annotate.exporting import export_labels
 
-    number = export_labels(opened, folder, data_root, out)
-    return f"wrote labels of {number} views to {out}"
+    return f"wrote labels of {export_labels(opened, folder, data_root, out)} views to {out}"
 
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")]

@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 from hilsplat.base.artifacts import atomic_folder, read_json, require_free_space, write_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_images, list_videos
+from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_images
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
 MARK = ".made_from.json"
@@ -27,7 +26,7 @@ POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 
 @dataclass(frozen=True)
 class PreparedFolder:
-    """A folder to be registered as a scene's source, with notes on the conversion and on skipped files."""
+    """A scene's source, with notes on its conversion and on skipped files."""
 
     folder: Path
     notes: tuple[str, ...] = ()
@@ -37,11 +36,8 @@ class PreparedFolder:
 def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[PreparedFolder]:
     """Yield the source folder of photographs itself, or `target`, made from videos or an archive.
 
-    If the block ends with an error, a folder that was made is removed.
-
-    Args:
-        source: a folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d).
-        frames: maximum number of frames taken from videos.
+    The source is a folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most
+    `frames` frames are taken from videos. If the block ends with an error, a folder that was made is removed.
 
     Raises:
         SceneError: the source cannot be used, or the target exists and was made from other files.
@@ -62,7 +58,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
             return [f"{len(list_images(folder))} frames of {named} are in {target}", *notes]
 
     elif source.is_dir():
-        beside = list_videos(photo_folder(source))
+        beside = list_images(photo_folder(source), VIDEO_SUFFIXES)
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used" if beside else ""
         yield PreparedFolder(source, (note,) if note else ())
         return
@@ -78,28 +74,22 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
             expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
             fix="give the folder that holds the photographs",
         )
-    mark = _mark(videos or [source], frames)
+    files = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in videos or [source]]
+    mark = {"files": files, "frames": frames}
     if not target.exists():
         with atomic_folder(target) as folder:
             notes = make(folder)
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} is there already, from the same files"]  # an earlier run was killed later
+        notes = [f"{target} already exists, from the same files"]  # an earlier run was killed later
     else:
-        raise SceneError(
-            f"{target} is in the way",
-            fix="choose another name for the scene, or move that folder away",
-        )
+        fix = "choose another name for the scene, or move that folder away"
+        raise SceneError(f"{target} already exists", fix=fix)
     try:
         yield PreparedFolder(unwrapped(target), tuple(notes))
     except BaseException:
         shutil.rmtree(target, ignore_errors=True)
         raise
-
-
-def _mark(files: list[Path], frames: int) -> dict[str, Any]:
-    found = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files]
-    return {"files": found, "frames": frames}
 
 
 def _videos_of(source: Path) -> list[Path]:
@@ -108,7 +98,7 @@ def _videos_of(source: Path) -> list[Path]:
         return [source] if source.suffix.lower() in VIDEO_SUFFIXES else []
     if list_images(photo_folder(source)) or has_known_poses(source):
         return []
-    return list_videos(source)
+    return list_images(source, VIDEO_SUFFIXES)
 
 
 def unpack_photographs(archive: Path, folder: Path) -> None:

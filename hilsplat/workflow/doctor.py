@@ -13,6 +13,7 @@ from typing import Literal
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from hilsplat.base.artifacts import existing_folder
 from hilsplat.base.device import is_installed
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import merged_config
@@ -29,12 +30,7 @@ RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip"
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check.
-
-    Attributes:
-        state: "ok"; "note" if something optional is missing; "fault" if runs fail or give wrong results.
-        fix: empty if no action is needed.
-    """
+    """Result of a check; a note is about something optional, a fault makes runs fail or results wrong."""
 
     check: str
     state: Literal["ok", "note", "fault"]
@@ -43,7 +39,6 @@ class Finding:
 
 
 def verdict(check: str, problem: str | None, sound: str, fix: str) -> Finding:
-    """Return a fault with its fix, or what was found if there is no problem."""
     return Finding(check, "fault", problem, fix) if problem else Finding(check, "ok", sound)
 
 
@@ -57,7 +52,6 @@ def examine() -> Iterator[Finding]:
 
 
 def python() -> Iterator[Finding]:
-    """Check the version of Python."""
     required = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     found = platform.python_version()
     problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is needed"
@@ -66,7 +60,6 @@ def python() -> Iterator[Finding]:
 
 
 def libraries() -> Iterator[Finding]:
-    """Check the versions of the libraries that the package requires."""
     wrong, number = [], 0
     for text in importlib.metadata.requires(PACKAGE) or ():
         requirement = Requirement(text)
@@ -87,7 +80,7 @@ def libraries() -> Iterator[Finding]:
 
 
 def onnx() -> Iterator[Finding]:
-    """Report onnxruntime's providers, and whether two builds of it overwrite each other."""
+    """Check whether two builds of onnxruntime overwrite each other."""
     import onnxruntime
 
     problem = ""
@@ -100,8 +93,7 @@ def onnx() -> Iterator[Finding]:
 
 def cuda() -> Iterator[Finding]:
     """Check whether torch and gsplat can use CUDA, and whether they render what the CPU renders."""
-    from hilsplat.splat.rasterise.device import cuda_problem
-    from hilsplat.splat.rasterise.parity import cuda_disagreement
+    from hilsplat.splat.rasterise.device import cuda_disagreement, cuda_problem
 
     if problem := cuda_problem():
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
@@ -113,7 +105,7 @@ def cuda() -> Iterator[Finding]:
 
 def kernels() -> Iterator[Finding]:
     """Compile or load the rasteriser's loops, and render a small scene."""
-    from hilsplat.splat.rasterise.parity import disagreement
+    from hilsplat.splat.rasterise.device import disagreement
 
     begin = time.monotonic()
     apart = disagreement("cpu", "cpu")
@@ -151,12 +143,8 @@ def models() -> Iterator[Finding]:
         yield verdict("models", problem, sound, "pip install onnxruntime instead")
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
-        yield Finding(
-            "models",
-            "note",
-            f"no {names} for photographs: answers about them mean nothing",
-            f"hilsplat models get ({' and '.join(RECOMMENDED)})",
-        )
+        problem = f"no {names} for photographs: answers about them mean nothing"
+        yield Finding("models", "note", problem, f"hilsplat models get ({' and '.join(RECOMMENDED)})")
 
 
 def space() -> Iterator[Finding]:
@@ -164,16 +152,15 @@ def space() -> Iterator[Finding]:
     try:
         plan = Plan(merged_config([]))
     except HilsplatError as error:
-        yield Finding(
-            "configuration", "note", str(error), "choose scenes, or name them: hilsplat run photos/desk"
-        )
+        fix = "choose scenes, or name them: hilsplat run photos/desk"
+        yield Finding("configuration", "note", str(error), fix)
         return
     resources, disk_mb, memory = JobResources(plan), 0.0, (0.0, "", "")
     for row in plan.scenes:
         disk_mb += sum(resources.disk_mb(rule, row) for rule in RULES)
         for rule in RULES:
             memory = max(memory, (resources.memory_mb(rule)(row, threads=1, attempt=1), rule, row.name))
-    folder = _existing(plan.results)
+    folder = existing_folder(plan.results)
     free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30
     text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes take about {needed:.1f}"
     problem = "" if free > needed else text
@@ -187,14 +174,13 @@ def space() -> Iterator[Finding]:
 
 
 def writing() -> Iterator[Finding]:
-    """Check that the folders to which hilsplat writes are writable."""
     kernels_folder = Path(__file__).resolve().parents[1] / "__pycache__"
     for what, folder in (
         ("working folder", Path.cwd()),
         ("models", user_models()),
         ("compiled kernels", kernels_folder),
     ):
-        existing = _existing(folder)
+        existing = existing_folder(folder)
         if os.access(existing, os.W_OK):
             yield Finding("writing", "ok", f"{what}: {folder}")
         else:
@@ -204,11 +190,6 @@ def writing() -> Iterator[Finding]:
 
 
 CHECKS = (python, libraries, onnx, cuda, kernels, video, models, space, writing)
-
-
-def _existing(folder: Path) -> Path:
-    """Return the folder, or its nearest existing parent."""
-    return next(path for path in (folder, *folder.resolve().parents) if path.exists())
 
 
 def _codec(name: str, mode: Literal["r", "w"]) -> bool:

@@ -6,7 +6,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
-from hilsplat.configuration import StageSettings
 from hilsplat.models.store import read_model
 from hilsplat.scene.finished import KEY_VIEWS
 from hilsplat.scene.sheet import PHOTOS, SceneRow
@@ -18,19 +17,16 @@ from hilsplat.workflow.scene_data import of_variant
 GPU_GAIN = {"gaussians": 4, "masks": 27, "clip": 60}
 """Rule -> speed with a GPU relative to one core. Measured for a fit of 100,000 Gaussians
 (docs/benchmarks.md), whose loss and Adam stay on the CPU. The others are from published times on an
-RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop. Other rules are assumed to
-run on the CPU."""
+RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."""
 
-OTHERS = "tables"
-"""Name of the row for jobs without a scene."""
+OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
     "Hours can be wrong by a factor of two on another machine. Memory is that of the largest job.",
     "GPU: published times of a 24 GB card for fits, SAM and CLIP; the cores do the rest.",
 )
 
-KEPT_PROMPTS = 0.3
-"""Share of the previewed prompts whose masks are decoded."""
+KEPT_PROMPTS = 0.3  # share of the previewed prompts whose masks are decoded
 
 
 class JobEstimate(NamedTuple):
@@ -51,7 +47,6 @@ class RunEstimate:
         self._jobs = defaultdict[str, list[JobEstimate]](list)
 
     def add(self, rule: str, wildcards: Mapping[str, str], memory_mb: int) -> None:
-        """Add a job to its data set."""
         gain = GPU_GAIN.get(rule, 0)
         if "scene" not in wildcards:
             self._jobs[OTHERS].append(JobEstimate("", 0.0, memory_mb, START_S, gain))
@@ -104,15 +99,12 @@ def forecasts(plan: Plan, cores: int) -> list[str]:
     resources = JobResources(plan)
     lines = []
     for row in plan.scenes:
-        is_done = Path(plan.path(row, "default", "clip")).exists()
-        if row.group == PHOTOS and _is_real(plan.stages(row)) and not is_done:
+        stages = plan.stages(row)
+        models = [read_model(Path(section.model)) for section in (stages.masks, stages.clip)]
+        full = stages.masks.segmenter == "sam" and all(model and not model.embedded for model in models)
+        if row.group == PHOTOS and full and not Path(plan.path(row, "default", "clip")).exists():
             lines.append(_forecast(plan, resources, row, cores))
     return lines
-
-
-def _is_real(stages: StageSettings) -> bool:
-    models = [read_model(Path(section.model)) for section in (stages.masks, stages.clip)]
-    return stages.masks.segmenter == "sam" and all(model and not model.embedded for model in models)
 
 
 def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) -> str:
@@ -132,16 +124,16 @@ def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) ->
     full_s, guided_s = base_s + prompts * prompt_s, base_s + GUIDED * prompts * prompt_s
     before_s = sum(resources.core_seconds(rule, row) for rule in ("poses", "gaussians"))
     after_s = sum(resources.core_seconds(rule, row) for rule in ("contributions", "semantic_tree"))
-    said, rest_s = "", views * full_s
+    first_answer, rest_s = "", views * full_s
     if plan.first_answer(of_variant(row, "default")):
         settings = plan.stages(of_variant(row, KEY_VIEWS))
         first = views * settings.masks.key_views
         key_s = base_s + settings.masks.points_per_side**2 * prompt_s
         before_s += first * key_s + after_s / 2 + NODES * settings.clip.crops_per_node * crop_s
         rest_s = (views - first) * (guided_s if stages.masks.prompts == "guided" else full_s)
-        said = f"first answer in {duration(before_s / cores)}, "
+        first_answer = f"first answer in {duration(before_s / cores)}, "
     total_s = before_s + rest_s + after_s + NODES * stages.clip.crops_per_node * crop_s
     return (
-        f"{row.name}: {said}all photographs in {duration(total_s / cores)}. "
+        f"{row.name}: {first_answer}all photographs in {duration(total_s / cores)}. "
         f"A photograph takes {full_s:.0f} s of SAM on one of {cores} cores, a crop {crop_s:.2f} s of CLIP."
     )

@@ -98,18 +98,16 @@ class Plan:
             raise SettingsError(
                 f"results: {self.results} is not a folder", fix="move that file away, or name another folder"
             )
-        seen: set[Any] = set()
+        where: dict[StageSettings, str] = {}
         for row in self.scenes:
             for variant in self.run.variant_names():
-                stages = self.stages_of(variant, self.scopes(row))
-                if stages not in seen:
-                    seen.add(stages)
-                    check_models(stages, f"{row.name}, variant {variant}")
-                    if devices:
-                        check_device(stages, f"{row.name}, variant {variant}")
+                where.setdefault(self.stages_of(variant, self.scopes(row)), f"{row.name}, variant {variant}")
+        for stages, place in where.items():
+            check_models(stages, place)
+            if devices:
+                check_device(stages, place)
 
     def path(self, job: Job, *parts: str) -> str:
-        """Return a path in the folder of a scene."""
         return "/".join([self.run.results, job.dataset, job.scene, *parts])
 
     def variants(self, by_baseline: bool | None = None) -> str:
@@ -121,7 +119,6 @@ class Plan:
         )
 
     def row(self, job: Job) -> SceneRow:
-        """Return a scene's row of the sheet."""
         return self.data.row(job)
 
     def stages(self, job: Job) -> StageSettings:
@@ -133,7 +130,6 @@ class Plan:
         return getattr(job, "variant", "default"), self.scopes(self.row(job))
 
     def _section_of(self, section: str, variant: str, scopes: tuple[str, ...]) -> tuple[str, dict[str, Any]]:
-        """Return a section's settings as JSON and as values."""
         settings = getattr(self.stages_of(variant, scopes), section)
         return inert(settings.model_dump_json()), settings.model_dump(mode="json")
 
@@ -146,7 +142,7 @@ class Plan:
         return self._section(section, *self.which(job))[1] if section in SECTIONS else {}
 
     def seeded(self, variant: str, row: SceneRow) -> list[str]:
-        """Return a variant and, if it depends on the seed, its repetitions with other seeds."""
+        """Return a variant and, if it is random, its repetitions with other seeds."""
         return self._seeded(variant, self.scopes(row))
 
     def seed(self, job: VariantJob) -> int:
@@ -154,9 +150,7 @@ class Plan:
         return self.run.seed_of(job.variant)
 
     def code(
-        self,
-        stage: str | Callable[[Any], str],
-        plugins: Callable[[Any], tuple[str, ...]] = lambda job: (),
+        self, stage: str | Callable[[Any], str], plugins: Callable[[Any], tuple[str, ...]] = lambda job: ()
     ) -> Callable[[Any], str]:
         """Return the parameter function for the digest of a stage's code and of its readers or baseline."""
         return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
@@ -195,7 +189,6 @@ class Plan:
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
         """Return the input function for a stage's output, from the first variant with equal settings.
 
-        A sweep over Omega thus fits only fields, and shares masks, trees and embeddings with `default`.
         Variants that are in no table are included, so that shared files do not move when tables change.
         """
         return lambda job: self.path(job, self.shared_variant(stage, job), path)
@@ -205,7 +198,7 @@ class Plan:
         return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
 
     def compared_scores(self, job: Job) -> list[str]:
-        """Return the input: every variant's scores in the main tables."""
+        """Return the input of comparison: the scores of each variant in the main tables."""
         return [self.path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
 
     def _main_jobs(self, job: Job) -> list[VariantJob]:
@@ -251,10 +244,7 @@ class Plan:
         return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
-        """Return an input of masks that only orders jobs: what must exist before all views are segmented.
-
-        It is the CLIP output of `key-views`, for photographs whose masks take a full-size SAM minutes.
-        """
+        """Return an input of masks that only orders jobs: vectors of key views, before a full-size SAM."""
         row, masks = self.row(job), self.stages(job).masks
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
@@ -363,11 +353,9 @@ class Plan:
         return "langsplat" if self.row(job).features else "clip"
 
     def baseline(self, job: VariantJob) -> tuple[str, ...]:
-        """Return the baseline that computes a variant's field."""
         return (METHODS.places[self.stages(job).method.name],)
 
     def main_variants(self) -> str:
-        """Return the variants in the main tables as JSON."""
         return json.dumps(self.run.main_variants)
 
     def names(self, _: object) -> str:
@@ -381,10 +369,7 @@ class Plan:
 
 
 def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
-    """Refuse a misspelt scene in `overrides`, `queries` or `sweep_scenes`, and suggest the closest name.
-
-    `rows` includes the default sheet, because settings for its scenes are allowed too.
-    """
+    """Refuse a misspelt scene in `overrides`, `queries` or `sweep_scenes`, and suggest the closest name."""
     datasets = {row.dataset for row in rows} | {PHOTOS}
     scenes = [row.name for row in rows]
     # Settings of a scene that was removed from the sheet may stay in the configuration.

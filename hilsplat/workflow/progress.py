@@ -27,11 +27,11 @@ from hilsplat.workflow.scene_data import Job
 REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_info"})
 """Events that are not printed, besides the start and end of a job."""
 
+SELECTING = "Select jobs to execute..."
+"""Message without an event that is not printed."""
+
 TARGETS = ("all", "everything", "tables", "total")
 """Entries of the job counts that are not jobs."""
-
-SELECTING = "Select jobs to execute..."
-"""Message that Snakemake logs before every job, without an event."""
 
 LOOPS = {
     "world": "rendered views",
@@ -134,7 +134,6 @@ class RunProgress:
         self._refined: set[str] = set()
 
     def begin(self, jobs: Mapping[str, int]) -> None:
-        """Start a run with the given number of jobs of each rule."""
         self.waiting = Counter({rule: number for rule, number in jobs.items() if rule not in TARGETS})
         self.total = self.waiting.total()
         estimates.learn_from_benchmarks()
@@ -150,7 +149,6 @@ class RunProgress:
         self.running[number] = job
 
     def fail(self, number: int) -> None:
-        """End a job with an error."""
         if self.running.pop(number, None) is not None:
             self.failed += 1
 
@@ -166,7 +164,6 @@ class RunProgress:
         return [*warnings, f"{job.name}: {seconds:.0f} s ({self.counts()})", *self._hint(job)]
 
     def counts(self) -> str:
-        """Return the number of finished jobs and the time left, as text."""
         failed = f", {self.failed} failed" if self.failed else ""
         left = f", {duration(self.seconds_left())} left" if self.running or self.waiting.total() else ""
         return f"{self.done} of {self.total} done{failed}{left}"
@@ -265,7 +262,6 @@ class ProgressDisplay:
         self._line.refresh()
 
     def close(self) -> None:
-        """Remove the status line."""
         self._line.stop()
 
     def _draw(self) -> Text:

@@ -121,12 +121,10 @@ def outdated(plan: Plan) -> dict[str, str]:
 
 
 def verify(results: Path) -> tuple[str, bool]:
-    """Read every byte of a results folder and compare it with the provenance.
+    """Read every byte of a results folder, or a copy of it, and compare it with the provenance.
 
     An artifact is damaged if its files differ from what was written. It is stale if other code made it or its
     inputs have changed. Missing inputs outside the folder are ignored.
-
-    The folder may have been moved or copied.
 
     Returns:
         A report that ends with the Snakemake command that repairs the folder, and whether all is whole.

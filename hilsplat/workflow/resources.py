@@ -33,20 +33,16 @@ with Path(__file__).with_suffix(".tsv").open(encoding="utf-8") as _stream:
     _rows = list(csv.DictReader(_stream, delimiter="\t"))
 COSTS = {row.pop("rule"): {name: float(value) for name, value in row.items()} for row in _rows}
 
-MP_PER_THREAD = 2.0
-"""Megapixels of all views per thread."""
+MP_PER_THREAD = 2.0  # megapixels of all views per thread
 
-RUNNER_MB = 700
-"""Memory of the two Snakemake processes that a cluster job starts before its stage."""
+RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job starts before its stage
 
-COMPARED_MB = (450, 4)
-"""Memory of `comparison` per method: base, and per thousand Gaussians."""
+COMPARED_MB = (450, 4)  # memory of `comparison` per method: base, and per thousand Gaussians
 
 TIME_FACTOR, LEAST_MINUTES = 6, 10
 """Time limit of a job divided by its estimate, and the lowest limit."""
 
-START_S = 2.0
-"""Seconds that each job takes to start Python, load libraries and read its inputs."""
+START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
 """Core seconds per fit step, for each megapixel of the view and for each Gaussian of the limit; core seconds
@@ -55,11 +51,9 @@ per megapixel in the graph segmenter."""
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
 
-NETWORK_S = 10.0
-"""Core seconds to train an autoencoder."""
+NETWORK_S = 10.0  # core seconds to train an autoencoder
 
-EMBEDDED_S = {"masks": 1.5, "clip": 0.1}
-"""Core seconds of the embedded models per view."""
+EMBEDDED_S = {"masks": 1.5, "clip": 0.1}  # core seconds of the embedded models per view
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
 """Part of a SAM's name -> core seconds to encode a picture; others: SAM 2.1 small (docs/benchmarks.md)."""
@@ -73,15 +67,13 @@ PREVIEWED, GUIDED = 0.65, 0.25
 MASKS, NODES = 230, 400
 """Typical numbers of masks of a photograph and nodes of a room, from `plush_bedroom` (docs/benchmarks.md)."""
 
-UNTRAINED = ("lifted", "occam", "dr_splat")
-"""Baselines without training."""
+UNTRAINED = ("lifted", "occam", "dr_splat")  # baselines without training
 
-UNKNOWN_MP = 0.5
-"""Megapixels of a view if no image header can be read before the run, such as in an archive."""
+UNKNOWN_MP = 0.5  # megapixels of a view if no image header can be read before the run
 
 
 class Size(NamedTuple):
-    """Number of views of a scene, and the megapixels of one view."""
+    """Size of a scene; `view_mp` are the megapixels of one view."""
 
     views: int
     view_mp: float
@@ -90,10 +82,8 @@ class Size(NamedTuple):
 class JobResources:
     """Resources of the jobs of a plan, as functions of wildcards that Snakemake calls.
 
-    Args:
-        cores: cores of this machine if it runs the jobs; they get one thread each if there are jobs for all
-            cores. None on a cluster, where resources must not depend on the machine, because a job recomputes
-            them on its node.
+    With the `cores` of this machine, jobs get one thread each if there are enough jobs for all cores. On a
+    cluster, `cores` is None: a job recomputes its resources on its node, so they must not depend on cores.
     """
 
     def __init__(self, plan: Plan, cores: int | None = None) -> None:
@@ -189,9 +179,10 @@ class JobResources:
         if rule == "method" and stages.method.name in UNTRAINED:
             return COSTS["field"]["core_s_per_mp"] * views * view_mp
         if rule == "method":
-            return _trained_s(TRAINED_S_PER_MP, stages.method.steps, view_mp / stages.method.pixel_step**2)
+            pixels_mp = view_mp / stages.method.pixel_step**2
+            return TRAINED_S_PER_MP * len(LEVELS) * stages.method.steps * pixels_mp
         if rule == "field" and stages.field.trainer == "literal":
-            return _trained_s(LITERAL_S_PER_MP, stages.field.iterations, view_mp)
+            return LITERAL_S_PER_MP * len(LEVELS) * stages.field.iterations * view_mp
         if rule == "autoencoder" and stages.autoencoder.code == "network":
             return NETWORK_S
         return COSTS.get(rule, {}).get("core_s_per_mp", 0.0) * views * view_mp
@@ -222,10 +213,6 @@ class JobResources:
             return 0
         batch = settings.batch if rule == "clip" else settings.points_per_batch
         return _model_memory_mb(model_path(settings.model), settings.variant, batch, threads)
-
-
-def _trained_s(s_per_mp: float, steps: int, mp: float) -> float:
-    return s_per_mp * len(LEVELS) * steps * mp
 
 
 def _sam_s(masks: MasksSettings) -> float:

@@ -36,7 +36,7 @@ from hilsplat.workflow.records import outdated
 logger = logging.getLogger(__name__)
 
 STATE = Path(".hilsplat")
-"""Folder for locks and markers, in the working folder."""
+"""Folder in the working folder for locks and markers."""
 
 UNREGISTERED = "HILSPLAT_UNREGISTERED"
 """Environment variable of a Snakemake process that takes no lock of ours, such as the one that unlocks."""
@@ -48,8 +48,7 @@ ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
 """Snakemake options with which cores and threads are not set here."""
 
 
-_marks: list[TextIOWrapper] = []
-"""The marker of this process's run, if one is in progress."""
+_marks: list[TextIOWrapper] = []  # the marker of this process's run, if one is in progress
 
 
 def prepare_process() -> TextIOWrapper | None:
@@ -107,10 +106,7 @@ def _locked(name: str, kind: int) -> TextIOWrapper:
 
 
 def start_project(folder: Path) -> list[Path]:
-    """Copy the default configuration and scene sheet into a folder, where they override the installed ones.
-
-    If one of them already exists, nothing is written.
-    """
+    """Copy the default configuration and scene sheet into a folder, unless one of them exists there."""
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:
         if path.exists():
@@ -125,8 +121,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
 
     Args:
         targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
-        configs: configuration files that override `config/config.yaml`, in order.
-        options: further options of Snakemake, passed on unchanged.
+        options: Snakemake's.
 
     Returns:
         Snakemake's exit status.
@@ -189,7 +184,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
 
 
 def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str) -> None:
-    """Raise an error for a target that is neither a scene nor a rule and cannot be a results file."""
+    """Refuse a target that is neither a scene nor a rule and cannot be a results file."""
     known = [*TARGET_RULES, *(name for row in rows for name in (row.scene, row.name))]
     for target in targets:
         near = difflib.get_close_matches(target, known, n=1)

@@ -13,14 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.datasets.registry import readers_of
-from hilsplat.datasets.sources import (
-    DATA_PREFIX,
-    absence,
-    image_files,
-    is_exported,
-    label_files,
-    label_sets,
-)
+from hilsplat.datasets.sources import DATA_PREFIX, absence, image_files, is_exported, label_files, label_sets
 from hilsplat.scene.layouts import TRAINED, dataparser_of, transforms_of
 from hilsplat.scene.sheet import SceneRow
 
@@ -54,10 +47,7 @@ def options_of(named: Mapping[str, Any]) -> str:
 
 
 class SceneData:
-    """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels.
-
-    `path` returns a path in the results folder of a job's scene.
-    """
+    """Inputs and options of the jobs that read a scene's photographs, Gaussians and labels."""
 
     def __init__(self, rows: Iterable[SceneRow], data_root: str, path: Callable[..., str]) -> None:
         self.data_root, self.path = data_root, path
@@ -68,7 +58,6 @@ class SceneData:
         self._labels = functools.cache(lambda row: label_sets(row.source, data_root, row.name))
 
     def row(self, job: Job) -> SceneRow:
-        """Return a scene's row of the sheet."""
         return self._row_of[job.dataset, job.scene]
 
     def images(self, job: Job, input: Sequence[str]) -> str:
@@ -99,7 +88,6 @@ class SceneData:
         return sorted({*files, *(str(path) for path in named if path.is_file())})
 
     def poses_option(self, job: Job) -> str:
-        """Return the options of poses: whether the images are renders, and poses given in the sheet."""
         row = self.row(job)
         if row.world:
             return "--render"
@@ -121,7 +109,6 @@ class SceneData:
         return [str(path) for path in image_files(self.row(job).source, self.data_root)]
 
     def source_name(self, job: Job) -> str:
-        """Return the parameter of source: data set and scene."""
         return self.row(job).source.removeprefix(DATA_PREFIX)
 
     def source_reader(self, job: Job) -> tuple[str, ...]:
@@ -138,7 +125,6 @@ class SceneData:
         return [str(path) for path in (ply, *described)]
 
     def existing_gaussians_option(self, job: Job) -> str:
-        """Return the options for such a PLY and nerfstudio's files for it, if any."""
         return options_of({"existing": self.row(job).gaussians, **self._nerfstudio(job)})
 
     def _nerfstudio(self, job: Job) -> dict[str, Path]:
@@ -157,7 +143,6 @@ class SceneData:
         return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
     def features_option(self, job: Job) -> str:
-        """Return the option for the folder of LangSplat's files, if there is one."""
         return options_of({"features": self.row(job).features})
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
@@ -165,7 +150,6 @@ class SceneData:
         return () if row.world else self._labels(row)
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
-        """Return the readers of a scene's labels."""
         return readers_of(self.labels(self.row(job)))
 
     def _label_files(self, row: SceneRow) -> list[str]:

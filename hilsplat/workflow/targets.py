@@ -52,7 +52,7 @@ def labelled(plan: Plan) -> list[SceneRow]:
 
 
 def annotated(plan: Plan) -> list[SceneRow]:
-    """Return the scenes with your own labels only."""
+    """Return the scenes that have only your own labels."""
     return [row for row in labelled(plan) if not data_of(row)]
 
 

@@ -200,12 +200,12 @@ def test_a_folder_without_index_is_incomplete(tmp_path: Path) -> None:
 
 def test_cache_computes_once_and_recovers_from_a_damaged_entry(tmp_path: Path) -> None:
     cache = artifacts.ViewCache(tmp_path)
-    for counts in ((0, 1), (1, 1)):
+    for hits in (0, 1):
         assert cache.get("key", lambda: {"x": np.array([1, 2])})["x"].tolist() == [1, 2]
-        assert (cache.hits, cache.misses) == counts
+        assert cache.hits == hits
     cache.path("key").write_bytes(b"broken")
     assert cache.get("key", lambda: {"x": np.array([3])})["x"].tolist() == [3]
-    assert (cache.hits, cache.misses) == (1, 2)
+    assert cache.hits == 1
 
 
 @pytest.mark.parametrize("compressed", [True, False])
