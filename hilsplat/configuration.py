@@ -127,8 +127,8 @@ def _known_keys(model: Any, path: list[str]) -> list[str]:
     return sorted(model.model_fields)
 
 
-VARIANT_SECTIONS = ("masks", "perturb", "coverage_tree", "clip", "contributions", "semantic_tree")
-VARIANT_SECTIONS += ("autoencoder", "field", "method", "evaluate")
+VARIANT_SECTIONS: tuple[str, ...] = ("masks", "perturb", "coverage_tree", "clip", "contributions")
+VARIANT_SECTIONS += ("semantic_tree", "autoencoder", "field", "method", "evaluate")
 """Sections that a variant may override; all variants share the stages before them."""
 
 UPSTREAM: dict[str, tuple[str, ...]] = {

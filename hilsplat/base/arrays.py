@@ -37,7 +37,8 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
             declared: Any = hints.get(name)
             if not (isinstance(declared, type) and issubclass(declared, AbstractArray)):
                 continue
-            if not isinstance(array, declared):
+            fits: bool = isinstance(array, declared)
+            if not fits:
                 raise ArtifactError(
                     f"{path}: array {name} cannot be used",
                     expected=described(declared),

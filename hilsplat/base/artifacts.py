@@ -29,8 +29,8 @@ ZIP64_BYTES = 2**30
 INDEX = "index.json"
 """Written last into a folder artifact: its presence means that the folder is complete."""
 
-DAMAGE = (EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError)
-DAMAGE += (zipfile.BadZipFile, zlib.error, AttributeError)  # the last for .npy where .npz is expected
+DAMAGE: tuple[type[Exception], ...] = (EOFError, MemoryError, NotImplementedError, OSError, SyntaxError)
+DAMAGE += (TokenError, ValueError, zipfile.BadZipFile, zlib.error, AttributeError)  # last: .npy for .npz
 """Errors that numpy and zipfile raise on damaged files."""
 
 

@@ -51,8 +51,8 @@ class Statement:
     signature: list[tuple[str, ...]] = field(default_factory=list)
 
     def __add__(self, other: "Statement") -> "Statement":
-        sums = (getattr(self, name) + getattr(other, name) for name in ("text", "names", "inner"))
-        return Statement(*sums, self.imports | other.imports, self.signature + other.signature)
+        text, names, inner = self.text + other.text, self.names + other.names, self.inner + other.inner
+        return Statement(text, names, inner, self.imports | other.imports, self.signature + other.signature)
 
 
 @dataclass
@@ -119,8 +119,8 @@ def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
     """Return the target of each name that an import statement binds."""
     if isinstance(node, ast.Import):
         whole = {alias.asname: alias.name for alias in node.names if alias.asname}
-        parents = {top: top for top in (alias.name.split(".")[0] for alias in node.names if not alias.asname)}
-        return {name: Import(module, "") for name, module in {**whole, **parents}.items()}
+        tops = [alias.name.split(".")[0] for alias in node.names if not alias.asname]
+        return {name: Import(module, "") for name, module in {**whole, **{top: top for top in tops}}.items()}
     if not isinstance(node, ast.ImportFrom):
         return {}
     base = node.module or ""

@@ -23,7 +23,7 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError
 
-LIBRARIES = ("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime")
+LIBRARIES: tuple[str, ...] = ("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime")
 LIBRARIES += ("opencv-contrib-python-headless", "pandas", "snakemake")
 """Libraries that affect results."""
 
