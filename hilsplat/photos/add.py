@@ -31,12 +31,11 @@ from hilsplat.scene.sheet import (
     MIN_PHOTOS,
     NOTHING,
     PHOTOS,
-    UNITS,
     content_lines,
     project_root,
     read_sheet,
 )
-from hilsplat.scene.view_names import require_usable_name
+from hilsplat.scene.view_names import view_names
 
 OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
 """Suffixes of unsupported photograph formats; skipped files are reported instead of "no images"."""
@@ -98,23 +97,17 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     Other `poses` may replace those in the folder (`has_known_poses`).
 
     Raises:
-        SceneError: the folder does not exist, or two photographs differ only in their suffix.
+        SceneError: a photograph has an unusable name, or two differ only in their suffix.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise SceneError(
-            f"photo folder {folder} {'is a file' if folder.exists() else 'is missing'}",
-            fix="give the folder that holds the photographs",
-        )
     where = photo_folder(folder)
+    photos = list_images(where)
+    view_names(photos)
     sizes: Counter[tuple[int, int]] = Counter()
     unreadable: list[tuple[str, str]] = []
     by_digest: dict[str, list[str]] = defaultdict(list)
-    by_stem: dict[str, list[str]] = defaultdict(list)
     num_rotated = 0
     checked: list[CheckedPhoto] = []
-    for path in track(list_images(where), "photographs checked"):
-        require_usable_name(path)
+    for path in track(photos, "photographs checked"):
         if not path.exists() or path.stat().st_size == 0:
             is_link = not path.exists()
             reason = "it is a link to a file that does not exist" if is_link else "the file is empty"
@@ -134,41 +127,25 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
         checked.append(CheckedPhoto(path.name, size_hw, exif_focal_px(path, size_hw), grey))
         with path.open("rb") as stream:
             by_digest[hashlib.file_digest(stream, "sha256").hexdigest()].append(path.name)
-        by_stem[path.stem].append(path.name)
-    for names in by_stem.values():
-        if len(names) > 1:
-            raise SceneError(
-                f"{len(names)} photographs in {where} would become the same view",
-                found=", ".join(names),
-                fix="rename or remove all but one: views are named after the file without its suffix",
-            )
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
-    passed_over = Counter(
-        path.suffix.lower()
-        for path in where.iterdir()
-        if path.is_file() and path.suffix.lower() in OTHER_PHOTO_SUFFIXES
-    )
+    suffixes = Counter(path.suffix.lower() for path in where.iterdir() if path.is_file())
+    passed_over = {suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES}
     return PhotoReport(
         folder=where,
         sizes=dict(sizes),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
-        passed_over=dict(passed_over),
+        passed_over=passed_over,
         doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder, poses))),
     )
-
-
-NONE = NO_POSES
-"""Argument value for ignoring files found in the folder."""
 
 
 def add_scene(
     sheet: Path,
     name: str,
     photos: Path,
-    unit: str = "arbitrary",
     frames: int = 60,
     poses: Path | None = None,
     gaussians: Path | None = None,
@@ -178,20 +155,18 @@ def add_scene(
     """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
 
     A folder is used in place: the sheet refers to it, with a relative path if it is inside the project.
-    Frames of a video and the contents of an archive are written to `photos/<name>/` in the project.
+    Frames of a video and the contents of an archive are written to `photos/<name>/` in the project. Of the
+    last four arguments, None uses what is found in the folder, and `NO_POSES` ("none") ignores it.
 
     Args:
         photos: folder of photographs or of videos, a video, or a zip archive of photographs.
-        unit: unit of lengths, for a folder with metric poses.
         frames: maximum number of frames taken from videos.
-        poses: a COLMAP model or transforms file. None uses the poses in the folder, if any; `NONE` runs
-            structure from motion.
-        gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates, used
-            instead of a fit. None uses the PLY of 3DGS or nerfstudio in the folder, if any; `NONE` fits.
-        features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP. None uses the one in
-            the folder, if any; `NONE` runs SAM and CLIP.
+        poses: a COLMAP model or transforms file; instead of it, structure from motion.
+        gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates; instead
+            of it, a fit.
+        features: LangSplat's folder of masks and vectors; instead of it, SAM and CLIP.
         labels: folder of label files of LERF-OVS or `hilsplat annotate`, used only for evaluation and copied
-            to `annotated/photos/<name>/` in the project. None uses those found, if any; `NONE` uses none.
+            to `annotated/photos/<name>/` in the project.
 
     Raises:
         SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three
@@ -205,8 +180,6 @@ def add_scene(
             found=problem,
             fix="choose another name, such as my-desk_2",
         )
-    if unit not in UNITS:
-        raise SceneError(f"unit {unit!r} is unknown", expected=f"one of {', '.join(UNITS)}")
     rows = read_sheet(sheet, checked_groups=()) if sheet.exists() else []
     taken = {row.name.casefold(): row for row in rows}
     if (row := taken.get(f"{PHOTOS}/{name}".casefold())) is not None:
@@ -217,21 +190,22 @@ def add_scene(
         )
     root = project_root(sheet)
     with prepared_photographs(photos, root / PHOTOS / name, frames) as existing:
-        extra = _trained(existing.folder, {"poses": poses, "gaussians": gaussians, "features": features})
-        notes = _notes(existing.folder, extra)
-        if skipped := [path.name for path in sorted(existing.folder.rglob("*.pth"))[:3]]:
-            notes.append(f"not read, because a pickle can run code: {', '.join(skipped)}")
-        files = _labels(existing.folder, labels)
+        folder = existing.folder
+        extra = _trained(folder, {"poses": poses, "gaussians": gaussians, "features": features})
+        notes = [*existing.notes, *_notes(folder, extra)]
         annotated = root / "annotated" / PHOTOS / name
-        if files and not annotated.exists():
+        files = _labels(folder, labels)
+        if annotated.exists():
+            files = []
+        if files:
             notes.append(f"labels of {len(files)} photographs, for scores: {files[0].parent}")
-        report = replace(inspect_photos(existing.folder, poses), notes=(*existing.notes, *notes))
-        _check(report, has_known_poses(existing.folder, poses))
-        if files and not annotated.exists():
+        report = replace(inspect_photos(folder, poses), notes=tuple(notes))
+        _check(report, has_known_poses(folder, poses))
+        if files:
             with atomic_folder(annotated) as target:
                 for path in files:
                     shutil.copy2(path, target / path.name)
-        _append(sheet, name, existing.folder, unit, extra)
+        _append(sheet, name, folder, extra)
     return report
 
 
@@ -241,18 +215,18 @@ def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
     Without known poses, the coordinates of another program's Gaussians are unknown, so they are not used.
     """
     for what, path in named.items():
-        if path is not None and path != NONE and not path.exists():
+        if path is not None and path != NO_POSES and not path.exists():
             raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass none")
     found = {"gaussians": trained_gaussians(folder), "features": langsplat_features(folder)}
     if not has_known_poses(folder, named["poses"]):
         found["gaussians"] = None
     chosen = {what: path or found.get(what) for what, path in named.items()}
-    if chosen["poses"] == NONE and not has_known_poses(folder):
+    if chosen["poses"] == NO_POSES and not has_known_poses(folder):
         chosen["poses"] = None
     return {
-        what: path if path == NONE else path.resolve()
+        what: path if path == NO_POSES else path.resolve()
         for what, path in chosen.items()
-        if path is not None and (path != NONE or what == "poses")
+        if path is not None and (path != NO_POSES or what == "poses")
     }
 
 
@@ -263,18 +237,19 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
     notes += [f"{what}: {path}" for what, path in extra.items() if what != "poses"]
     if (ply := extra.get("gaussians")) and (dataparser := dataparser_of(ply, folder)):
         notes.append(f"coordinates of the Gaussians: nerfstudio's, by {dataparser}")
+    if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
+        notes.append(f"not read, because a pickle can run code: {', '.join(skipped)}")
     return notes
 
 
-def _labels(folder: Path, asked: Path | None) -> list[Path]:
+def _labels(folder: Path, named: Path | None) -> list[Path]:
     """Return the label files given by the user, or else those found."""
-    if asked is None or asked == NONE:
-        return label_files(folder) if asked is None else []
-    files = sorted(asked.glob("*.json"))
+    if named is None or named == NO_POSES:
+        return label_files(folder) if named is None else []
+    files = sorted(named.glob("*.json"))
     if not files:
-        raise SceneError(
-            f"--labels {asked} holds no label file", expected="a .json for each labelled photograph"
-        )
+        expected = "a .json for each labelled photograph"
+        raise SceneError(f"--labels {named} contains no label file", expected=expected)
     return files
 
 
@@ -297,7 +272,7 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
         )
 
 
-def _append(sheet: Path, name: str, photos: Path, unit: str, extra: dict[str, Path]) -> None:
+def _append(sheet: Path, name: str, photos: Path, extra: dict[str, Path]) -> None:
     """Append the row of a scene to the sheet, and add missing columns."""
     root = project_root(sheet)
     places = {
@@ -306,10 +281,9 @@ def _append(sheet: Path, name: str, photos: Path, unit: str, extra: dict[str, Pa
     }
     for place in places.values():
         if not place.isprintable() or place.startswith("world:"):
-            raise SceneError(
-                f"the path {place!r} cannot be written in the scene sheet", fix="rename the folder"
-            )
-    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": unit, **places}
+            problem = f"the path {place!r} cannot be written in the scene sheet"
+            raise SceneError(problem, fix="rename the folder")
+    values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": "arbitrary", **places}
     if sheet.exists():
         text = sheet.read_text(encoding="utf-8-sig")
         first = content_lines(sheet)[0][1]

@@ -60,9 +60,8 @@ NAMED = 5
 class CheckedPhoto:
     """The data of a photograph that the checks use.
 
-    Attributes:
-        focal_px: focal length from EXIF, px of the full picture; None if unknown.
-        grey: upright grey copy, longer side at most `CHECK_SIDE_PX`.
+    `focal_px` is the focal length from EXIF, px of the full picture, or None; `grey` an upright grey copy
+    with a longer side of at most `CHECK_SIDE_PX`.
     """
 
     name: str
@@ -74,36 +73,24 @@ class CheckedPhoto:
 def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[str]:
     """Return sentences about likely problems and what to do about them; empty if there are none.
 
-    Args:
-        photos: readable photographs in the order of their names, which is assumed to be the capture order.
-        have_poses: poses are known, so that only the quality of each photograph matters.
+    Photographs are in the order of their names, which is assumed to be the capture order. If their poses are
+    known, only the quality of each photograph matters.
     """
     doubts = []
     if len(photos) < FEW_PHOTOS:
         doubts.append(f"only {len(photos)} photographs: take 20 or more, less than 10 degrees apart")
-    doubts += _quality_doubts(photos)
-    if not have_poses:
-        doubts += _lens_doubts(photos) + _motion_doubts(photos)
-    return doubts
-
-
-def _quality_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
-    doubts = []
     blurred = [photo.name for photo in photos if blur(photo.grey) > BLURRED]
     dark = [photo.name for photo in photos if np.percentile(photo.grey, 95) < DARK_LEVEL]
     white = [photo.name for photo in photos if (photo.grey >= WHITE_LEVEL).mean() > WHITE_SHARE]
-    if blurred:
-        doubts.append(
-            f"{_listed(blurred, photos)} blurred: leave them out, or take them again with "
-            "more light, a still hand and the focus on the scene"
-        )
-    if dark:
-        doubts.append(f"{_listed(dark, photos)} too dark: take them again with more light")
-    if white:
-        doubts.append(
-            f"{_listed(white, photos)} more than half white: take them again with less exposure, unless the "
-            "background is white"
-        )
+    for names, advice in (
+        (blurred, "blurred: leave them out, or take them again with more light, a still hand and in focus"),
+        (dark, "too dark: take them again with more light"),
+        (white, "more than half white: take them again with less exposure, unless the background is white"),
+    ):
+        if names:
+            doubts.append(f"{_listed(names, photos)} {advice}")
+    if not have_poses:
+        doubts += _lens_doubts(photos) + _motion_doubts(photos)
     return doubts
 
 
@@ -166,9 +153,6 @@ def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
     return f"{len(names)} of {len(photos)} photographs ({', '.join(names[:NAMED])}{more}) {verb}"
 
 
-# ---- one photograph -------------------------------------------------------------------------------
-
-
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that another blur preserves.
 
@@ -183,9 +167,6 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
         total = float(steps.sum(dtype=np.float64))
         shares.append(1 - float(lost.sum(dtype=np.float64)) / total if total else 1.0)
     return max(shares)
-
-
-# ---- two photographs ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

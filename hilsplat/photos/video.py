@@ -50,9 +50,7 @@ MIN_FOLLOWED = 20
 class Frame:
     """A video frame that may become a photograph.
 
-    Attributes:
-        number: index of the frame among the intact frames of its video.
-        grey: small copy, as stored (not rotated).
+    `number` counts the intact frames of its video; `grey` is a small copy, as stored (not rotated).
     """
 
     video: int
@@ -64,13 +62,7 @@ class Frame:
 
 @dataclass
 class Decoding:
-    """Statistics of decoding a video.
-
-    Attributes:
-        stated_s: duration according to the file, or None.
-        decoded_s: presentation time of the last intact frame.
-        num_damaged: number of packets and frames that could not be decoded.
-    """
+    """Statistics of decoding: duration according to the file, time of the last intact frame, counts."""
 
     stated_s: float | None = None
     decoded_s: float = 0.0
@@ -155,9 +147,6 @@ def _damage(video: Path, decoding: Decoding) -> list[str]:
             "part is used; copy it again if the rest matters"
         )
     return notes
-
-
-# ---- decoding -------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -281,9 +270,6 @@ def upright(pixels: UInt8[np.ndarray, "H W 3"], rotation_deg: int) -> UInt8[np.n
     return np.ascontiguousarray(np.rot90(pixels, round(rotation_deg / 90) % 4))
 
 
-# ---- choosing -------------------------------------------------------------------------------------
-
-
 def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
     """Select the sharpest candidate of each of at most `count` equal sections of the camera path.
 
@@ -328,9 +314,6 @@ def _step(one: Frame, other: Frame) -> float:
     if one.video != other.video or one.grey.shape != other.grey.shape:
         return MIN_STEP
     return displacement(one.grey, other.grey)
-
-
-# ---- two pictures of one camera ----------------------------------------------------------------
 
 
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:

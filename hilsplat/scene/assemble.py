@@ -28,12 +28,7 @@ MIN_LEVELNESS_GAP = 3.0
 
 @dataclass(frozen=True)
 class PosedView:
-    """One view with its lens, before undistortion.
-
-    Attributes:
-        image: PNG file whose pixels the lens describes.
-        cam_from_source: world-to-camera transform in source coordinates.
-    """
+    """One view with its lens before undistortion, the PNG that it describes, and the pose in the source."""
 
     view: str
     image: Path
@@ -158,9 +153,7 @@ def write_scene(
     """Write the scene artifact with its registration report, atomically.
 
     Args:
-        name: `<dataset>/<scene>`.
         unit: "metre" keeps the source's scale; for any other unit, the scale is normalised.
-        split: "train" or "test" per view.
         report: registration report; this function adds split, size and focal length per view.
         turn: rotate the scene so that +z is up.
         lost: picture of the photographs that were not registered, appended to the plot of the cameras.
@@ -178,16 +171,9 @@ def write_scene(
             K=np.stack([view.camera.calibration_matrix() for view in pinhole]),
             size_hw=np.array([(view.camera.height, view.camera.width) for view in pinhole], dtype=np.int32),
         )
-        scene = Scene(
-            folder=folder,
-            name=name,
-            unit=unit,
-            cameras=cameras,
-            split={view: split[view] for view in cameras.names},
-            points_xyz=points.astype(np.float32),
-            points_rgb=points_rgb,
-            scene_from_source=scene_from_source,
-        )
+        of_view = {view: split[view] for view in cameras.names}
+        xyz = points.astype(np.float32)
+        scene = Scene(folder, name, unit, cameras, of_view, xyz, points_rgb, scene_from_source)
         for camera_row, view in enumerate(cameras.names):
             entry = report["views"][view]
             entry["split"] = scene.split[view]
@@ -227,9 +213,8 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
         for chosen, colour, label in ((~is_test, "tab:blue", "train"), (is_test, "tab:orange", "test")):
             if chosen.any():
                 at, ahead = centres[chosen], centres[chosen] + arrow * looks[chosen]
-                axes.plot(
-                    [at[:, x], ahead[:, x]], [at[:, y], ahead[:, y]], color=colour, linewidth=0.8, zorder=2
-                )
+                lines = [at[:, x], ahead[:, x]], [at[:, y], ahead[:, y]]
+                axes.plot(*lines, color=colour, linewidth=0.8, zorder=2)
                 count = int(chosen.sum())
                 axes.scatter(at[:, x], at[:, y], s=14, color=colour, label=f"{count} {label}", zorder=3)
         axes.set_xlim(low[x] - margin, high[x] + margin)

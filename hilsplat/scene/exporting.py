@@ -29,13 +29,13 @@ def source_points(scene: Scene) -> Float64[np.ndarray, "P 3"]:
 
 
 def write_colmap(scene: Scene, out: Path) -> None:
-    """Write `images/` and a COLMAP model in `sparse/0` (binary; points without tracks)."""
+    """Write `images/` and a COLMAP model in `sparse/0` to a new folder, atomically."""
     with atomic_folder(out) as folder:
         add_colmap(scene, folder)
 
 
 def add_colmap(scene: Scene, folder: Path) -> None:
-    """Write `images/` and `sparse/0` to an existing folder."""
+    """Write `images/` and a COLMAP model in `sparse/0` (binary; points without tracks) to a folder."""
     (folder / "images").mkdir()
     model = pycolmap.Reconstruction()
     for number, posed in enumerate(source_images(scene), start=1):

@@ -45,12 +45,9 @@ DIAGONAL_35MM = 43.2666
 
 @dataclass(frozen=True)
 class WorkImage:
-    """Copy of a photograph for structure from motion: upright, shrunk, PNG.
+    """Copy of a photograph (`source`) for structure from motion: upright, shrunk, a PNG named after the view.
 
-    Attributes:
-        view: view name, which is the file name of the work image.
-        source: the original photograph.
-        focal_px: focal length from EXIF, in px of the work image, or None.
+    `focal_px` is the focal length from EXIF, in px of the copy, or None.
     """
 
     view: str
@@ -119,10 +116,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
 
 
 def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[WorkImage]]:
-    """Group the views that share intrinsics, in the order of their first view.
-
-    "auto" groups views with the same size and EXIF focal length, "yes" groups all views, "no" none.
-    """
+    """Group the views that share intrinsics: by size and EXIF focal length ("auto"), all ("yes") or none."""
     if single_camera == "no":
         return [[image] for image in images]
     groups: dict[object, list[WorkImage]] = {}
@@ -218,20 +212,6 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
     return options
 
 
-@dataclass(frozen=True)
-class MatchCounts:
-    """Counts of a view.
-
-    Attributes:
-        pairs: other views with at least `MIN_INLIERS` verified matches.
-        best_pair: verified matches with the best of them.
-    """
-
-    features: int
-    pairs: int
-    best_pair: int
-
-
 def verified_matches(database: Path) -> dict[str, dict[str, int]]:
     """Return the number of verified matches of each view with each other view, by their names."""
     with pycolmap.Database.open(database) as opened:
@@ -244,15 +224,19 @@ def verified_matches(database: Path) -> dict[str, dict[str, int]]:
     return shared
 
 
-def count_matches(database: Path) -> dict[str, MatchCounts]:
-    """Count the features and verified pairs of every view in the database, by view name."""
+def count_matches(database: Path) -> dict[str, dict[str, int]]:
+    """Return entries of the registration report for every view: features, and verified matches with others.
+
+    Views count as matched from `MIN_INLIERS` verified matches.
+    """
     shared = verified_matches(database)
-    with pycolmap.Database.open(database) as opened:
-        features = {
-            image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()
-        }
     counts = {}
-    for name in sorted(features):
-        pairs = [count for count in shared[name].values() if count >= MIN_INLIERS]
-        counts[name] = MatchCounts(features[name], len(pairs), max(pairs, default=0))
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            pairs = [count for count in shared[image.name].values() if count >= MIN_INLIERS]
+            counts[image.name] = {
+                "features": opened.num_keypoints_for_image(image.image_id),
+                "matched_views": len(pairs),
+                "best_pair_matches": max(pairs, default=0),
+            }
     return counts

@@ -92,15 +92,9 @@ class FinishedScene:
         elif not clip.exists():  # `default` has its own vectors; other variants may share them
             raise _unfinished(folder, clip if variant == "default" else field)
         tree = _input_of(autoencoder or clip, "semantic_tree", folder)
-        parts = SceneParts(
-            scene=folder / "scene",
-            gaussians=folder / "gaussians.ply",
-            semantic_tree=tree,
-            field=field if autoencoder else None,
-            autoencoder=autoencoder,
-            clip=clip,
-            masks=_input_of(clip, "masks", folder),
-        )
+        used_field, masks = field if autoencoder else None, _input_of(clip, "masks", folder)
+        gaussians = folder / "gaussians.ply"
+        parts = SceneParts(folder / "scene", gaussians, tree, used_field, autoencoder, clip, masks)
         for path in parts.as_inputs().values():
             if not path.exists():
                 raise _unfinished(folder, path)
@@ -112,10 +106,9 @@ class FinishedScene:
         return self.parts.clip.parent / "names"
 
     def evaluate_settings(self) -> EvaluateSettings:
-        """Return the canonical phrases, template, scale and selection of the run that made the scene.
+        """Return the settings of queries of the run that made the scene, from the provenance of its scores.
 
-        They are read from the provenance of its scores. A scene without labels has no scores, but its panel
-        was drawn with the same settings.
+        A scene without labels has no scores, but its panel was drawn with the same settings.
         """
         scores, place = self.folder / self.variant / "scores.csv", self.folder.resolve()
         panel = place.parent.parent / "figures" / place.parent.name / place.name / "panel.png"
@@ -172,12 +165,11 @@ def _input_of(artifact: Path, name: str, folder: Path) -> Path:
 def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
     """Return the path of an artifact's recorded input in the scene folder, which may have moved, or None."""
     record = read_provenance(artifact)
-    if record is not None and name in record.inputs:
-        path = Path(record.inputs[name].path)
-        recorded = folder / path.parent.name / path.name
-        if path.name and recorded.exists():
-            return recorded
-    return None
+    if record is None or name not in record.inputs:
+        return None
+    path = Path(record.inputs[name].path)
+    recorded = folder / path.parent.name / path.name
+    return recorded if path.name and recorded.exists() else None
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:

@@ -45,15 +45,9 @@ def read_json_object(path: Path, fix: str) -> dict[str, Any]:
 
 def trained_gaussians(folder: Path) -> Path | None:
     """Return the PLY that 3DGS or nerfstudio trained in a folder, the one with the most steps, or None."""
-    found = [
-        path
-        for pattern in (
-            "output/*/point_cloud/iteration_*",
-            "output/point_cloud/iteration_*",
-            "point_cloud/iteration_*",
-        )
-        for path in Path(folder).glob(f"{pattern}/point_cloud.ply")
-    ]
+    starts = ("output/*/", "output/", "")
+    patterns = [f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts]
+    found = [path for pattern in patterns for path in Path(folder).glob(pattern)]
     found.sort(key=lambda path: (int(path.parent.name.partition("_")[2] or 0), path.stat().st_mtime_ns))
     others = [path for name in EXPORTED for path in sorted(Path(folder).glob(name))]
     return [*others, *found][-1] if others or found else None
@@ -62,8 +56,8 @@ def trained_gaussians(folder: Path) -> Path | None:
 def dataparser_of(ply: Path, source: Path) -> Path | None:
     """Return the file with the training coordinates of nerfstudio's PLY, or None for other PLYs.
 
-    It is in the PLY's folder, the source's folder, or that of the latest training run. The last two are
-    searched only if the PLY has nerfstudio's file name.
+    It is in the PLY's folder or, if the PLY has nerfstudio's file name, in the source's folder or that of the
+    latest training run.
     """
     places = [ply.parent]
     if ply.name == "splat.ply":
@@ -105,24 +99,17 @@ def photo_folder(folder: Path) -> Path:
         return folder
     if (folder / "images").is_dir():
         return folder / "images"
-    if (polycam := polycam_folders(folder)) is not None:
-        return polycam[0]
-    if (record3d := record3d_export(folder)) is not None:
-        return record3d[0]
-    return folder
+    export = polycam_folders(folder) or record3d_export(folder)
+    return export[0] if export else folder
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
     """Return whether a folder has poses that `find_known_poses` supports, or other poses are given."""
     if named is not None:
         return named != NO_POSES
-    return (
-        (folder / "sparse").is_dir()
-        or any(folder.glob("transforms*.json"))
-        or (folder / POSES_BOUNDS).is_file()
-        or polycam_folders(folder) is not None
-        or record3d_export(folder) is not None
-    )
+    has_file = (folder / POSES_BOUNDS).is_file() or any(folder.glob("transforms*.json"))
+    has_export = any((polycam_folders(folder), record3d_export(folder)))
+    return has_file or has_export or (folder / "sparse").is_dir()
 
 
 @dataclass(frozen=True)

@@ -24,26 +24,18 @@ ADVICE = (
 
 
 def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
-    """Add `belongs_near` to every lost view: the registered views with the most shared verified matches.
-
-    `views` has the entries of the registration report, which are modified in place.
-    """
+    """Add `belongs_near` to lost views of a report: the registered ones that share most verified matches."""
     shared = verified_matches(database)
     for view, entry in views.items():
         if entry["registered"]:
             continue
-        near = [
-            (count, other) for other, count in shared[view].items() if count and views[other]["registered"]
-        ]
-        near.sort(key=lambda item: (-item[0], item[1]))
-        entry["belongs_near"] = [{"view": other, "matches": count} for count, other in near[:NEIGHBOURS]]
+        near = [(-count, other) for other, count in shared[view].items() if views[other]["registered"]]
+        best = sorted(each for each in near if each[0])[:NEIGHBOURS]
+        entry["belongs_near"] = [{"view": other, "matches": -count} for count, other in best]
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
-    """Draw each lost photograph in a row with its registered neighbours, below the advice.
-
-    Without lost photographs, nothing is written. Return whether a picture was written.
-    """
+    """Draw each lost photograph in a row with its registered neighbours; return False if there is none."""
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
         return False
@@ -76,8 +68,7 @@ def stack_pictures(upper: Path, lower: Path) -> None:
     """Append a picture below another one, in place, and pad the narrower one with white."""
     pictures = [read_image(path) for path in (upper, lower)]
     width = max(picture.shape[1] for picture in pictures)
-    padded = [
-        np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0)), constant_values=255)
-        for picture in pictures
-    ]
-    write_png(upper, np.concatenate(padded))
+    stacked = np.full((sum(map(len, pictures)), width, 3), 255, np.uint8)
+    stacked[: len(pictures[0]), : pictures[0].shape[1]] = pictures[0]
+    stacked[len(pictures[0]) :, : pictures[1].shape[1]] = pictures[1]
+    write_png(upper, stacked)

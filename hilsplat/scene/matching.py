@@ -70,10 +70,8 @@ def match_pairs(
 ) -> None:
     """Match pairs of views, verify the matches, and write both to COLMAP's database.
 
-    Args:
-        partners: for each view, in the order of names, the rows of the later views to match with.
-        options: verification options; RANSAC makes fewer trials for pairs with few matches (see `_matched`).
-        threads: number of threads; the result does not depend on it.
+    `partners` has, for each view in the order of names, the rows of the later views to match with. The result
+    does not depend on `threads`.
     """
     with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(threads) as pool:
         views = read_features(opened)

@@ -17,7 +17,6 @@ from hilsplat.scene.assemble import PosedView, split_views, write_scene
 from hilsplat.scene.colmap import camera_of, pose_matrix, pycolmap, reprojection_errors, sparse_points
 from hilsplat.scene.features import (
     MIN_INLIERS,
-    MatchCounts,
     WorkImage,
     count_matches,
     find_matches,
@@ -56,19 +55,16 @@ def run_poses(
     threads: int,
     named: Path | None = None,
 ) -> None:
-    """Pose the images of one scene and write its Scene artifact with a registration report.
+    """Pose the images of scene `<dataset>/<scene>`, and write its Scene artifact with a registration report.
 
     A folder with known poses, such as a COLMAP model (`sparse/`) or a `transforms*.json`, is imported; any
     other is posed by structure from motion. The result depends on images, settings and seed, but not on
     `threads`: features and matches are computed pair by pair, and the mapping runs on one thread.
 
-    Structure from motion cannot recover metric scale, so its scenes always have the unit "arbitrary".
-
     Args:
-        name: `<dataset>/<scene>`.
-        unit: "metre" or "arbitrary": the unit of imported poses.
+        unit: "metre" or "arbitrary": the unit of imported poses. Structure from motion cannot recover metric
+            scale, so its scenes always have the unit "arbitrary".
         is_render: images are renders of a pinhole camera without distortion.
-        seed: seed of RANSAC and the mapper.
         named: poses to use instead of those in the folder (`find_known_poses`).
 
     Raises:
@@ -126,7 +122,7 @@ def _reconstruct(
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)
     model = models[0] if models else None
-    report = registration_report(work_images, matches, models, settings)
+    report = registration_report(work_images, matches, models)
     name_neighbours(database, report["views"])
     report = {
         "scene": name,
@@ -150,10 +146,9 @@ def _reconstruct(
     for image in (model.images[image_id] for image_id in model.reg_image_ids()):
         pose, file = pose_matrix(image.cam_from_world()), work / "images" / image.name
         views.append(PosedView(image.name, file, camera_of(image), pose))
-    xyz, rgb = sparse_points(model)
     split = split_views([view.view for view in views], settings.test_every)
     lost = picture if has_lost else None
-    write_scene(out, name, "arbitrary", views, xyz, rgb, split, report, turn=True, lost=lost)
+    write_scene(out, name, "arbitrary", views, *sparse_points(model), split, report, turn=True, lost=lost)
     return report
 
 
@@ -197,29 +192,25 @@ def _global_options(seed: int) -> pycolmap.GlobalPipelineOptions:
 
 def registration_report(
     images: Sequence[WorkImage],
-    matches: Mapping[str, MatchCounts],
+    matches: Mapping[str, Mapping[str, int]],
     models: Sequence[pycolmap.Reconstruction],
-    settings: PosesSettings,
 ) -> dict[str, Any]:
     """Return the registration report: totals, models and, for each view, whether it was posed or why not."""
     errors = reprojection_errors(models[0]) if models else {}
     members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     views: dict[str, Any] = {}
     for image in images:
-        found = matches.get(image.view, MatchCounts(0, 0, 0))
         entry: dict[str, Any] = {
             "file": image.source.name,
             "registered": image.view in errors,
-            "features": found.features,
-            "matched_views": found.pairs,
-            "best_pair_matches": found.best_pair,
+            **matches[image.view],
         }
         if image.view in errors:
             of_view = errors[image.view]
             entry["observations"] = len(of_view)
             entry["reprojection_error_px"] = round(float(of_view.mean()), 4) if len(of_view) else None
         else:
-            entry["why_not"] = _why_not(image.view, found, members)
+            entry["why_not"] = _why_not(image.view, entry, members)
         views[image.view] = entry
     every_error = np.concatenate([*errors.values(), np.zeros(0)])
     num_points = models[0].num_points3D() if models else 0
@@ -253,15 +244,16 @@ def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
     ]
 
 
-def _why_not(view: str, found: MatchCounts, members: Sequence[set[str]]) -> str:
-    if found.features == 0:
+def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -> str:
+    if entry["features"] == 0:
         return "no features: the image is flat, dark or out of focus"
-    if found.pairs == 0:
+    if entry["matched_views"] == 0:
         return f"too few matches: no other view shares {MIN_INLIERS} verified ones"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} of {len(names)} views, not in the largest"
-    return f"no pose found: too few matches with posed views (best pair: {found.best_pair} matches)"
+    best = entry["best_pair_matches"]
+    return f"no pose found: too few matches with posed views (best pair: {best} matches)"
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:

@@ -47,20 +47,18 @@ WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
 
 @dataclass(frozen=True)
 class SceneRow:
-    """One scene in the sheet.
+    """One scene in the sheet. Paths are resolved; those of `data:` are None without a data root.
 
     Attributes:
         dataset: first part of the scene's path under `results/`; `scene` is the second.
-        group: "benchmark", "development", "ci", "photos" or a real data set such as "lerf".
+        group: one of `GROUPS`.
         source: `world:<kind>:<seed>`, `data:<folder below data_root>`, or a folder.
         unit: unit of the source's lengths, "metre" or "arbitrary".
-        folder: the source folder, resolved; None for a world, and for `data:` without a data root.
-        gaussians: an existing 3DGS PLY in the source's coordinates, used instead of a fit; None if the
-            Gaussians are fitted, and for `data:` without a data root.
-        features: a folder of LangSplat's masks and CLIP vectors, used instead of SAM and CLIP; None if masks
-            are computed, and for `data:` without a data root.
-        poses: a COLMAP model or transforms file used instead of the poses in the folder; `NO_POSES` if those
-            are ignored; None if they are used, and for `data:` without a data root.
+        folder: the source folder; None for a world.
+        gaussians: 3DGS PLY in the source's coordinates, used instead of a fit; None to fit.
+        features: folder of LangSplat's masks and CLIP vectors; None to run SAM and CLIP.
+        poses: COLMAP model or transforms file used instead of the poses in the folder; `NO_POSES` to ignore
+            those; None to use them.
     """
 
     dataset: str
@@ -102,8 +100,8 @@ def read_sheet(
     Args:
         checked_groups: groups whose source folders must exist and contain images; None for all. A run checks
             only the groups it runs, so that a missing folder of another group does not stop it.
-        data_root: folder of the real data sets, the base of `data:` sources; if it is empty, such rows have
-            no folder. This function does not check that these sources exist.
+        data_root: folder of the published data sets, the base of `data:` sources, which may not exist; empty
+            if not set.
 
     Raises:
         SceneError: the sheet cannot be used; the message names line, column and fix.
@@ -153,9 +151,7 @@ def choose_scenes(
 ) -> tuple[SceneRow, ...]:
     """Return the scenes of a run in the order of the sheet: all scenes of the groups, or only named ones.
 
-    Args:
-        only: names such as `table-1` or `synthetic/table-1`; empty for all scenes of the groups. A name
-            selects scenes in the groups or, if there is none of that name, in any group.
+    A name (`table-1` or `synthetic/table-1`) selects scenes in the groups or, if there is none, in any group.
     """
     in_groups = [row for row in rows if row.group in groups]
     if not only:
@@ -183,9 +179,8 @@ def content_lines(path: Path) -> list[tuple[int, str]]:
     except IsADirectoryError as error:
         raise SceneError(f"scene sheet {path} is a folder", fix="give the path of a file") from error
     except UnicodeDecodeError as error:
-        raise SceneError(
-            f"scene sheet {path} is not UTF-8 text", fix="save it as tab-separated text in UTF-8"
-        ) from error
+        fix = "save it as tab-separated text in UTF-8"
+        raise SceneError(f"scene sheet {path} is not UTF-8 text", fix=fix) from error
     return [
         (number, line)
         for number, line in enumerate(text.replace("\r\n", "\n").split("\n"), start=1)
@@ -198,12 +193,9 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
     missing = [column for column in COLUMNS if column not in header]
     unknown = [column for column in header if column not in (*COLUMNS, *OPTIONAL_COLUMNS)]
     repeated = [column for column, count in Counter(header).items() if count > 1]
-    if missing or unknown or repeated:
-        problems = [
-            f"{what}: {', '.join(repr(column) for column in columns)}"
-            for what, columns in (("missing", missing), ("unknown", unknown), ("repeated", repeated))
-            if columns
-        ]
+    kinds = (("missing", missing), ("unknown", unknown), ("repeated", repeated))
+    problems = [f"{what}: {', '.join(map(repr, columns))}" for what, columns in kinds if columns]
+    if problems:
         raise SceneError(
             f"{path}, line {line}: the header cannot be used",
             expected=f"the columns {' '.join(COLUMNS)}, separated by tabs; also {' '.join(OPTIONAL_COLUMNS)}",
@@ -225,8 +217,8 @@ def _row(
     for column in ("dataset", "scene"):
         if problem := name_problem(cells[column]):
             fix = "choose another name, such as my-desk_2"
-            problem_of_name = f"{cells[column]!r} cannot be a name"
-            raise fault(column, problem_of_name, expected=NAME_RULE, found=problem, fix=fix)
+            bad = f"{cells[column]!r} cannot be a name"
+            raise fault(column, bad, expected=NAME_RULE, found=problem, fix=fix)
     for column, allowed in (("group", GROUPS), ("unit", UNITS)):
         if cells[column] not in allowed:
             expected, fix = f"one of {', '.join(allowed)}", f"correct column {column} of that line"
@@ -237,12 +229,8 @@ def _row(
         raise fault("source", "it is empty", fix="give world:<kind>:<seed>, or a folder of images")
     if source.startswith("world:"):
         if not WORLD_SOURCE.fullmatch(source):
-            raise fault(
-                "source",
-                f"{source!r} is not the name of a synthetic world",
-                expected="world:<kind>:<seed>, as in world:tabletop:201",
-                fix="correct the source",
-            )
+            expected = "world:<kind>:<seed>, as in world:tabletop:201"
+            raise fault("source", f"{source!r} is not the name of a synthetic world", expected=expected)
     else:
         folder = _resolved(path, source, data_root)
         # The workflow skips and reports missing scenes of a published data set.
@@ -250,17 +238,8 @@ def _row(
             _check_source(f"{path}, line {line}, column source", folder)
     gaussians, features = optional("gaussians"), optional("features")
     poses = NO_POSES if cells.get("poses") == str(NO_POSES) else optional("poses")
-    row = SceneRow(
-        cells["dataset"],
-        cells["scene"],
-        cells["group"],
-        source,
-        cells["unit"],
-        folder,
-        gaussians,
-        features,
-        poses,
-    )
+    fixed = {column: cells[column] for column in COLUMNS}
+    row = SceneRow(**fixed, folder=folder, gaussians=gaussians, features=features, poses=poses)
     if not is_checked:
         return row
     if gaussians is not None and (problem := _ply_problem(gaussians)):
@@ -320,18 +299,14 @@ def _check_source(where: str, folder: Path) -> None:
             fix="correct the path, or remove the line",
         )
     if not list_images(photo_folder(folder)) and not has_known_poses(folder):
+        kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
+        found = ", ".join(f"{count} files {kind}" for kind, count in sorted(kinds.items()))
+        below = sorted(sub.name for sub in folder.iterdir() if sub.is_dir() and list_images(sub))
+        if below and not found:
+            found = f"folders with images below it: {', '.join(below[:5])}"
         raise SceneError(
             f"{where}: folder {folder} has no images",
             expected=f"files with suffix {', '.join(sorted(IMAGE_SUFFIXES))} in it or in its images/ folder",
-            found=_what_else(folder),
+            found=found or "nothing",
             fix="correct the path, or convert the photographs to JPEG or PNG",
         )
-
-
-def _what_else(folder: Path) -> str:
-    """Describe the content of a folder without readable images."""
-    kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
-    if kinds:
-        return ", ".join(f"{count} files {kind}" for kind, count in sorted(kinds.items()))
-    below = sorted(sub.name for sub in folder.iterdir() if sub.is_dir() and list_images(sub))
-    return f"folders with images below it: {', '.join(below[:5])}" if below else "nothing"

@@ -17,25 +17,6 @@ LONGEST_NAME = 200
 """Maximum bytes of a photograph's name: later files append to it, and file systems allow 255 bytes."""
 
 
-def require_usable_name(photo: Path) -> None:
-    """Refuse a photograph whose name later stages cannot use in file names.
-
-    Braces are wildcards in Snakemake.
-    """
-    if "{" in photo.name or "}" in photo.name or not photo.name.isprintable():
-        raise SceneError(
-            f"the name of photograph {str(photo)!r} has a brace or a sign that cannot be shown",
-            fix="rename it",
-        )
-    if (num_bytes := len(os.fsencode(photo.name))) > LONGEST_NAME:
-        raise SceneError(
-            f"the name of photograph {photo} is too long",
-            expected=f"at most {LONGEST_NAME} bytes",
-            found=f"{num_bytes}",
-            fix="rename it",
-        )
-
-
 def view_names(sources: Sequence[Path]) -> list[str]:
     """Return the view names of image files: the file names with the suffix .png ("DSC_1.jpg" -> "DSC_1.png").
 
@@ -43,10 +24,16 @@ def view_names(sources: Sequence[Path]) -> list[str]:
     prefix: "train_r_0.png".
 
     Raises:
-        SceneError: two files would get the same view name.
+        SceneError: two files would get the same view name, or later stages cannot use a file's name.
     """
     for source in sources:
-        require_usable_name(source)
+        name, num_bytes = source.name, len(os.fsencode(source.name))
+        if "{" in name or "}" in name or not name.isprintable():  # braces are wildcards in Snakemake
+            problem = f"the name of photograph {str(source)!r} has a brace or an unprintable character"
+            raise SceneError(problem, fix="rename it")
+        if num_bytes > LONGEST_NAME:
+            limit, problem = f"at most {LONGEST_NAME} bytes", f"the name of photograph {source} is too long"
+            raise SceneError(problem, expected=limit, found=num_bytes, fix="rename it")
     stems = Counter(source.stem for source in sources)
     by_folder = {stem for stem, count in stems.items() if count > 1}
     same_folder = Counter((source.parent, source.stem) for source in sources)

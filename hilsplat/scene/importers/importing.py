@@ -59,7 +59,17 @@ def import_poses(
     present = [view for view in described if view.image is not None]
     files = [view.image for view in described if view.image is not None]
     missing = sorted(view.name for view in described if view.image is None)
-    _check_present(known, name, present, missing, settings)
+    total, least = len(described), settings.min_registered_share
+    if total == 0:
+        raise SceneError(f"{known.files[0]} of {name} does not pose any view", fix="export it again")
+    if not present or len(present) < least * total:
+        listed = ", ".join(missing[:20]) + (f" and {len(missing) - 20} more" if len(missing) > 20 else "")
+        raise RegistrationError(
+            f"too few posed views of {name} have an image in {known.root}",
+            expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
+            found=f"{len(present)}; missing: {listed}",
+            fix="put the images where the model names them: in images/ or beside it",
+        )
     named = list(zip(present, files, view_names(files), strict=True))
     views = [
         _with_pixels(view, file, view_name, work / "images", settings.max_side_px)
@@ -91,9 +101,8 @@ def import_poses(
     for gone in missing:
         entries[gone] = {"file": gone, "registered": False, "why_not": "its image file is missing"}
     for path in unposed:
-        entries.setdefault(
-            path.name, {"file": path.name, "registered": False, "why_not": "the source has no pose for it"}
-        )
+        lacks = {"file": path.name, "registered": False, "why_not": "the source has no pose for it"}
+        entries.setdefault(path.name, lacks)
     observed = [(entry["observations"], entry["reprojection_error_px"]) for entry in errors.values()]
     num_observations = sum(count for count, error in observed if error is not None)
     total_error = sum(count * error for count, error in observed if error is not None)
@@ -119,31 +128,11 @@ def import_poses(
     trained = {path.stem for path in (known.root / TRAIN_FOLDER).glob("*")}
     held_out = [view.is_test or (bool(trained) and Path(view.name).stem not in trained) for view in present]
     if any(held_out):  # the source has its own split
-        split = {name: "test" if is_test else "train" for name, is_test in zip(names, held_out, strict=True)}
+        split = {view: "test" if is_test else "train" for view, is_test in zip(names, held_out, strict=True)}
     else:
         split = split_views(names, settings.test_every)
-    write_scene(out, name, unit, views, points[0], points[1], split, report, turn=False)
+    write_scene(out, name, unit, views, *points, split, report, turn=False)
     return report
-
-
-def _check_present(
-    known: KnownPoses,
-    name: str,
-    present: Sequence[KnownView],
-    missing: Sequence[str],
-    settings: PosesSettings,
-) -> None:
-    total = len(present) + len(missing)
-    if total == 0:
-        raise SceneError(f"{known.files[0]} of {name} does not pose any view", fix="export it again")
-    if not present or len(present) < settings.min_registered_share * total:
-        listed = ", ".join(missing[:20]) + (f" and {len(missing) - 20} more" if len(missing) > 20 else "")
-        raise RegistrationError(
-            f"too few posed views of {name} have an image in {known.root}",
-            expected=f"at least {settings.min_registered_share:.0%} of {total} (poses.min_registered_share)",
-            found=f"{len(present)}; missing: {listed}",
-            fix="put the images where the model names them: in images/ or beside it",
-        )
 
 
 def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:

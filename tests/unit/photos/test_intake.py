@@ -69,7 +69,7 @@ def test_a_video_in_which_nothing_moves_leaves_nothing_behind(tmp_path, sheet):
 def test_what_is_in_the_way_stays(tmp_path, sheet):
     mine = tmp_path / "project/photos/desk"
     write_noise(mine, 1)
-    with pytest.raises(SceneError, match=r"photos/desk is in the way"):
+    with pytest.raises(SceneError, match=r"photos/desk already exists"):
         add_scene(sheet, "desk", write_video(tmp_path / "walk.mp4", pan([0] + [6] * 20)))
     assert len(list(mine.iterdir())) == 1
 
@@ -79,7 +79,7 @@ def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):
     with prepared_photographs(video, made, 10):
         before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))
     report = add_scene(sheet, "desk", video, frames=10)  # the same again: no frame is taken twice
-    assert report.num_readable == 10 and "is there already, from the same files" in str(report)
+    assert report.num_readable == 10 and "already exists, from the same files" in str(report)
     assert sorted(path.stat().st_mtime_ns for path in made.glob("*.*")) == before
 
 

@@ -174,7 +174,7 @@ def test_what_was_found_can_be_left_out_or_replaced(tmp_path):
     plain, mixed = read_sheet(sheet)
     assert (plain.gaussians, plain.features, plain.poses) == (None, None, None)
     assert (mixed.gaussians, mixed.features, mixed.poses) == (tmp_path / "other.ply", None, None)
-    with pytest.raises(SceneError, match="holds no label file"):
+    with pytest.raises(SceneError, match="contains no label file"):
         add_scene(sheet, "lost", folder, labels=tmp_path / "config")
     with pytest.raises(SceneError, match="--features gone is missing"):
         add_scene(sheet, "lost", folder, features=Path("gone"))
@@ -257,6 +257,6 @@ def test_adding_unusable_photographs_leaves_the_sheet_alone(tmp_path):
     with pytest.raises(SceneError, match=r"gone is missing(.|\n)*a folder of photographs, a video, or a zip"):
         add_scene(sheet, "desk", tmp_path / "gone")
     Image.open(folder / "0.png").save(folder / "0.jpg")
-    with pytest.raises(SceneError, match=r"same view(.|\n)*0\.jpg, 0\.png"):
+    with pytest.raises(SceneError, match=r"same view(.|\n)*0\.jpg, .*0\.png"):
         add_scene(sheet, "desk", folder)
     assert not sheet.exists()
