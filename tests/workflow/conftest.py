@@ -10,7 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 MODELS = ("models/sam-tiny", "models/clip-tiny")
 """Of the checkout's models the tests see these alone, whatever was fetched."""
@@ -29,20 +31,18 @@ class Project:
 
     def run(self, *command: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
         """Run a command there and capture what it prints."""
-        result = subprocess.run(
-            command,
-            cwd=self.root,
-            env=self.environment(**environment),
-            capture_output=True,
-            text=True,
-            timeout=1500,
-            check=False,
-        )
+        how = {"cwd": self.root, "env": self.environment(**environment), "timeout": 1500}
+        result = subprocess.run(command, **how, capture_output=True, text=True, check=False)
         if check and result.returncode != 0:
             raise AssertionError(
                 f"{command} ended with {result.returncode}:\n{result.stdout}\n{result.stderr}"
             )
         return result
+
+    def start(self, *command: str) -> subprocess.Popen:
+        """Start a silent command there, in its own process group."""
+        where = {"cwd": self.root, "env": self.environment(), "start_new_session": True}
+        return subprocess.Popen(command, **where, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def environment(self, **more: str) -> dict[str, str]:
         """The environment in which `hilsplat` and `snakemake` are the copy's."""
@@ -64,6 +64,16 @@ class Project:
         """Run `hilsplat run` with the CI configuration."""
         command = [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", *words]
         return self.run(*command, check=check)
+
+    def hilsplat(self, *words: str, folder: Path | None = None, **environment: str) -> str:
+        """Return what a command of this copy prints, run here or in another folder."""
+        command = (sys.executable, "-c", "from hilsplat.cli.main import main; main()", *words)
+        return Project(folder or self.root).run(*command, PYTHONPATH=str(self.root), **environment).stdout
+
+    def add_photos(self, name: str, source: str) -> None:
+        """Add a scene of photographs to the sheet."""
+        with (self.root / "config/scenes.tsv").open("a") as sheet:
+            sheet.write(f"photos\t{name}\tphotos\t{source}\tarbitrary\n")
 
     def planned(self, *words: str) -> set[str]:
         """Rules that a dry run would run, except for the summary that follows every other rule."""
@@ -110,6 +120,15 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
     return Project(target)
 
 
+def noise_photos(folder: Path, count: int) -> Path:
+    """Write photographs in which nothing matches."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        Image.fromarray(rng.integers(0, 255, (96, 128, 3), dtype=np.uint8)).save(folder / f"{number}.png")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
     """A copy in which the CI configuration ran to its end; the processes of a test run share it."""
@@ -130,6 +149,12 @@ def finished(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project
 def copy_of_finished(finished: Project, tmp_path: Path) -> Project:
     """A fresh copy of the finished run, to edit."""
     return copy_project(finished.root, tmp_path / "project", results=True)
+
+
+@pytest.fixture
+def plain(project: Path, tmp_path: Path) -> Project:
+    """A fresh copy of the project without results, to edit."""
+    return copy_project(project, tmp_path / "project", results=False)
 
 
 @pytest.fixture

@@ -7,16 +7,8 @@ import pytest
 from tests.workflow.conftest import Project
 
 AFTER_FIELD = {"field", "evaluate", "table", "figures", "comparison", "sweep_plot"}
-VARIANT_STAGES = {
-    "masks",
-    "coverage_tree",
-    "clip",
-    "contributions",
-    "semantic_tree",
-    "names",
-    "autoencoder",
-    "method",
-} | AFTER_FIELD
+BEFORE_CLIP = {"masks", "coverage_tree", "contributions", "semantic_tree"}
+FROM_CLIP = {"clip", "names", "autoencoder", "method"} | AFTER_FIELD
 
 
 def test_nothing_is_planned_after_a_finished_run(copy_of_finished: Project) -> None:
@@ -32,15 +24,12 @@ def test_prose_and_what_no_stage_reaches_rerun_nothing(copy_of_finished: Project
     assert copy_of_finished.planned() == set()
 
 
-BEFORE_CLIP = {"masks", "coverage_tree", "contributions", "semantic_tree"}
-
-
 @pytest.mark.parametrize(
     ("module", "function", "expected"),
     [
         ("hilsplat/field/field.py", "run_field", AFTER_FIELD),
-        ("hilsplat/embed/stage.py", "run_clip", VARIANT_STAGES - BEFORE_CLIP),
-        ("hilsplat/evaluate/tables/hierarchy.py", "hierarchy_table", {"table", "sweep_plot"}),
+        ("hilsplat/embed/stage.py", "run_clip", FROM_CLIP),
+        ("hilsplat/evaluate/tables/image_tables.py", "hierarchy_table", {"table", "sweep_plot"}),
         ("hilsplat/methods/lifted.py", "fit", {"method", "evaluate", "table", "comparison"}),
         ("hilsplat/datasets/images/lerf_ovs.py", "open_scene", set()),
     ],
@@ -70,14 +59,14 @@ def test_theta_reruns_trees_and_later_only(copy_of_finished: Project) -> None:
 def test_a_model_that_changed_reruns_what_reads_it(copy_of_finished: Project) -> None:
     card = copy_of_finished.root / "models/clip-tiny/config.json"
     card.write_text(card.read_text() + "\n")
-    assert copy_of_finished.planned() == VARIANT_STAGES - BEFORE_CLIP
+    assert copy_of_finished.planned() == FROM_CLIP
 
 
 def test_variants_share_what_they_do_not_change(finished: Project) -> None:
     folder = finished.root / "results/synthetic/tiny"
     assert (folder / "paper/field.safetensors").is_file()
     assert (folder / "paper/autoencoder").is_dir()
-    for shared in ("masks", "coverage_tree", "contributions", "semantic_tree", "clip"):
+    for shared in (*BEFORE_CLIP, "clip"):
         assert not (folder / "paper" / shared).exists(), shared
 
 

@@ -12,7 +12,6 @@ import pytest
 
 from hilsplat.base.artifacts import read_index
 from tests.workflow.conftest import SCENE, Project
-from tests.workflow.test_front_door import hilsplat
 
 
 @pytest.fixture
@@ -20,8 +19,8 @@ def theirs(finished: Project, tmp_path: Path) -> Path:
     """What 3DGS and LangSplat leave beside the photographs of the tiny scene, with LERF-OVS's labels."""
     own, folder = str(finished.root / SCENE), tmp_path / "their scene"
     export = ("export", own, "--as")
-    hilsplat(finished, tmp_path, *export, "langsplat", "--out", str(folder))
-    hilsplat(finished, tmp_path, *export, "labels", "--out", str(folder / "label"))
+    finished.hilsplat(*export, "langsplat", "--out", str(folder), folder=tmp_path)
+    finished.hilsplat(*export, "labels", "--out", str(folder / "label"), folder=tmp_path)
     for number, path in enumerate(sorted((folder / "label").glob("*.json"))):
         if number >= 3:  # few views are labelled, and scoring takes time
             path.unlink()
@@ -41,7 +40,7 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     theirs: Path, finished: Project, fresh: Callable[[], Project]
 ) -> None:
     project = fresh()
-    said = hilsplat(project, project.root, "new", "theirs", str(theirs))
+    said = project.hilsplat("new", "theirs", str(theirs))
     assert "iteration_30000/point_cloud.ply" in said and "language_features" in said
     assert "chkpnt30000.pth" in said
     told = project.run(sys.executable, "-m", "hilsplat", "run", "theirs", "--", "--cores", "2").stderr
@@ -56,12 +55,12 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
         field = scores[(scores["protocol"] == "lerf/langsplat@2") & (scores["metric"] == "iou")]
         assert field["value"].mean() > 0.1, variant
     assert (project.root / "results/figures/photos/theirs/panel.png").is_file()
-    before = hilsplat(finished, finished.root, "query", "synthetic/tiny", "mug", "--out", str(theirs / "a"))
-    after = hilsplat(project, project.root, "query", "photos/theirs", "mug", "--out", str(theirs / "b"))
+    before = finished.hilsplat("query", "synthetic/tiny", "mug", "--out", str(theirs / "a"))
+    after = project.hilsplat("query", "photos/theirs", "mug", "--out", str(theirs / "b"))
     level = [text.split("\n")[2].split()[1] for text in (before, after)]
     assert level[0] == level[1]
     # a rerun of an early stage keeps what was brought
-    hilsplat(project, project.root, "run", "theirs", "--", "--cores", "2", "--forcerun", "poses")
+    project.hilsplat("run", "theirs", "--", "--cores", "2", "--forcerun", "poses")
     assert read_index(results / "default/masks")["segmenter"] == "langsplat"
 
 
@@ -72,7 +71,7 @@ def test_features_of_another_clip_stop_the_run_and_say_which_clip(
     for path in (theirs / "language_features").glob("*_f.npy"):
         np.save(path, rng.normal(size=np.load(path).shape).astype(np.float32))
     project = fresh()
-    hilsplat(project, project.root, "new", "theirs", str(theirs))
+    project.hilsplat("new", "theirs", str(theirs))
     command = ("-c", "from hilsplat.cli.main import main; main()", "run", "theirs", "--", "--cores", "2")
     failed = project.run(sys.executable, *command, check=False)
     assert failed.returncode != 0

@@ -36,21 +36,21 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
     (copy.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
     world = {"views": 12, "image_px": 128, "arc_deg": 100, "objects": 3, "samples": 2}
     source = ("--source", "world:tabletop:210", "--out", "drawn", "--settings", json.dumps(world))
-    hilsplat(copy, "world", "make", *source)
+    copy.hilsplat("world", "make", *source)
     (copy.root / "drawn/images").rename(copy.root / "photographs")
 
-    without = hilsplat(copy, "new", "before", "photographs")
-    assert "text queries by clip-tiny" in without and "mean nothing" in without
+    without = copy.hilsplat("new", "before", "photographs")
+    assert "text queries by clip-tiny" in without and "meaningless" in without
     with loopback_hub() as hub:
         serve(hub, project, tmp_path / "hub")
+        where = {"HF_ENDPOINT": hub.endpoint, "HF_HOME": str(tmp_path / "home")}
         hub.cuts["vision_encoder.onnx"] = [2_000_000]
-        printed = hilsplat(copy, "models", "get", HF_ENDPOINT=hub.endpoint, HF_HOME=str(tmp_path / "home"))
+        printed = copy.hilsplat("models", "get", HF_HUB_OFFLINE="0", **where)
         assert len(hub.ranges("vision_encoder.onnx")) == 2
     assert "photographs use sam2.1-hiera-small and clip-vit-base-patch16" in printed
-    told = hilsplat(copy, "new", "desk", "photographs")
-    assert (
-        "masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in told and "nothing" not in told
-    )
+    told = copy.hilsplat("new", "desk", "photographs")
+    assert "masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in told
+    assert "meaningless" not in told
 
     run = snakemake(copy)
     assert "photos/desk: masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in run
@@ -59,8 +59,8 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
         assert index["model"] == f"models/{name}"
         record = json.loads((copy.root / DESK / f"default/{stage}.provenance.json").read_text())
         assert record["settings"]["model"] == f"models/{name}"
-    answer = hilsplat(copy, "query", "photos/desk", "mug")
-    assert "to 'mug' in photos/desk" in answer and "mean nothing" not in answer
+    answer = copy.hilsplat("query", "photos/desk", "mug")
+    assert "to 'mug' in photos/desk" in answer and "meaningless" not in answer
 
     # without them, masks and words would be made anew by what is left; poses and Gaussians stay
     shutil.rmtree(copy.root / "models/sam2.1-hiera-small")
@@ -68,13 +68,6 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
     planned = snakemake(copy, "-n")
     assert "rule masks:" in planned and "rule clip:" in planned
     assert "rule poses:" not in planned and "rule gaussians:" not in planned
-
-
-def hilsplat(project: Project, *words: str, **environment: str) -> str:
-    """What the copy's own command prints."""
-    offline = {"HF_HUB_OFFLINE": "0", **environment}
-    command = "from hilsplat.cli.main import main; main()"
-    return project.run(sys.executable, "-c", command, *words, **offline).stdout
 
 
 def snakemake(project: Project, *words: str) -> str:

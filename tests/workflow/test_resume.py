@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -25,14 +24,7 @@ ENTRIES = {"masks": 2}
 
 def kill_when(project: Project, command: list[str], cache: Path, entries: int) -> None:
     """Start a command and SIGKILL it once its cache holds the given number of finished entries."""
-    process = subprocess.Popen(
-        command,
-        cwd=project.root,
-        env=project.environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    process = project.start(*command)
     deadline = time.monotonic() + 300
     while process.poll() is None and time.monotonic() < deadline:
         if len(finished_entries(cache)) >= entries:

@@ -10,30 +10,13 @@ import pandas as pd
 from tests.reference import tiny
 from tests.workflow.conftest import SCENE, Project
 
-TABLES = (
-    "hierarchy",
-    "lerf",
-    "3dovs",
-    "ablation",
-    "theta",
-    "omega",
-    "frames-hi-lerf",
-    "frames-hi-3dovs",
-)
+TABLES = ("hierarchy", "lerf", "3dovs", "ablation", "theta", "omega", "frames-hi-lerf", "frames-hi-3dovs")
 TABLES += ("efficiency", "pruning", "cost-seconds", "efficiency-seconds", "pruning-seconds")
 OWN = ("components",)
 """Tables without a row of the paper."""
 REPORTED = ("cost", "replica", "scannet", "waymo")
 """Tables in which the tiny scene has no row."""
-LAST_BEFORE_EVALUATE = (
-    "masks",
-    "coverage_tree",
-    "clip",
-    "contributions",
-    "semantic_tree",
-    "autoencoder",
-    "field",
-)
+FOLDERS = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder")
 
 
 def test_all_tables_and_figures_are_there(finished: Project) -> None:
@@ -48,15 +31,11 @@ def test_all_tables_and_figures_are_there(finished: Project) -> None:
 
 
 def test_tables_hold_measured_rows_beside_reported_ones(finished: Project) -> None:
-    for table in TABLES:
-        rows = pd.read_csv(finished.root / f"results/tables/{table}.csv")
-        assert set(rows["kind"]) == {"reported", "synthetic stand-in"}, table
-    for table in OWN:
-        assert set(pd.read_csv(finished.root / f"results/tables/{table}.csv")["kind"]) == {
-            "synthetic stand-in"
-        }
-    for table in REPORTED:
-        assert set(pd.read_csv(finished.root / f"results/tables/{table}.csv")["kind"]) == {"reported"}, table
+    both, measured, reported = {"reported", "synthetic stand-in"}, {"synthetic stand-in"}, {"reported"}
+    for tables, kinds in ((TABLES, both), (OWN, measured), (REPORTED, reported)):
+        for table in tables:
+            rows = pd.read_csv(finished.root / f"results/tables/{table}.csv")
+            assert set(rows["kind"]) == kinds, table
 
 
 def test_answers_and_baselines_have_rows_of_their_own(finished: Project) -> None:
@@ -103,7 +82,7 @@ def times_of(project: Project) -> dict[str, int]:
 
 
 def test_every_artifact_has_provenance(finished: Project) -> None:
-    for name in (*LAST_BEFORE_EVALUATE[:-1], "field.safetensors", "scores.csv"):
+    for name in (*FOLDERS, "field.safetensors", "scores.csv"):
         path = finished.root / SCENE / "default" / f"{name}.provenance.json"
         record = json.loads(path.read_text())
         assert record["code"], name

@@ -7,7 +7,6 @@ from collections import Counter
 import pytest
 
 from tests.workflow.conftest import Project, copy_project
-from tests.workflow.test_bad_input import noise_photos
 
 LISTS = ("theta", "omega", "pruning", "ablation", "component")
 NONE = tuple(f"{name}_variants=[]" for name in LISTS)
@@ -68,14 +67,8 @@ def test_without_sweeps_every_stage_runs_once(base):
             {"field": 4, "evaluate": 4, "table": 1},
         ),
         # d = 3 needs its own autoencoder, which both share; baselines write the field by another rule
-        (
-            "ablation_variants=[regression,paper]",
-            {"autoencoder": 1, "field": 2, "evaluate": 2, "table": 1},
-        ),
-        (
-            "main_variants=[default,langsplat,lifted]",
-            {"autoencoder": 2, "method": 2, "evaluate": 2},
-        ),
+        ("ablation_variants=[regression,paper]", {"autoencoder": 1, "field": 2, "evaluate": 2, "table": 1}),
+        ("main_variants=[default,langsplat,lifted]", {"autoencoder": 2, "method": 2, "evaluate": 2}),
         # LangSplat has levels by head; the other rows share all but the field
         (
             "ablation_variants=[langsplat,initial-2d,paper-hc,paper-instance,paper-part,paper-tree]",
@@ -91,10 +84,7 @@ def test_without_sweeps_every_stage_runs_once(base):
         # only what is random is repeated: PCA and our solver are not
         ("seeds=3", {}),
         ("seeds=3 main_variants=[default,paper]", {"autoencoder": 3, "field": 3, "evaluate": 3}),
-        (
-            "seeds=3 main_variants=[default,lifted,langsplat]",
-            {"autoencoder": 4, "method": 4, "evaluate": 4},
-        ),
+        ("seeds=3 main_variants=[default,lifted,langsplat]", {"autoencoder": 4, "method": 4, "evaluate": 4}),
     ],
 )
 def test_a_sweep_adds_its_own_stages_and_later_alone(plain, base, config, added):
@@ -107,31 +97,3 @@ def test_sweeps_take_the_scenes_that_are_named_for_them(plain):
     every = jobs(plain, "pruning_variants=[pruned,default]")
     other = jobs(plain, "pruning_variants=[pruned,default]", "sweep_scenes=[table-2]")
     assert (every["field"], other["field"]) == (2, 1)
-
-
-def test_a_run_of_photographs_leaves_the_tables_of_another_alone(plain, tmp_path):
-    source = noise_photos(tmp_path / "desk", 3)
-    sheet = plain.root / "config/scenes.tsv"
-    before = sheet.read_text()
-    sheet.write_text(before + f"photos\tdesk\tphotos\t{source}\tarbitrary\n")
-    command = [sys.executable, "-m", "snakemake", "-n", "--cores", "1", "--quiet", "rules"]
-    printed = plain.run(*command, "--config", "groups=[photos]", "only=[desk]").stdout
-    sheet.write_text(before)
-    planned = {line.split()[0] for line in printed.splitlines() if line.strip()}
-    assert {"poses", "semantic_tree", "field", "figures"} <= planned
-    assert not planned & {"table", "sweep_plot", "evaluate"}
-
-
-def test_an_unknown_method_stops_the_run_at_once(plain):
-    command = [
-        sys.executable,
-        "-m",
-        "snakemake",
-        "-n",
-        "--config",
-        "only=[table-1]",
-        "method={name: lerfsplat}",
-    ]
-    result = plain.run(*command, check=False)
-    assert result.returncode != 0
-    assert "there is no method 'lerfsplat'" in result.stdout + result.stderr

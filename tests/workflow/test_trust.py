@@ -87,17 +87,7 @@ def test_a_file_that_is_added_during_a_stage_is_refused(copy_of_finished: Projec
     """The photographs of a scene change while its poses are computed."""
     project, images = copy_of_finished, copy_of_finished.root / IMAGES
     out = tmp_path / "scene"
-    stage = [
-        sys.executable,
-        "-m",
-        "hilsplat",
-        "poses",
-        "--images",
-        str(images),
-        "--out",
-        str(out),
-        "--render",
-    ]
+    words = ["hilsplat", "poses", "--images", str(images), "--out", str(out), "--render"]
     first = sorted(images.glob("*.png"))[0]
     code = f"""
 import shutil
@@ -108,15 +98,14 @@ def adding(*given):
     shutil.copy({str(first)!r}, {str(images / "added.png")!r})
 poses.run_poses = adding
 import sys
-sys.argv = {["hilsplat", *stage[3:]]!r}
+sys.argv = {words!r}
 from hilsplat.cli.main import main
 main()
 """
     refused = project.run(sys.executable, "-c", code, check=False)
     assert refused.returncode == 1
-    assert (
-        "poses: input images changed while the stage ran" in refused.stderr and "added.png" in refused.stderr
-    )
+    assert "poses: input images changed while the stage ran" in refused.stderr
+    assert "added.png" in refused.stderr
     assert not out.with_name("scene.provenance.json").exists()
 
 
@@ -124,14 +113,7 @@ main()
 def job_of(project: Project, log: str, *words: str, freeze: bool = False) -> Iterator[subprocess.Popen]:
     """Start a run, and yield its process, perhaps frozen, once the log of its job exists."""
     (project.root / log).unlink(missing_ok=True)
-    process = subprocess.Popen(
-        [sys.executable, *words],
-        cwd=project.root,
-        env=project.environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    process = project.start(sys.executable, *words)
     deadline = time.monotonic() + 120
     while not (project.root / log).exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
