@@ -54,7 +54,7 @@ def finish(candidates, model, folder) -> int:
 def test_view(benchmark, model, image, tmp_path):
     def view() -> tuple[int, int]:
         candidates = decode_candidates(image, model, SETTINGS)
-        write_npz(tmp_path / "cache.npz", **candidates.arrays())
+        write_npz(tmp_path / "cache.npz", **vars(candidates))
         return len(candidates), finish(candidates, model, tmp_path)
 
     benchmark.extra_info |= {"case": VIEW, "count": 1, "of": "views"}

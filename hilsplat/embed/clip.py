@@ -13,7 +13,7 @@ from hilsplat.base.artifacts import read_full_index, read_json
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
 from hilsplat.base.processes import in_order
-from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
+from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
 from hilsplat.models.store import MODELS, user_models
 from hilsplat.segment.crops import crop_to_square
@@ -24,8 +24,7 @@ logger = logging.getLogger(__name__)
 
 SIGLIP_TOKENS = 64
 """Text length of a SigLIP if its configuration does not specify one."""
-MODEL_PATTERNS = ("*/config.json", "*/*/config.json")
-"""Patterns of model folders in `models/`."""
+MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # of model folders in `models/`
 
 
 class ClipModel:
@@ -34,14 +33,9 @@ class ClipModel:
     Args:
         threads: number of batches of crops embedded at once; results do not depend on it.
         template: prompt template, in which each text replaces `{}`.
-
-    Attributes:
-        side_px: side of the vision network's square input.
-        max_tokens: maximum text length of the text network; None if the folder specifies no limit.
-        precision: precision of the vision network, "fp32" or "int8".
     """
 
-    precision: str = "fp32"
+    precision: str = "fp32"  # or "int8", of the vision network
 
     def __init__(self, model: ModelFolder, threads: int = 1, template: str = "{}") -> None:
         self.model = model
@@ -61,9 +55,9 @@ class ClipModel:
         try:
             self.tokenizer = Tokenizer.from_file(str(path))
         except Exception as error:  # the tokenizers package raises bare Exception
-            raise ModelError(f"{path} cannot be read: {error}", fix="fetch a whole copy") from error
+            raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
         if not self.tokenizer.get_vocab_size(with_added_tokens=False):
-            raise ModelError(f"{path} has no word", fix="fetch a whole copy")
+            raise ModelError(f"{path} contains no word", fix=WHOLE_COPY)
         fixed = self.text.fixed_axis(self.ids, 1)
         text_config = model.config.get("text_config", {})
         self.siglip = model.layout == "siglip"
@@ -79,15 +73,11 @@ class ClipModel:
 
     @cached_property
     def vision(self) -> Network:
-        """Vision network, opened on first use because it is large and not needed for texts.
-
-        Raises:
-            ModelError: it cannot be read, or its vectors differ in width from those of the text network.
-        """
+        """Vision network, opened on first use because it is large and not needed for texts."""
         opened = self.model.network("vision_model")
         (vector,) = opened.spec.outputs
-        numbers = opened.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
-        require_one_space(self.model.folder, *numbers)
+        widths = opened.fixed_axis(vector, 1), self.text.fixed_axis(self.words, 1)
+        require_one_space(self.model.folder, *widths)
         return opened
 
     @property
@@ -118,11 +108,7 @@ class ClipModel:
 
     @staticmethod
     def load(folder: Path, threads: int = 1, template: str = "{}", variant: str = "") -> "ClipModel":
-        """Open a model folder (`open_model_folder`).
-
-        Raises:
-            ModelError: it is missing, incomplete or not a CLIP, or its networks do not belong together.
-        """
+        """Open a model folder and its vision network; errors as in `open_model_folder`."""
         model = ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
         _ = model.vision  # open and check it now
         return model
@@ -137,7 +123,7 @@ class ClipModel:
         if self.width != numbers:
             raise MisalignedArtifactError(
                 f"{what} does not belong to the CLIP in {self.model.folder}",
-                expected=f"vectors of {self.width} numbers, as this CLIP gives",
+                expected=f"vectors of {self.width} numbers, as from this CLIP",
                 found=f"{numbers} numbers",
                 fix="use the CLIP it was made with (clip.model), or rerun the clip stage and those after it",
             )
@@ -188,10 +174,10 @@ class ClipModel:
         return crop_to_square(image[y0:y1, x0:x1], inside, settings.background, self.side_px, as_langsplat)
 
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
-        """Return the unit vectors of texts, each inserted into the template.
+        """Return the unit vectors of texts, each inserted into the template; vectors are cached.
 
-        Texts are embedded one by one, so a vector never depends on other queries. Vectors are cached. A text
-        without a token raises a ModelError.
+        Texts are embedded one by one, so a vector never depends on other queries. A text without a token
+        raises a ModelError.
         """
         for text in texts:
             if text not in self._known_texts:

@@ -36,13 +36,10 @@ def maps_of(
 def export_langsplat(scene: Scene, masks: Path, clip: Path, gaussians: Path, out: Path) -> None:
     """Export a scene as LangSplat's input: images, `sparse/0`, `language_features/` and `point_cloud.ply`.
 
-    Args:
-        masks, clip: masks of its training views, and a CLIP vector for each mask.
-        gaussians: the scene's PLY.
-        out: folder to write; an existing one is replaced.
+    `masks` are those of its training views; `out` is replaced if it exists.
 
     Raises:
-        MisalignedArtifactError: the vectors were computed from other masks.
+        MisalignedArtifactError: the CLIP vectors were computed from other masks.
         ArtifactError: a mask has no vector.
     """
     with atomic_folder(out) as folder:

@@ -45,13 +45,9 @@ def stem_of(view: str) -> str:
 def stems_of(views: list[str]) -> dict[str, str]:
     """Return the stem of each view, or raise an ArtifactError if two views have the same one."""
     stems = {view: stem_of(view) for view in views}
-    twins = [view for view in views if list(stems.values()).count(stems[view]) > 1]
-    if twins:
-        raise ArtifactError(
-            f"these views would share LangSplat's files: {', '.join(twins[:4])}",
-            expected="names that differ before their first dot",
-            fix="rename the images",
-        )
+    if twins := [view for view in views if list(stems.values()).count(stems[view]) > 1]:
+        shared = f"these views would share LangSplat's files: {', '.join(twins[:4])}"
+        raise ArtifactError(shared, fix="rename the images so that their names differ before the first dot")
     return stems
 
 
@@ -61,12 +57,8 @@ def read_view(
     """Read the masks and vectors of one view, with rows in `content_order`.
 
     The map of mixed levels is ignored. Where masks of one level overlap, the files contain only the one
-    painted last. They contain no scores, so predicted IoU and stability are set to 1.
-
-    Args:
-        folder: folder of `<stem>_s.npy` and `<stem>_f.npy`.
-        size_hw: size of the view; maps of another size with the same aspect ratio, such as LangSplat's 1080
-            rows, are read at the nearest pixel.
+    painted last. They contain no scores, so predicted IoU and stability are set to 1. Maps of another size
+    with the same aspect ratio, such as LangSplat's 1080 rows, are read at the nearest pixel.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or not as described above.
@@ -75,38 +67,33 @@ def read_view(
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
     if maps.ndim != 3 or len(maps) != len(MAPS):
-        raise ArtifactError(
-            f"{maps_path} is not a LangSplat map",
-            expected="an array of shape (4, height, width): default, s, m, l",
-            found=f"shape {maps.shape}",
-        )
+        shape = "an array of shape (4, height, width): default, s, m, l"
+        raise ArtifactError(f"{maps_path} is not a LangSplat map", expected=shape, found=f"{maps.shape}")
     if vectors.ndim != 2 or vectors.dtype.kind != "f" or not np.isfinite(vectors).all():
         raise ArtifactError(
             f"{vectors_path} is not an array of vectors",
             expected="finite floating-point numbers of shape (masks, channels)",
             found=f"{vectors.dtype} of shape {vectors.shape}",
         )
-    finite = bool(np.isfinite(maps).all())
     labels = np.where(np.isfinite(maps), maps, -2).astype(np.int64)
-    if not finite or (labels != maps).any() or labels.min() < -1 or labels.max() >= len(vectors):
+    if (labels != maps).any() or labels.min() < -1 or labels.max() >= len(vectors):
         raise ArtifactError(
             f"{maps_path} does not belong to {vectors_path.name}",
             expected=f"row numbers from -1 (none) to {len(vectors) - 1}",
             found=f"numbers from {maps.min():g} to {maps.max():g}",
-            fix="take both files from the same run of the preprocessing",
+            fix="use two files from the same run of the preprocessing",
         )
-    if labels.shape[1:] != size_hw:
-        height, width = labels.shape[1:]
+    height, width = labels.shape[1:]
+    if (height, width) != size_hw:
         if abs(height * size_hw[1] / (width * size_hw[0]) - 1) > SHAPE_TOLERANCE:
             raise MisalignedArtifactError(
                 f"{maps_path} and view {view} differ in shape",
                 expected=f"the shape of {size_hw} (height, width)",
-                found=f"{labels.shape[1:]}",
+                found=f"{(height, width)}",
                 fix="make both from the same image; poses that undistort an image change its shape",
             )
-        rows, columns = (
-            ((np.arange(n) + 0.5) * m / n).astype(int) for n, m in zip(size_hw, (height, width), strict=True)
-        )
+        rows = ((np.arange(size_hw[0]) + 0.5) * height / size_hw[0]).astype(int)
+        columns = ((np.arange(size_hw[1]) + 0.5) * width / size_hw[1]).astype(int)
         labels = labels[:, rows[:, None], columns]
     parts, vector_rows = [], []
     for place, level in enumerate(MAPS):
@@ -125,7 +112,7 @@ def read_view(
 
 
 def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Read the training views that have files; raise an ArtifactError if these are less than half of them."""
+    """Read the training views that have files; raise an ArtifactError if fewer than half have."""
     maps = {view: f"{stem}_s.npy" for view, stem in stems_of(train_views(scene)).items()}
     views = [view for view, name in maps.items() if (folder / name).is_file()]
     missing = [name for view, name in maps.items() if view not in views]
@@ -139,10 +126,8 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
         )
     if missing:
         logger.warning("%s: %s", lacking, ", ".join(missing[:5]))
-    return {
-        view: read_view(folder, view, scene.cameras[view].size_hw)
-        for view in track(views, "LangSplat's files")
-    }
+    sizes = {view: scene.cameras[view].size_hw for view in views}
+    return {view: read_view(folder, view, sizes[view]) for view in track(views, "LangSplat's files")}
 
 
 def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
@@ -153,23 +138,16 @@ def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
         for view, (masks, _) in _read_all(scene, files).items():
             masks.save(folder / f"{view}.npz")
             index[view] = index_entry(masks)
-        write_index(
-            folder,
-            index,
-            scene=scene.name,
-            partial=len(index) < len(train_views(scene)),
-            segmenter="langsplat",
-            model=None,
-            model_sha256=None,
-        )
+        origin = {"segmenter": "langsplat", "model": None, "model_sha256": None}
+        partial = len(index) < len(train_views(scene))
+        write_index(folder, index, scene=scene.name, partial=partial, **origin)
         counts.update(views=len(index))
 
 
 def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
     """Write LangSplat's vectors in the format of the clip stage: `<view>.npy`, with rows as in `read_masks`.
 
-    Raises:
-        MisalignedArtifactError: the vectors were not computed with `settings.model`, which embeds the texts.
+    A MisalignedArtifactError is raised if `settings.model`, which embeds the texts, didn't compute them.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
@@ -195,10 +173,7 @@ def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings
 
 
 def _require_model(
-    model: ClipModel,
-    scene: Scene,
-    files: Path,
-    found: dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]],
+    model: ClipModel, scene: Scene, files: Path, found: dict[str, tuple[HierarchicalMasks, np.ndarray]]
 ) -> None:
     """Embed some masks of a view again, as LangSplat does, and compare the vectors.
 
@@ -213,7 +188,7 @@ def _require_model(
     logger.info("the CLIP in %s agrees with %s: median cosine %.3f", model.model.folder, files, cosine)
     if cosine < LEAST_COSINE:
         raise MisalignedArtifactError(
-            f"the vectors in {files} are not of the CLIP in {model.model.folder}",
+            f"the vectors in {files} were not computed by the CLIP in {model.model.folder}",
             expected=f"a median cosine of at least {LEAST_COSINE} with its own vectors of the same masks",
             found=f"{cosine:.3f} for {len(rows)} masks of {view}",
             fix="set clip.model to the CLIP that made them; LangSplat's is clip-vit-b-16-laion2b: "

@@ -10,7 +10,7 @@ import numpy as np
 from hilsplat.base.artifacts import read_json, write_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.embed.clip import ClipModel
-from hilsplat.models.folder import ModelFolder, input_side_px, open_model_folder
+from hilsplat.models.folder import input_side_px, open_model_folder
 from hilsplat.models.int8 import int8_network, may_be_int8
 from hilsplat.models.network import execution_providers, require_one_space
 from hilsplat.segment.sam import SamModel
@@ -26,14 +26,14 @@ Seconds = dict[str, float]
 def check_model(folder: Path, variant: str = "") -> str:
     """Run each network of a model on an empty input, also in int8, and describe the model line by line.
 
-    Raises:
-        ModelError: as in `open_model_folder` and `Network`.
+    Errors as in `open_model_folder` and `Network`.
     """
     model = open_model_folder(folder, variant=variant)
     side = input_side_px(model)
     lines = [f"folder     {model.folder}", f"kind       {model.layout}", f"image      {side} x {side} px"]
     opened = SamModel(model) if model.kind == "sam" else ClipModel(model)
-    seconds = {precision: _measure(opened, precision) for precision in _precisions(model)}
+    precisions = ["fp32", "int8"] if may_be_int8(model) else ["fp32"]
+    seconds = {precision: _measure(opened, precision) for precision in precisions}
     times = "; ".join(
         f"{precision}: " + ", ".join(f"{value:.4f} s per {what}" for what, value in each.items())
         for precision, each in seconds.items()
@@ -55,8 +55,7 @@ def check_model(folder: Path, variant: str = "") -> str:
         require_one_space(model.folder, vectors.shape[1], opened.embed_texts(["object"]).shape[1])
         lines += [f"vectors    {vectors.shape[1]} numbers"]
         providers = opened.vision.providers
-    for precision, each in seconds.items():
-        _remember(folder, variant, precision, each)
+    _remember(folder, variant, seconds, CACHE)
     lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)
 
@@ -83,23 +82,17 @@ def provider_disagreement(folder: Path) -> str | None:
 
 
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
-    """Return the timings of a model, from an earlier measurement if there is one.
+    """Return the timings of a model, from an earlier measurement in `cache` if there is one.
 
-    Args:
-        precision: "fp32", or "auto" or "int8" for int8 where possible.
-        cache: folder of the measurements.
+    `precision` is "fp32", or "auto" or "int8" for int8 where possible.
     """
     model = open_model_folder(folder, variant=variant)
-    requested = "fp32" if precision == "fp32" else _precisions(model)[-1]
+    requested = "int8" if precision != "fp32" and may_be_int8(model) else "fp32"
     found = _known(cache).get(_key(folder, variant, requested))
     if found is None:
         found = _measure(SamModel(model) if model.kind == "sam" else ClipModel(model), requested)
-        _remember(folder, variant, requested, found, cache)
+        _remember(folder, variant, {requested: found}, cache)
     return found
-
-
-def _precisions(model: ModelFolder) -> list[str]:
-    return ["fp32", "int8"] if may_be_int8(model) else ["fp32"]
 
 
 def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
@@ -138,5 +131,6 @@ def _known(cache: Path) -> dict[str, Seconds]:
         return {}
 
 
-def _remember(folder: Path, variant: str, precision: str, found: Seconds, cache: Path = CACHE) -> None:
-    write_json(cache / "model_seconds.json", {**_known(cache), _key(folder, variant, precision): found})
+def _remember(folder: Path, variant: str, found: dict[str, Seconds], cache: Path) -> None:
+    measured = {_key(folder, variant, precision): seconds for precision, seconds in found.items()}
+    write_json(cache / "model_seconds.json", _known(cache) | measured)

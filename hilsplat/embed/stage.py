@@ -1,4 +1,4 @@
-"""The stage `clip`: CLIP vectors of each node's best crops, or of all masks."""
+"""Stage `clip`: CLIP vectors of each node's best crops, or of all masks."""
 
 import math
 from collections.abc import Mapping
@@ -38,14 +38,10 @@ from hilsplat.models.int8 import (
 from hilsplat.models.memory import available_mib, needs_of
 from hilsplat.models.network import Network
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.digests import (
-    MASKS_SHA256,
-    digests_in,
-    load_masks,
-    pixel_digests,
-    require_same_masks,
-)
+from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, pixel_digests, require_same_masks
 from hilsplat.settings import ClipSettings
+
+RERUN_MASKS = "rerun the masks stage for this scene"
 
 
 def run_clip(
@@ -76,13 +72,13 @@ def run_clip(
     scene = Scene.load(scene_folder)
     digests = digests_in(masks_folder)
     views = list(digests)
-    strangers = sorted(set(views) - set(scene.views("train")))
-    if strangers:
+    training = scene.views("train")
+    if unknown := sorted(set(views) - set(training)):
         raise MisalignedArtifactError(
             f"masks in {masks_folder} do not belong to the training views of {scene.name}",
-            expected=f"only masks of its {len(scene.views('train'))} training views",
-            found=", ".join(strangers[:5]),
-            fix="run the masks stage again for this scene",
+            expected=f"only masks of its {len(training)} training views",
+            found=", ".join(unknown[:5]),
+            fix=RERUN_MASKS,
         )
     chosen = None
     if semantic_tree_folder is not None:
@@ -114,7 +110,7 @@ def run_clip(
                 f"masks of view {view} of {scene.name} do not fit its camera",
                 expected=f"{scene.cameras[view].size_hw} (height, width)",
                 found=f"{masks.size_hw}",
-                fix="run the masks stage again for this scene",
+                fix=RERUN_MASKS,
             )
         rows = np.arange(len(masks)) if chosen is None else chosen[view]
         found = view_cache.find(key)
@@ -149,13 +145,8 @@ def run_clip(
             precision=model.precision,
             background=settings.background,
         )
-        counts.update(
-            views=len(views),
-            masks=sum(entry["masks"] for entry in index.values()),
-            crops=sum(entry["crops"] for entry in index.values()),
-            dim=model.width,
-            from_cache=view_cache.hits,
-        )
+        totals = {name: sum(entry[name] for entry in index.values()) for name in ("masks", "crops")}
+        counts.update(views=len(views), **totals, dim=model.width, from_cache=view_cache.hits)
 
 
 def _choose_precision(
@@ -177,12 +168,12 @@ def _choose_precision(
     places = places[:: max(1, len(places) // CHECKED_CROPS)][:CHECKED_CROPS]
     if not places:
         return
-
-    def crop(place: tuple[str, int]) -> np.ndarray:
-        view, row = place
-        return model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
-
-    crops = np.stack([crop(place) for place in places])
+    crops = np.stack(
+        [
+            model.crop(scene.image(view), load_masks(masks_folder, view, digests), row, settings)
+            for view, row in places
+        ]
+    )
 
     @cache_calls
     def quantised() -> Network:
@@ -211,8 +202,7 @@ def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[n
     """
     rank = read_npz(sealed(semantic_tree_folder, "tree.npz"), "crop_rank")["crop_rank"]
     is_chosen = (rank >= 0) & (rank < per_node)
-    if not is_chosen.any():
-        is_chosen[:] = True
+    is_chosen |= not is_chosen.any()
     counts = {view: entry["masks"] for view, entry in read_index(semantic_tree_folder)["views"].items()}
     parts = np.split(is_chosen, np.cumsum(list(counts.values())))
     return {view: np.flatnonzero(part) for view, part in zip(counts, parts, strict=False)}

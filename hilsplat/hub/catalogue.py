@@ -23,20 +23,22 @@ from hilsplat.models.onnx_graph import WHOLE
 from hilsplat.models.store import RELEASES, Release
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
-"""PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers does
-not run code in it (`weights_only`)."""
+"""PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers
+doesn't run code in it (`weights_only`)."""
 SMALL_BYTES = 50_000_000
 """Text files of a PyTorch model above this size are not part of its tokenizer."""
+OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
+"""Errors of the connection to the hub."""
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
 """Possible paths of a whole CLIP without `.onnx`."""
 
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """A model to download: folder name, owner/name on the hub, and release (None for other repositories)."""
+    """A model to download."""
 
-    name: str
-    repository: str
+    name: str  # of its folder
+    repository: str  # owner/name on the hub
     release: Release | None
 
     @staticmethod
@@ -49,15 +51,11 @@ class ModelRequest:
         try:
             validate_repo_id(name)
         except HFValidationError as error:
-            raise DownloadError(
-                f"{name!r} cannot be a repository: {error}", fix="write owner/name"
-            ) from error
+            problem = f"{name!r} cannot be a repository: {error}"
+            raise DownloadError(problem, fix="write owner/name") from error
         if name.count("/") != 1:
-            raise DownloadError(
-                f"no model is known by the name {name!r}",
-                expected=f"{', '.join(release.name for release in RELEASES)}, or owner/name on the hub",
-                fix="hilsplat models list shows what there is",
-            )
+            known = ", ".join(release.name for release in RELEASES)
+            raise DownloadError(f"unknown model {name!r}", expected=f"{known}, or owner/name on the hub")
         return ModelRequest(f"{name.split('/')[1]}{ending}", name, None)
 
 
@@ -73,20 +71,15 @@ def usual_files(kind: str) -> list[str]:
 
 @dataclass(frozen=True)
 class HubFile:
-    """A file as listed by the hub.
-
-    Attributes:
-        digest: SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits).
-        cached: the file in the hub's cache on this machine, if the listing is that of the cache.
-    """
+    """A file as listed by the hub."""
 
     path: str
     size: int
-    digest: str
-    cached: Path | None = None
+    digest: str  # SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits)
+    cached: Path | None = None  # the file in the hub's local cache, if the listing is that of the cache
 
     def digest_of(self, path: Path) -> str:
-        """Return the digest of a file, of the kind that the hub states for this one."""
+        """Return the digest of a local file, of the same kind as the listed one."""
         with path.open("rb") as stream:
             if len(self.digest) == 64:
                 return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -96,12 +89,12 @@ class HubFile:
 
 @dataclass(frozen=True)
 class Listing:
-    """A repository at one commit; `licence` is the hub's, or empty if not stated."""
+    """A repository at one commit."""
 
     repository: str
     revision: str
-    licence: str
-    files: Mapping[str, HubFile]
+    licence: str  # empty if the hub states none
+    files: Mapping[str, HubFile]  # by path
 
     def require(self, *paths: str) -> list[HubFile]:
         """Return files by path, and refuse a repository that lacks one of them."""
@@ -117,17 +110,11 @@ class Listing:
 
 @dataclass(frozen=True)
 class Choice:
-    """The files to download.
+    """The files to download."""
 
-    Attributes:
-        files: path in the repository -> path in the model folder.
-        exported: whether they are PyTorch weights, to be exported as networks.
-        split: whether they are a whole CLIP, to be split into its two networks.
-    """
-
-    files: Mapping[str, str]
-    exported: bool = False
-    split: bool = False
+    files: Mapping[str, str]  # path in the repository -> path in the model folder
+    exported: bool = False  # they are PyTorch weights, to be exported as networks
+    split: bool = False  # they are a whole CLIP, to be split into its two networks
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
@@ -145,11 +132,8 @@ def read_listing(repository: str, revision: str | None) -> Listing:
             continue  # no hub has such a file, and it would be written elsewhere
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
-            raise DownloadError(
-                f"{constants.ENDPOINT} states no size and digest of {each.rfilename}",
-                expected="what the hub's API states about each file (?blobs=true)",
-                fix="unset HF_ENDPOINT, or name a complete mirror",
-            )
+            problem = f"{constants.ENDPOINT} states no size and digest of {each.rfilename} (?blobs=true)"
+            raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
         files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
     licence = getattr(info.card_data, "license", None) or ""
     return Listing(repository, str(info.sha), str(licence), files)
@@ -162,16 +146,14 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
     except CacheNotFound:
         return None
     requested = revision or constants.DEFAULT_REVISION
-    for repo in repositories:
-        if (repo.repo_type, repo.repo_id) != ("model", repository):
-            continue
-        for snapshot in repo.revisions:
-            if requested in snapshot.refs or requested == snapshot.commit_hash:
-                files = {}
-                for each in snapshot.files:
-                    path = each.file_path.relative_to(snapshot.snapshot_path).as_posix()
-                    files[path] = HubFile(path, each.size_on_disk, each.blob_path.name, each.file_path)
-                return Listing(repository, snapshot.commit_hash, "", files)
+    own = [repo for repo in repositories if (repo.repo_type, repo.repo_id) == ("model", repository)]
+    for snapshot in (snapshot for repo in own for snapshot in repo.revisions):
+        if requested in snapshot.refs or requested == snapshot.commit_hash:
+            files = {}
+            for each in snapshot.files:
+                path = each.file_path.relative_to(snapshot.snapshot_path).as_posix()
+                files[path] = HubFile(path, each.size_on_disk, each.blob_path.name, each.file_path)
+            return Listing(repository, snapshot.commit_hash, "", files)
     return None
 
 
@@ -192,11 +174,11 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
         described = None
     kind = layout_of(described)
     if kind is None:
-        is_object = isinstance(described, dict)
+        found = f"model_type {described.get('model_type')!r}" if isinstance(described, dict) else "no object"
         raise DownloadError(
-            f"{listing.repository} does not hold a model that can be used here",
+            f"{listing.repository} contains no supported model",
             expected="; ".join(SUPPORTED.values()),
-            found=f"model_type {described.get('model_type')!r}" if is_object else "no object",
+            found=found,
             fix="name a SAM or a CLIP (hilsplat models list)",
         )
     layout, ending = LAYOUTS[kind], f"_{variant}" if variant else ""
@@ -208,24 +190,14 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             listing.require(*layout.described)
             plain = [*layout.described, *(path for path in layout.beside if path in listing.files)]
             files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
-            # a network looks for its weights under the names that it was saved with
-            weights = [
-                path
-                for path in listing.files
-                if any(path.startswith((f"{network}_data", f"{network}.data")) for network in files)
-            ]
+            # external weights keep the names under which the networks refer to them
+            endings = tuple(f"{network}{mark}data" for network in files for mark in "_.")
+            weights = [path for path in listing.files if path.startswith(endings)]
             return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)
     weights = [name for name in WEIGHTS if name in listing.files][:1]
     if variant or not weights:
         listing.require(*(f"{places[0]}{ending}.onnx" for places in networks_of(kind)))
-    texts = [
-        path
-        for path, file in listing.files.items()
-        if path.endswith((".json", ".txt")) and "/" not in path and file.size < SMALL_BYTES
-    ]
+    at_root = [file for path, file in listing.files.items() if "/" not in path and file.size < SMALL_BYTES]
+    texts = [file.path for file in at_root if file.path.endswith((".json", ".txt"))]
     listing.require(*(name for name in layout.described if name != "tokenizer.json"))
     return Choice({path: path for path in [*texts, *weights]}, exported=True)
-
-
-OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
-"""Errors of the connection to the hub."""

@@ -17,15 +17,14 @@ NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
 """Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
 
-LAST_LINES = 15
-"""Lines of the exporter's output shown in an error."""
+LAST_LINES = 15  # of the exporter's output, shown in an error
 
 
 def require_exporter(what: str) -> None:
     """Refuse to continue without the exporter's packages, before anything is downloaded."""
     if missing := [name for name in NEEDED if not _is_installed(name)]:
         raise ModelError(
-            f"{what} has no ready networks, and what would make them is not installed",
+            f"{what} has no ONNX networks, and the packages that export them are not installed",
             expected="the extra export: optimum-onnx, transformers, torch, pillow",
             found=f"no {', '.join(missing)}",
             fix=f"{INSTALL}, then run the command again",
@@ -40,10 +39,9 @@ def _is_installed(module: str) -> bool:
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
-    """Export the networks of a PyTorch SAM or CLIP, and return the versions of the exporter's packages.
+    """Export the networks of a SAM or CLIP saved by transformers; return the exporter's package versions.
 
-    `weights` is in the format of transformers: config.json, weights, preprocessor, tokenizer. If the exporter
-    fails, its last lines are in the error.
+    If the exporter fails, its last lines are in the error.
     """
     logger.info("exporting to ONNX; this takes a few minutes and about three times the weights in memory")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
@@ -59,7 +57,7 @@ def export_networks(weights: Path, out: Path) -> dict[str, str]:
         raise ModelError(
             f"the weights in {weights} cannot be exported: the exporter ended with {done.returncode}",
             found="\n            ".join(lines) or "no output",
-            fix=f"install the versions that are tested together ({INSTALL}), then run the command again",
+            fix=f"install the tested versions ({INSTALL}), then run the command again",
         )
     if whole_clip(out) is not None:
         split_whole(out)

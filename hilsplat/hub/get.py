@@ -4,17 +4,20 @@ import logging
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import huggingface_hub
 import requests
+from huggingface_hub import constants
+from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 from huggingface_hub.utils import disable_progress_bars
 
 from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
-from hilsplat.base.errors import DiskSpaceError, DownloadError
+from hilsplat.base.errors import DiskSpaceError, DownloadError, HilsplatError
 from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.catalogue import (
@@ -26,9 +29,9 @@ from hilsplat.hub.catalogue import (
     choose_files,
     read_cached_listing,
     read_listing,
+    usual_files,
 )
 from hilsplat.hub.export import export_networks, require_exporter
-from hilsplat.hub.refusals import explain_refusals
 from hilsplat.models.onnx_graph import split_whole
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
@@ -36,6 +39,7 @@ logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
 """File in a model folder that records its origin."""
+KEPT = "transferred data is kept, and the transfer is continued"
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
 """Waits between attempts to download a file."""
 CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
@@ -48,28 +52,18 @@ EXPORT_FACTOR = 4
 
 @dataclass(frozen=True)
 class Prepared:
-    """A model whose required files are known.
-
-    Attributes:
-        staging: folder of the download; kept after a failure, and resumed.
-    """
+    """A model whose required files are known."""
 
     requested: ModelRequest
     listing: Listing
     choice: Choice
-    staging: Path
+    staging: Path  # folder of the download; kept after a failure, and resumed
     target: Path
 
-    @property
-    def num_bytes(self) -> int:
-        """Total size of the required files."""
-        return sum(self.listing.files[path].size for path in self.choice.files)
-
-    @property
-    def missing_bytes(self) -> int:
-        """Size of the files that have not been transferred."""
-        files = self.listing.files
-        return sum(files[path].size for path in self.choice.files if not (self.staging / path).is_file())
+    def num_bytes(self, *, missing: bool = False) -> int:
+        """Return the total size of the required files, or of those that have not been transferred."""
+        paths = [path for path in self.choice.files if not (missing and (self.staging / path).is_file())]
+        return sum(self.listing.files[path].size for path in paths)
 
 
 def get_models(
@@ -95,11 +89,7 @@ def get_models(
     if not names:
         logger.info("the recommended pair: %s", " and ".join(RECOMMENDED))
     if revision is not None and len(names) != 1:
-        raise DownloadError(
-            "a revision belongs to one model",
-            found=f"{len(names)} names",
-            fix="name one model with --revision",
-        )
+        raise DownloadError(f"--revision needs one model, found {len(names)} names", fix="name one model")
     prepared, texts = [], []
     for name in names or RECOMMENDED:
         requested = ModelRequest.named(name, variant)
@@ -108,7 +98,7 @@ def get_models(
             _require_ours(requested, target)
             listing = _listing(requested, revision)
             if _is_present(target, listing):
-                texts.append(f"{target} is there already, from {listing.repository} at {listing.revision}")
+                texts.append(f"{target} exists already, from {listing.repository} at {listing.revision}")
             else:
                 prepared.append(_prepare(requested, listing, target, variant))
     if prepared:
@@ -122,13 +112,11 @@ def get_models(
 
 def _require_ours(requested: ModelRequest, target: Path) -> None:
     """Refuse to replace a folder that was not downloaded from this repository."""
-    if not target.exists():
-        return
     origin = _origin(target)
-    if origin.get("repository") != requested.repository:
+    if target.exists() and origin.get("repository") != requested.repository:
         raise DownloadError(
-            f"{target} is there already and was not fetched from {requested.repository}",
-            found=f"{ORIGIN} names {origin['repository']}" if origin else f"no {ORIGIN}",
+            f"{target} exists already and was not fetched from {requested.repository}",
+            found=f"{ORIGIN} of {origin['repository']}" if origin else f"no {ORIGIN}",
             fix="rename or remove that folder, then run the command again",
         )
 
@@ -154,7 +142,7 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
         cached = read_cached_listing(requested.repository, revision)
         if cached is None:
             raise
-        logger.info("the hub is out of reach: %s is taken from its cache here", requested.repository)
+        logger.info("the hub is unreachable: %s is read from its local cache", requested.repository)
         return cached
 
 
@@ -164,16 +152,11 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     (config,) = listing.require("config.json")
     choice = choose_files(listing, _fetch(listing, config, staging).read_bytes(), variant)
     found = Prepared(requested, listing, choice, staging, target)
-    logger.info(
-        "%s: %s at %s, %.1f MB in %d files, %.1f MB of them still to fetch; licence: %s",
-        requested.name,
-        requested.repository,
-        listing.revision[:12],
-        found.num_bytes / 1e6,
-        len(choice.files),
-        found.missing_bytes / 1e6,
-        listing.licence or (requested.release.licence if requested.release else "not stated by the hub"),
-    )
+    licence = requested.release.licence if requested.release else "not stated by the hub"
+    source = f"{requested.name}: {requested.repository} at {listing.revision[:12]}"
+    size = f"{found.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
+    left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB of them still to fetch"
+    logger.info("%s, %s, %s; licence: %s", source, size, left, listing.licence or licence)
     if choice.exported:
         require_exporter(requested.repository)
     return found
@@ -181,8 +164,8 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
 
 def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
     """Log the size of the download and the free space, and refuse a download that does not fit."""
-    fetched = sum(each.missing_bytes for each in prepared)
-    made = sum(each.num_bytes * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
+    fetched = sum(each.num_bytes(missing=True) for each in prepared)
+    made = sum(each.num_bytes() * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
     free = shutil.disk_usage(models).free
     logger.info("%.1f MB to fetch; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
     if free < fetched + made + SPARE_BYTES:
@@ -211,7 +194,7 @@ def _install(found: Prepared) -> str:
         (found.staging / path).replace(found.staging / place)
     for file in [path for path in found.staging.rglob("*") if path.is_file()]:
         if file.relative_to(found.staging).as_posix() not in choice.files.values():
-            file.unlink()  # what the download keeps, and files of another revision
+            file.unlink()  # metadata of the download, and files of another revision
     shutil.rmtree(found.staging / ".cache", ignore_errors=True)
     if choice.split:
         split_whole(found.staging)
@@ -219,7 +202,7 @@ def _install(found: Prepared) -> str:
 
 
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
-    """Fetch one file, continue it if a part is there, and delete and refuse it if its digest is wrong."""
+    """Fetch one file or the rest of it; delete and refuse it if its digest is wrong."""
     target = staging / file.path
     with explain_full_disk(target):
         if file.cached is None:
@@ -227,12 +210,11 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file.cached, target)
-    found = file.digest_of(target)
+    found, size = file.digest_of(target), target.stat().st_size
     if found != file.digest:
-        size = target.stat().st_size
         target.unlink()
         raise DownloadError(
-            f"{file.path} of {listing.repository} arrived with other bytes than the hub states",
+            f"{file.path} of {listing.repository} arrived with another digest than the hub states",
             expected=f"digest {file.digest}, {file.size} bytes",
             found=f"digest {found}, {size} bytes; they were deleted",
             fix="run the command again; if it happens again, a proxy or mirror changes the file",
@@ -241,14 +223,13 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
 
 
 def _download(listing: Listing, file: HubFile, staging: Path) -> None:
-    """Download a file with `huggingface_hub`, which resumes; connections that break are tried again."""
+    """Download a file with `huggingface_hub`, which resumes; retry if the connection breaks."""
     if not sys.stderr.isatty():
         disable_progress_bars()
     for wait_s in (*WAITS_S, None):
         try:
-            huggingface_hub.hf_hub_download(
-                listing.repository, file.path, revision=listing.revision, local_dir=staging
-            )
+            where = {"revision": listing.revision, "local_dir": staging}
+            huggingface_hub.hf_hub_download(listing.repository, file.path, **where)
         except CUT as error:
             if wait_s is None:
                 raise
@@ -279,3 +260,75 @@ def _place(found: Prepared, made: Path, **more: Any) -> str:
         shutil.rmtree(found.target)
     made.replace(found.target)
     return text
+
+
+@contextmanager
+def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
+    """Convert errors from the network and the hub into a `DownloadError` with a fix."""
+    place = f"{constants.ENDPOINT}/{requested.repository}"
+    try:
+        yield
+    except HilsplatError:
+        raise
+    except GatedRepoError as error:
+        raise DownloadError(
+            f"{requested.repository} requires you to accept its terms before downloading ({_status(error)})",
+            fix=f"accept its terms at {place}, `hf auth login` or set HF_TOKEN, and run the command again",
+        ) from error
+    except RepositoryNotFoundError as error:
+        raise DownloadError(
+            f"the hub has no repository {requested.repository}, or it is private ({_status(error)})",
+            expected=place,
+            fix="correct the name (hilsplat models list); for a private one, `hf auth login` or set HF_TOKEN",
+        ) from error
+    except (requests.RequestException, *OUT_OF_REACH) as error:
+        answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
+        if isinstance(answered, requests.HTTPError) and answered.response is not None:
+            raise _refused(answered, requested, place) from error
+        families = [requested.release.family] if requested.release else ["sam", "clip"]
+        raise DownloadError(
+            f"{requested.repository} cannot be fetched: {type(error).__name__}, {place} is unreachable",
+            found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
+            fix=f"run the command again when the hub is reachable ({KEPT}; HF_ENDPOINT sets a mirror, "
+            f"HTTPS_PROXY a proxy), or put these files into {models / requested.name} by hand, from {place}: "
+            f"{', '.join(file for family in families for file in usual_files(family))}",
+        ) from error
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise DownloadError(
+            f"{error.filename} cannot be written: {error.strerror}", fix=f"make {models} writable"
+        ) from error
+
+
+def _refused(error: requests.HTTPError, requested: ModelRequest, place: str) -> DownloadError:
+    """Return the error for a response with a status other than 2xx."""
+    response = error.response
+    assert response is not None  # an HTTPError is made from a response
+    of = f"{requested.repository} ({_status(error)})"
+    if response.status_code == requests.codes.too_many_requests:
+        return DownloadError(
+            f"the hub received too many requests to serve {of}",
+            found=f"Retry-After: {response.headers.get('Retry-After', 'not stated')}",
+            fix=f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit",
+        )
+    if response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
+        problem = f"the hub denies access to {of}"
+        fix = f"look at {place}; `hf auth login` or set HF_TOKEN to a token with access"
+    elif response.status_code == requests.codes.not_found:
+        problem = f"the hub does not have this revision or file of {of}"
+        fix = f"correct the name or --revision; {place} lists what exists"
+    else:
+        problem, fix = f"the hub does not serve {of}", f"run the command again later: {KEPT}"
+    return DownloadError(problem, found=str(response.url), fix=fix)
+
+
+def _status(error: requests.HTTPError) -> str:
+    return f"{error.response.status_code} {error.response.reason}" if error.response is not None else ""
+
+
+def _innermost(error: BaseException) -> str:
+    """Return the message of an error's root cause."""
+    while (cause := error.__cause__ or error.__context__) is not None:
+        error = cause
+    return str(error) or type(error).__name__

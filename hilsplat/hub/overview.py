@@ -36,12 +36,12 @@ def models_table() -> str:
             continue
         files = [path for path in model.folder.rglob("*") if path.is_file()]
         size = f"{sum(path.stat().st_size for path in files) / 1e6:.0f}"
-        use = "the synthetic world alone" if model.embedded else ""
+        use = "the synthetic world only" if model.embedded else ""
         lines.append(COLUMNS.format(name, model.family.upper(), size, "", state(name), use).rstrip())
     lines += [
         "",
-        "hilsplat models get NAME, or owner/name of the hub; without a name, the recommended pair",
-        f"Fetched models go to {user_models()}; those in models/ of a project come first.",
+        "hilsplat models get NAME, or owner/name on the hub; without a name, the recommended pair",
+        f"Models are stored in {user_models()}; those in a project's models/ take precedence.",
     ]
     return "\n".join(lines)
 

@@ -171,6 +171,6 @@ def real_model(family: str) -> Path | None:
 def meaningless(name: str) -> str:
     """Return the warning for queries of photographs with an embedded CLIP."""
     return (
-        f"{name} knows the synthetic world alone: its answers about photographs mean nothing. "
-        "For answers that do: hilsplat models get, then run again"
+        f"{name} was trained only on the synthetic world: its answers about photographs are meaningless. "
+        "To use a pretrained model, run `hilsplat models get` and rerun."
     )

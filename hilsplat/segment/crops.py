@@ -6,8 +6,7 @@ from jaxtyping import Bool, UInt8
 from hilsplat.base.errors import EmptyMaskError
 
 BACKGROUNDS = ("black", "keep", "dim")
-DIM = 0.35
-"""Brightness factor of pixels outside the mask for the background `dim`."""
+DIM = 0.35  # brightness factor of pixels outside the mask for the background `dim`
 
 
 def square_crop(
@@ -19,13 +18,8 @@ def square_crop(
 ) -> UInt8[np.ndarray, "size size 3"]:
     """Crop a mask's box with a margin, and make it square (`crop_to_square`).
 
-    Args:
-        background, size: see `crop_to_square`.
-        context: margin on each side of the box, as a share of the box's longer side, clipped at the
-            border of the image.
-
-    Raises:
-        EmptyMaskError: if the mask has no pixel.
+    `context` is the margin on each side as a share of the box's longer side, clipped at the image's border.
+    A mask without a pixel raises an EmptyMaskError.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
@@ -48,8 +42,7 @@ def crop_to_square(
     The side of the square is the longer side of the box. Shrinking averages areas; enlarging is bilinear.
 
     Args:
-        box: image crop at the mask's box.
-        inside: mask in the crop.
+        box, inside: image and mask in the mask's box.
         background: pixels outside the mask: `black`, `keep` (unchanged), or `dim` (0.35 of their brightness).
         size: side of the result, px.
         as_langsplat: follow LangSplat's preprocessing: omit the last row and column of the box (but keep at

@@ -76,10 +76,6 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.head)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return all fields as plain arrays."""
-        return dict(vars(self))
-
     @staticmethod
     def concatenate(parts: "list[Candidates]") -> "Candidates":
         """Concatenate the rows of all parts (at least one)."""

@@ -1,8 +1,8 @@
 """Masks without a model: OpenCV's graph segmentation, merged into three nested scales.
 
 It is for photographs without SAM weights and has no notion of objects: its levels are coarse, middle and
-fine regions of even colour, nested by construction, and its scores measure how clearly a region stands
-out. A region that is the same at two scales appears at both levels.
+fine regions of even colour, and its scores measure the contrast to the surroundings. A region that is the
+same at two scales appears at both levels.
 """
 
 import heapq
@@ -43,15 +43,13 @@ def segment_graph(
     stay separate even if they differ less. A level of least size s (a share of the image side) is the state
     in which every remaining merge costs at least `CONTRAST * s * sqrt(image area)`.
 
+    The result has a mask for each region (of at least `min_area_px`) and level. `predicted_iou` is the mean
+    colour difference along the region's border over `CLEAR_EDGE`, clipped to 1. `stability` is the share of
+    scales over which the region persists unchanged, on a logarithmic axis from the level's own scale to the
+    one where all regions are merged.
+
     Args:
         scales: least size at whole, part, subpart; none exceeds the one before.
-        min_area_px: smaller regions are omitted.
-
-    Returns:
-        one mask per region and level. `predicted_iou` is the mean colour difference along the region's
-        border over `CLEAR_EDGE`, clipped to 1. `stability` is the share of scales over which the region
-        persists unchanged, on a logarithmic axis from the level's own scale to the one where all regions
-        are merged.
     """
     height, width = image.shape[:2]
     small = resize_to_fit(image, WORK_SIDE_PX)
@@ -68,15 +66,10 @@ def segment_graph(
         full = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
         counts = np.bincount(full.reshape(-1), minlength=len(border))
         large = np.flatnonzero(counts >= min_area_px)
-        parts.append(
-            HierarchicalMasks.from_runs(
-                *runs_of_labels(full, large),
-                level,
-                np.clip(border[large] / CLEAR_EDGE, 0, 1).astype(np.float32),
-                life[large].astype(np.float32),
-                (height, width),
-            )
-        )
+        clear = np.clip(border[large] / CLEAR_EDGE, 0, 1).astype(np.float32)
+        scores = clear, life[large].astype(np.float32)
+        runs = runs_of_labels(full, large)
+        parts.append(HierarchicalMasks.from_runs(*runs, level, *scores, (height, width)))
     masks = HierarchicalMasks.concatenate(parts, (height, width))
     return masks.take(masks.content_order())
 
@@ -87,10 +80,7 @@ region, numbered after the base regions in the order of merges."""
 
 
 def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Smooth an image slightly, against texture of a pixel or two, and convert it to CIELAB.
-
-    Lightness is scaled by `LIGHTNESS`.
-    """
+    """Smooth texture of a pixel or two, and convert to CIELAB with lightness scaled by `LIGHTNESS`."""
     smooth = cv2.bilateralFilter(image, d=7, sigmaColor=20, sigmaSpace=3)
     lab = cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
     return lab * np.array([LIGHTNESS, 1, 1], dtype=np.float32)
@@ -104,9 +94,7 @@ def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.n
     return np.unique(labels, return_inverse=True)[1].reshape(labels.shape).astype(np.int32)
 
 
-def steps_along(
-    axis: int, labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
-) -> tuple[Int32[np.ndarray, "n m"], Int32[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+def steps_along(axis: int, labels: Int32[np.ndarray, "H W"], lab: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the labels of each pair of adjacent pixels along an axis, and the colour difference there.
 
     The difference spans one pixel more on each side: edges in photographs are wider than one pixel.
@@ -131,10 +119,8 @@ def neighbours(
     unique, place = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)
     sums = np.bincount(place.reshape(-1), weights=np.concatenate(contrasts), minlength=len(unique))
     counts = np.bincount(place.reshape(-1), minlength=len(unique))
-    return {
-        (int(a), int(b)): (float(total), int(count))
-        for (a, b), total, count in zip(unique, sums, counts, strict=True)
-    }
+    borders = zip(sums.tolist(), counts.tolist(), strict=True)
+    return dict(zip(map(tuple, unique.tolist()), borders, strict=True))
 
 
 def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, " n"]:
@@ -212,7 +198,7 @@ def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 
 def cut(
     labels: Int32[np.ndarray, "H W"], merges: list[Merge], threshold: float
 ) -> tuple[Int32[np.ndarray, "H W"], Float[np.ndarray, " n"]]:
-    """Return the regions after all merges cheaper than `threshold`: labels 0..n-1.
+    """Return the regions after all merges cheaper than `threshold`, as labels 0..n-1.
 
     The second result is the cost at which each region merges next (infinity for the last one).
     """

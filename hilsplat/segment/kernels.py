@@ -1,6 +1,5 @@
-"""Compiled loops over run lengths.
+"""Compiled loops over run lengths of masks (`masks.encode_runs`): no loop needs an image per mask.
 
-Masks are run lengths over the flattened image (`masks.encode_runs`), so no loop needs an image per mask.
 Loops are sequential, so results do not depend on the number of threads.
 """
 
@@ -41,8 +40,7 @@ def upscaled_runs(
     Args:
         logits, offsets, windows: all windows, as in `generate.Candidates`.
         rows: windows to upscale.
-        first_y, weight_y: first low-resolution row and weights of each row of the crop.
-        first_x, weight_x: the same along x.
+        first_y, weight_y: first low-resolution row and weights of each row of the crop; the same along x.
         top, left, height, width: position of the crop in the image, and the image's size.
 
     Returns:
@@ -195,8 +193,7 @@ def _region_areas(row, start, stop, value, of, parent, area):
 def cleaned_runs(runs, offsets, width, min_area):
     """Fill holes and drop islands below `min_area` (8-connected); always keep the largest island.
 
-    Returns:
-        runs and offsets of the result, and which masks changed.
+    Returns runs and offsets of the result, and which masks changed.
     """
     number = len(offsets) - 1
     out, count = np.empty(max(1024, len(runs)), np.uint32), 0

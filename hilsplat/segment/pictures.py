@@ -19,18 +19,17 @@ from hilsplat.segment.masks import HierarchicalMasks
 
 GOLDEN = 0.6180339887498949
 """Hue step between rows, the golden ratio: consecutive rows have clearly different colours."""
-UNCOVERED = 0.35
-"""Brightness of pixels without a mask."""
+UNCOVERED = 0.35  # brightness of pixels without a mask
+THUMB_PX = 56  # side of a mask's crop in the tree picture
 
 
 def row_colours(number: int) -> UInt8[np.ndarray, "n 3"]:
     """Return one colour per row, the same in every picture."""
-    colours = [
-        colorsys.hsv_to_rgb(
-            (row * GOLDEN) % 1.0, 0.55 + 0.4 * ((row // 3) % 2), 0.95 - 0.25 * ((row // 7) % 2)
-        )
+    hsv = [
+        ((row * GOLDEN) % 1.0, 0.55 + 0.4 * ((row // 3) % 2), 0.95 - 0.25 * ((row // 7) % 2))
         for row in range(number)
     ]
+    colours = [colorsys.hsv_to_rgb(*each) for each in hsv]
     return (np.array(colours).reshape(number, 3) * 255).astype(np.uint8)
 
 
@@ -65,10 +64,6 @@ def masks_picture(
         cv2.putText(header, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
         drawn.append(np.concatenate([header, large]))
     return np.concatenate(drawn, axis=1)
-
-
-THUMB_PX = 56
-"""Side of a mask's crop in the tree picture."""
 
 
 def tree_picture(

@@ -129,10 +129,8 @@ def sam_masks(
     size_hw = scene.cameras[view].size_hw
 
     def from_candidates() -> dict[str, np.ndarray]:
-        arrays = cache.get(
-            key, lambda: decode_candidates(scene.image(view), model, settings, points).arrays()
-        )
-        return masks_from_candidates(Candidates(**arrays), size_hw, model, settings).arrays()
+        decoded = cache.get(key, lambda: vars(decode_candidates(scene.image(view), model, settings, points)))
+        return masks_from_candidates(Candidates(**decoded), size_hw, model, settings).arrays()
 
     masks_key = sha256_of_json(
         {

@@ -191,7 +191,7 @@ def test_vectors_of_the_same_clip_are_taken(embedded, scene, tmp_path):
 
 @pytest.mark.parametrize(
     ("width", "words"),
-    [(100, r"a_f.npy does not belong to the CLIP in"), (None, r"are not of the CLIP in(.|\n)*laion2b")],
+    [(100, r"a_f.npy does not belong to the CLIP in"), (None, r"were not computed by the CLIP in(.|\n)*laion2b")],
 )
 def test_vectors_of_another_clip_are_refused(embedded, scene, tmp_path, width, words):
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(embedded.width, embedded.width)))

@@ -76,7 +76,7 @@ def test_masks_do_not_depend_on_the_batch(model, batch):
 
 def one_row(candidates: Candidates, row: int) -> Candidates:
     low, high = candidates.offsets[row : row + 2]
-    arrays = candidates.arrays() | {"logits": candidates.logits[low:high]}
+    arrays = vars(candidates) | {"logits": candidates.logits[low:high]}
     arrays["offsets"] = np.array([0, high - low])
     for name in ("window_xyxy", "head", "predicted_iou", "stability", "crop"):
         arrays[name] = arrays[name][row : row + 1]

@@ -1,6 +1,7 @@
 """Pictures are drawn for scenes with and without annotations, and show what they claim."""
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
@@ -59,8 +61,7 @@ def test_panel_with_annotations_is_drawn(block_world, tmp_path):
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png", dpi=60)
     with Image.open(tmp_path / "panel.png") as picture:
-        assert picture.width == 780
-        assert picture.info["Software"] == "hilsplat"
+        assert (picture.width, picture.info["Software"]) == (780, "hilsplat")
 
 
 @pytest.mark.parametrize("texts", [["bear", "bear > head"], []])
@@ -73,22 +74,23 @@ def test_panel_without_annotations_shows_given_texts_below_the_overview(block_wo
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
-def test_a_panel_of_meaningless_answers_says_so(block_world):
-    drawn = (block_world.folder / "masks", [], EVALUATE)
-    sound = draw_panel(block_world.answers, *drawn)
-    doubtful = draw_panel(replace(block_world.answers, caution=meaningless("clip-tiny")), *drawn)
-    assert "\n" not in sound.get_suptitle()
-    assert "answers about photographs mean nothing" in doubtful.get_suptitle().replace("\n", " ")
-
-
-def test_panel_without_queries_shows_the_overview(block_world, tmp_path):
-    figure = draw_panel(block_world.answers, block_world.folder / "masks", [], EVALUATE)
-    save_figure(figure, tmp_path / "panel.png", dpi=60)
+def test_a_panel_of_meaningless_answers_or_true_masks_is_marked(block_world, tmp_path):
+    answers, masks = block_world.answers, block_world.folder / "masks"
+    title = draw_panel(answers, masks, [], EVALUATE).get_suptitle()
+    assert "\n" not in title and "true" not in title
+    doubtful = draw_panel(replace(answers, caution=meaningless("clip-tiny")), masks, [], EVALUATE)
+    assert "answers about photographs are meaningless" in doubtful.get_suptitle().replace("\n", " ")
+    shutil.copytree(masks, tmp_path / "masks")
+    label = "truth-perturbed (merge 0.2)"
+    write_index(tmp_path / "masks", {"000.png": {}}, segmenter="truth-perturbed", model=None, label=label)
+    figure = draw_panel(answers, tmp_path / "masks", [], EVALUATE)
+    assert "masks made from the true labels" in figure.get_suptitle()
+    assert f"masks: {label}" in [axes.get_ylabel() for axes in figure.axes]
 
 
 def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     answers, text = block_world.answers, "bear > head"
-    found = answers.find(text)
+    found = answers.select(text)
     assert views_of(answers, answers.hits_of(found, 10), 2) == ["000.png", "001.png"]
     lines = report(answers, text, found).splitlines()
     assert lines[0] == "1 answer to 'bear > head' in synthetic/blocks; lengths in metres"
@@ -98,26 +100,24 @@ def test_a_query_is_reported_and_drawn(block_world, tmp_path):
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
-def test_reports_say_what_was_not_found(block_world):
+def test_reports_state_what_was_not_found(block_world):
     answers = block_world.answers
-    empty = replace(answers.find("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
-    nothing = report(answers, "unicorn", empty)
-    assert nothing.startswith(
-        "nothing in synthetic/blocks answers to 'unicorn' at level whole; try --level part"
-    )
-    nothing = report(answers, "unicorn", empty, "000.png")
-    assert nothing.startswith("nothing in what 000.png shows of synthetic/blocks answers to 'unicorn'")
-    found = answers.find("bear > head")
+    empty = replace(answers.select("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
+    expected = "nothing in synthetic/blocks answers to 'unicorn' at level whole; try --level part"
+    assert report(answers, "unicorn", empty).startswith(expected)
+    expected = "nothing in what 000.png shows of synthetic/blocks answers to 'unicorn'"
+    assert report(answers, "unicorn", empty, "000.png").startswith(expected)
+    found = answers.select("bear > head")
     assert "the whole scene was searched" not in report(answers, "bear > head", found)
     outside = report(answers, "bear > head", replace(found, route="fallback"))
     assert "no answer is part of anything that answers to 'bear'" in outside
-    found = answers.find("unicorn > head")
+    found = answers.select("unicorn > head")
     assert found.route == "child"
     last = report(answers, "unicorn > head", found).splitlines()[-1]
     assert last.startswith("doubtful: nothing here answers to 'unicorn' better than to a generic word")
 
 
-def test_file_names_hold_no_separators():
+def test_file_names_have_no_separators():
     assert re.fullmatch("plush-doll-bonnet-[0-9a-f]{8}", file_name("plush doll > ../bonnet"))
     assert re.fullmatch("query-[0-9a-f]{8}", file_name(" > "))
 
@@ -144,7 +144,7 @@ def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
     assert parts.semantic_tree == folder / "default" / "semantic_tree"
 
 
-def test_what_is_missing_of_a_scene_is_named(tmp_path):
+def test_missing_parts_of_a_scene_are_named(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .*photos/desk is missing"):
         FinishedScene.locate(tmp_path / "photos/desk")
     folder = finished_scene(tmp_path)
