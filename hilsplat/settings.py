@@ -60,16 +60,14 @@ class WorldSettings(Section):
     arc_deg: float = knob(360.0, "azimuth covered by the cameras; a ring is 360", unit="degree", gt=0, le=360)
     objects: int = knob(6, "objects to place; the log says how many fitted", unit="objects", ge=1, le=30)
     samples: int = knob(3, "samples per pixel along each side", ge=1, le=8)
-    min_area_px: int = knob(
-        60, "wholes and parts with a smaller visible region are not scored", unit="px", ge=1
-    )
+    min_area_px: int = knob(60, "wholes and parts with less visible area are not scored", unit="px", ge=1)
 
 
 class PosesSettings(Section):
     """Camera poses, from structure from motion or imported."""
 
     max_side_px: int = knob(
-        1600, "larger images are shrunk to this longer side", unit="px", ge=64, origin="3DGS: 1600"
+        1600, "longest side after shrinking images", unit="px", ge=64, origin="3DGS: 1600"
     )
     camera_model: Literal["auto", "simple_pinhole", "simple_radial", "opencv"] = knob(
         "auto", "lens model; auto: simple_radial, for renders simple_pinhole"
@@ -90,9 +88,7 @@ class PosesSettings(Section):
     several_models: Literal["largest", "stop"] = knob(
         "largest", "if the photographs form several models: use the largest, or stop"
     )
-    test_every: int = knob(
-        8, "every n-th view is held out for testing; 0: none", unit="views", ge=0, origin="3DGS"
-    )
+    test_every: int = knob(8, "every n-th view is a test view; 0: none", unit="views", ge=0, origin="3DGS")
 
 
 class GaussiansSettings(Section):
@@ -101,15 +97,9 @@ class GaussiansSettings(Section):
     iterations: int = knob(3000, "most optimisation steps, each on one view", ge=1, origin="3DGS: 30000")
     steps_per_view: int = knob(60, "steps per training view, if that is fewer than `iterations`", ge=1)
     max_gaussians: int = knob(50_000, "largest number of Gaussians at any step", ge=100)
-    image_scale: float = knob(
-        1.0, "scale of the images that the fit sees; 0.5 halves their sides", gt=0, le=1
-    )
-    quarter_until: float = knob(
-        0.15, "share of the iterations on images of a quarter of the size", ge=0, le=1, origin="3DGS: 0"
-    )
-    half_until: float = knob(
-        0.75, "share of the iterations after which images have their full size", ge=0, le=1, origin="3DGS: 0"
-    )
+    image_scale: float = knob(1.0, "scale of the fit's images; 0.5 halves their sides", gt=0, le=1)
+    quarter_until: float = knob(0.15, "share of the iterations at quarter size", ge=0, le=1, origin="3DGS: 0")
+    half_until: float = knob(0.75, "share of the iterations before full size", ge=0, le=1, origin="3DGS: 0")
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: float = knob(0.2, "weight of D-SSIM in the loss; L1 has the rest", ge=0, le=1, origin="3DGS")
     # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
@@ -123,13 +113,13 @@ class GaussiansSettings(Section):
     scales_rate: float = knob(0.01, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
     quats_rate: float = knob(0.004, "step size of the quaternions", gt=0, origin="3DGS: 1e-3")
     sh_rate: float = knob(
-        4e-3, "step size of the constant harmonics; the others have a twentieth", gt=0, origin="3DGS: 2.5e-3"
+        4e-3, "step size of constant harmonics; others: a twentieth", gt=0, origin="3DGS: 2.5e-3"
     )
     densify_from: float = knob(
-        0.06, "share of the iterations before densification", ge=0, le=1, origin="3DGS: 500 / 30000"
+        0.06, "densification: its start, share of iterations", ge=0, le=1, origin="3DGS: 500 / 30000"
     )
     densify_until: float = knob(
-        0.6, "share of the iterations after which densification ends", ge=0, le=1, origin="3DGS: 0.5"
+        0.6, "densification: its end, share of iterations", ge=0, le=1, origin="3DGS: 0.5"
     )
     densify_every: int = knob(100, "steps between densifications", ge=1, origin="3DGS")
     densify_gradient: float = knob(
@@ -137,15 +127,11 @@ class GaussiansSettings(Section):
     )
     opacity_reset_every: int = knob(3000, "steps between opacity resets", ge=1, origin="3DGS")
     min_opacity: float = knob(0.005, "Gaussians with a lower opacity are pruned", gt=0, lt=1, origin="3DGS")
-    background: Literal["black", "white", "random"] = knob(
-        "black", "colour behind the Gaussians", origin="3DGS"
-    )
+    background: Literal["black", "white", "random"] = knob("black", "background colour", origin="3DGS")
     strategy: Literal["default", "mcmc"] = knob(
         "default", "default: clone, split and prune (3DGS); mcmc: relocate, and add noise", origin="3DGS"
     )
-    mcmc_growth: float = knob(
-        0.05, "mcmc: growth per densification, up to max_gaussians", unit="share", ge=0, le=1, origin="MCMC"
-    )
+    mcmc_growth: float = knob(0.05, "mcmc: growth per densification", unit="share", ge=0, le=1, origin="MCMC")
     mcmc_noise: float = knob(5e5, "mcmc: weight of the noise on the means", ge=0, origin="MCMC")
     mcmc_opacity_weight: float = knob(0.01, "mcmc: weight of the mean opacity", ge=0, origin="MCMC")
     mcmc_scale_weight: float = knob(
@@ -200,18 +186,14 @@ class MasksSettings(Section):
         "theta",
         origin="paper: three levels by theta; LangSplat: head",
     )
-    theta: float | None = knob(
-        None, "with levels: tree, threshold of that tree; empty: coverage_tree.theta", gt=0.5, lt=1
-    )
+    theta: float | None = knob(None, "threshold for levels: tree; empty: coverage_tree.theta", gt=0.5, lt=1)
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
         "prompts per decoder call; auto: the model folder's number, else 8 (full-size SAM: 60 MB each)",
         origin="LangSplat: 64",
     )
-    crop_layers: int = knob(
-        0, "layers of overlapping crops segmented besides the image", ge=0, le=2, origin="LangSplat: 1"
-    )
+    crop_layers: int = knob(0, "layers of crops segmented too", ge=0, le=2, origin="LangSplat: 1")
     predicted_iou_min: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
         "masks need a higher predicted IoU, which may exceed 1; 0: all; auto: the model folder's number, "
@@ -241,20 +223,14 @@ class MasksSettings(Section):
         le=1,
         origin="SAM",
     )
-    min_area_px: int = knob(
-        16, "smaller masks, islands and holes are removed", unit="px", ge=1, origin="LangSplat: 100"
-    )
-    nms_iou: float = knob(
-        0.8, "mask IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat"
-    )
+    min_area_px: int = knob(16, "smallest mask, island, hole", unit="px", ge=1, origin="LangSplat: 100")
+    nms_iou: float = knob(0.8, "mask IoU above which the worse is dropped", gt=0, le=1, origin="LangSplat")
     nms_score: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
         "masks need a higher predicted IoU x stability; 0: all; auto: the model folder's number, else 0.7",
         origin="LangSplat: 0.7",
     )
-    nms_inner: float = knob(
-        0.5, "threshold of the suppression of inner masks", ge=0, le=1, origin="LangSplat"
-    )
+    nms_inner: float = knob(0.5, "threshold for suppressing inner masks", ge=0, le=1, origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
         (0.12, 0.04, 0.015), "graph: smallest segment at whole, part, subpart, as a share of the image side"
     )
@@ -270,14 +246,10 @@ class PerturbSettings(Section):
 
     seed: int = knob(0, "seed of the faults; independent of the run's seed", ge=0)
     background: bool = knob(True, "also mask the surroundings (table, floor, walls), as SAM does")
-    boundary_px: float = knob(
-        0.6, "standard deviation of the boundary's displacement along its normal", unit="px", ge=0, le=64
-    )
-    boundary_smooth_px: float = knob(
-        6.0, "length along the boundary over which the displacement changes", unit="px", ge=1, le=256
-    )
+    boundary_px: float = knob(0.6, "std of the boundary's normal displacement", unit="px", ge=0, le=64)
+    boundary_smooth_px: float = knob(6.0, "boundary length per displacement", unit="px", ge=1, le=256)
     merge: float = knob(
-        0.02, "probability per node and view of being merged with a touching sibling", ge=0, le=1
+        0.02, "probability per node and view of merging with a sibling in contact", ge=0, le=1
     )
     split: float = knob(0.02, "probability per mask of being cut in two", ge=0, le=1)
     missing: tuple[Probability, Probability, Probability] = knob(
@@ -295,9 +267,7 @@ class PerturbSettings(Section):
         0.02, "probability per node, drawn once per scene, of having no mask in most views", ge=0, le=1
     )
     systematic_share: float = knob(0.9, "probability that a systematic fault occurs in a view", ge=0, le=1)
-    score_noise: float = knob(
-        0.05, "standard deviation of predicted IoU and stability about their true values", ge=0, le=1
-    )
+    score_noise: float = knob(0.05, "standard deviation of predicted IoU and stability", ge=0, le=1)
 
 
 class CoverageTreeSettings(Section):
@@ -371,9 +341,7 @@ class SemanticTreeSettings(Section):
         origin="paper: features",
     )
     feature_size: int = knob(6, "features: numbers of a feature", ge=2, le=64, origin="OpenGaussian: 6")
-    link_threshold: float = knob(
-        0.3, "clusters of masks are joined while their pooled IoU is at least this", gt=0, lt=1
-    )
+    link_threshold: float = knob(0.3, "least pooled IoU to join clusters of masks", gt=0, lt=1)
     min_views: int = knob(3, "nodes with masks in fewer views are dropped", ge=1)
     parent_coverage: float = knob(
         0.5, "a node becomes the child of a coarser one that holds more than this share of it", gt=0, lt=1
@@ -404,10 +372,10 @@ class AutoencoderSettings(Section):
     min_steps: int = knob(2000, "network: least number of steps, however few the vectors", ge=1)
     batch: int = knob(64, "network: vectors per step", ge=2, origin="LangSplat: 64")
     learning_rate: float = knob(
-        2e-3, "network: initial Adam step size, decayed along a cosine", gt=0, origin="LangSplat: 7e-4"
+        2e-3, "network: initial Adam step, cosine decay", gt=0, origin="LangSplat: 7e-4"
     )
     cosine_weight: float = knob(
-        1e-3, "network: weight of 1 - cosine, added to the squared error", ge=0, origin="LangSplat: 1e-3"
+        1e-3, "network: weight of 1 - cosine in the loss", ge=0, origin="LangSplat: 1e-3"
     )
 
     @property
@@ -419,9 +387,7 @@ class AutoencoderSettings(Section):
 class FieldSettings(Section):
     """Language field: one latent per Gaussian and level."""
 
-    weight_language: float = knob(
-        1.0, "weight of the regression to the latents", ge=0, origin="paper: not stated"
-    )
+    weight_language: float = knob(1.0, "weight of the latent regression", ge=0, origin="paper: not stated")
     weight_clustering: float = knob(0.0, "weight of L_h (Eq. 2)", ge=0, origin="paper: 1")
     weight_instance: float = knob(0.0, "weight of L_ins (Eq. 3), lambda_1", ge=0, origin="paper: e-6")
     weight_part: float = knob(0.01, "weight of L_part (Eq. 5), lambda_2", ge=0, origin="paper: e-5")
@@ -435,9 +401,7 @@ class FieldSettings(Section):
         "literal: Eq. 5 as printed; disentangle: as its prose says, parts repel",
         origin="paper: literal",
     )
-    omega: float = knob(
-        10.0, "similarity degree Omega: base of the distances that L_ins aims at", gt=1, origin="paper: 10"
-    )
+    omega: float = knob(10.0, "similarity degree Omega: base of L_ins's distances", gt=1, origin="paper: 10")
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
     start: Literal["average", "median", "random", "langsplat"] = knob(
         "average",
@@ -506,9 +470,7 @@ class MethodSettings(Section):
         origin="LangSplat, LangSplatV2: 30000",
     )
     rate: float = knob(0.0025, "trained methods: Adam step size", gt=0, origin="LangSplat")
-    pixel_step: int = knob(
-        2, "trained methods: every n-th pixel of every n-th row is used", ge=1, origin="LangSplat: 1"
-    )
+    pixel_step: int = knob(2, "trained methods: pixel stride in x and y", ge=1, origin="LangSplat: 1")
     codebook: tuple[Size, Size] = knob(
         (64, 10),
         "opengaussian: groups by feature and position, and groups by feature within each",
@@ -547,17 +509,13 @@ class EvaluateSettings(Section):
         origin="LangSplat: 30, paper: 20",
     )
     mix: bool = knob(True, "average the filtered relevancy with the unfiltered one", origin="LangSplat")
-    relevancy_threshold: float = knob(
-        0.4, "pixels of a map above this form its mask", ge=0, lt=1, origin="LangSplat, paper"
-    )
+    relevancy_threshold: float = knob(0.4, "map threshold of its mask", ge=0, lt=1, origin="LangSplat, paper")
     threshold_on: Literal["normalised_pm1", "raw"] = knob(
         "normalised_pm1",
         "scale of the threshold; normalised_pm1: maps stretched to [-1, 1], so 0.4 is 70 % of the range",
         origin="LangSplat's code",
     )
-    majority: bool = knob(
-        True, "smooth the mask of a map by the majority in 7 x 7 px", origin="LangSplat's code"
-    )
+    majority: bool = knob(True, "smooth a map's mask by 7 x 7 px majority", origin="LangSplat's code")
     level_rule: Literal["max", "mean_in_mask"] = knob(
         "max",
         "level if none is given: that of the highest value, or of the highest mean in its mask",
@@ -571,15 +529,13 @@ class EvaluateSettings(Section):
         le=1,
     )
     ancestors: float = knob(
-        0.2, "share of the mean margin of a node's ancestors added to its own to rank nodes", ge=0
+        0.2, "share of the ancestors' mean margin added to a node's own, to rank nodes", ge=0
     )
     min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "what answers the queries; each has its rows in the tables"
     )
-    view_consistency: bool = knob(
-        True, "score whether answers agree on surfaces in neighbouring views (synthetic scenes)"
-    )
+    view_consistency: bool = knob(True, "score agreement in neighbouring views (synthetic scenes)")
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
         "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within 10 "
