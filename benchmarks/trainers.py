@@ -20,8 +20,8 @@ import yaml
 from benchmarks.rehearsal import PROJECT
 from hilsplat.base.artifacts import read_json
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
-from hilsplat.evaluate.protocols.totals import level_values, mean_over_levels
 from hilsplat.evaluate.scores import read_scores
+from hilsplat.evaluate.tables.measured import level_values, mean_over_levels
 from hilsplat.settings import FieldSettings
 
 PAPER = {

@@ -26,10 +26,7 @@ STAND_INS: Mapping[str, tuple[str, ...]] = {
 class Asked:
     """Protocols beyond those that score every labelled image (`protocols.views`).
 
-    Attributes:
-        flat: protocols for texts without levels.
-        points: protocols for labelled points.
-        level: level whose texts the flat protocols query; None if the labels have no levels.
+    `level` is the level whose texts the flat protocols query; None if the labels have no levels.
     """
 
     flat: tuple[ProtocolCard, ...] = ()
@@ -38,11 +35,7 @@ class Asked:
 
     @staticmethod
     def of_world(kind: str) -> "Asked":
-        """Return the protocols of a synthetic scene; none for kind "".
-
-        Raises:
-            SceneError: the kind is unknown.
-        """
+        """Return the protocols of a synthetic scene; none for kind "", a SceneError for an unknown kind."""
         if kind and kind not in STAND_INS:
             raise SceneError(
                 f"unknown kind of synthetic scene: {kind!r}",
@@ -52,17 +45,7 @@ class Asked:
         return Asked.of(STAND_INS.get(kind, ()), Level.WHOLE)
 
     @staticmethod
-    def of_dataset(name: str) -> "Asked":
-        """Return the protocols listed in the data set's registry entry.
-
-        Raises:
-            SceneError: the data set is unknown.
-            ArtifactError: the entry lists an unknown protocol.
-        """
-        return Asked.of(dataset_of(name).protocols, None)
-
-    @staticmethod
-    def of(names: tuple[str, ...], level: Level | None) -> "Asked":
+    def of(names: tuple[str, ...], level: Level | None = None) -> "Asked":
         """Sort named protocols into those for images and those for points."""
         cards = [card_named(name) for name in names]
         points = tuple(card for card in cards if card.classes)
@@ -70,10 +53,6 @@ class Asked:
 
     @staticmethod
     def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Asked]":
-        """Return data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines".
-
-        Raises:
-            SceneError: the data set or scene is unknown or cannot be read.
-        """
+        """Return data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines"."""
         dataset = name.partition("/")[0]
-        return dataset, open_labels(name, data_root), Asked.of_dataset(dataset)
+        return dataset, open_labels(name, data_root), Asked.of(dataset_of(dataset).protocols)

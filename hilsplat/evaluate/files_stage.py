@@ -8,17 +8,19 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64, Int64
 
+from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
-from hilsplat.base.levels import Level
+from hilsplat.base.images import open_image
+from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log
-from hilsplat.datasets.labelled import LabelledScene, image_size_hw
+from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.asked import Asked
 from hilsplat.evaluate.metrics.instances import InstanceMatches
-from hilsplat.evaluate.prediction_files import read_point_classes, read_point_instances, read_view_masks
+from hilsplat.evaluate.protocols.answers import mask_rows
 from hilsplat.evaluate.protocols.cards import (
     INSTANCES,
     LERF_LANGSPLAT,
@@ -29,10 +31,8 @@ from hilsplat.evaluate.protocols.cards import (
     OVS_NODES,
     ProtocolCard,
 )
-from hilsplat.evaluate.protocols.flat_views import eighth_truth
-from hilsplat.evaluate.protocols.points import measure_points
-from hilsplat.evaluate.protocols.rows import class_map_rows, mask_rows
-from hilsplat.evaluate.protocols.scene_points import class_set, instance_scan
+from hilsplat.evaluate.protocols.flat_views import argmax_rows
+from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_points
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, annotated_truths
 from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
@@ -49,6 +49,9 @@ WORDS = "masks of files"
 
 MASK_METRICS = (*MASK, "acc_25", "acc_50")
 """Metrics of masks; those of maps cannot be computed."""
+
+FOREGROUND = 128
+"""Grey values above this are foreground, as in Gaussian Grouping's script."""
 
 Masks = Mapping[tuple[str, str], Bool[np.ndarray, "h w"]]
 
@@ -67,21 +70,18 @@ def run_evaluate_files(
     name: str = "",
     min_region_px: int | None = None,
 ) -> None:
-    """Score masks or point labels written by any program (see `prediction_files` for the format).
+    """Score masks or point labels written by any program (see `read_view_masks` for the format).
 
     Masks without a level are scored under the text protocols, masks with levels under
     `hierarchy/level-given`, point labels under the point protocols for which there is a file. A text without
     a mask counts as 0, except under the protocol that omits it.
 
     Args:
-        out: `scores.csv`; `instances.npz` is written beside it if there are instances.
+        out: `scores.csv`; `instances.npz` is written beside it.
         method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
-        data_root: folder of the data sets' folders.
-        truth: alternatively, the truth folder of a synthetic scene.
-        scene: posed scene of the truth, which defines the test views.
-        kind: kind of synthetic scene, as in `run_evaluate`.
-        dataset: data set in a synthetic scene's rows, as is the scene's `name`.
+        truth: alternatively, the truth folder of a synthetic scene, with its posed `scene` (which defines the
+            test views), `kind` as in `run_evaluate`, and data set and name for the rows.
         min_region_px: smaller true regions of a synthetic scene are not scored; None for the default setting.
 
     Raises:
@@ -91,11 +91,11 @@ def run_evaluate_files(
     """
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
         raise SettingsError(
-            "it is not clear what to score against",
+            "it is unclear what to score against",
             expected="--labels of a data set, or --truth and --scene of a synthetic scene",
         )
     with stage_log("evaluate-files", str(predictions)) as counts:
-        views: Mapping[str, Callable[[], ViewTruth]] = {}
+        views: dict[str, Callable[[], ViewTruth]] = {}
         points: Mapping[str, LabelledPoints] = {}
         if truth is not None and scene is not None:
             asked = Asked.of_world(kind)
@@ -110,16 +110,18 @@ def run_evaluate_files(
             if isinstance(known, PointScene):
                 points = known.truth
             else:
-                views = _label_truths(known)
+                for view, regions in known.views.items():
+                    if regions:
+                        image_hw = image_size_hw(known.images[view]) if view in known.images else None
+                        views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
         scores: list[Score] = []
         matches: dict[tuple[str, ...], InstanceMatches] = {}
 
         def keep(view: str, measured: Measured) -> None:
             scores.append(Score(dataset, name, method, "-", view=view, **vars(measured)))
 
-        if views:
-            for view, row in _mask_rows(predictions, views, asked):
-                keep(view, row)
+        for view, row in _mask_rows(predictions, views, asked) if views else ():
+            keep(view, row)
         for each in _point_rows(predictions, points, asked) if points else ():
             if isinstance(each, Measured):
                 keep("", each)
@@ -128,19 +130,6 @@ def run_evaluate_files(
         counts["views"], counts["rows"] = len(views), len(scores)
         write_instances(out, matches)
         write_scores(out, scores)
-
-
-def _label_truths(known: LabelledScene) -> dict[str, Callable[[], ViewTruth]]:
-    return {
-        view: partial(
-            ViewTruth.of_regions,
-            regions,
-            regions[0].size_hw,
-            image_size_hw(known.images[view]) if view in known.images else None,
-        )
-        for view, regions in known.views.items()
-        if regions
-    }
 
 
 def _mask_rows(
@@ -203,7 +192,7 @@ def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measure
         if card is OVS_NODES:  # masks from files are not nodes of a tree
             continue
         if card is OVS_ARGMAX:
-            yield from _argmax_rows(flat, masks, words, labelled=asked.level is not None)
+            yield from argmax_rows(METHOD, flat, partial(_cosine, masks), words, asked.level is not None)
             continue
         for query in flat:
             yield from _text_rows(card, replace(query, level=None), masks.get(("", query.text)), words)
@@ -221,23 +210,13 @@ def _text_rows(
     yield from mask_rows(METHOD, replace(query, truth=region), protocol, answer, metrics=metrics)
 
 
-def _argmax_rows(
-    queries: Sequence[Query], masks: Masks, words: list[str], labelled: bool
-) -> Iterator[Measured]:
-    """Yield rows of 3D-OVS by argmax: in overlaps the first text wins, a pixel in no mask is a miss."""
-    if not queries:
-        return
-    ordered = sorted(queries, key=lambda query: query.text)
-    rows, columns, truth = eighth_truth(ordered)
-    nothing = np.zeros(ordered[0].truth.shape, bool)
-    given = [masks.get(("", query.text), nothing)[np.ix_(rows, columns)] for query in ordered]
-    similarity = np.where(np.stack(given), 1.0, -np.inf)
-    asked = truth.any(axis=0) if labelled else np.full(truth.shape[1:], True)
-    words = [*(["labelled pixels"] if labelled else []), *words]
-    texts = [query.text for query in ordered]
-    if asked.any():
-        protocol = OVS_ARGMAX.labelled(words)
-        yield from class_map_rows(METHOD, protocol, similarity[:, None, asked], truth[:, None, asked], texts)
+def _cosine(
+    masks: Masks, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]
+) -> Float64[np.ndarray, "K 1 P"]:
+    """Return 1 in the mask of a text and -inf elsewhere, so that a pixel in no mask is a miss."""
+    nothing = np.zeros(len(pixels), dtype=bool)
+    given = [masks["", text].reshape(-1)[pixels] if ("", text) in masks else nothing for text in texts]
+    return np.where(np.stack(given), 1.0, -np.inf)[:, None]
 
 
 def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
@@ -258,8 +237,7 @@ def _files_of(cards: tuple[ProtocolCard, ...]) -> list[str]:
     """Return the names, without suffix, of the files read under point protocols."""
     names = ["instances"] if INSTANCES in cards else []
     for card in cards:
-        if card is not INSTANCES:
-            names += [card.classes, class_set(card.classes)[0]]
+        names += [card.classes, class_set(card.classes)[0]] if card is not INSTANCES else []
     return list(dict.fromkeys(names))
 
 
@@ -282,14 +260,146 @@ def _point_rows(
         own, shared = (predictions / f"{each}.txt" for each in (card.classes, labelling))
         path = own if own.is_file() else shared
         if not path.is_file():
-            logger.info("%s: not scored, neither %s nor %s is there", card.name, own.name, shared.name)
+            logger.info("%s: not scored, neither %s nor %s exists", card.name, own.name, shared.name)
             continue
         predicted = classes.labels(read_point_classes(path, len(points)))
         yield from measure_points(card, METHOD, points.labels(classes), predicted, classes, "files")
         scored.append(card.name)
     if not scored:
         raise ArtifactError(
-            f"{predictions} holds no labels of points",
+            f"{predictions} has no point labels",
             expected=" or ".join(f"{each}.txt" for each in _files_of(asked.points)),
             fix="write one class id per point and line",
         )
+
+
+def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.ndarray, "h w"]]:
+    """Return the masks of one view by (level, text); the level is "" for masks without one.
+
+    Files are `<view>/<text>.png`, `<view>/<level>/<text>.png` (level whole, part or subpart), or `<view>.npz`
+    with an array per text, "<text>" or "<level>/<text>". The view is named without its suffix. A view without
+    predictions has an empty folder.
+
+    Raises:
+        ArtifactError: the view has neither folder nor file, or both, or one of them cannot be used.
+    """
+    stem = Path(view).stem
+    place, packed = Path(folder) / stem, Path(folder) / f"{stem}.npz"
+    if packed.is_file() and place.is_dir():
+        raise ArtifactError(
+            f"view {stem} has predictions twice",
+            expected=f"{packed.name} or {place.name}/",
+            found="both",
+            fix="remove one of them",
+        )
+    if packed.is_file():
+        return {_key(name): _as_mask(array, f"{packed}: {name}") for name, array in read_npz(packed).items()}
+    if not place.is_dir():
+        raise ArtifactError(
+            f"view {stem} has no predictions",
+            expected=f"{place}/<text>.png, or {packed.name}",
+            fix="write them, or an empty folder if nothing was found",
+        )
+    masks = {}
+    for path in sorted(place.rglob("*.png")):
+        masks[_key(path.relative_to(place).with_suffix("").as_posix())] = _read_png(path)
+    return masks
+
+
+def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
+    """Read class ids of points from ScanNet's text format, one integer per line; 0 means none.
+
+    Raises:
+        ArtifactError: the file is missing or malformed.
+        MisalignedArtifactError: the number of points differs.
+    """
+    words = _text(path).split()
+    try:
+        values = np.array(words, dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise ArtifactError(
+            f"{path} does not have one whole number per line",
+            found=str(error),
+            fix="write class ids, 0 for none",
+        ) from error
+    if len(values) != num_points:
+        raise MisalignedArtifactError(
+            f"{path} does not fit the labelled points",
+            expected=f"{num_points} lines, one per point in the order of the labels",
+            found=len(values),
+            fix="predict on the points of the ground truth",
+        )
+    return values
+
+
+def read_point_instances(
+    path: Path, num_points: int
+) -> tuple[Bool[np.ndarray, "M P"], Int64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
+    """Read masks, class ids and confidences in ScanNet's format: lines of mask file, class id and confidence.
+
+    A mask file, relative to the folder of `path`, has one integer per point, not 0 in the instance.
+
+    Raises:
+        ArtifactError: a file is missing or malformed.
+        MisalignedArtifactError: the number of points in a mask differs.
+    """
+    path = Path(path)
+    masks, classes, confidences = [], [], []
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            name, class_id, confidence = line.rsplit(maxsplit=2)
+            classes.append(int(class_id))
+            confidences.append(float(confidence))
+        except ValueError as error:
+            raise ArtifactError(
+                f"line {number} of {path} is not an instance",
+                expected="<mask file> <class id> <confidence>",
+                found=line,
+                fix="write one line per predicted instance, in ScanNet's format",
+            ) from error
+        masks.append(read_point_classes(path.parent / name, num_points) != 0)
+    stacked = np.array(masks, dtype=bool).reshape(len(masks), num_points)
+    return stacked, np.array(classes, dtype=np.int64), np.array(confidences, dtype=np.float64)
+
+
+def _key(name: str) -> tuple[str, str]:
+    first, _, rest = name.partition("/")
+    return (first, rest) if rest and first in [level.label for level in LEVELS] else ("", name)
+
+
+def _read_png(path: Path) -> Bool[np.ndarray, "h w"]:
+    try:
+        with open_image(path) as image:
+            grey = np.asarray(image.convert("L"))
+    except (OSError, SyntaxError) as error:
+        raise ArtifactError(f"mask {path} cannot be read: {error}", fix="write it again") from error
+    return _as_mask(grey, str(path))
+
+
+def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
+    if array.ndim != 2:
+        raise ArtifactError(
+            f"mask {where} is not an image",
+            expected="height x width",
+            found=" x ".join(map(str, array.shape)),
+        )
+    if array.dtype == bool:
+        return array
+    mask = array > FOREGROUND
+    if not mask.any() and array.any():
+        raise ArtifactError(
+            f"mask {where} has values, but none is foreground",
+            expected=f"0 and 255: values above {FOREGROUND} are foreground",
+            found=f"values up to {array.max()}",
+            fix="multiply the mask by 255, or store it as bool in a .npz",
+        )
+    return mask
+
+
+def _text(path: Path) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as text") from error

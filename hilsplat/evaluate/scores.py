@@ -1,7 +1,6 @@
-"""Rows of `scores.csv`, one number each, in long form; matches of predicted instances in `instances.npz`.
+"""Rows of `scores.csv`, one number each, and matches of predicted instances in `instances.npz`.
 
-The official average precision pools the matches of all scans before computing a curve; one number per scan is
-not enough.
+The official average precision pools the matches of all scans, so one number per scan is not enough.
 """
 
 from collections.abc import Iterable, Mapping
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING
 from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import write_csv
-from hilsplat.evaluate.metrics.registry import METRICS
 from hilsplat.evaluate.protocols.cards import card_of
 
 if TYPE_CHECKING:
@@ -38,30 +36,20 @@ class Measured:
 
 @dataclass(frozen=True)
 class Score:
-    """One number.
-
-    Attributes:
-        masks: origin of the masks, such as `sam-tiny`; see `made_from_truth`.
-        method: method that answered: `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC.
-        query: text; empty if the number describes a whole view.
-        level: level label of the annotation; empty if the protocol has no levels.
-        metric: a key of `METRICS`.
-        protocol: full name of the protocol, with deviating settings (`protocols.cards`).
-        n: number of items that the value averages.
-    """
+    """One number."""
 
     dataset: str
     scene: str
     variant: str
-    masks: str
-    method: str
+    masks: str  # their origin, such as `sam-tiny`; see `made_from_truth`
+    method: str  # `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC
     view: str
-    query: str
-    level: str
+    query: str  # empty if the number describes a whole view
+    level: str  # of the annotation; empty if the protocol has no levels
     metric: str
-    protocol: str
+    protocol: str  # full name, with deviating settings (`protocols.cards`)
     value: float
-    n: int
+    n: int  # number of items that the value averages
 
 
 COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
@@ -71,7 +59,6 @@ def write_scores(path: Path, scores: Iterable[Score]) -> None:
     """Write sorted rows, values with six decimals, so that equal rows give identical files."""
     rows = []
     for score in scores:
-        assert score.metric in METRICS, score.metric
         assert score.metric in card_of(score.protocol).metrics, (score.metric, score.protocol)
         row = {**vars(score), "value": f"{score.value:.6f}"}
         rows.append([str(row[name]) for name in COLUMNS])
@@ -109,11 +96,7 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
 
 
 def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
-    """Write a scene's matches, possibly none, beside its score file.
-
-    Args:
-        matches: matches by (data set, scene, variant, masks, method).
-    """
+    """Write matches by (data set, scene, variant, masks, method), possibly none, beside a score file."""
     arrays = {
         "/".join([*key, name]): array for key, found in matches.items() for name, array in vars(found).items()
     }
@@ -134,14 +117,7 @@ def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMat
 
 
 def score_summary(scene: str, files: Mapping[str, Path]) -> list[str]:
-    """Return a user-facing table of mean IoU and localization: a line per variant, method and protocol.
-
-    Args:
-        files: score files, by variant name.
-
-    Raises:
-        ArtifactError: a file cannot be read.
-    """
+    """Return a user-facing table of mean IoU and localization from the score files by variant name."""
     lines = []
     for name, path in files.items():
         scores = read_scores([path])

@@ -15,7 +15,7 @@ from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.scene_points import measure_scene_points
+from hilsplat.evaluate.protocols.points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, annotated_truths, labelled_truths
 from hilsplat.evaluate.protocols.views import measure_view, relevancy_departures, rule_of
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
@@ -57,19 +57,15 @@ def run_evaluate(
     """Score every annotated query in every annotated test view, and every labelled point (`protocols`).
 
     With the labels of a published data set, every labelled view is scored, even if it was used for training,
-    because most benchmarks train on all views. `times.csv` (seconds per query) and, for instances,
-    `instances.npz` are written beside `scores.csv`.
+    because most benchmarks train on all views. `times.csv` (seconds per query) and `instances.npz` are
+    written beside `scores.csv`, which holds only the header without truth and labels.
 
     Args:
         parts: the finished scene; its test views were held out from all earlier stages.
-        out: `scores.csv`; without truth and labels it holds only the header.
-        settings: queries and protocols.
         dataset: data set in every row, as are `scene` and `variant`.
         truth: truth folder of a synthetic scene.
         kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Asked.of_world`).
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
-        data_root: folder of the data sets' folders.
-        threads: threads for rendering.
 
     Raises:
         MisalignedArtifactError: label images and cameras differ in size.

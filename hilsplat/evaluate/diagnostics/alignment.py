@@ -40,7 +40,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
             "no similarity maps the true cameras to the scene's",
             expected="camera centres with the same arrangement",
             found="centres in one place, or mirrored",
-            fix="look at registration.png; the poses have probably failed",
+            fix="check registration.png; the poses have probably failed",
         )
     transform = np.eye(4)
     transform[:3, :3] = scale * rotation

@@ -1,8 +1,4 @@
-"""Fit of masks and nodes to annotated regions, by level and regardless of texts.
-
-The best IoU of any mask or node with a region needs no text and no CLIP: it is the upper limit for a perfect
-query.
-"""
+"""Best IoU of any mask or node with annotated regions, by level: the upper limit for a perfect query."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -35,17 +31,11 @@ COLUMNS = (
 
 @dataclass
 class Fits:
-    """Results for the regions of one level, over some views.
+    """Results for the regions of one level, over some views."""
 
-    Attributes:
-        best: per region, IoU of the best mask or node of the same level; 0 if there is none.
-        anywhere: per region, IoU of the best mask or node of any level.
-        containment: per region with an annotated parent, the share of its best mask inside the parent's best
-            mask; 0 if either has none.
-    """
-
-    best: list[float] = field(default_factory=list)
-    anywhere: list[float] = field(default_factory=list)
+    best: list[float] = field(default_factory=list)  # IoU of the best mask or node of the same level, or 0
+    anywhere: list[float] = field(default_factory=list)  # IoU of the best mask or node of any level
+    # per region with a parent: share of its best mask inside the parent's best mask; 0 if either has none
     containment: list[float] = field(default_factory=list)
 
     def row(self) -> list[str]:
@@ -91,13 +81,6 @@ def region_ious(
     return np.divide(shared, union, out=np.zeros(shared.shape), where=union > 0)
 
 
-def masks_of_view(folder: Path, view: str) -> dict[Level, np.ndarray]:
-    """Return the segmenter's masks by level."""
-    masks = HierarchicalMasks.load(folder / f"{view}.npz")
-    dense = {level: masks.dense(masks.rows_of(level)) for level in LEVELS}
-    return {level: each.reshape(len(each), -1) for level, each in dense.items()}
-
-
 def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:
     """Return, by level, the pixels in which each visible node has more than half of the weight."""
     found = {}
@@ -118,15 +101,11 @@ def run_label_fits(
 ) -> str:
     """Write and return a table: masks in views that have some, nodes in all annotated views.
 
-    Args:
-        folder: scene folder, with `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`.
-        labels: labels with levels, such as "annotated/photos/desk".
-        data_root: folder of the data sets.
-        out: output CSV.
+    The scene folder has `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`. The labels
+    have levels, such as "annotated/photos/desk".
 
     Raises:
         SceneError: the labels cannot be read, or do not fit the scene.
-        ArtifactError: a part of the scene is missing.
     """
     folder, scene = Path(folder), Scene.load(folder / "scene")
     labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
@@ -142,7 +121,10 @@ def run_label_fits(
             raw = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
             found = {"nodes": nodes_of_view(tree, normalised_weights(raw))}
             if (masks / f"{view}.npz").is_file():
-                found[f"masks, {masks_label(masks)}"] = masks_of_view(masks, view)
+                own = HierarchicalMasks.load(masks / f"{view}.npz")
+                dense = {level: own.dense(own.rows_of(level)) for level in LEVELS}
+                flat = {level: each.reshape(len(each), -1) for level, each in dense.items()}
+                found[f"masks, {masks_label(masks)}"] = flat
             for what, by_level in found.items():
                 add_view(
                     fits.setdefault((what, split), {level: Fits() for level in LEVELS}), regions, by_level

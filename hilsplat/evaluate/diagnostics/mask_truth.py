@@ -31,19 +31,12 @@ COLOURS = "RdYlGn"
 
 @dataclass(frozen=True)
 class ViewFit:
-    """Masks of one level of one view against the true regions of that level.
+    """Masks of one level of one view against the true regions of that level."""
 
-    Attributes:
-        ids: true nodes with a region of at least `LEAST_PX`.
-        best: IoU of the best mask of each, 0 if there is no mask.
-        masks: number of masks.
-        fitting: number of masks with an IoU of at least 0.5 with some region of any size.
-    """
-
-    ids: Int64[np.ndarray, " r"]
-    best: Float32[np.ndarray, " r"]
-    masks: int
-    fitting: int
+    ids: Int64[np.ndarray, " r"]  # true nodes with a region of at least `LEAST_PX`
+    best: Float32[np.ndarray, " r"]  # IoU of the best mask of each, 0 if there is no mask
+    masks: int  # number of masks
+    fitting: int  # number of masks with an IoU of at least 0.5 with some region of any size
 
 
 def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
@@ -75,10 +68,6 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
     """Write a table of all views and a picture of a median view and the worst one; return a Markdown table.
 
     The PDF and the table as CSV are written beside the PNG.
-
-    Raises:
-        ArtifactError: an artifact is missing, or the scene is not synthetic.
-        MisalignedArtifactError: masks and labels differ in size.
     """
     scene, index = Scene.load(scene_folder), read_index(masks_folder)
     truth = HierarchyAnnotations.load(truth_folder)

@@ -27,30 +27,17 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class TreeMeasure:
-    """Results for one level of a tree.
-
-    Attributes:
-        nodes: number of nodes of the tree at the level.
-        true_nodes: number of true nodes that have any Gaussian.
-        precision: share of nodes matched one to one with a true node at IoU 0.5.
-        recall: share of true nodes matched.
-        mean_iou: mean over true nodes of the matched node's IoU, 0 if unmatched.
-        purity: share of the nodes' mass that belongs to each one's main true node.
-        parent_accuracy: share of matched nodes whose parent's main true node is the true parent, among
-            those with a true parent; nan at level whole.
-        view_consistency: mean pooled IoU of the nodes' masks across views.
-        pairs: each matched node with its true node.
-    """
+    """Results for one level of a tree."""
 
     nodes: int
-    true_nodes: int
-    precision: float
-    recall: float
-    mean_iou: float
-    purity: float
-    parent_accuracy: float
-    view_consistency: float
-    pairs: tuple[tuple[int, int], ...] = ()
+    true_nodes: int  # those that have any Gaussian
+    precision: float  # share of nodes matched one to one with a true node at IoU 0.5
+    recall: float  # share of true nodes matched
+    mean_iou: float  # mean over true nodes of the matched node's IoU, 0 if unmatched
+    purity: float  # share of the nodes' mass that belongs to each one's main true node
+    parent_accuracy: float  # of matches with a true parent: share whose parent's main true node is it; or nan
+    view_consistency: float  # mean pooled IoU of the nodes' masks across views
+    pairs: tuple[tuple[int, int], ...] = ()  # each matched node with its true node
 
 
 def measure_tree(
@@ -59,12 +46,7 @@ def measure_tree(
     """Compare nodes with true nodes.
 
     At each level a Gaussian belongs to the true node with most of its visible weight, and is weighted by its
-    total weight in labelled pixels.
-
-    Args:
-        tree: the semantic tree.
-        votes: visible weight of each Gaussian in each true node, by id.
-        truth: true nodes, their levels and parents.
+    total weight in labelled pixels. `votes` is the visible weight of each Gaussian in each true node, by id.
     """
     true_level = np.array([node.level for node in truth.nodes])
     true_parent = np.array([node.parent for node in truth.nodes])

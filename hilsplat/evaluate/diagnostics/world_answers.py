@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from hilsplat.base.levels import LEVELS
-from hilsplat.evaluate.diagnostics.consistency import SharedPoints, neighbours, shared_points, thinned
+from hilsplat.evaluate.diagnostics.world_consistency import neighbours, shared_points
 from hilsplat.evaluate.metrics.masks import iou
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
@@ -23,8 +23,6 @@ from hilsplat.world.mesh import TrueMesh
 METHODS = ("field", "tree")
 TEXTS_PER_LEVEL = 4
 """Texts per level and view, each queried in two views."""
-MaskOf = Callable[[str, str, Query], Bool[np.ndarray, "H W"]]
-"""(method, view, query) -> answer at the query's level."""
 
 
 def measure_world_consistency(
@@ -37,28 +35,33 @@ def measure_world_consistency(
 ) -> Iterator[tuple[str, Measured]]:
     """Yield the rows of `world/view-consistency`: each annotated view and its nearest neighbour.
 
-    Nothing is yielded without the true mesh (labels of a photographed scene).
-
-    Args:
-        truths: annotated views.
-        answered: stored answers in them (`views.measure_view`).
-        truth: truth folder of a synthetic scene.
+    The IoU is that of the answers in both views, over shared surface points; `n` is the number of points in
+    the union, and texts without an answer are omitted. Nothing is yielded without the true mesh (labels of a
+    photographed scene). `answered` has the stored answers by view (`views.measure_view`).
     """
-    if not (Path(truth) / "mesh.ply").is_file():
+    if not (truth / "mesh.ply").is_file():
         return
-    true = Cameras.load(Path(truth) / "cameras.npz")
-    mesh = TrueMesh.load(Path(truth) / "mesh.ply")
+    true = Cameras.load(truth / "cameras.npz")
+    mesh = TrueMesh.load(truth / "mesh.ply")
     views = [view for view in answers.scene.cameras.names if view in set(true.names)]
     nearest = dict(neighbours(true, views, 1))
     pairs = [(view, nearest[view]) for view in truths if view in nearest]
     for number, pair in enumerate(pairs):
-        view = pair[0]
         here, there = (true[each] for each in pair)
-        points = thinned(shared_points(here, mesh.depth(here), there, mesh.depth(there)))
-        queries = spread(truths[view]().queries, TEXTS_PER_LEVEL)
+        points = shared_points(here, mesh.depth(here), there, mesh.depth(there))
+        queries = spread(truths[pair[0]]().queries, TEXTS_PER_LEVEL)
         mask_of = answers_of(answers, selections, answered, pair, queries, settings)
-        for row in consistency_rows(pair, points, queries, mask_of, settings):
-            yield view, row
+        for method in (method for method in METHODS if method in settings.methods):
+            protocol = label_of(VIEW_CONSISTENCY, method, settings)
+            for query in queries:
+                assert query.level is not None
+                seen_here = mask_of(method, pair[0], query).reshape(-1)[points.pixel_a]
+                seen_there = mask_of(method, pair[1], query).reshape(-1)[points.pixel_b]
+                union, level = int(np.count_nonzero(seen_here | seen_there)), query.level.label
+                if union:
+                    value = iou(seen_here[None], seen_there[None])
+                    row = Measured(method, query.text, level, "view_consistency", protocol, value, union)
+                    yield pair[0], row
         for each in set(pair) - {each for later in pairs[number + 1 :] for each in later}:
             answers.forget(each)
 
@@ -81,8 +84,8 @@ def answers_of(
     pair: tuple[str, str],
     queries: Sequence[Query],
     settings: EvaluateSettings,
-) -> MaskOf:
-    """Return a function for the answers in two views at given levels; stored answers are reused."""
+) -> Callable[[str, str, Query], Bool[np.ndarray, "H W"]]:
+    """Return a function from (method, view, query) to the answer at its level; stored answers are reused."""
 
     def is_kept(view: str, query: Query) -> bool:
         return view in answered and given_key("field", query, settings) in answered[view]
@@ -105,30 +108,3 @@ def answers_of(
         return relevancy_mask(smoothed, query.level, rule)[0]
 
     return mask_of
-
-
-def consistency_rows(
-    pair: tuple[str, str],
-    points: SharedPoints,
-    queries: Sequence[Query],
-    mask_of: MaskOf,
-    settings: EvaluateSettings,
-) -> Iterator[Measured]:
-    """Yield the IoU over shared points of the answers in two views.
-
-    Texts with no answer in either view are omitted; `n` is the number of points in the union.
-    """
-    for method in METHODS:
-        if method not in settings.methods:
-            continue
-        protocol = label_of(VIEW_CONSISTENCY, method, settings)
-        for query in queries:
-            assert query.level is not None
-            here = mask_of(method, pair[0], query).reshape(-1)[points.pixel_a]
-            there = mask_of(method, pair[1], query).reshape(-1)[points.pixel_b]
-            union = int(np.count_nonzero(here | there))
-            if union:
-                value = iou(here[None], there[None])
-                yield Measured(
-                    method, query.text, query.level.label, "view_consistency", protocol, value, union
-                )

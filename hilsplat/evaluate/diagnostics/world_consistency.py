@@ -1,18 +1,19 @@
-"""View consistency of masks on a synthetic scene, measured with its exact geometry."""
+"""View consistency of masks on a synthetic scene: is a surface point in the same mask in two views?"""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int, Int32, Int64
 
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
-from hilsplat.base.levels import Level
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.diagnostics.consistency import measure_consistency, neighbours
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
 from hilsplat.world.mesh import TrueMesh
@@ -25,18 +26,190 @@ COLUMNS = (
     *("best_iou", "disagreement", "joined_disagreement"),
 )
 
+DEPTH_TOLERANCE = 0.01
+"""Two views show the same point if its depths differ by at most this share."""
+
+MIN_POINTS = 16
+"""Masks with fewer shared points are not compared."""
+
+MAX_POINTS = 50_000
+"""Maximum number of shared points per pair of views; more are evenly subsampled."""
+
+
+@dataclass(frozen=True)
+class SharedPoints:
+    """Row-major pixels of views A (each at most once) and B that show the same surface points."""
+
+    pixel_a: Int64[np.ndarray, " P"]
+    pixel_b: Int64[np.ndarray, " P"]
+
+    def __len__(self) -> int:
+        return len(self.pixel_a)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of the masks of one level between two views, or the mean over pairs of views."""
+
+    masks: int  # number of masks of A compared, over all pairs
+
+    best_iou: float
+    """Highest IoU of a mask of A with any mask of B, in shared points (0 if B has none), mean over the masks
+    of A; 1 is perfect, nan if A has none."""
+
+    disagreement: float
+    """Share of all pairs of shared points that are in the same mask in one view and not in the other (1 minus
+    the Rand index); 0 is perfect. If most pairs are in different masks in both views, it is always small."""
+
+    joined_disagreement: float
+    """The same among pairs in the same mask in at least one view (a Jaccard distance); nan without any."""
+
+
+def shared_points(
+    camera_a: Camera,
+    depth_a: Float[np.ndarray, "Ha Wa"],
+    camera_b: Camera,
+    depth_b: Float[np.ndarray, "Hb Wb"],
+    tolerance: float = DEPTH_TOLERANCE,
+    most: int = MAX_POINTS,
+) -> SharedPoints:
+    """Return at most `most` points of view A's pixel centres, evenly spaced, that are also visible in view B.
+
+    A point is lifted by A's depth and projected into B. It is visible there if B's depth at the projection
+    equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse depth, which
+    is exact on planes of any slant; next to a depth jump the interpolated value belongs to neither side, so
+    points at occluding borders are dropped. Depths are along the optical axis, inf without a surface.
+    """
+    pixel = np.flatnonzero(np.isfinite(depth_a))
+    depth = depth_a.reshape(-1)[pixel].astype(np.float64)
+    width_a = depth_a.shape[1]
+    centres = np.stack([pixel % width_a + 0.5, pixel // width_a + 0.5, np.ones(len(pixel))], axis=1)
+    in_a = centres @ np.linalg.inv(camera_a.K).T * depth[:, None]
+    b_from_a = camera_b.cam_from_world @ np.linalg.inv(camera_a.cam_from_world)
+    in_b = in_a @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    ahead = in_b[:, 2] > 1e-9 * depth
+    pixel, in_b = pixel[ahead], in_b[ahead]
+    projected = in_b @ camera_b.K.T
+    xy = projected[:, :2] / projected[:, 2:]
+    height, width = depth_b.shape
+    # The four pixel centres around the projection must be in the image.
+    low = np.floor(xy - 0.5)
+    whole = (low >= 0).all(axis=1) & (low[:, 0] + 1 < width) & (low[:, 1] + 1 < height)
+    pixel, in_b, xy, low = pixel[whole], in_b[whole], xy[whole], low[whole].astype(np.int64)
+    share_x, share_y = (xy - 0.5 - low).T
+    inverse = 1 / depth_b.astype(np.float64)
+    x, y = low.T
+    upper = inverse[y, x] * (1 - share_x) + inverse[y, x + 1] * share_x
+    lower = inverse[y + 1, x] * (1 - share_x) + inverse[y + 1, x + 1] * share_x
+    shown = upper * (1 - share_y) + lower * share_y
+    visible = np.abs(shown * in_b[:, 2] - 1) <= tolerance
+    x, y = np.floor(xy[visible]).astype(np.int64).T
+    pixel_a, pixel_b = pixel[visible], y * width + x
+    if len(pixel_a) > most:
+        kept = np.linspace(0, len(pixel_a) - 1, most).astype(np.int64)
+        pixel_a, pixel_b = pixel_a[kept], pixel_b[kept]
+    return SharedPoints(pixel_a, pixel_b)
+
+
+def best_ious(
+    inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
+) -> Float[np.ndarray, " m"]:
+    """Return, for each mask of A with enough shared points, the highest IoU with a mask of B, in points."""
+    a = inside_a[inside_a.sum(axis=1) >= min_points].astype(np.float32)  # counts exactly up to 2**24
+    b = inside_b.astype(np.float32)
+    if not len(b):
+        return np.zeros(len(a))
+    both = (a @ b.T).astype(np.float64)
+    union = a.sum(axis=1, dtype=np.float64)[:, None] + b.sum(axis=1, dtype=np.float64)[None, :] - both
+    return (both / union).max(axis=1)
+
+
+def pair_disagreement(
+    labels_a: Int[np.ndarray, " P"], labels_b: Int[np.ndarray, " P"]
+) -> tuple[float, float]:
+    """Return the shares of pairs of points that are in the same mask in one view and not in the other.
+
+    The first is the share among all pairs of points, the second among those in the same mask in at least one
+    view; nan if there is no such pair. Labels are -1 for points in no mask, which share theirs with no other.
+    All pairs are counted, via the contingency table of the labels.
+    """
+    rows = np.unique(labels_a, return_inverse=True)[1]
+    names, columns = np.unique(labels_b, return_inverse=True)
+    in_mask = (labels_a != NONE) & (labels_b != NONE)
+    cells = np.bincount((rows * max(1, len(names)) + columns)[in_mask])
+    together_a = _pairs(np.bincount(rows[labels_a != NONE]))
+    together_b = _pairs(np.bincount(columns[labels_b != NONE]))
+    both = _pairs(cells)
+    differ, all_pairs = together_a + together_b - 2 * both, _pairs(np.array([len(labels_a)]))
+    either = differ + both
+    return differ / all_pairs if all_pairs else np.nan, differ / either if either else np.nan
+
+
+def _pairs(counts: Int[np.ndarray, " n"]) -> int:
+    """Return the number of pairs within groups of the given sizes."""
+    counts = counts.astype(np.int64)
+    return int((counts * (counts - 1) // 2).sum())
+
+
+def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> Int32[np.ndarray, " P"]:
+    """Return the mask at each point, -1 for none: masks are painted from large to small, as in a label map.
+
+    Of two equally large masks the one in the lower row is painted last.
+    """
+    labels = np.full(inside.shape[1], NONE, dtype=np.int32)
+    for row in np.lexsort((-np.arange(len(area_px)), -area_px)):
+        labels[inside[row]] = row
+    return labels
+
+
+def view_agreement(
+    masks_a: Bool[np.ndarray, "Ma Ha Wa"], masks_b: Bool[np.ndarray, "Mb Hb Wb"], points: SharedPoints
+) -> Agreement:
+    """Return the agreement of the masks of one level between two views.
+
+    Masks of a view may overlap. `best_iou` uses them as they are, the disagreements use the smallest mask at
+    each point (`painted`), like the language field.
+    """
+    inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, points.pixel_a]
+    inside_b = masks_b.reshape(len(masks_b), np.prod(masks_b.shape[1:], dtype=int))[:, points.pixel_b]
+    ious = best_ious(inside_a, inside_b)
+    all_pairs, joined = pair_disagreement(
+        painted(inside_a, masks_a.sum(axis=(1, 2))), painted(inside_b, masks_b.sum(axis=(1, 2)))
+    )
+    return Agreement(len(ious), float(ious.mean()) if len(ious) else np.nan, all_pairs, joined)
+
+
+def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
+    """Sum the counts, and average the shares over the pairs of views in which they are defined."""
+
+    def mean(name: str) -> float:
+        values = [value for part in parts if (value := getattr(part, name)) == value]
+        return sum(values) / len(values) if values else np.nan
+
+    shares = (mean(name) for name in ("best_iou", "disagreement", "joined_disagreement"))
+    return Agreement(sum(part.masks for part in parts), *shares)
+
+
+def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple[str, str]]:
+    """Return each view with each of its `count` nearest views, by camera centre; the earlier wins ties."""
+    centres = np.array([cameras[view].centre for view in views])
+    pairs = []
+    for row, view in enumerate(views):
+        apart = np.linalg.norm(centres - centres[row], axis=1)
+        apart[row] = np.inf
+        nearest = np.argsort(apart, kind="stable")[: min(count, len(views) - 1)]
+        pairs += [(view, views[other]) for other in nearest]
+    return pairs
+
 
 def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
     """Measure how consistently masks of neighbouring views divide the same surface; return a Markdown table.
 
-    Args:
-        truth: truth folder of the scene: true cameras, mesh and labels.
-        masks_folder: masks artifact of any segmenter.
-        out: CSV to write, one row per level for the masks and for the true regions.
-        count: number of neighbours of each view.
+    Each view is compared with its `count` nearest views. The CSV has a row per level for the masks and for
+    the true regions.
 
     Raises:
-        ArtifactError: a folder is missing or incomplete, or fewer than two views have masks.
+        ArtifactError: fewer than two views have masks.
         MisalignedArtifactError: masks and true cameras differ in size.
     """
     index = read_index(masks_folder)
@@ -69,20 +242,23 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         masks = loaded(view)
         return masks.dense(masks.rows_of(level))
 
+    def regions_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
+        labels = annotations.label_image(view, level)  # surroundings are nodes too
+        return labels[None] == np.unique(labels[labels >= 0])[:, None, None]
+
+    sources = {masks_label(masks_folder): masks_of, TRUTH: regions_of}
+    found: dict[tuple[str, Level], list[Agreement]] = {
+        (name, level): [] for name in sources for level in LEVELS
+    }
+    for a, b in pairs:
+        points = shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b))
+        for name, level in found:
+            of_level = sources[name]
+            found[name, level].append(view_agreement(of_level(a, level), of_level(b, level), points))
     rows = []
-    for name, source in (
-        (masks_label(masks_folder), masks_of),
-        (TRUTH, lambda view, level: true_masks(annotations, view, level)),
-    ):
-        for level, one in measure_consistency(cameras, pairs, depth_of, source).items():
-            shares = [f"{share:.4f}" for share in (one.best_iou, one.disagreement, one.joined_disagreement)]
-            rows.append([index["scene"], name, level.label, str(one.pairs), str(one.masks), *shares])
+    for (name, level), parts in found.items():
+        one = mean_agreement(parts)
+        shares = [f"{share:.4f}" for share in (one.best_iou, one.disagreement, one.joined_disagreement)]
+        rows.append([index["scene"], name, level.label, str(len(parts)), str(one.masks), *shares])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
-
-
-def true_masks(annotations: HierarchyAnnotations, view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
-    """Return the true regions of a view at a level, one per visible node, including surroundings."""
-    labels = annotations.label_image(view, level)
-    ids = np.unique(labels[labels >= 0])
-    return labels[None] == ids[:, None, None]

@@ -34,13 +34,7 @@ VIEWS = 4
 
 @dataclass(frozen=True)
 class Answerer:
-    """One of the compared methods.
-
-    Attributes:
-        title: name of its rows in tables.
-        method: "tree" or "field".
-        scene: the variant's scene.
-    """
+    """One compared method: "tree" or "field" of a variant's scene, titled as in tables."""
 
     title: str
     method: str
@@ -77,7 +71,7 @@ def run_comparison(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the three figures of a scene, each as PNG and PDF.
+    """Draw the three figures of a scene as PNG and PDF, from its true regions or else from given queries.
 
     Args:
         folder: `results/<dataset>/<scene>`, finished under every variant.
@@ -86,14 +80,10 @@ def run_comparison(
         names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
         evaluate: settings for true regions and for converting maps to masks.
-        truth: truth folder of a synthetic scene.
-        labels: labels of a published data set instead, such as "lerf_ovs/figurines".
-        data_root: folder of the data sets' folders.
-        queries: texts to show if there is neither truth nor labels.
+        labels: labels of a published data set instead of `truth`, such as "lerf_ovs/figurines".
 
     Raises:
         SettingsError: no variant is named.
-        ArtifactError: the scene is not finished under a variant.
     """
     if not variants:
         raise SettingsError(
@@ -129,7 +119,7 @@ def open_variants(folder: Path, variants: Sequence[str], threads: int) -> dict[s
 
 
 def over_views(
-    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, Callable[[], ViewTruth]], count: int = VIEWS
+    scene: Scene, rows: Sequence[Shown], truths: Mapping[str, Callable[[], ViewTruth]]
 ) -> list[Shown]:
     """Return one query in several views: the first part or subpart in `rows`, else the first query.
 
@@ -141,24 +131,21 @@ def over_views(
     chosen = levelled[0] if levelled else rows[0]
     found = [chosen]
     for view, truth_of in truths.items():
-        if view != chosen.view and len(found) < count:
+        if view != chosen.view and len(found) < VIEWS:
             known = truth_of()
             for query in known.queries or known.categories:
                 if (query.text, query.level) == (chosen.text, chosen.level):
                     found.append(Shown(chosen.text, chosen.path, chosen.level, view, query.truth))
     others = scene.views()
-    for number in range(count):
-        view = others[number * len(others) // count]
-        if len(found) < count and view not in {row.view for row in found}:
+    for number in range(VIEWS):
+        view = others[number * len(others) // VIEWS]
+        if len(found) < VIEWS and view not in {row.view for row in found}:
             found.append(Shown(chosen.text, chosen.path, chosen.level, view, None))
     return found
 
 
 def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: EvaluateSettings) -> Figure:
-    """Draw one row per query and one column per method, transposed if there are many methods.
-
-    The truth is outlined, and the IoU is in the title.
-    """
+    """Draw one row per query and one column per method, transposed if there are many methods."""
     first = methods[0].scene
     scene = first.scene
     many = len(methods) > MOST_COLUMNS

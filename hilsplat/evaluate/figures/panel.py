@@ -14,8 +14,7 @@ from hilsplat.base.artifacts import atomic_path, read_index
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.evaluate.metrics.localization import peak_points
-from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.metrics.masks import iou, peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, annotated_truths, labelled_truths
 from hilsplat.evaluate.protocols.views import rule_of
@@ -43,21 +42,13 @@ RING = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "white", 
 
 @dataclass(frozen=True)
 class Shown:
-    """One row of the panel: a query in a view.
+    """One row of the panel: a query in a view."""
 
-    Attributes:
-        text: the query; texts separated by ">" form a path.
-        path: texts from the whole down; without annotations, those of the query.
-        level: the annotation's level; None if there is none.
-        view: view name.
-        truth: true region; None if unknown.
-    """
-
-    text: str
-    path: tuple[str, ...]
-    level: Level | None
+    text: str  # texts separated by ">" form a path
+    path: tuple[str, ...]  # texts from the whole down; without annotations, those of the query
+    level: Level | None  # of the annotation, if any
     view: str
-    truth: Bool[np.ndarray, "H W"] | None
+    truth: Bool[np.ndarray, "H W"] | None  # true region; None if unknown
 
     def hits(self, answers: LanguageScene, *, by_path: bool = False) -> NodeHits:
         """Return the tree's answer to the text alone, or to the whole path.
@@ -85,15 +76,11 @@ def run_figures(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the panel, and copy the pictures of poses and fit beside it.
+    """Draw the panel from true regions or else from queries; copy the pictures of poses and fit beside it.
 
     Args:
-        out: PNG to write; `registration.png` and `fit.png` are copied into its folder.
         fit: report folder of the fit; None copies nothing.
-        truth: annotations of a synthetic scene, which define the queries.
-        labels: labels of a published data set instead, such as "lerf_ovs/figurines".
-        data_root: folder of the data sets' folders.
-        queries: texts to show if there is neither truth nor labels.
+        labels: labels of a published data set instead of `truth`, such as "lerf_ovs/figurines".
     """
     if fit is not None:
         copies = {"registration.png": parts.scene / "registration.png", "fit.png": fit / "test_views.png"}

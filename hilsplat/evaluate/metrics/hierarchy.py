@@ -13,12 +13,9 @@ READINGS: tuple[Reading, ...] = ("containment", "literal", "anchored")
 
 @dataclass(frozen=True)
 class Family:
-    """Predicted masks of one annotated parent and of its annotated children, in one view.
+    """Predicted masks of one annotated parent and of its annotated children (at least one), in one view.
 
-    Attributes:
-        parent: prediction for the parent's text.
-        children: predictions for the children's texts, at least one.
-        true_parent: the annotated region of the parent, used by `anchored`.
+    `true_parent` is the parent's annotated region, used by the reading `anchored`.
     """
 
     parent: Bool[np.ndarray, "H W"]
@@ -47,9 +44,8 @@ def hierarchical_consistency(
 ) -> float:
     """Return the HC of one view (paper, Sec. IV, Eq. 7), averaged over children, parents and levels in turn.
 
-    Every parent has the same weight, whatever its number of children: one child inside its parent and three
-    outside another give (1 + 0) / 2 = 0.5. The mean over children alone is `consistency_per_child`: 0.25.
-    A scene's value is the mean over its views with at least one parent; then scenes are averaged.
+    Every parent has the same weight, whatever its number of children. A scene's value is the mean over its
+    views with at least one parent; then scenes are averaged.
 
     Departs: the printed normaliser uses N_l outside the sum over l, where it is undefined; here it is the
     mean over the parents of each level, then over the L - 1 transitions. A transition without parents
@@ -63,7 +59,7 @@ def hierarchical_consistency(
 
 
 def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Reading) -> list[list[float]]:
-    """Return the score of every parent, the mean over its children, per level of the parent."""
+    """Return the score of each parent, the mean over its children, per level of the parent."""
     return [
         [float(np.mean(children_consistency(family, reading))) for family in families]
         for families in transitions
@@ -71,10 +67,7 @@ def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Re
 
 
 def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
-    """Return containment averaged over all children of a level, then over levels.
-
-    As in `hierarchical_consistency`, a transition without parents contributes 0.
-    """
+    """Return containment averaged over all children of a level, then over levels."""
     return mean_over_parents(
         [
             [term for family in families for term in children_consistency(family, "containment")]

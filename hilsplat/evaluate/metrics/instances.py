@@ -1,9 +1,8 @@
 """Instance segmentation of points: AP, AP50 and AP25 of the ScanNet benchmark.
 
-Source: OpenMask3D's copy of ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`.
-The integration of the curve follows that code, including its quirks. Predictions are matched in the order
-given; ScanNet's own script uses the order of a dict, which is undefined in Python 2. OpenMask3D assigns every
-ScanNet200 prediction the confidence 1.
+Source: OpenMask3D's copy of ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`,
+including its quirks. Predictions are matched in the order given; ScanNet's own script uses the order of a
+dict, which is undefined in Python 2. OpenMask3D assigns every ScanNet200 prediction the confidence 1.
 """
 
 from collections.abc import Sequence
@@ -26,25 +25,14 @@ MIN_POINTS = 100
 
 @dataclass(frozen=True)
 class InstanceMatches:
-    """Contribution of one scan to the precision-recall curves of K classes at T thresholds.
+    """Matches of one scan, from which the precision-recall curves over all scans are computed."""
 
-    Scans are matched one by one, but curves are computed over all scans, so matches are stored in between.
-
-    Attributes:
-        class_index: class of each curve entry, 0 .. K - 1.
-        overlap_index: threshold of each entry, 0 .. T - 1.
-        confidence: confidence of each entry.
-        is_match: True for a match, False for a false positive.
-        misses: number of unmatched true instances.
-        has_truth: whether the scan has a sufficiently large instance of the class.
-    """
-
-    class_index: Int64[np.ndarray, " E"]
-    overlap_index: Int64[np.ndarray, " E"]
+    class_index: Int64[np.ndarray, " E"]  # class of each curve entry, 0 .. K - 1
+    overlap_index: Int64[np.ndarray, " E"]  # threshold of each entry, 0 .. T - 1
     confidence: Float64[np.ndarray, " E"]
-    is_match: Bool[np.ndarray, " E"]
-    misses: Int64[np.ndarray, "K T"]
-    has_truth: Bool[np.ndarray, " K"]
+    is_match: Bool[np.ndarray, " E"]  # otherwise the entry is a false positive
+    misses: Int64[np.ndarray, "K T"]  # number of unmatched true instances
+    has_truth: Bool[np.ndarray, " K"]  # whether the scan has a sufficiently large instance of the class
 
 
 def match_instances(
@@ -64,20 +52,15 @@ def match_instances(
     unless the share of its points in void or in instances that are too small exceeds the threshold.
 
     Args:
-        truth: per point class * 1000 + instance; values below 1000 or of a class that is not evaluated are
-            void.
+        truth: per point class * 1000 + instance; values below 1000 or of other classes are void.
         masks: predicted instances over the same points; they may overlap.
-        classes: class id of each prediction.
-        confidences: confidence of each prediction; a constant if the method has none.
-        class_ids: the evaluated classes.
-        min_points: smaller instances and predictions are ignored.
 
     Raises:
         MisalignedArtifactError: masks and truth have different numbers of points.
     """
     if masks.shape[1] != len(truth):
         raise MisalignedArtifactError(
-            "predicted instances do not belong to the scan's points",
+            "predicted instances do not fit the scan's points",
             expected=f"{len(truth)} points",
             found=masks.shape[1],
             fix="predict on the vertices of the evaluated mesh",
@@ -148,10 +131,10 @@ def _matches(
 def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, " E"], misses: int) -> float:
     """Return the area under one precision-recall curve, integrated as in the benchmark.
 
-    For each distinct confidence s, precision P and recall R are computed from the entries with at least s;
-    matches below s and unmatched instances reduce recall. The point (1, 0) ends the curve. The area is the
-    sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last, without an interpolation
-    envelope. Without entries the area is 0.
+    For each distinct confidence, precision P and recall R are computed from the entries with at least that
+    confidence; matches below it and unmatched instances reduce recall. The point (1, 0) ends the curve. The
+    area is the sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last, without an
+    interpolation envelope. Without entries it is 0.
     """
     if not len(confidence):
         return 0.0

@@ -1,9 +1,11 @@
-"""Metrics that compare predicted masks with true regions."""
+"""Metrics of masks against true regions, and of localization: is the most relevant point on the object?"""
 
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+
+from hilsplat.base.levels import LEVELS, Level
 
 BOUNDARY_RATIO = 0.02
 """Width of a boundary as a share of the image diagonal (Cheng et al. 2021)."""
@@ -23,8 +25,7 @@ def boundary_width_px(size_hw: tuple[int, int]) -> int:
 def boundary(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
     """Return the pixels of the mask that an erosion by `width_px` removes.
 
-    Outside the image counts as background, so mask pixels along the image border are boundary. One
-    erosion with a square of 2 width + 1 px equals `width_px` erosions with a 3 x 3 square.
+    Outside the image counts as background, so mask pixels along the image border are boundary.
     """
     import cv2
 
@@ -45,10 +46,9 @@ def boundary_iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H
 
 
 def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
-    """Return the largest IoU that any threshold on the score map could give.
+    """Return the largest IoU of any threshold on the score map: a diagnostic that uses the truth.
 
-    This diagnostic uses the truth: it separates a wrong ranking of pixels from a wrong threshold. It is
-    exact: lowering the threshold between two scores of true pixels only adds false ones, so testing the
+    It is exact: lowering the threshold between two scores of true pixels only adds false ones, so testing the
     scores of true pixels is sufficient.
     """
     inside, outside = np.sort(score[truth]), np.sort(score[~truth])
@@ -59,23 +59,15 @@ def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, 
 
 
 def exceeds(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"], threshold: float) -> float:
-    """Return 1 if the IoU exceeds the threshold, else 0; the mean over pairs is Acc@0.25 or Acc@0.5.
-
-    Source: yanmin-wu/OpenGaussian `scripts/compute_lerf_iou.py`.
-    """
+    """Return 1 if the IoU exceeds the threshold, else 0 (OpenGaussian `scripts/compute_lerf_iou.py`)."""
     return float(iou(prediction, truth) > threshold)
 
 
 def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K H W"]:
-    """Return one mask per class, the pixels where its similarity is largest: 3D-OVS's original protocol.
+    """Return one mask per class, the pixels where its cosine is largest (Kunhao-Liu/3D-OVS `renderer.py`).
 
-    The first class wins ties; a pixel whose similarities are all -inf has no class. The IoU of a class absent
-    from prediction and truth is 0 (the default of scikit-learn, used by that code).
-    Source: Kunhao-Liu/3D-OVS `renderer.py`.
-
-    Args:
-        similarity: cosine of each pixel's feature with each class text, without template or canonical
-            phrases. Classes are in the order of the sorted texts, which determines ties.
+    The first class wins ties; a pixel whose values are all -inf has no class. The IoU of a class absent from
+    prediction and truth is 0 (the default of scikit-learn, used by that code).
     """
     winner = similarity.argmax(axis=0)
     answered = similarity.max(axis=0) > -np.inf
@@ -88,3 +80,35 @@ def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray
     A pixel with two true classes or none is never correct, because the prediction has one.
     """
     return float((prediction == truth).all(axis=0).mean())
+
+
+def peak_points(
+    filtered: Float[np.ndarray, "3 H W"], level: Level | None
+) -> tuple[Int[np.ndarray, "P 2"], Level]:
+    """Return all pixels (x, y) with the maximum of a filtered map, and the level of the map.
+
+    Without a level, the one with the largest maximum is used; the finest wins ties, as in LangSplat.
+    """
+    if level is None:
+        level = max(LEVELS, key=lambda each: (filtered[each.index].max(), each.index))
+    chosen = filtered[level.index]
+    pixels = np.flatnonzero(chosen == chosen.max())  # np.nonzero in two dimensions is six times slower
+    return np.stack([pixels % chosen.shape[1], pixels // chosen.shape[1]], axis=1), level
+
+
+def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B 4"]) -> bool:
+    """Return whether any point is in any box, borders included (x1 <= x <= x2), as in LERF."""
+    x, y = points_xy[:, None, 0], points_xy[:, None, 1]
+    x1, y1, x2, y2 = (boxes_xyxy[None, :, side] for side in range(4))
+    return bool(((x1 <= x) & (x <= x2) & (y1 <= y) & (y <= y2)).any())
+
+
+def hits_the_mask(points_xy: Int[np.ndarray, "P 2"], truth: Bool[np.ndarray, "H W"]) -> bool:
+    """Return whether any point is in the true region, which is stricter than the box."""
+    return bool(truth[points_xy[:, 1], points_xy[:, 0]].any())
+
+
+def box_of(mask: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, " 4"]:
+    """Return the xyxy box of a region, borders included as in LERF; other boxes are end-exclusive."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return np.array([columns[0], rows[0], columns[-1], rows[-1]])

@@ -1,8 +1,7 @@
 """Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
 
-Labels are 1 .. K; 0 means none: ignored in the truth, a miss in the prediction. All benchmarks share the
-counts and IoU of a class. They differ in which counts are summed first (those of one scene or of all) and in
-which classes are averaged; the functions are named accordingly.
+Labels are 1 .. K; 0 means none: ignored in the truth, a miss in the prediction. The benchmarks differ in
+which counts are summed first (those of one scene or of all) and in which classes are averaged.
 """
 
 from collections.abc import Iterable
@@ -14,13 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 
 @dataclass(frozen=True)
 class ClassCounts:
-    """Points per class, over all points with a true label.
-
-    Attributes:
-        hits: points of the class predicted as such.
-        truth: points of the class, including those predicted 0.
-        predicted: points predicted as the class.
-    """
+    """Points per class, among those with a true label: correct, true (even if predicted 0), predicted."""
 
     hits: Int64[np.ndarray, " K"]
     truth: Int64[np.ndarray, " K"]
@@ -65,10 +58,9 @@ def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
 
 
 def miou_over_present(counts: ClassCounts) -> float:
-    """Return the mean IoU over the classes of the truth; nan if it has none.
+    """Return the mean IoU over the classes of the truth, else nan (OpenGaussian, per scene).
 
-    A wrong prediction of an absent class lowers only the true class's IoU. Source: yanmin-wu/OpenGaussian
-    `scripts/eval_scannet.py`, per scene.
+    A wrong prediction of an absent class lowers only the true class's IoU.
     """
     return _mean(class_iou(counts)[counts.truth > 0])
 
@@ -82,10 +74,7 @@ def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | Non
     """Return the mean IoU over the classes of truth or prediction; nan if there is none.
 
     A class that is only predicted counts as 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
-    over all scans.
-
-    Args:
-        among: classes to average, such as the head, common or tail of ScanNet200.
+    over all scans. `among` selects classes, such as the head, common or tail of ScanNet200.
     """
     ious = class_iou(counts)
     return _mean(ious[(counts.union > 0) & (True if among is None else among)])
@@ -102,7 +91,7 @@ def macc_over_all(counts: ClassCounts) -> float:
 
 
 def miou_absent_as_one(counts: ClassCounts) -> float:
-    """Return the mean IoU over all K classes; a class that doesn't occur counts as 1 (Waymo).
+    """Return the mean IoU over all K classes; a class that doesn't occur counts as 1.
 
     Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. The value is inflated for
     subsets that lack classes; report `miou_over_present` beside it.

@@ -25,36 +25,27 @@ Border = Literal["langsplat", "inside"]
 class RelevancyRule:
     """How a map becomes a mask, and which level's mask is used. The defaults are LangSplat's code.
 
-    Attributes:
-        filter_px: side of the mean filter. LangSplat's code uses 30 at an image height of 730, its text and
-            the paper state 20. 0 scales 30 with the height of the map.
-        mix: average the filtered map with the map itself.
-        threshold: threshold that the scores must exceed.
-        threshold_on: `normalised_pm1`: min-max mapped to [-1, 1], clipped at 0, so that 0.4 means
-            min-max above 0.7; `raw`: the relevancy itself.
-        majority: smooth the mask with the 7 x 7 majority filter.
-        level_rule: `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the highest
-            mean inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because
-            LangSplat stacks its levels from fine to coarse.
-        border: windows at the border. `langsplat`: the mean filter reflects, the majority filter ignores the
-            last row and column; `inside`: both average the part of the window inside the image (LangSplatV2).
-        levels: candidate levels (LangSplatV2 on 3D-OVS: whole and part).
-        empty_wins: under `mean_in_mask`, a level with an empty mask is chosen (LangSplatV2 on 3D-OVS: its
-            mean is NaN, which torch's argmax prefers); otherwise it is chosen last.
+    LangSplat's mean filter has 30 px at an image height of 730; its text and the paper state 20. Level rules:
+    `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the highest mean inside its own
+    mask (LangSplat's text on 3D-OVS). The finest level wins ties, because LangSplat stacks its levels from
+    fine to coarse. At the border, `langsplat` reflects in the mean filter and ignores the last row and column
+    in the majority filter; `inside` averages the part of the window inside the image (LangSplatV2).
     """
 
-    filter_px: int = 0
-    mix: bool = True
+    filter_px: int = 0  # side of the mean filter; 0 scales 30 with the height of the map
+    mix: bool = True  # average the filtered map with the map itself
     threshold: float = 0.4
+    # `normalised_pm1`: min-max mapped to [-1, 1], clipped at 0 (0.4: min-max above 0.7); `raw`: relevancy
     threshold_on: ThresholdOn = "normalised_pm1"
-    majority: bool = True
+    majority: bool = True  # smooth the mask with the 7 x 7 majority filter
     level_rule: LevelRule = "max"
     border: Border = "langsplat"
-    levels: tuple[Level, ...] = LEVELS
+    levels: tuple[Level, ...] = LEVELS  # candidates (LangSplatV2 on 3D-OVS: whole and part)
+    # Under `mean_in_mask`, an empty mask is chosen first (LangSplatV2: torch's argmax prefers NaN) or last.
     empty_wins: bool = False
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
-        """Return the differences from another rule in few words, for protocol names."""
+        """Return the differences from another rule that settings can cause, for protocol names."""
         words = {
             "filter_px": f"filter {self.filter_px}" if self.filter_px else "filter scaled",
             "mix": "mix" if self.mix else "no mix",
@@ -62,9 +53,6 @@ class RelevancyRule:
             "threshold_on": self.threshold_on,
             "majority": "majority" if self.majority else "no majority",
             "level_rule": self.level_rule,
-            "border": f"border {self.border}",
-            "levels": "levels " + "+".join(level.label for level in self.levels),
-            "empty_wins": "empty wins" if self.empty_wins else "empty last",
         }
         return tuple(text for name, text in words.items() if getattr(self, name) != getattr(reference, name))
 
@@ -77,11 +65,10 @@ def filter_side_px(filter_px: int, height_px: int) -> int:
 def mean_filter(
     relevancy: Float[np.ndarray, "H W"], side_px: int, border: Border = "langsplat"
 ) -> Float32[np.ndarray, "H W"]:
-    """Average over a square window.
+    """Average over a square window, by OpenCV's default or `inside` the image only.
 
-    `langsplat`: OpenCV's default. Borders are reflected without repeating the edge pixel, and the anchor of
-    an even window is right of its centre: for side 30, output y averages rows y - 15 .. y + 14. `inside`: the
-    mean over those pixels of the window that are in the image.
+    OpenCV reflects borders without repeating the edge pixel, and the anchor of an even window is right of its
+    centre: for side 30, output y averages rows y - 15 .. y + 14.
     """
     import cv2
 
@@ -109,9 +96,8 @@ def threshold_mask(
 def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat") -> Bool[np.ndarray, "H W"]:
     """Set each pixel to the most frequent value of its 7 x 7 window; a tie gives False.
 
-    `langsplat`: the window is rows max(0, i - 3) .. min(i + 4, h - 1) - 1 and the corresponding columns, as
-    sliced in its code: the last row and column are never used, so the filter is asymmetric near the lower and
-    right edges. `inside`: the part of the window that is in the image.
+    `langsplat` uses rows max(0, i - 3) .. min(i + 4, h - 1) - 1 and the corresponding columns, as sliced in
+    its code: the last row and column are never used, so the filter is asymmetric there.
     """
     seen, count = _majority_windows(mask.shape, border)
     return 2 * _ones_in_windows(mask.view(np.uint8) & seen) > count
@@ -138,12 +124,7 @@ def _ones_in_windows(ones: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]
 
 @dataclass(frozen=True)
 class SmoothedRelevancy:
-    """Relevancy of one query in one view at three levels, with its filtered forms.
-
-    Attributes:
-        filtered: mean-filtered maps, used for localization.
-        mixed: maps used for masks: the mean of map and filtered map, or the map itself.
-    """
+    """Relevancy of one query in one view at three levels: filtered for localization, mixed for masks."""
 
     filtered: Float32[np.ndarray, "3 H W"]
     mixed: Float32[np.ndarray, "3 H W"]
@@ -171,9 +152,8 @@ def relevancy_mask(
 ) -> tuple[Bool[np.ndarray, "H W"], Level]:
     """Return the mask of a level, or of the level that the rule chooses if `level` is None.
 
-    Args:
-        united: unfiltered relevancy of another text, whose mask is merged with this one's before the majority
-            filter; the level is chosen by the first text alone.
+    `united` is the unfiltered relevancy of another text, whose mask is merged with this one's before the
+    majority filter; the level is chosen by the first text alone.
     """
 
     def mask_of(level: Level) -> np.ndarray:

@@ -1,38 +1,31 @@
-"""Interface that a scene must implement to be scored, and caches of its answers."""
+"""Answers of a scene in one view, cached, and their rows of scores."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
 
 from hilsplat.base.levels import Level
+from hilsplat.evaluate.metrics.masks import (
+    argmax_masks,
+    boundary_iou,
+    exceeds,
+    hits_a_box,
+    hits_the_mask,
+    iou,
+    pixel_accuracy,
+)
+from hilsplat.evaluate.protocols.cards import LERF_LANGSPLAT
+from hilsplat.evaluate.protocols.view_truth import Query
+from hilsplat.evaluate.scores import Measured
 
+if TYPE_CHECKING:
+    from hilsplat.query.language_scene import LanguageScene
 
-@runtime_checkable
-class QueryableScene(Protocol):
-    """Methods that scoring calls; `hilsplat.query.language_scene.LanguageScene` implements them."""
-
-    def field_relevancy(self, texts, view):
-        """Return the rendered relevancy, (T, 3, H, W)."""
-
-    def node_relevancy_map(self, texts, view):
-        """Return the relevancy of the node at each pixel, (T, 3, H, W)."""
-
-    def field_cosine(self, texts, view, pixels):
-        """Return the cosine of the decoded latent at given pixels, (T, 3, P); -inf at levels without one."""
-
-    def node_cosine(self, texts, view, pixels):
-        """Return the cosine of the node at given pixels, (T, 3, P); -inf at levels without one."""
-
-    def select(self, path, *, level=None, view=None):
-        """Return the nodes that answer the last text of a path.
-
-        The tree chooses the level if none is given. With a view, only nodes visible in it compete."""
-
-    def node_masks(self, view, ids):
-        """Return the union of the nodes rendered in a view, (H, W)."""
+NO_POINTS = np.zeros((0, 2), np.int64)
+"""Peaks of answers without localization."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +66,15 @@ def unpacked(bits: UInt8[np.ndarray, " B"], size_hw: tuple[int, int]) -> Bool[np
 class Selections:
     """Nodes selected for texts and paths, cached per view and for the whole scene."""
 
-    def __init__(self, scene: QueryableScene) -> None:
+    def __init__(self, scene: "LanguageScene") -> None:
         self.scene = scene
         self._of: dict[tuple, np.ndarray] = {}
         self._masks: dict[tuple[str, bytes], np.ndarray] = {}
 
     def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:
-        """Return the ids of the nodes that answer a text, or the last text of a path.
+        """Return the ids of the nodes that answer the last text of a path, ordered from coarse to fine.
 
-        Args:
-            path: one text, or several from coarse to fine.
-            level: level of the last text; None if the tree chooses it.
-            view: only nodes visible in it compete, as in maps; None if all nodes of the scene compete.
+        The tree chooses the level if it is None. With a view, only nodes visible in it compete, as in maps.
         """
         key = (path, level, view)
         if key not in self._of:
@@ -92,13 +82,50 @@ class Selections:
         return self._of[key]
 
     def mask(self, view: str, ids: np.ndarray, size_hw: tuple[int, int]) -> np.ndarray:
-        """Return the union of the given nodes in a view, empty without nodes.
-
-        Several protocols request the same nodes, so each union is rendered once and cached as packed bits.
-        """
+        """Return the union of the given nodes in a view; each is rendered once, for all protocols."""
         if len(ids) == 0:
             return np.zeros(size_hw, dtype=bool)
         key = (view, ids.tobytes())
         if key not in self._masks:
             self._masks[key] = np.packbits(np.asarray(self.scene.node_masks(view, ids)).astype(bool))
         return unpacked(self._masks[key], size_hw)
+
+
+def mask_rows(
+    method: str,
+    query: Query,
+    protocol: str,
+    mask: Bool[np.ndarray, "H W"],
+    points_xy: Int[np.ndarray, "P 2"] = NO_POINTS,
+    metrics: Sequence[str] = LERF_LANGSPLAT.metrics,
+) -> Iterator[Measured]:
+    """Yield a row per metric of one mask; `points_xy` are the relevancy peaks, for localization."""
+    level = query.level.label if query.level else ""
+    values = {
+        "iou": lambda: iou(mask, query.truth),
+        "boundary_iou": lambda: boundary_iou(mask, query.truth),
+        "acc_25": lambda: exceeds(mask, query.truth, 0.25),
+        "acc_50": lambda: exceeds(mask, query.truth, 0.5),
+        "localization_box": lambda: float(hits_a_box(points_xy, query.boxes_xyxy)),
+        "localization_mask": lambda: float(hits_the_mask(points_xy, query.truth)),
+    }
+    for metric in metrics:
+        yield Measured(method, query.text, level, metric, protocol, values[metric]())
+
+
+def class_map_rows(
+    method: str,
+    protocol: str,
+    similarity: Float[np.ndarray, "K H W"],
+    truth: Bool[np.ndarray, "K H W"],
+    texts: Sequence[str],
+) -> Iterator[Measured]:
+    """Yield the rows of one view under `3d-ovs/argmax`: IoU of each class and pixel accuracy.
+
+    `similarity` is the cosine of each pixel with each text. Texts are sorted, because the first wins ties.
+    """
+    prediction = argmax_masks(similarity)
+    for row, text in enumerate(texts):
+        yield Measured(method, text, "", "iou", protocol, iou(prediction[row], truth[row]))
+    accuracy = pixel_accuracy(prediction, truth)
+    yield Measured(method, "", "", "pixel_accuracy", protocol, accuracy, truth[0].size)

@@ -1,9 +1,8 @@
 """Protocols: name, version and everything that determines a number measured under them.
 
-A number is meaningless without its protocol: the same model scores 51.4 under `lerf/langsplat` and 9.66
-under `lerf/opengaussian`. A row of `scores.csv` carries the full name, such as `lerf/langsplat@2`, followed
-by any deviating settings in brackets: `lerf/langsplat@2 (filter 20, raw)`. A change to a card that affects
-its numbers requires a new version; a test checks this.
+The same model scores 51.4 under `lerf/langsplat` and 9.66 under `lerf/opengaussian`, so a row of `scores.csv`
+carries the full name, such as `lerf/langsplat@2`, followed by deviating settings in brackets. A change to a
+card that affects its numbers requires a new version; a test checks this.
 """
 
 from collections.abc import Iterable
@@ -45,40 +44,24 @@ pooled: counts of all scenes are summed first, so each scene is weighted by its 
 """
 
 
-Missing = Literal["zero", "left out"]
-"""Whether a (view, query) pair without a prediction counts as 0 or is omitted, which inflates the score."""
-
-
 @dataclass(frozen=True)
 class ProtocolCard:
-    """One protocol.
+    """One protocol."""
 
-    Attributes:
-        name: `benchmark/variant`.
-        version: incremented when a change below affects the numbers.
-        metrics: keys of `METRICS` for which it has rows.
-        selection: how a prediction is chosen, threshold and level, in words.
-        source: origin and departures from it. Begins with "none" if there is no public code.
-        rule: how relevancy maps become masks, if they do.
-        classes: name of the queried `ClassSet`, if it is fixed.
-        truth: `labels`: the region that the data set defines; `any grey`: all non-black pixels of its mask
-            file, if it has one.
-        united: text -> second text; the answer to the first is the union of both masks.
-        public: public function with the same results up to rounding, except for the departures in `source`:
-            `owner/repository@commit file`, with `:function` where the file has several; "" if there is none.
-    """
-
-    name: str
-    version: int
+    name: str  # `benchmark/variant`
+    version: int  # incremented when a change below affects the numbers
     metrics: tuple[str, ...]
     averaging: Averaging
-    selection: str
-    source: str
-    rule: RelevancyRule | None = None
-    missing: Missing = "zero"
-    classes: str = ""
+    selection: str  # how a prediction is chosen, threshold and level, in words
+    source: str  # origin and departures from it; begins with "none" if there is no public code
+    rule: RelevancyRule | None = None  # how relevancy maps become masks, if they do
+    missing: Literal["zero", "left out"] = "zero"  # score of a pair without a prediction; omission inflates
+    classes: str = ""  # name of the queried `ClassSet`, if it is fixed
+    # `labels`: the region that the data set defines; `any grey`: all non-black pixels of its mask file
     truth: Literal["labels", "any grey"] = "labels"
-    united: tuple[tuple[str, str], ...] = ()
+    united: tuple[tuple[str, str], ...] = ()  # (text, other): the answer to a text is the union of both masks
+    # Public function with the same results up to rounding, except for the departures in `source`:
+    # `owner/repository@commit file`, with `:function` where the file has several; "" if there is none.
     public: str = ""
 
     @property
@@ -95,15 +78,11 @@ class ProtocolCard:
 MASK = ("iou", "boundary_iou")
 LOCALIZATION = ("localization_box", "localization_mask")
 CONSISTENCY = (
-    "hc_containment",
-    "hc_literal",
-    "hc_anchored",
-    "hc_containment_pooled",
-    "hc_literal_pooled",
-    "hc_anchored_pooled",
-    "hc_containment_per_child",
+    *("hc_containment", "hc_literal", "hc_anchored"),
+    *("hc_containment_pooled", "hc_literal_pooled", "hc_anchored_pooled", "hc_containment_per_child"),
 )
-PRESENT = ("class_iou", "class_accuracy", "miou_present", "macc_present")
+PER_CLASS = ("class_iou", "class_accuracy")
+PRESENT = (*PER_CLASS, "miou_present", "macc_present")
 
 OPENGAUSSIAN = "yanmin-wu/OpenGaussian@b70dcc6 scripts/eval_scannet.py"
 GAUSSIAN_GROUPING = "lkeab/gaussian-grouping@c93f24b script/eval_lerf_mask.py"
@@ -293,8 +272,6 @@ def card_named(name: str) -> ProtocolCard:
         f"there is no protocol {name!r}", expected=f"one of {', '.join(card.name for card in CARDS)}"
     )
 
-
-PER_CLASS = ("class_iou", "class_accuracy")
 
 CARDS: tuple[ProtocolCard, ...] = (
     LERF_LANGSPLAT,

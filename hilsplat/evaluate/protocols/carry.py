@@ -32,24 +32,17 @@ CHUNK_POINTS = 65536
 
 @dataclass(frozen=True)
 class CarriedPoints:
-    """Gaussians assigned to each of P points, with weights.
+    """Gaussians assigned to each of P points, with weights."""
 
-    Attributes:
-        mode: name used in rows, with departures from the defaults.
-        index: Gaussians of each point; undefined where the weight is 0.
-        weight: non-negative weights that sum to 1; all 0 if no Gaussian is assigned to the point.
-        is_scored: False for points that the mode excludes from the evaluation.
-    """
-
-    mode: str
-    index: Int64[np.ndarray, "P k"]
-    weight: Float64[np.ndarray, "P k"]
-    is_scored: Bool[np.ndarray, " P"]
+    mode: str  # name used in rows, with departures from the defaults
+    index: Int64[np.ndarray, "P k"]  # undefined where the weight is 0
+    weight: Float64[np.ndarray, "P k"]  # non-negative, sum 1; all 0 if no Gaussian is assigned to the point
+    is_scored: Bool[np.ndarray, " P"]  # False for points that the mode excludes from the evaluation
 
     def labels(self, of_gaussian: Int[np.ndarray, " N"]) -> Int32[np.ndarray, " P"]:
         """Return the label with the largest total weight among each point's Gaussians; the lowest wins ties.
 
-        Label 0 means none and has no vote; a point whose Gaussians are unlabelled gets 0.
+        Label 0 means none and has no weight; a point whose Gaussians are unlabelled gets 0.
         """
         result = np.zeros(len(self.index), dtype=np.int32)
         for rows in _chunks(len(self.index)):
@@ -72,7 +65,7 @@ class CarriedPoints:
         return result
 
     def truth(self, labels: Int[np.ndarray, " P"]) -> Int[np.ndarray, " P"]:
-        """Return the labels, set to 0 (ignored) at points that the mode excludes from the evaluation."""
+        """Return the labels, set to 0 (ignored) at points that are not scored."""
         return np.where(self.is_scored, labels, 0).astype(labels.dtype)
 
 
@@ -93,8 +86,7 @@ def carried_to(
 def frozen(opacities: Float[np.ndarray, " N"], num_points: int) -> CarriedPoints:
     """Assign Gaussian i to point i; the fit must not have moved, split or dropped any Gaussian.
 
-    Points whose Gaussian has an opacity below 0.1 are not scored: yanmin-wu/OpenGaussian
-    `scripts/eval_scannet.py` sets their truth to 0.
+    As in OpenGaussian's `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
 
     Raises:
         MisalignedArtifactError: the numbers of Gaussians and points differ.
@@ -116,11 +108,7 @@ def nearest(
     opacities: Float[np.ndarray, " N"],
     threads: int = 1,
 ) -> CarriedPoints:
-    """Assign the nearest Gaussian with an opacity of at least 0.1, at any distance.
-
-    Raises:
-        MisalignedArtifactError: no Gaussian is opaque enough.
-    """
+    """Assign the nearest Gaussian that is not transparent, at any distance."""
     index, _ = _neighbours(points, means, opacities, 1, np.inf, threads)
     return CarriedPoints("nearest", index, np.ones(index.shape), np.ones(len(points), dtype=bool))
 
@@ -133,12 +121,9 @@ def vote(
     k: int = 5,
     threads: int = 1,
 ) -> CarriedPoints:
-    """Assign the k nearest Gaussians of opacity at least 0.1 within a radius, weighted by opacity.
+    """Assign the k nearest Gaussians that are not transparent within a radius, weighted by opacity.
 
     A point without such a Gaussian has no prediction, which counts as a miss.
-
-    Raises:
-        MisalignedArtifactError: no Gaussian is opaque enough.
     """
     index, distance = _neighbours(points, means, opacities, k, radius, threads)
     weight = np.where(np.isfinite(distance), opacities[index], 0.0)
@@ -158,19 +143,9 @@ def density(
 ) -> CarriedPoints:
     """Assign the k nearest Gaussians, weighted by opacity * exp(-d**2 / 2), d the Mahalanobis distance.
 
-    This weight is the alpha that 3DGS blends at the point. Candidates are the nearest centres, so a large
-    Gaussian with a distant centre has no weight. Relative weights are used even far from all Gaussians, so
-    every point has a prediction.
-
-    Args:
-        points: labelled points, scene units.
-        means: centres, scene units.
-        opacities: peak alphas; Gaussians below 0.1 are not candidates.
-        scales: standard deviations along the axes, scene units.
-        quats: world-from-Gaussian rotation, wxyz, any non-zero length.
-
-    Raises:
-        MisalignedArtifactError: no Gaussian is opaque enough.
+    This weight is the alpha that 3DGS blends at the point. Candidates are the nearest centres that are not
+    transparent, so a large Gaussian with a distant centre has no weight. Relative weights are used even far
+    from all Gaussians, so every point has a prediction. Quaternions (wxyz) may have any non-zero length.
     """
     index, distance = _neighbours(points, means, opacities, k, np.inf, threads)
     # Matrices (N, 3, 3) that map an offset from the centre to standard deviations.
@@ -187,14 +162,10 @@ def density(
 
 
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:
-    """Return labels 1 .. K by the largest cosine with the class texts: no canonical phrases, no "other".
+    """Return labels 1 .. K by the largest cosine with the class texts (unit vectors); the first wins ties.
 
-    The first class wins ties. Departs: OpenGaussian's argmax assigns points without a feature to its first
-    class, wall; here they get 0, a miss.
-
-    Args:
-        features: features of points or Gaussians, any length; all zero for none.
-        texts: unit vectors.
+    There are no canonical phrases and no "other". Departs: OpenGaussian's argmax assigns points without a
+    feature (all zero) to its first class, wall; here they get 0, a miss.
     """
     labels = np.zeros(len(features), dtype=np.int32)
     for rows in _chunks(len(features)):
@@ -207,14 +178,18 @@ def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]
 def _neighbours(
     points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return index (P, k) and distance (P, k) of the nearest opaque Gaussians; infinite if missing."""
+    """Return index and distance (P, k) of the nearest opaque Gaussians; the distance is infinite if missing.
+
+    Raises:
+        MisalignedArtifactError: no Gaussian is opaque enough.
+    """
     opaque = np.flatnonzero(opacities >= OPACITY_MIN)
     if not opaque.size:
         raise MisalignedArtifactError(
-            "no Gaussian is opaque enough to speak for a point",
+            "no Gaussian is opaque enough to label a point",
             expected=f"an opacity of at least {OPACITY_MIN}",
             found=f"{len(opacities)} Gaussians below",
-            fix="look at gaussians.ply; the fit has probably failed",
+            fix="check gaussians.ply; the fit has probably failed",
         )
     from scipy.spatial import cKDTree  # importing takes 0.2 s and is needed only for points
 

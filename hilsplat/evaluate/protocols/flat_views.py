@@ -1,26 +1,20 @@
 """Protocols for images without levels, scored beside LangSplat's: 3D-OVS, LERF-Mask and other map rules.
 
-They use plain cosines and the relevancy maps that `views.measure_view` renders anyway. On a stand-in with
-levels, only texts of whole objects are queried, because those benchmarks do not name parts; the protocol
-names then include `wholes`.
+On a stand-in with levels, only texts of whole objects are queried, because those benchmarks do not name
+parts; the protocol names then include `wholes`.
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.localization import peak_points
-from hilsplat.evaluate.metrics.relevancy_rule import (
-    Border,
-    RelevancyRule,
-    SmoothedRelevancy,
-    relevancy_mask,
-)
-from hilsplat.evaluate.protocols.answers import ViewMaps
+from hilsplat.evaluate.metrics.masks import peak_points
+from hilsplat.evaluate.metrics.relevancy_rule import Border, RelevancyRule, SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.answers import NO_POINTS, ViewMaps, class_map_rows, mask_rows
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -29,7 +23,6 @@ from hilsplat.evaluate.protocols.cards import (
     OVS_NODES,
     ProtocolCard,
 )
-from hilsplat.evaluate.protocols.rows import NO_POINTS, class_map_rows, mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
 from hilsplat.evaluate.scores import Measured
 
@@ -38,7 +31,6 @@ class FlatProtocols:
     """Scores one view under further protocols, one text at a time.
 
     Args:
-        cards: protocols with a map rule, LERF-Mask's protocols, and 3D-OVS by nodes and by argmax.
         level: only texts of this level are queried; None for data without levels.
         words: settings that change the relevancy, for the protocol names.
     """
@@ -103,32 +95,36 @@ class FlatProtocols:
 
     def finish(self) -> Iterator[Measured]:
         """Yield the rows that need all texts of the view: 3D-OVS by argmax over texts and levels."""
-        texts = sorted(self._queries)  # the first wins ties
-        if not texts:
-            return
-        rows, columns, truth = eighth_truth([self._queries[text] for text in texts])
-        asked = np.full(truth.shape[1:], True)
-        words = ["best level", *self.words]
-        if self.level is not None:  # pixels around the objects have no text
-            words = ["labelled pixels", *words]
-            asked &= truth.any(axis=0)
-        width = self._queries[texts[0]].truth.shape[1]
-        pixels = (rows[:, None] * width + columns)[asked]
-        if not len(pixels):
-            return
+        queries, words = list(self._queries.values()), ["best level", *self.words]
         for method, maps in self._maps.items():
-            similarity = maps.cosine(texts, pixels).max(axis=1)
-            protocol = OVS_ARGMAX.labelled(words)
-            yield from class_map_rows(method, protocol, similarity[:, None], truth[:, None, asked], texts)
+            yield from argmax_rows(method, queries, maps.cosine, words, self.level is not None)
 
 
-def eighth_truth(
+def argmax_rows(
+    method: str,
     queries: Sequence[Query],
-) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"], Bool[np.ndarray, "K h w"]]:
-    """Return rows, columns and the queries' regions of a prediction at an eighth of the image's size."""
-    size_hw, small = queries[0].truth.shape, queries[0].eighth
+    cosine_of: Callable[[Sequence[str], Int64[np.ndarray, " P"]], Float[np.ndarray, "K L P"]],
+    words: Sequence[str],
+    is_stand_in: bool,
+) -> Iterator[Measured]:
+    """Yield the rows of 3D-OVS by argmax at an eighth of the image's size; the first text wins ties.
+
+    Args:
+        cosine_of: cosine of texts with pixels (row * width + column) at any number of levels; -inf for none.
+        words: departures, for the protocol's name.
+        is_stand_in: whether pixels around the objects have no text; they are not compared.
+    """
+    if not queries:
+        return
+    ordered = sorted(queries, key=lambda query: query.text)
+    size_hw, small = ordered[0].truth.shape, ordered[0].eighth
     rows, columns = kept_by_pillow(size_hw, eighth_of(size_hw) if small is None else small.shape)
-    masks = [
-        query.truth[np.ix_(rows, columns)] if query.eighth is None else query.eighth for query in queries
-    ]
-    return rows, columns, np.stack(masks)
+    grid = np.ix_(rows, columns)
+    truth = np.stack([query.truth[grid] if query.eighth is None else query.eighth for query in ordered])
+    compared = truth.any(axis=0) if is_stand_in else np.full(truth.shape[1:], True)
+    pixels = (rows[:, None] * size_hw[1] + columns)[compared]
+    if len(pixels):
+        protocol = OVS_ARGMAX.labelled([*(["labelled pixels"] if is_stand_in else []), *words])
+        texts = [query.text for query in ordered]
+        similarity = cosine_of(texts, pixels).max(axis=1)
+        yield from class_map_rows(method, protocol, similarity[:, None], truth[:, None, compared], texts)

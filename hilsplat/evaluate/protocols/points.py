@@ -1,49 +1,59 @@
-"""Score classes and instances of points: ScanNet, ScanNet200, Replica, Waymo.
+"""Score classes and instances of labelled points: ScanNet, ScanNet200, Replica, Waymo and their stand-ins.
 
-Predictions may have any source; `carry` transfers those of Gaussians to points. Every row names the mode.
+| method | class of a point |
+|---|---|
+| `tree` | the class text with the highest cosine to the node of its Gaussian at level whole |
+| `field` | the class text with the highest cosine to the latent transferred to the point at level whole |
+
+Instances (ScanNet200) are the tree's nodes at level whole; a field has none. `carry` transfers predictions
+from Gaussians to points; those of other programs are read from files. Every row names the mode.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int, Int32
 
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import Level
 from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES, splits_of
-from hilsplat.evaluate.metrics.instances import InstanceMatches, ap, ap25, ap50, average_precision
-from hilsplat.evaluate.metrics.point_classes import (
-    ClassCounts,
-    class_accuracy,
-    class_iou,
-    frequency_weighted_iou,
-    macc_over_all,
-    macc_over_present,
-    miou_absent_as_one,
-    miou_over_all,
-    miou_over_occurring,
-    miou_over_present,
-    pooled,
+from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.evaluate.metrics import point_classes as means
+from hilsplat.evaluate.metrics.instances import (
+    CLASS_STRIDE,
+    InstanceMatches,
+    ap,
+    ap25,
+    ap50,
+    average_precision,
+    match_instances,
 )
+from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou, pooled
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
+from hilsplat.evaluate.protocols.carry import CarriedPoints, Mode, carried_to, classify
 from hilsplat.evaluate.scores import Measured
 
+if TYPE_CHECKING:
+    from hilsplat.query.language_scene import LanguageScene
+
 MEANS: dict[str, Callable[[ClassCounts], float]] = {
-    "miou_present": miou_over_present,
-    "macc_present": macc_over_present,
-    "miou_occurring": miou_over_occurring,
-    "miou_all": miou_over_all,
-    "macc_all": macc_over_all,
-    "miou_absent_as_one": miou_absent_as_one,
-    "frequency_weighted_iou": frequency_weighted_iou,
+    "miou_present": means.miou_over_present,
+    "macc_present": means.macc_over_present,
+    "miou_occurring": means.miou_over_occurring,
+    "miou_all": means.miou_over_all,
+    "macc_all": means.macc_over_all,
+    "miou_absent_as_one": means.miou_absent_as_one,
+    "frequency_weighted_iou": means.frequency_weighted_iou,
 }
 """Metrics with one number per scene, or one for all scenes under a pooled protocol."""
 
+VOTE_RADIUS_M = 0.1
+"""Radius of votes; 10 cm."""
 
-def point_label(card: ProtocolCard, carried: str) -> str:
-    """Return the protocol name of a row, including how predictions were transferred to points."""
-    return card.labelled([f"points: {carried}"])
+LEVEL = Level.WHOLE
+"""The classes of these data sets are things and surfaces, not parts."""
 
 
 def measure_points(
@@ -57,13 +67,9 @@ def measure_points(
     """Yield the rows of one scene: IoU and accuracy per class, and the scene's means if the card has them.
 
     In a class row, `n` is the number of points in the denominator, so that `pooled_points` can pool scenes.
-    Classes absent from truth and prediction have no row; a scene without truth has no rows.
-
-    Args:
-        card: a point protocol; its classes are `classes`.
-        truth: labels 1 .. K in the order of `classes`; 0 is ignored.
-        prediction: labels as in `truth`, 0 for a miss.
-        carried: mode of `carry.CarriedPoints`, or another way by which predictions reached the points.
+    Classes absent from truth and prediction have no row; a scene without truth has no rows. Labels are 1 .. K
+    in the order of `classes`; 0 is ignored in the truth and a miss in the prediction. `carried` names the way
+    in which predictions reached the points.
 
     Raises:
         MisalignedArtifactError: prediction and truth have different numbers of points, or the classes
@@ -75,13 +81,13 @@ def measure_points(
         )
     if len(prediction) != len(truth):
         raise MisalignedArtifactError(
-            "predictions do not belong to the scene's points",
+            "predictions do not fit the scene's points",
             expected=f"{len(truth)} points",
             found=len(prediction),
-            fix="carry the predictions to the points of the ground truth",
+            fix="transfer the predictions to the points of the ground truth",
         )
     counts = ClassCounts.of(truth, prediction, len(classes))
-    protocol = point_label(card, carried)
+    protocol = card.labelled([f"points: {carried}"])
     for metric, values, points in (
         ("class_iou", class_iou(counts), counts.union),
         ("class_accuracy", class_accuracy(counts), counts.truth),
@@ -96,17 +102,13 @@ def measure_points(
 
 
 def pooled_points(card: ProtocolCard, scenes: Iterable[Iterable[Any]], classes: ClassSet) -> dict[str, float]:
-    """Return the means of a pooled protocol.
-
-    Args:
-        scenes: the class rows of each scene, from one method: `Measured` or named tuples of a score file.
-    """
+    """Return the means of a pooled protocol, from the class rows of each scene (or similar named tuples)."""
     counts = pooled(_counts_of(rows, classes) for rows in scenes)
-    means = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
+    values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
     if "miou_head" in card.metrics:
         for split, members in splits_of(classes).items():
-            means[f"miou_{split}"] = miou_over_occurring(counts, np.array(members))
-    return means
+            values[f"miou_{split}"] = means.miou_over_occurring(counts, np.array(members))
+    return values
 
 
 def _counts_of(rows: Iterable[Any], classes: ClassSet) -> ClassCounts:
@@ -126,7 +128,7 @@ def measure_instances(method: str, scans: Mapping[str, InstanceMatches], carried
     """Yield AP, AP50 and AP25 over all scans, and AP of each split; `n` is the number of scans.
 
     Scans without predictions must be included: their instances are misses. Nothing is yielded if no scan has
-    an instance of any class.
+    an instance.
     """
     precisions = average_precision(list(scans.values()))
     if np.isnan(precisions).all():
@@ -134,5 +136,101 @@ def measure_instances(method: str, scans: Mapping[str, InstanceMatches], carried
     values = {"ap": ap(precisions), "ap50": ap50(precisions), "ap25": ap25(precisions)}
     for split, members in splits_of(SCANNET200_INSTANCES).items():
         values[f"ap_{split}"] = ap(precisions[np.array(members)])
+    protocol = INSTANCES.labelled([f"points: {carried}"])
     for metric, value in values.items():
-        yield Measured(method, "", "", metric, point_label(INSTANCES, carried), value, len(scans))
+        yield Measured(method, "", "", metric, protocol, value, len(scans))
+
+
+def point_classes(
+    scene: "LanguageScene", carried: CarriedPoints, method: str, texts: Sequence[str]
+) -> Int32[np.ndarray, " P"]:
+    """Return labels 1 .. K of points by "tree" or "field"; 0 if no Gaussian is assigned to a point."""
+    vectors = scene.text_vectors(texts)
+    if method == "tree":
+        of_node = classify(scene.tree.clip.astype(np.float32), vectors)
+        node = scene.tree.node_of_gaussian[:, LEVEL.index]
+        return carried.labels(np.append(of_node, 0)[node])  # -1 is none
+    language, code = scene.trained()
+    latents = carried.features(np.ascontiguousarray(language.features[:, LEVEL.index]))
+    fitted = np.flatnonzero(latents.any(axis=1))
+    labels = np.zeros(len(latents), dtype=np.int32)
+    if len(fitted):
+        decoded = code.decode_array(latents[fitted].astype(np.float32))
+        labels[fitted] = classify(decoded, vectors)
+    return labels
+
+
+def node_instances(
+    scene: "LanguageScene", carried: CarriedPoints, truth: LabelledPoints, classes: ClassSet
+) -> InstanceMatches:
+    """Match the nodes at level whole to the truth; a node's best cosine gives class and confidence."""
+    tree = scene.tree
+    nodes = tree.nodes_of(LEVEL)
+    cosines = tree.clip[nodes].astype(np.float32) @ scene.text_vectors(classes.texts).T
+    own = carried.labels(tree.node_of_gaussian[:, LEVEL.index] + 1) - 1
+    return instance_scan(
+        truth,
+        classes,
+        own[None] == nodes[:, None],
+        np.array(classes.ids)[cosines.argmax(axis=1)],
+        cosines.max(axis=1),
+    )
+
+
+def instance_scan(
+    truth: LabelledPoints,
+    classes: ClassSet,
+    masks: Bool[np.ndarray, "M P"],
+    class_ids: Int[np.ndarray, " M"],
+    confidences: Float[np.ndarray, " M"],
+) -> InstanceMatches:
+    """Match predicted instances, with class ids as in the data set's files, to the labelled instances."""
+    labels = classes.labels(truth.class_id)
+    ids = np.array([0, *classes.ids])[labels]
+    of_points = np.where(labels > 0, ids * CLASS_STRIDE + truth.instance_id, 0).astype(np.int64)
+    return match_instances(of_points, masks, class_ids, confidences, classes.ids)
+
+
+def class_set(name: str) -> tuple[str, ClassSet]:
+    """Return the labelling and the class set with the given name."""
+    sets = {classes.name: (labelling, classes) for labelling, sets in LABELLINGS.items() for classes in sets}
+    return sets[name]
+
+
+def measure_scene_points(
+    scene: "LanguageScene",
+    truth: Mapping[str, LabelledPoints],
+    scene_from_points: Float[np.ndarray, "4 4"],
+    cards: Sequence[ProtocolCard],
+    methods: Sequence[str],
+    mode: Mode,
+    threads: int = 1,
+) -> Iterator[Measured | tuple[str, InstanceMatches]]:
+    """Yield the rows of one scene under point protocols, and the instance matches of the tree.
+
+    Labelled points are given by labelling, in metres; `scene_from_points` is a similarity transform.
+    Protocols whose labelling is absent are skipped.
+    """
+    radius = VOTE_RADIUS_M * float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
+    carried_of: dict[int, CarriedPoints] = {}  # labellings of a mesh share its vertices
+    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # protocols share classes
+    for card in cards:
+        labelling, classes = class_set(card.classes)
+        if labelling not in truth:
+            continue
+        points = truth[labelling]
+        if id(points.xyz) not in carried_of:
+            places = points.xyz @ scene_from_points[:3, :3].T + scene_from_points[:3, 3]
+            carried_of[id(points.xyz)] = carried_to(places, scene.gaussians, mode, radius, threads)
+        carried = carried_of[id(points.xyz)]
+        if card is INSTANCES:
+            if "tree" in methods:
+                yield "tree", node_instances(scene, carried, points, classes)
+            continue
+        labels = carried.truth(points.labels(classes))
+        for method in ("tree", "field"):
+            if method in methods:
+                key = (id(points.xyz), method, classes.name)
+                if key not in labels_of:
+                    labels_of[key] = point_classes(scene, carried, method, classes.texts)
+                yield from measure_points(card, method, labels, labels_of[key], classes, carried.mode)

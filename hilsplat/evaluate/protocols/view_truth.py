@@ -14,7 +14,7 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, check_label_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.metrics.localization import box_of
+from hilsplat.evaluate.metrics.masks import box_of
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -28,25 +28,15 @@ SHAPE_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Query:
-    """One annotated text in one view.
-
-    Attributes:
-        text: query text.
-        level: level of its annotation; None if merged over levels.
-        paths: distinct chains of texts that lead to its nodes.
-        truth: true region.
-        boxes_xyxy: box of each annotated node, borders included.
-        any_grey: true region for protocols with truth `any grey`; None if it equals `truth`.
-        eighth: true region at an eighth of the image's size, read from the label; None: from `truth`.
-    """
+    """One annotated text in one view."""
 
     text: str
-    level: Level | None
-    paths: tuple[tuple[str, ...], ...]
+    level: Level | None  # of its annotation; None if merged over levels
+    paths: tuple[tuple[str, ...], ...]  # distinct chains of texts that lead to its nodes
     truth: Bool[np.ndarray, "H W"]
-    boxes_xyxy: Int[np.ndarray, "B 4"]
-    any_grey: Bool[np.ndarray, "H W"] | None = None
-    eighth: Bool[np.ndarray, "h w"] | None = None
+    boxes_xyxy: Int[np.ndarray, "B 4"]  # of each annotated node, borders included
+    any_grey: Bool[np.ndarray, "H W"] | None = None  # region for truth `any grey`, if it differs
+    eighth: Bool[np.ndarray, "h w"] | None = None  # at an eighth of the image's size, read from the label
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
         """Return the true region for protocols with this `truth`, `labels` or `any grey`."""
@@ -55,19 +45,12 @@ class Query:
 
 @dataclass(frozen=True)
 class ViewTruth:
-    """Everything that is scored in one view.
+    """Everything that is scored in one view."""
 
-    Attributes:
-        queries: one per (text, level).
-        categories: one query per text, merged over levels.
-        regions: true region of each path that is large enough.
-        absent: texts that the labels list but the view doesn't show. They compete in an argmax, and protocols
-            with truth `any grey` may find a region.
-    """
-
-    queries: tuple[Query, ...]
-    categories: tuple[Query, ...]
-    regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]
+    queries: tuple[Query, ...]  # one per (text, level)
+    categories: tuple[Query, ...]  # one per text, merged over levels
+    regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]  # of each path that is large enough
+    # Texts that the labels list but the view doesn't show compete in an argmax, and may have `any_grey`.
     absent: tuple[Query, ...] = ()
 
     @staticmethod
@@ -131,26 +114,22 @@ class ViewTruth:
             if region.level is not None and len(region.path) == int(region.level):
                 path = region.path
                 by_path[path] = by_path[path] | mask if path in by_path else mask
-        queries = [
-            Query(
-                text,
-                level,
-                tuple(dict.fromkeys(region.path for region, _ in same)),
-                np.any([mask for _, mask in same], axis=0),
-                np.concatenate([region.boxes(size_hw) for region, _ in same]),
-                np.any([region.mask(size_hw, any_grey=True) for region, _ in same], axis=0)
-                if any(region.any_grey for region, _ in same)
-                else None,
-                np.any(
-                    [
-                        region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))]
-                        for region, _ in same
-                    ],
-                    axis=0,
-                ),
+        queries = []
+        for (text, level), same in groups.items():
+            own = [region for region, _ in same]
+            with_grey = own if any(region.any_grey for region in own) else []
+            small = [region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))] for region in own]
+            queries.append(
+                Query(
+                    text,
+                    level,
+                    tuple(dict.fromkeys(region.path for region in own)),
+                    np.any([mask for _, mask in same], axis=0),
+                    np.concatenate([region.boxes(size_hw) for region in own]),
+                    _union(region.mask(size_hw, any_grey=True) for region in with_grey),
+                    _union(small),
+                )
             )
-            for (text, level), same in groups.items()
-        ]
         united = _united(queries)
         return ViewTruth(
             tuple(query for query in queries if query.level is not None),
@@ -164,29 +143,26 @@ class ViewTruth:
 
         The answer to "leg" covers legs of chair and table; those in the annotated table aren't the chair's.
         """
-        named_alike = (
+        parent = path[:-1]
+        named_alike = [
             other for other in self.regions if len(other) == len(path) > 1 and other[-1] == path[-1]
-        )
-        others = [
-            self.regions[other[:-1]]
-            for other in named_alike
-            if other[:-1] in self.regions.keys() - {path[:-1]}
         ]
-        if not others or path[:-1] not in self.regions:
+        parents = {other[:-1] for other in named_alike} - {parent}
+        others = [self.regions[each] for each in parents if each in self.regions]
+        if not others or parent not in self.regions:
             return answer
-        return answer & ~(np.any(others, axis=0) & ~self.regions[path[:-1]])
+        return answer & ~(np.any(others, axis=0) & ~self.regions[parent])
 
     def families(self) -> list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]]:
         """Return (parent path, child paths) pairs per transition whole -> part, part -> subpart."""
-        transitions: list[list[tuple[tuple[str, ...], list[tuple[str, ...]]]]] = []
-        for depth in range(1, len(LEVELS)):
-            families = []
-            for parent in (path for path in self.regions if len(path) == depth):
-                children = [path for path in self.regions if path[:-1] == parent]
-                if children:
-                    families.append((parent, children))
-            transitions.append(families)
-        return transitions
+        children: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+        for path in self.regions:
+            children.setdefault(path[:-1], []).append(path)
+        parents = [path for path in self.regions if path in children]
+        return [
+            [(parent, children[parent]) for parent in parents if len(parent) == depth]
+            for depth in range(1, len(LEVELS))
+        ]
 
 
 def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
@@ -194,20 +170,21 @@ def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
     by_text: dict[str, list[Query]] = {}
     for query in queries:
         by_text.setdefault(query.text, []).append(query)
-    return tuple(
-        Query(
-            text,
-            None,
-            tuple(path for query in same for path in query.paths),
-            np.any([query.truth for query in same], axis=0),
-            np.concatenate([query.boxes_xyxy for query in same]),
-            np.any([query.region("any grey") for query in same], axis=0)
-            if any(query.any_grey is not None for query in same)
-            else None,
-            _union(query.eighth for query in same),
+    united = []
+    for text, same in by_text.items():
+        with_grey = same if any(query.any_grey is not None for query in same) else []
+        united.append(
+            Query(
+                text,
+                None,
+                tuple(path for query in same for path in query.paths),
+                np.any([query.truth for query in same], axis=0),
+                np.concatenate([query.boxes_xyxy for query in same]),
+                _union(query.region("any grey") for query in with_grey),
+                _union(query.eighth for query in same),
+            )
         )
-        for text, same in by_text.items()
-    )
+    return tuple(united)
 
 
 def _union(masks: Iterable[np.ndarray | None]) -> np.ndarray | None:
@@ -224,10 +201,7 @@ def eighth_of(size_hw: tuple[int, int]) -> tuple[int, int]:
 def kept_by_pillow(
     old_hw: tuple[int, int], new_hw: tuple[int, int]
 ) -> tuple[Int64[np.ndarray, " h"], Int64[np.ndarray, " w"]]:
-    """Return the rows and columns that Pillow's nearest-neighbour resizing keeps, as in 3D-OVS.
-
-    At an eighth of a size divisible by 8 they are 8 i + 4.
-    """
+    """Return the rows and columns that Pillow's nearest-neighbour resizing keeps, as in 3D-OVS."""
 
     def kept(old: int, new: int) -> Int64[np.ndarray, " n"]:
         line = Image.fromarray(np.arange(old, dtype=np.int32)[None])
@@ -247,11 +221,7 @@ def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str,
 
 
 def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """Return the true regions in each labelled view of a published data set, loaded on demand.
-
-    Raises:
-        SceneError: a labelled view has no pose, or its labels differ in shape.
-    """
+    """Return the true regions in each labelled view of a published data set, loaded on demand."""
     for sentence in labels.warnings:
         logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
     truths: dict[str, Callable[[], ViewTruth]] = {}

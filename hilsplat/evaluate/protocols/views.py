@@ -16,7 +16,9 @@ prediction counts as 0. Only Gaussians and nodes visible in the view compete, ex
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,8 +31,7 @@ from hilsplat.evaluate.metrics.hierarchy import (
     consistency_per_child,
     mean_over_parents,
 )
-from hilsplat.evaluate.metrics.localization import peak_points
-from hilsplat.evaluate.metrics.masks import best_threshold_iou
+from hilsplat.evaluate.metrics.masks import best_threshold_iou, peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
@@ -38,7 +39,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     mean_filter,
     relevancy_mask,
 )
-from hilsplat.evaluate.protocols.answers import PackedMasks, QueryableScene, Selections, ViewMaps
+from hilsplat.evaluate.protocols.answers import NO_POINTS, PackedMasks, Selections, ViewMaps, mask_rows
 from hilsplat.evaluate.protocols.cards import (
     ANCESTORS,
     ANNOTATIONS,
@@ -55,10 +56,12 @@ from hilsplat.evaluate.protocols.cards import (
     ProtocolCard,
 )
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.rows import NO_POINTS, mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.evaluate.scores import Measured
 from hilsplat.settings import EvaluateSettings
+
+if TYPE_CHECKING:
+    from hilsplat.query.language_scene import LanguageScene
 
 RELEVANCY_CHUNK_MIB = 512
 """Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
@@ -111,7 +114,7 @@ def relevancy_departures(settings: EvaluateSettings) -> list[str]:
 
 
 def measure_view(
-    scene: QueryableScene,
+    scene: "LanguageScene",
     selections: Selections,
     truth: ViewTruth,
     view: str,
@@ -123,21 +126,17 @@ def measure_view(
     """Yield all rows of one view, in no particular order.
 
     Args:
-        selections: cached selections of the scene's nodes.
-        truth: queries to score, with their regions.
-        size_hw: height and width of the view, px.
-        settings: methods, map rule and relevancy settings.
         also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
         masks: stores the answers, for measures between views.
     """
-    masks = PackedMasks(size_hw) if masks is None else masks
+    answers = _ViewAnswers(selections, view, settings, PackedMasks(size_hw) if masks is None else masks)
     rule = rule_of(settings)
 
     def by_map(smoothed: SmoothedRelevancy, level: Level | None) -> np.ndarray:
         return relevancy_mask(smoothed, level, rule)[0]
 
     def by_nodes(text: str, level: Level | None) -> np.ndarray:
-        return selections.mask(view, selections.nodes((text,), level, view), size_hw)
+        return answers.of_nodes((text,), level)
 
     def maps_of(render: Callable, cosine: Callable) -> ViewMaps:
         return ViewMaps(
@@ -153,9 +152,8 @@ def measure_view(
     for start in range(0, len(categories), per_chunk):
         chunk = categories[start : start + per_chunk]
         texts = [category.text for category in chunk]
-        fields = _relevancy(scene.field_relevancy, texts, view) if "field" in settings.methods else None
-        asks_nodes = {"tree", "tree-path"} & set(settings.methods)
-        nodes = _relevancy(scene.node_relevancy_map, texts, view) if asks_nodes else None
+        fields = field_maps.relevancy(texts) if "field" in settings.methods else None
+        nodes = node_maps.relevancy(texts) if {"tree", "tree-path"} & set(settings.methods) else None
         for row, category in enumerate(chunk):
             queries = [query for query in truth.queries if query.text == category.text]
             for method, found, maps in (("field", fields, field_maps), ("tree", nodes, node_maps)):
@@ -167,21 +165,19 @@ def measure_view(
                     flat, answer = LERF_LANGSPLAT, partial(by_map, smoothed)
                     if method == "tree":
                         flat, answer = TREE_NODES, partial(by_nodes, category.text)
-                        yield from _scene_wide_rows(queries, settings, selections, view, masks)
+                        yield from answers.scene_wide_rows(queries)
                         mask = by_nodes(category.text, None) if also is not None else None
-                    yield from _answer_rows(
-                        method, flat, smoothed, answer, category, queries, settings, masks
-                    )
+                    yield from answers.rows(method, flat, smoothed, answer, category, queries)
                 if also is not None:
                     yield from also.add(method, found[row], mask, category, queries, maps)
             if nodes is not None and "tree-path" in settings.methods:
-                yield from _path_rows(nodes[row], queries, settings, selections, view, masks)
+                yield from answers.path_rows(nodes[row], queries)
     if also is not None:
         yield from also.finish()
-    yield from _consistency_rows(truth, masks, settings)
+    yield from answers.consistency_rows(truth)
 
 
-def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
+def _relevancy(render: Callable, texts: Sequence[str], view: str) -> np.ndarray:
     found = np.asarray(render(tuple(texts), view), dtype=np.float32)
     if np.isnan(found).any():
         raise ArtifactError(
@@ -192,118 +188,109 @@ def _relevancy(render, texts: Sequence[str], view: str) -> np.ndarray:
     return found
 
 
-def _answer_rows(
-    method: str,
-    flat: ProtocolCard,
-    smoothed: SmoothedRelevancy,
-    answer: Callable[[Level | None], np.ndarray],
-    category: Query,
-    queries: Sequence[Query],
-    settings: EvaluateSettings,
-    masks: PackedMasks,
-) -> Iterator[Measured]:
-    """Yield the rows of one text by field or tree.
+@dataclass(frozen=True)
+class _ViewAnswers:
+    """Rows of one view under the protocols of this module; every answer is stored in `masks`."""
 
-    Args:
-        flat: protocol of texts merged over levels.
-        answer: level, or None if the method chooses it -> mask of the text.
-        category: the text, merged over levels.
-        queries: the text at each level.
-        masks: stores the answers.
-    """
-    united, given, auto = (label_of(card, method, settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO))
-    auto_mask = answer(None)
-    auto_points, _ = peak_points(smoothed.filtered, None)
-    yield from mask_rows(method, category, united, auto_mask, auto_points)
-    masks.put((method, auto, category.text), auto_mask)
-    for query in queries:
-        assert query.level is not None
-        given_mask = answer(query.level)
-        given_points, _ = peak_points(smoothed.filtered, query.level)
-        yield from mask_rows(method, query, given, given_mask, given_points)
-        yield from mask_rows(method, query, auto, auto_mask, auto_points)
-        best = best_threshold_iou(smoothed.mixed[query.level.index], query.truth)
-        yield Measured(method, query.text, query.level.label, "best_threshold_iou", given, best)
-        masks.put(given_key(method, query, settings), given_mask)
+    selections: Selections
+    view: str
+    settings: EvaluateSettings
+    masks: PackedMasks
 
+    def of_nodes(self, path: tuple[str, ...], level: Level | None, *, scene_wide: bool = False) -> np.ndarray:
+        """Return the mask of the nodes that answer the last text of a path."""
+        ids = self.selections.nodes(path, level, None if scene_wide else self.view)
+        return self.selections.mask(self.view, ids, self.masks.size_hw)
 
-def _scene_wide_rows(
-    queries: Sequence[Query],
-    settings: EvaluateSettings,
-    selections: Selections,
-    view: str,
-    masks: PackedMasks,
-) -> Iterator[Measured]:
-    """Yield the rows of the tree's answers for the whole scene, without localization, which is per view."""
-    protocol = label_of(SCENE_WIDE, "tree", settings)
-    for query in queries:
-        mask = selections.mask(view, selections.nodes((query.text,), query.level, None), masks.size_hw)
-        yield from mask_rows("tree", query, protocol, mask, NO_POINTS, MASK)
-        masks.put(("tree", protocol, query.text, query.level), mask)
+    def rows(
+        self,
+        method: str,
+        flat: ProtocolCard,
+        smoothed: SmoothedRelevancy,
+        answer: Callable[[Level | None], np.ndarray],
+        category: Query,
+        queries: Sequence[Query],
+    ) -> Iterator[Measured]:
+        """Yield the rows of one text by field or tree.
 
+        Args:
+            flat: protocol of texts merged over levels, as `category` is.
+            answer: level, or None if the method chooses it -> mask of the text.
+            queries: the text at each level.
+        """
+        united, given, auto = (
+            label_of(card, method, self.settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO)
+        )
+        auto_mask = answer(None)
+        auto_points, _ = peak_points(smoothed.filtered, None)
+        yield from mask_rows(method, category, united, auto_mask, auto_points)
+        self.masks.put((method, auto, category.text), auto_mask)
+        for query in queries:
+            assert query.level is not None
+            given_mask = answer(query.level)
+            given_points, _ = peak_points(smoothed.filtered, query.level)
+            yield from mask_rows(method, query, given, given_mask, given_points)
+            yield from mask_rows(method, query, auto, auto_mask, auto_points)
+            best = best_threshold_iou(smoothed.mixed[query.level.index], query.truth)
+            yield Measured(method, query.text, query.level.label, "best_threshold_iou", given, best)
+            self.masks.put(given_key(method, query, self.settings), given_mask)
 
-def _path_rows(
-    relevancy: np.ndarray,
-    queries: Sequence[Query],
-    settings: EvaluateSettings,
-    selections: Selections,
-    view: str,
-    masks: PackedMasks,
-) -> Iterator[Measured]:
-    """Yield the rows of answers to paths; localization searches the parent's predicted mask, if any."""
-    protocol = label_of(PATH, "tree-path", settings)
-    size_hw = masks.size_hw
-    side_px = filter_side_px(settings.filter_px, size_hw[0])
-    for query in queries:
-        assert query.level is not None
-        mask = np.zeros(size_hw, dtype=bool)
-        inside = np.zeros(size_hw, dtype=bool)
-        for path in query.paths:
-            path_mask = selections.mask(view, selections.nodes(path, query.level, view), size_hw)
-            masks.put(("tree-path", protocol, path), path_mask)
-            mask |= path_mask
-            if len(path) > 1:
-                is_full = len(path) == int(query.level)  # labels may lack an intermediate level
-                parent_level = Level(len(path) - 1) if is_full else None
-                inside |= selections.mask(view, selections.nodes(path[:-1], parent_level, view), size_hw)
-        level_map = relevancy[query.level.index]
-        filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
-        points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)
-        yield from mask_rows("tree-path", query, protocol, mask, points)
+    def scene_wide_rows(self, queries: Sequence[Query]) -> Iterator[Measured]:
+        """Yield the rows of the tree's answers for the whole scene, without localization (per view)."""
+        protocol = label_of(SCENE_WIDE, "tree", self.settings)
+        for query in queries:
+            mask = self.of_nodes((query.text,), query.level, scene_wide=True)
+            yield from mask_rows("tree", query, protocol, mask, NO_POINTS, MASK)
+            self.masks.put(("tree", protocol, query.text, query.level), mask)
 
+    def path_rows(self, relevancy: np.ndarray, queries: Sequence[Query]) -> Iterator[Measured]:
+        """Yield the rows of answers to paths; localization searches the parent's predicted mask, if any."""
+        protocol = label_of(PATH, "tree-path", self.settings)
+        size_hw = self.masks.size_hw
+        side_px = filter_side_px(self.settings.filter_px, size_hw[0])
+        for query in queries:
+            assert query.level is not None
+            mask = np.zeros(size_hw, dtype=bool)
+            inside = np.zeros(size_hw, dtype=bool)
+            for path in query.paths:
+                path_mask = self.of_nodes(path, query.level)
+                self.masks.put(("tree-path", protocol, path), path_mask)
+                mask |= path_mask
+                if len(path) > 1:
+                    is_full = len(path) == int(query.level)  # labels may lack an intermediate level
+                    inside |= self.of_nodes(path[:-1], Level(len(path) - 1) if is_full else None)
+            level_map = relevancy[query.level.index]
+            filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
+            points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)
+            yield from mask_rows("tree-path", query, protocol, mask, points)
 
-def _consistency_rows(truth: ViewTruth, masks: PackedMasks, settings: EvaluateSettings) -> Iterator[Measured]:
-    """Yield the HC of every method and of the annotations; nothing for a view without parents."""
-    cards = {
-        "truth": (ANNOTATIONS,),
-        "field": (LEVEL_AUTO, LEVEL_GIVEN),
-        "tree": (LEVEL_AUTO, LEVEL_GIVEN, SCENE_WIDE),
-        "tree-path": (PATH,),
-    }
+    def consistency_rows(self, truth: ViewTruth) -> Iterator[Measured]:
+        """Yield the HC of every method and of the annotations; nothing for a view without parents."""
+        cards = {
+            "truth": (ANNOTATIONS,),
+            "field": (LEVEL_AUTO, LEVEL_GIVEN),
+            "tree": (LEVEL_AUTO, LEVEL_GIVEN, SCENE_WIDE),
+            "tree-path": (PATH,),
+        }
 
-    def mask_of(method: str, card: ProtocolCard, protocol: str, path: tuple[str, ...]) -> np.ndarray:
-        if card is ANNOTATIONS:
-            return truth.regions[path]
-        if card is PATH:
-            return masks.get((method, protocol, path))
-        key = path[-1:] if card is LEVEL_AUTO else (path[-1], Level(len(path)))
-        return truth.own_part(path, masks.get((method, protocol, *key)))
+        def mask_of(method: str, card: ProtocolCard, protocol: str, path: tuple[str, ...]) -> np.ndarray:
+            if card is ANNOTATIONS:
+                return truth.regions[path]
+            if card is PATH:
+                return self.masks.get((method, protocol, path))
+            key = path[-1:] if card is LEVEL_AUTO else (path[-1], Level(len(path)))
+            return truth.own_part(path, self.masks.get((method, protocol, *key)))
 
-    for method, of_method in cards.items():
-        for card in of_method if method in ("truth", *settings.methods) else ():
-            protocol = label_of(card, method, settings)
-            yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
+        for method, of_method in cards.items():
+            for card in of_method if method in ("truth", *self.settings.methods) else ():
+                protocol = label_of(card, method, self.settings)
+                yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
 
 
 def consistency_rows(
     method: str, protocol: str, truth: ViewTruth, mask_of: Callable[[tuple[str, ...]], np.ndarray]
 ) -> Iterator[Measured]:
-    """Yield the HC of one method in one view; nothing if the view has no parent.
-
-    Args:
-        protocol: full name, with deviating settings.
-        mask_of: path of texts -> its answer.
-    """
+    """Yield the HC of one method, which answers paths with `mask_of`; nothing if the view has no parent."""
     transitions = truth.families()
     parents = sum(map(len, transitions))
     if not parents:

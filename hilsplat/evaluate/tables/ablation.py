@@ -7,10 +7,15 @@ from typing import TYPE_CHECKING
 
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH
-from hilsplat.evaluate.protocols.totals import level_averages_of_scenes, table_value
-from hilsplat.evaluate.tables.measured import level_cells, measured_blocks, same_row, with_seeds
-from hilsplat.evaluate.tables.rows import Block, Cell, Table
-from hilsplat.evaluate.tables.sources import Sources
+from hilsplat.evaluate.tables.measured import (
+    level_averages_of_scenes,
+    level_cells,
+    measured_blocks,
+    same_row,
+    table_value,
+    with_seeds,
+)
+from hilsplat.evaluate.tables.rows import Block, Cell, Sources, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,16 +27,8 @@ PAPER_DATA = "LERF, 3D-OVS, Hi-LERF"
 
 AGAINST = "against default field"
 COLUMNS = (
-    "LERF localization",
-    "LERF mIoU",
-    "3D-OVS mIoU",
-    "L1",
-    "L2",
-    "L3",
-    "Hi-LERF mIoU",
-    "Hi-LERF HC",
-    "Avg, best threshold",
-    AGAINST,
+    *("LERF localization", "LERF mIoU", "3D-OVS mIoU", "L1", "L2", "L3"),
+    *("Hi-LERF mIoU", "Hi-LERF HC", "Avg, best threshold", AGAINST),
 )
 
 COLUMNS_NOTE = (
@@ -63,31 +60,29 @@ def component_table(sources: Sources) -> Table:
 
 def theta_table(sources: Sources) -> Table:
     """Build the sweep over the coverage threshold."""
-    footnotes = (
-        COLUMNS_NOTE,
+    note = (
         "theta decides which mask of a view lies inside which other. Rows in the paper's reading take levels "
         "from this tree (masks.levels: tree), so theta moves masks between levels. With levels by SAM's head "
-        "it affects a field only through L_ins and L_part, and the linked semantic tree not at all.",
+        "it affects a field only through L_ins and L_part, and the linked semantic tree not at all."
     )
-    blocks = [
-        sources.reported(PAPER_DATA, "coverage threshold", families=False),
-        *component_blocks(sources, ("field",)),
-    ]
-    return sources.finished("theta", "Influence of the coverage threshold theta", blocks, footnotes)
+    return _sweep(sources, "theta", "coverage threshold theta", "coverage threshold", note)
 
 
 def omega_table(sources: Sources) -> Table:
     """Build the sweep over the similarity degree."""
-    footnotes = (
-        COLUMNS_NOTE,
+    note = (
         "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and "
-        "lambda_2 = exp(-5): with 1e-6 and 1e-5 all rows are equal.",
+        "lambda_2 = exp(-5): with 1e-6 and 1e-5 all rows are equal."
     )
+    return _sweep(sources, "omega", "similarity degree Omega", "similarity degrees", note)
+
+
+def _sweep(sources: Sources, name: str, setting: str, reported: str, note: str) -> Table:
     blocks = [
-        sources.reported(PAPER_DATA, "similarity degrees", families=False),
+        sources.reported(PAPER_DATA, reported, families=False),
         *component_blocks(sources, ("field",)),
     ]
-    return sources.finished("omega", "Influence of the similarity degree Omega", blocks, footnotes)
+    return sources.finished(name, f"Influence of the {setting}", blocks, (COLUMNS_NOTE, note))
 
 
 def component_blocks(
@@ -127,13 +122,9 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
 
 
 def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """Return a row's mIoU minus that of the default field, paired by scene.
+    """Return a row's mIoU, over all its seeds, minus that of the default field, paired by scene.
 
     Scenes differ more than rows, so the spread of the paired differences shows whether one row is better.
-
-    Args:
-        scores: scores with seeds (`with_seeds`).
-        part: the scores of one row under all its seeds.
     """
     first = part.iloc[0]
     default = (scores["variant"] == "default") & (scores["method"] == "field")

@@ -14,11 +14,9 @@ from hilsplat.evaluate.tables.ablation import ablation_table, component_table, o
 from hilsplat.evaluate.tables.cost_tables import SECONDS, cost_table, efficiency_table, pruning_table
 from hilsplat.evaluate.tables.costs import read_costs
 from hilsplat.evaluate.tables.formats import as_csv, as_html, as_latex, as_markdown
-from hilsplat.evaluate.tables.hierarchy import frames_table, hierarchy_table
-from hilsplat.evaluate.tables.image_tables import lerf_table, ovs_table
+from hilsplat.evaluate.tables.image_tables import frames_table, hierarchy_table, lerf_table, ovs_table
 from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
-from hilsplat.evaluate.tables.rows import Table
-from hilsplat.evaluate.tables.sources import Sources, read_published
+from hilsplat.evaluate.tables.rows import Sources, Table, read_published
 
 logger = logging.getLogger(__name__)
 
@@ -28,13 +26,9 @@ LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
 
 @dataclass(frozen=True)
 class TableKind:
-    """Description of one table of the paper.
+    """One table: its builder, the kinds of scenes and data sets that it covers, and its variants.
 
-    Attributes:
-        build: function that builds the table.
-        data: kinds of synthetic scenes and published data sets that it covers.
-        variants: configuration key that lists its variants.
-        shows_costs: whether it also reads the times of jobs and queries.
+    `variants` is the configuration key that lists them; `shows_costs` also reads times of jobs and queries.
     """
 
     build: Callable[[Sources], Table]
@@ -59,20 +53,14 @@ TABLES: dict[str, TableKind] = {
     "components": TableKind(component_table, LEVELLED, "component_variants"),
     "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
     "cost-seconds": TableKind(partial(cost_table, seconds=True), LEVELLED, shows_costs=True),
-    "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),
-    "pruning-seconds": TableKind(
-        partial(pruning_table, seconds=True), LEVELLED, "pruning_variants", shows_costs=True
-    ),
+    "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", True),
+    "pruning-seconds": TableKind(partial(pruning_table, seconds=True), LEVELLED, "pruning_variants", True),
     "efficiency": TableKind(efficiency_table, LEVELLED, shows_costs=True),
     "efficiency-seconds": TableKind(partial(efficiency_table, seconds=True), LEVELLED, shows_costs=True),
     "theta": TableKind(theta_table, LEVELLED, "theta_variants"),
     "omega": TableKind(omega_table, LEVELLED, "omega_variants"),
-    "frames-hi-lerf": TableKind(
-        partial(frames_table, name="frames-hi-lerf", data="Hi-LERF"), ("tabletop", "lerf_ovs")
-    ),
-    "frames-hi-3dovs": TableKind(
-        partial(frames_table, name="frames-hi-3dovs", data="Hi-3DOVS"), ("tabletop", "3d_ovs")
-    ),
+    "frames-hi-lerf": TableKind(partial(frames_table, data="Hi-LERF"), ("tabletop", "lerf_ovs")),
+    "frames-hi-3dovs": TableKind(partial(frames_table, data="Hi-3DOVS"), ("tabletop", "3d_ovs")),
 }
 """Every table by name, in report order; a new table needs a function and an entry here."""
 
@@ -93,11 +81,8 @@ def run_table(
     """Build one table and write it as CSV, Markdown, LaTeX and HTML; equal tables give identical files.
 
     Args:
-        name: a key of `TABLES`.
-        scores: `scores.csv` of every scene and variant in the table.
         published: file with the paper's values, `published_values(name)`.
         labels: variant -> its name in the table; other variants keep their own.
-        out: the CSV; `.md`, `.tex` and `.html` are written beside it.
         absent: a sentence with the reason for each data set that was not measured.
 
     Raises:

@@ -5,20 +5,15 @@ so that the other tables are reproducible byte for byte.
 """
 
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import PAPER_DATA, component_cells
 from hilsplat.evaluate.tables.costs import Cost
 from hilsplat.evaluate.tables.measured import ANSWERS, kind_and_title, row_name, with_seeds
-from hilsplat.evaluate.tables.rows import Block, Cell, Row, Table
-from hilsplat.evaluate.tables.sources import Sources
-
-if TYPE_CHECKING:
-    import pandas as pd
+from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources, Table
 
 SECONDS = "-seconds"
 """Suffix of the names of tables that are not reproducible byte for byte."""
@@ -35,31 +30,28 @@ def cost_table(sources: Sources, seconds: bool = False) -> Table:
     """Build the table of training time, memory and seconds per query (paper: computational costs)."""
     blocks = [reported(sources, "one RTX 3090")]
     for data, costs in by_dataset(sources.costs).items():
-        scenes = sorted({cost.scene for cost in costs})
         columns = ["Preparation (min)", "Training (min)", "Memory (GB)"]
-        columns += [f"{scene} query (s)" for scene in scenes]
+        columns += [f"{scene} query (s)" for scene in sorted({cost.scene for cost in costs})]
         rows = []
         for variant, method, of_row in by_answer(sources, costs):
-            cells = {
-                **time_cells(of_row),
-                **{f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in of_row},
-            }
-            rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
-        blocks.append(timed(data, rows, columns))
+            queries = {f"{cost.scene} query (s)": Cell.number(cost.query_s[method]) for cost in of_row}
+            names = {"Method": row_name(variant, method, sources.labels)}
+            rows.append(Row(names, {**time_cells(of_row), **queries}))
+        blocks.append(Block(*kind_and_title(data), tuple(rows), tuple(columns), costs_of(columns)))
     return finished(sources, "cost", "Computational cost", blocks, seconds)
 
 
 def efficiency_table(sources: Sources, seconds: bool = False) -> Table:
     """Build the table of quality at three levels beside training time and memory (paper: efficiency)."""
-    blocks = [reported(sources, "one RTX 3090")]
-    blocks += quality_blocks(sources, ("Preparation (min)", "Training (min)", "Memory (GB)"))
+    columns = ("Preparation (min)", "Training (min)", "Memory (GB)")
+    blocks = [reported(sources, "one RTX 3090"), *quality_blocks(sources, columns)]
     return finished(sources, "efficiency", "Efficiency", blocks, seconds)
 
 
 def pruning_table(sources: Sources, seconds: bool = False) -> Table:
     """Build the table of cost and quality with pruned contrastive pairs (paper: sample pruning)."""
-    blocks = [reported(sources, "sample pruning")]
-    blocks += quality_blocks(sources, ("Training (min)", "Memory (GB)", "Query (s)"), ("field",))
+    columns = ("Training (min)", "Memory (GB)", "Query (s)")
+    blocks = [reported(sources, "sample pruning"), *quality_blocks(sources, columns, ("field",))]
     footnote = (
         "The paper removes redundant pairs by similarity of features and gives no rule. What our variant "
         "removes is set in config/config.yaml (variants)."
@@ -71,28 +63,24 @@ def finished(
     sources: Sources,
     name: str,
     title: str,
-    blocks: Iterable[Block],
+    blocks: Sequence[Block],
     seconds: bool,
     footnotes: Sequence[str] = (),
 ) -> Table:
     """Return a table with all columns, or only with those that are reproducible."""
     if seconds:
         return sources.finished(name + SECONDS, f"{title}, on this machine", blocks, (COST_NOTE, *footnotes))
-    repeated = [block if block.kind == "reported" else without_costs(block) for block in blocks]
+    repeated = []
+    for block in blocks:
+        if block.kind != "reported":
+            columns = tuple(column for column in block.columns if column not in block.lower_is_better)
+            own = [{name: cell for name, cell in row.cells.items() if name in columns} for row in block.rows]
+            rows = [replace(row, cells=cells) for row, cells in zip(block.rows, own, strict=True)]
+            block = replace(block, rows=tuple(rows), columns=columns)
+        if block.columns:
+            repeated.append(block)
     elsewhere = f"What the jobs of this machine took, beside these numbers: table {name}{SECONDS}."
-    return sources.finished(
-        name, title, (block for block in repeated if block.columns), (elsewhere, *footnotes)
-    )
-
-
-def without_costs(block: Block) -> Block:
-    """Return a block without times and memory."""
-    columns = tuple(column for column in block.columns if column not in block.lower_is_better)
-    rows = (
-        replace(row, cells={column: row.cells[column] for column in columns if column in row.cells})
-        for row in block.rows
-    )
-    return replace(block, rows=tuple(rows), columns=columns)
+    return sources.finished(name, title, repeated, (elsewhere, *footnotes))
 
 
 def reported(sources: Sources, title: str) -> Block:
@@ -109,54 +97,43 @@ def costs_of(columns: Iterable[str]) -> frozenset[str]:
 def quality_blocks(
     sources: Sources, time_columns: tuple[str, ...], methods: tuple[str, ...] = ("field", "tree")
 ) -> list[Block]:
-    """Return mIoU and HC at given levels beside times, for each data set with queries at levels."""
-    blocks = []
-    scores = with_seeds(sources.scores) if len(sources.scores) else sources.scores
-    for data, costs in by_dataset(sources.costs).items():
-        rows = []
-        for variant, method, of_row in by_answer(sources, costs):
-            part = given(scores, of_row, variant, method)
-            if method not in methods or part is None:
-                continue
-            quality = component_cells(scores, part)
-            cells = {name: quality[name] for name in ("Hi-LERF mIoU", "Hi-LERF HC")}
-            query = statistics.fmean(cost.query_s[method] for cost in of_row)
-            cells |= {**time_cells(of_row), "Query (s)": Cell.number(query)}
-            rows.append(Row({"Method": row_name(variant, method, sources.labels)}, cells))
-        blocks.append(timed(data, rows, ["Hi-LERF mIoU", "Hi-LERF HC", *time_columns]))
-    return blocks
-
-
-def given(scores: "pd.DataFrame", costs: Sequence[Cost], variant: str, method: str) -> "pd.DataFrame | None":
-    """Return a row's scores at given levels, or None if there are none.
+    """Return mIoU and HC at given levels beside times, for each data set with queries at levels.
 
     Labels with levels have their own data set (Hi-LERF), or are the scenes' own.
     """
-    if scores.empty:
-        return None
-    part = scores[
-        scores["dataset"].isin([*LEVELLED, costs[0].dataset])
-        & scores["scene"].isin([cost.scene for cost in costs])
-        & (scores["variant"] == variant)
-        & (scores["seed"] == "0")
-        & (scores["method"] == method)
-        & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)
-    ]
-    return None if part.empty else part
+    if sources.scores.empty:
+        return []
+    quality_columns, blocks = ("Hi-LERF mIoU", "Hi-LERF HC"), []
+    scores = with_seeds(sources.scores)
+    given = scores[(scores["seed"] == "0") & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)]
+    for data, costs in by_dataset(sources.costs).items():
+        rows = []
+        for variant, method, of_row in by_answer(sources, costs):
+            part = given[
+                given["dataset"].isin([*LEVELLED, data])
+                & given["scene"].isin([cost.scene for cost in of_row])
+                & (given["variant"] == variant)
+                & (given["method"] == method)
+            ]
+            if method not in methods or part.empty:
+                continue
+            quality = component_cells(scores, part)
+            query_s = statistics.fmean(cost.query_s[method] for cost in of_row)
+            cells = {name: quality[name] for name in quality_columns} | time_cells(of_row)
+            names = {"Method": row_name(variant, method, sources.labels)}
+            rows.append(Row(names, {**cells, "Query (s)": Cell.number(query_s)}))
+        columns = (*quality_columns, *time_columns)
+        blocks.append(Block(*kind_and_title(data), tuple(rows), columns, costs_of(columns)))
+    return blocks
 
 
-def time_cells(costs: list[Cost]) -> Mapping[str, Cell]:
+def time_cells(costs: list[Cost]) -> dict[str, Cell]:
     """Return mean times over scenes and the largest memory."""
     return {
         "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
         "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
         "Memory (GB)": Cell.number(max(cost.peak_mib for cost in costs) / 1024),
     }
-
-
-def timed(data: str, rows: list[Row], columns: list[str]) -> Block:
-    """Return a block of measured times."""
-    return Block(*kind_and_title(data), tuple(rows), tuple(columns), costs_of(columns))
 
 
 def by_dataset(costs: Iterable[Cost]) -> dict[str, list[Cost]]:

@@ -1,6 +1,6 @@
-"""Cost of a scene and variant: time and memory of its jobs, seconds per query.
+"""Time and memory of the jobs of a scene and variant, seconds per query, and time per stage.
 
-Times differ from run to run and are stored apart from `scores.csv`, which must be reproducible byte for byte.
+Times differ from run to run, so they are not in `scores.csv`, which is reproducible byte for byte.
 """
 
 import math
@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hilsplat.base.provenance import read_provenance
+from hilsplat.base.artifacts import parse_json, write_text
+from hilsplat.base.errors import ArtifactError
+from hilsplat.base.provenance import read_provenance, require_beginning
 from hilsplat.base.tables import read_csv, write_csv
-from hilsplat.evaluate.tables.efficiency import Job, read_benchmark
+from hilsplat.configuration import SECTIONS
 
 if TYPE_CHECKING:
     from hilsplat.query.language_scene import LanguageScene
@@ -24,23 +26,29 @@ TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
 
 
 @dataclass(frozen=True)
-class Cost:
-    """Cost of one scene under one variant; shared stages are counted in full.
+class Job:
+    """One finished job. Data set, scene and variant are empty where it has none."""
 
-    Attributes:
-        prepare_s: wall-clock time of masks, trees of the views and CLIP, s; nan if a job has no record.
-        train_s: wall-clock time of contributions, semantic tree, autoencoder and field, s; nan as above.
-        peak_mib: largest resident memory of a training job, MiB; nan without a record.
-        query_s: per method, seconds from a text to a mask in a view.
-    """
+    stage: str
+    dataset: str
+    scene: str
+    variant: str
+    elapsed_s: float  # wall-clock time
+    cpu_s: float  # of the job and its children; 0 if the job was too short to be sampled
+    peak_mib: float  # largest resident memory; 0 as above
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of one scene under one variant; shared stages are counted in full. Without a record: nan."""
 
     dataset: str
     scene: str
     variant: str
-    prepare_s: float
-    train_s: float
-    peak_mib: float
-    query_s: Mapping[str, float]
+    prepare_s: float  # wall-clock time of masks, trees of the views and CLIP
+    train_s: float  # wall-clock time of contributions, semantic tree, autoencoder and field
+    peak_mib: float  # largest resident memory of a training job
+    query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
 
 
 def time_queries(
@@ -48,11 +56,8 @@ def time_queries(
 ) -> dict[str, float]:
     """Return the seconds of one query per method: text, weights of the view, relevancy and mask.
 
-    The view's weights and the text's vector are timed once and added, because later queries reuse them.
-
-    Args:
-        asks: per method, a function from a text to its mask in `view`, with weights and vectors cached.
-        texts: texts whose vectors are cached; the result is the median over them.
+    The view's weights and the text's vector are timed once and added, because later queries reuse them. Each
+    function of `asks` maps a text to its mask, with weights and vectors cached; the median over texts counts.
     """
     start = time.perf_counter()
     answers.encode_texts([texts[0]])
@@ -77,11 +82,7 @@ def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: M
 
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:
-    """Return the costs of the scenes and variants of score files, from the records beside their artifacts.
-
-    Raises:
-        ArtifactError: a score file has no times, or a record cannot be read.
-    """
+    """Return the costs of the scenes and variants of score files, from the records beside their artifacts."""
     found = []
     for path in scores:
         rows = read_csv(Path(path).with_name(TIMES), TIME_COLUMNS, "run the evaluate stage again")
@@ -96,7 +97,7 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
                 first["variant"],
                 _seconds(jobs, PREPARATION),
                 _seconds(jobs, TRAINING),
-                _peak(jobs),
+                max((job.peak_mib for stage in TRAINING if (job := jobs.get(stage))), default=0) or math.nan,
                 {row["method"]: float(row["seconds"]) for row in rows},
             )
         )
@@ -133,6 +134,62 @@ def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
     return sum(job.elapsed_s if job is not None else math.nan for job in needed)
 
 
-def _peak(jobs: Mapping[str, Job | None]) -> float:
-    peaks = [job.peak_mib for stage in TRAINING if (job := jobs.get(stage)) is not None]
-    return max(peaks) if peaks and max(peaks) > 0 else math.nan
+def run_efficiency(results: Path, out: Path) -> str:
+    """Write a CSV of all jobs below `results`, and a Markdown table of stages beside it, which is returned.
+
+    Raises:
+        ArtifactError: there is no benchmark file, one is unreadable, or an output is an unrelated file.
+    """
+    files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
+    if not files:
+        raise ArtifactError(f"{results} contains no benchmark files", fix="run the workflow first")
+    jobs = [job for path in files for job in read_benchmark(path, Path(results))]
+    stages = list(SECTIONS)  # in the order of the data flow; other stages come after them, by name
+    places = {job.stage: stages.index(job.stage) if job.stage in stages else len(stages) for job in jobs}
+    jobs.sort(key=lambda job: (places[job.stage], job.stage, job.dataset, job.scene, job.variant))
+    columns = ("stage", "dataset", "scene", "variant", "seconds", "cpu_seconds", "peak_mib")
+    rows = []
+    of_stage: dict[str, list[Job]] = {}
+    for job in jobs:
+        numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
+        rows.append([job.stage, job.dataset, job.scene, job.variant, *numbers])
+        of_stage.setdefault(job.stage, []).append(job)
+    lines = [
+        "| stage | jobs | mean s | longest s | total s | CPU s | peak MiB |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name, of_row in [*of_stage.items(), ("all", jobs)]:
+        times = [job.elapsed_s for job in of_row]
+        seconds = (sum(times) / len(times), max(times), sum(times), sum(job.cpu_s for job in of_row))
+        shown = " | ".join(f"{value:.1f}" for value in seconds)
+        lines.append(f"| {name} | {len(of_row)} | {shown} | {max(job.peak_mib for job in of_row):.0f} |")
+    text, beside = "\n".join(lines) + "\n", Path(out).with_suffix(".md")
+    for path, begin in ((Path(out), ",".join(columns)), (beside, lines[0])):
+        require_beginning(path, begin)
+    write_csv(Path(out), columns, rows)
+    write_text(beside, text)
+    return text
+
+
+def read_benchmark(path: Path, results: Path) -> list[Job]:
+    """Read the jobs of `<dataset>/<scene>[/<variant>]/benchmarks/<stage>.jsonl`, one per line.
+
+    Raises:
+        ArtifactError: a line is not a JSON object with a time.
+    """
+    place = path.relative_to(results).parts[:-2]
+    dataset, scene, variant = (*place, "", "", "")[:3]
+    jobs = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            record = parse_json(line)
+            elapsed_s = float(record["s"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ArtifactError(
+                f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
+            ) from error
+        # Snakemake writes "-" or null for values that it could not sample.
+        sampled = (record.get(name) for name in ("cpu_time", "max_rss"))
+        cpu_s, peak_mib = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
+        jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, cpu_s, peak_mib))
+    return jobs

@@ -1,15 +1,24 @@
-"""Rows from scores: one block per data set, one row per variant, method, masks and protocol."""
+"""Averages of scores, in the order that their protocol sets, and blocks of measured rows.
+
+Scores are a frame of `scores.csv` (`evaluate.scores.read_scores`). A (view, query) pair without a prediction
+has a row with value 0 unless its protocol omits such pairs.
+"""
 
 import re
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from hilsplat.evaluate.protocols.cards import ANNOTATIONS, LEVEL_AUTO, LEVEL_GIVEN, PATH, SCENE_WIDE
-from hilsplat.evaluate.protocols.totals import level_values, mean_over_levels, scene_values, table_value
-from hilsplat.evaluate.tables.rows import Block, Cell, Row
-from hilsplat.evaluate.tables.sources import Sources
+from hilsplat.base.levels import LEVELS, Level
+from hilsplat.evaluate.protocols.cards import (
+    ANNOTATIONS,
+    LEVEL_AUTO,
+    LEVEL_GIVEN,
+    PATH,
+    SCENE_WIDE,
+    card_of,
+)
+from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
 from hilsplat.segment.origin import made_from_truth
 
 if TYPE_CHECKING:
@@ -60,69 +69,49 @@ def measured_blocks(
         protocols: prefixes of the protocols that have rows.
         cells_of: computes a row's values from the scores of one variant, method, masks, protocol and seed.
         columns_of: returns the value columns, from the scores of a data set.
-        ranked_by_protocol: whether rows of different protocols are ranked separately.
         over_seeds: computes further values of a row from the scores of all its seeds.
         label_of: maps protocols to labels; those with the same label share a row.
     """
     if sources.scores.empty:
         return []
+    order = ["default", *sources.labels]
     blocks = []
     for data, of_data in with_seeds(sources.scores).groupby("dataset", sort=True):
-        rows = []
+        placed: list[tuple[tuple, Row]] = []
         selected = of_data[of_data["protocol"].str.startswith(protocols)]
         selected = selected.assign(label=selected["protocol"].map(label_of))
-        for (*_, label), part in selected.groupby(["variant", "masks", "method", "label"], sort=True):
+        groups = selected.groupby(["variant", "masks", "method", "label"], sort=True)
+        for (variant, masks, method, label), part in groups:
+            is_truth, from_truth = method == "truth", made_from_truth(masks)
+            is_diagnostic = from_truth and not is_truth
+            names = {
+                "Method": (TRUE_MASKS if is_diagnostic else "") + row_name(variant, method, sources.labels),
+                "Masks": "-" if is_truth else masks,
+                "Protocol": PROTOCOLS.get(label, label),
+            }
+            seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
+            if is_truth:
+                seeds = seeds[:1]  # annotations are the same under every seed
+            if len(seeds) > 1:
+                names["Seeds"] = str(len(seeds))
+            place = (
+                from_truth,
+                list(PROTOCOLS).index(label) if label in PROTOCOLS else -1,
+                order.index(variant) if variant in order else len(order),
+                variant,
+                list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
+                masks,
+                label,
+            )
             group = label if ranked_by_protocol else ""
-            place, row = placed_row(label, part, sources.labels, cells_of, group)
-            rows.append((place, replace(row, cells={**row.cells, **over_seeds(part)})))
-        ordered = [row for _, row in sorted(rows, key=lambda placed: placed[0])]
+            cells = {**mean_over_seeds(seeds), **over_seeds(part)}
+            placed.append((place, Row(names, cells, None if is_truth or is_diagnostic else group)))
+        ordered = [row for _, row in sorted(placed, key=lambda each: each[0])]
         distinct = without_repeats(ordered)
         if distinct:
             columns = tuple(columns_of(selected))
             blocks.append(Block(*kind_and_title(str(data)), distinct, columns, unranked=unranked))
     return blocks
-
-
-def placed_row(
-    label: str,
-    part: "pd.DataFrame",
-    labels: Mapping[str, str],
-    cells_of: Callable[["pd.DataFrame"], Mapping[str, Cell]],
-    group: str,
-) -> tuple[tuple, Row]:
-    """Return one row and its position among the rows of a block.
-
-    Args:
-        label: full name of the protocol, or another label that distinguishes the row.
-        part: scores of the row under all its seeds.
-        cells_of: computes the row's values from the scores of one seed.
-        group: rows of a group are ranked together; annotations and true masks are not ranked.
-    """
-    variant, masks, method = part.iloc[0][["variant", "masks", "method"]]
-    is_diagnostic = method != "truth" and made_from_truth(masks)
-    title = row_name(variant, method, labels)
-    names = {
-        "Method": TRUE_MASKS + title if is_diagnostic else title,
-        "Masks": masks if method != "truth" else "-",
-        "Protocol": PROTOCOLS.get(label, label),
-    }
-    seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
-    if method == "truth":
-        seeds = seeds[:1]  # annotations are the same under every seed
-    if len(seeds) > 1:
-        names["Seeds"] = str(len(seeds))
-    order = ["default", *labels]
-    place = (
-        made_from_truth(masks),
-        list(PROTOCOLS).index(label) if label in PROTOCOLS else -1,
-        order.index(variant) if variant in order else len(order),
-        variant,
-        list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
-        masks,
-        label,
-    )
-    ranked_with = None if method == "truth" or is_diagnostic else group
-    return place, Row(names, mean_over_seeds(seeds), ranked_with)
 
 
 def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
@@ -151,8 +140,7 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
     """Remove duplicate rows: the annotations' row is the same for every variant."""
     seen: dict[tuple, Row] = {}
     for row in rows:
-        key = (*row.names.values(), *(cell.text for cell in row.cells.values()))
-        seen.setdefault(key, row)
+        seen.setdefault((*row.names.values(), *(cell.text for cell in row.cells.values())), row)
     return tuple(seen.values())
 
 
@@ -181,11 +169,7 @@ def kind_and_title(dataset: str) -> tuple[str, str, str]:
 def scene_cells(
     part: "pd.DataFrame", metrics: Mapping[str, str], average: str = "Average"
 ) -> dict[str, Cell]:
-    """Return the columns `<scene> <name>` of every scene, and their mean as `<average> <name>`.
-
-    Args:
-        metrics: name in the column -> metric.
-    """
+    """Return the columns `<scene> <name>` of every scene, and their mean; `metrics` maps names to metrics."""
     cells = {}
     for name, metric in metrics.items():
         values = scene_values(part, metric)
@@ -205,15 +189,59 @@ def level_cells(part: "pd.DataFrame", metric: str = "iou") -> dict[str, Cell]:
 def same_row(
     scores: "pd.DataFrame", part: "pd.DataFrame", protocols: tuple[str, ...], dataset: str | None = None
 ) -> "pd.DataFrame":
-    """Return the scores of the same variant, seed, method and masks under other protocols.
+    """Return the scores (with seeds) of the same variant, seed, method and masks under other protocols.
 
-    Args:
-        scores: scores with seeds (`with_seeds`).
-        protocols: prefixes of the protocols' names.
-        dataset: data set of the scores; None for the row's own.
+    `protocols` are prefixes; the data set is the row's own unless it is given.
     """
     first = part.iloc[0]
     same = scores["protocol"].str.startswith(protocols) & (scores["dataset"] == (dataset or first["dataset"]))
     for key in ("variant", "seed", "masks", "method"):
         same &= scores[key] == first[key]
     return scores[same]
+
+
+def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) -> "pd.Series":
+    """Return one number per scene, by name; scenes without a row are omitted.
+
+    The number is the mean over the scene's rows, of one level if it is given; under a protocol with averaging
+    `classes`, the mean over the views of each query, then over queries.
+    """
+    kept = rows[rows["metric"] == metric]
+    if level is not None:
+        kept = kept[kept["level"] == level]
+    orders = {card_of(label).averaging for label in kept["protocol"].unique()}
+    assert len(orders) <= 1, f"rows of several averaging orders: {sorted(orders)}"
+    assert "pooled" not in orders, "pooled protocols have no number per scene"
+    if "classes" in orders:
+        of_query = kept.groupby(["scene", "query"], sort=True)["value"].mean()
+        return of_query.groupby(level="scene", sort=True).mean()
+    return kept.groupby("scene", sort=True)["value"].mean()
+
+
+def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
+    """Return the unweighted mean of the scenes' numbers; nan without a row."""
+    return float(scene_values(rows, metric, level).mean())
+
+
+def share_above(rows: "pd.DataFrame", metric: str, threshold: float) -> float:
+    """Return the share of rows above a threshold, such as Acc@0.25, averaged as the values themselves are."""
+    return table_value(rows.assign(value=(rows["value"] > threshold).astype(float)), metric)
+
+
+def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:
+    """Return the number of each level, L1 to L3; nan for a level without a row."""
+    return {level: table_value(rows, metric, level.label) for level in LEVELS}
+
+
+def mean_over_levels(values: Iterable[float]) -> float:
+    """Return the mean of the levels that have a number (column Avg); nan if none has."""
+    present = [value for value in values if value == value]
+    return sum(present) / len(present) if present else float("nan")
+
+
+def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
+    """Return one number per scene, to pair two rows: mean over a level's rows, then levels, then seeds."""
+    kept = rows[rows["metric"] == metric]
+    of_level = kept.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
+    of_seed = of_level.groupby(level=["scene", "seed"], sort=True).mean()
+    return of_seed.groupby(level="scene", sort=True).mean()

@@ -4,16 +4,15 @@ A room has about twenty names, most entirely right or wrong: one node changes th
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from hilsplat.evaluate.protocols.cards import card_named, card_of
-from hilsplat.evaluate.protocols.totals import table_value
-from hilsplat.evaluate.tables.measured import measured_blocks, scene_cells
-from hilsplat.evaluate.tables.rows import Cell, Table
-from hilsplat.evaluate.tables.sources import Sources
+from hilsplat.evaluate.tables.measured import measured_blocks, scene_cells, table_value
+from hilsplat.evaluate.tables.rows import Cell, Sources, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,13 +85,10 @@ def scannet_table(sources: Sources) -> Table:
     ]
     columns += [*SPLIT_COLUMNS.values(), *AP_COLUMNS.values()]
 
-    def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
-        return {**semantic_cells(part), **split_cells(part), **instance_cells(sources, part)}
-
     blocks += measured_blocks(
         sources,
         (*SCANNET_COLUMNS, BENCHMARK),
-        cells_of,
+        partial(scannet_cells, sources),
         lambda _: columns,
         label_of=lambda protocol: protocol.partition("(")[2].rstrip(")"),  # how points got their class
     )
@@ -111,31 +107,14 @@ def scannet_table(sources: Sources) -> Table:
     return sources.finished("scannet", "ScanNet and ScanNet200: segmentation of points", blocks, footnotes)
 
 
-def semantic_cells(part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return mIoU and mAcc of each class set."""
+def scannet_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
+    """Return mIoU and mAcc of each class set, mIoU of ScanNet200's splits, and AP over all scans of a row."""
     cells = {}
     for protocol, name in SCANNET_COLUMNS.items():
         of_protocol = part[part["protocol"].str.startswith(protocol)]
-        for metric, key in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
-            cells[f"{name} {metric}"] = Cell.percent(table_value(of_protocol, key))
+        for mean, metric in (("mIoU", "miou_present"), ("mAcc", "macc_present")):
+            cells[f"{name} {mean}"] = Cell.percent(table_value(of_protocol, metric))
         cells |= interval_cells(of_protocol, name, pooled=False)
-    return cells
-
-
-def split_cells(part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return mIoU of ScanNet200's head, common and tail classes, pooled over scenes."""
-    of_benchmark = part[part["protocol"].str.startswith(BENCHMARK)]
-    if of_benchmark.empty:
-        return {}
-    from hilsplat.datasets.classes.scannet200 import SCANNET200
-    from hilsplat.evaluate.protocols.points import pooled_points
-
-    means = pooled_points(card_named(BENCHMARK), rows_of_scenes(of_benchmark), SCANNET200)
-    return {column: Cell.percent(means[metric]) for metric, column in SPLIT_COLUMNS.items()}
-
-
-def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
-    """Return the AP over all scans of a row; nothing if the method has no instances."""
     first = part.iloc[0]
     variant = first["variant"] if first["seed"] == "0" else f"{first['variant']}.seed{first['seed']}"
     key = (first["dataset"], variant, first["masks"], first["method"])
@@ -144,12 +123,19 @@ def instance_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
         for (dataset, scene, *rest), matches in sources.instances.items()
         if (dataset, *rest) == key
     }
-    if not scans:
-        return {}
-    from hilsplat.evaluate.protocols.points import measure_instances
+    of_benchmark = part[part["protocol"].str.startswith(BENCHMARK)]
+    if of_benchmark.empty and not scans:
+        return cells
+    from hilsplat.datasets.classes.scannet200 import SCANNET200
+    from hilsplat.evaluate.protocols.points import measure_instances, pooled_points
 
-    rows = measure_instances(first["method"], scans, "nearest")
-    return {AP_COLUMNS[row.metric]: Cell.percent(row.value) for row in rows}
+    if not of_benchmark.empty:  # the counts of all scenes are pooled
+        means = pooled_points(card_named(BENCHMARK), rows_of_scenes(of_benchmark), SCANNET200)
+        cells |= {column: Cell.percent(means[metric]) for metric, column in SPLIT_COLUMNS.items()}
+    if scans:
+        rows = measure_instances(first["method"], scans, "nearest")
+        cells |= {AP_COLUMNS[row.metric]: Cell.percent(row.value) for row in rows}
+    return cells
 
 
 def waymo_table(sources: Sources) -> Table:
@@ -229,12 +215,7 @@ def bootstrap_mean(
 
 
 def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
-    """Return interval, scenes and names of one protocol, method and seed; nothing without class rows.
-
-    Args:
-        name: prefix of the columns.
-        pooled: as in `bootstrap_mean`.
-    """
+    """Return interval, scenes and names of one protocol, method and seed; nothing without class rows."""
     ious = part[part["metric"] == "class_iou"]
     true = part[part["metric"] == "class_accuracy"]
     if ious.empty or true.empty:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnota
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
+from hilsplat.settings import EvaluateSettings
+from tests.unit.evaluate.builders import box
 from tests.unit.round_gaussians import round_gaussians
 
 SIDE_PX = 64
@@ -29,10 +32,7 @@ TEXTS = tuple(node[0] for node in NODES)
 
 def region(row):
     """True region of a node."""
-    mask = np.zeros((SIDE_PX, SIDE_PX), dtype=bool)
-    _, _, _, rows, columns = NODES[row]
-    mask[slice(*rows), slice(*columns)] = True
-    return mask
+    return box(*NODES[row][3:], (SIDE_PX, SIDE_PX))
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def encode_texts(texts):
 @pytest.fixture(scope="session")
 def block_world(tmp_path_factory) -> BlockWorld:
     from hilsplat.base.artifacts import write_index
+    from hilsplat.field.code import Autoencoder
     from hilsplat.field.language_field import LanguageField
-    from hilsplat.field.network_code import Autoencoder
     from hilsplat.query.language_scene import LanguageScene
     from tests.unit.evaluate.plain_tree import plain_tree
 
@@ -102,12 +102,9 @@ def block_world(tmp_path_factory) -> BlockWorld:
         {"001.png": labels},
         {"001.png": range(len(NODES))},
     )
-    masks = HierarchicalMasks.from_dense(
-        np.stack([region(row) for row in range(len(NODES))]),
-        np.array([node[1] for node in NODES], np.uint8),
-        np.ones(len(NODES), np.float32),
-        np.ones(len(NODES), np.float32),
-    )
+    regions, ones = np.stack(list(map(region, range(len(NODES))))), np.ones(len(NODES), np.float32)
+    levels = [node[1] for node in NODES]
+    masks = HierarchicalMasks.from_dense(regions, np.array(levels, np.uint8), ones, ones)
     masks.save(folder / "masks" / "000.png.npz")
     write_index(folder / "clip", {"000.png": {}}, model="models/clip-tiny")
     write_index(folder / "masks", {"000.png": {}}, segmenter="sam", model="models/sam-tiny")
@@ -129,23 +126,50 @@ def block_world(tmp_path_factory) -> BlockWorld:
     gaussians = replace(plain, sh=colours.astype(np.float32)[:, None])
     masks = np.arange(len(NODES), dtype=np.int32)
     tree = plain_tree(
-        [node[1] for node in NODES],
+        levels,
         [node[2] for node in NODES],
         node_of_gaussian,
         clip=clip,
         node_of_mask=masks,
         linked_node=masks,
-        crop_score=np.ones(len(NODES), np.float32),
+        crop_score=ones,
         crop_rank=np.zeros(len(NODES), np.int32),
-        view_area_px=np.array([[region(row).sum()] for row in range(len(NODES))], np.float32),
+        view_area_px=regions.sum(axis=(1, 2), dtype=np.float32)[:, None],
     )
     answers = LanguageScene(
         scene,
         gaussians,
         tree,
+        lambda view: weights,
         LanguageField(features, "0", "0"),
         Uncoded(8, 8, {}),
         encode_texts,
-        lambda view: weights,
     )
     return BlockWorld(folder, scene, HierarchyAnnotations.load(folder / "truth"), answers)
+
+
+@pytest.fixture
+def opened(block_world, monkeypatch):
+    """Parts of the block world, what a stage asks for when it opens them, and the evaluate stage."""
+    from hilsplat.evaluate import stage
+    from hilsplat.evaluate.figures import panel
+    from hilsplat.evaluate.scores import read_scores
+    from hilsplat.scene.finished import SceneParts
+
+    asked, folder = {}, block_world.folder
+
+    def open_scene(parts, settings, **options):
+        asked.update(options, parts=parts, settings=settings)
+        return block_world.answers
+
+    for module in (stage, panel):
+        monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(from_parts=open_scene))
+    names = ("scene", "gaussians", "semantic_tree", "field", "autoencoder", "clip", "masks")
+    parts = SceneParts(**{name: folder / name for name in names})
+
+    def evaluate(out, settings=None, **changes):
+        given = {"dataset": "synthetic", "scene": "blocks", "truth": folder / "truth", **changes}
+        stage.run_evaluate(parts, out, settings or EvaluateSettings(), **given)
+        return read_scores([out])
+
+    return SimpleNamespace(parts=parts, truth=folder / "truth", asked=asked, evaluate=evaluate)

@@ -1,28 +1,47 @@
-"""The table of scores that a run prints."""
+"""Score files, and the table of scores that a run prints."""
 
-from hilsplat.evaluate.scores import Score, score_summary, write_scores
+import pytest
+
+from hilsplat.base.errors import ArtifactError
+from hilsplat.evaluate.scores import COLUMNS, read_scores, score_summary, write_scores
+from tests.unit.evaluate.builders import score
+
+
+def test_score_files_are_sorted_and_stable(tmp_path):
+    rows = [
+        score("iou", 1 / 3, query="b"),
+        score("iou", 0.5, query="a, or b"),
+        score("boundary_iou", 0.5, query="a"),
+    ]
+    write_scores(tmp_path / "one.csv", rows)
+    write_scores(tmp_path / "two.csv", rows[::-1])
+    text = (tmp_path / "one.csv").read_bytes()
+    assert text == (tmp_path / "two.csv").read_bytes()
+    assert text.decode().splitlines()[0] == ",".join(COLUMNS)
+    frame = read_scores([tmp_path / "one.csv"])
+    assert list(frame["query"]) == ["a", "a, or b", "b"]
+    assert frame["value"].tolist() == [0.5, 0.5, 0.333333]
+
+
+def test_other_columns_are_refused_by_name(tmp_path):
+    (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ArtifactError, match=r"found     a, b"):
+        read_scores([tmp_path / "scores.csv"])
 
 
 def test_the_summary_averages_over_queries_and_views(tmp_path):
-    def score(method: str, metric: str, value: float, query: str, protocol: str) -> Score:
-        return Score(
-            "annotated", "desk", "default", "sam", method, "a.png", query, "", metric, protocol, value, 1
-        )
-
-    tree, field = "lerf/tree-nodes@5", "lerf/langsplat@2"
-    write_scores(
-        tmp_path / "scores.csv",
-        [
-            score("tree", "iou", 0.5, "mug", tree),
-            score("tree", "iou", 1.0, "pen", tree),
-            score("tree", "localization_mask", 1.0, "mug", tree),
-            score("field", "iou", 0.25, "mug", field),
-        ],
-    )
+    tree, field = {"protocol": "lerf/tree-nodes@5"}, {"protocol": "lerf/langsplat@2", "method": "field"}
+    rows = [
+        score("iou", 0.5, query="mug", **tree),
+        score("iou", 1.0, query="pen", **tree),
+        score("localization_mask", 1.0, query="mug", **tree),
+        score("iou", 0.25, query="mug", **field),
+    ]
+    write_scores(tmp_path / "scores.csv", rows)
     heading, columns, *lines = score_summary("photos/desk", {"hilsplat": tmp_path / "scores.csv"})
     assert "photos/desk" in heading and columns.split() == ["mIoU", "localized", "queries", "protocol"]
     assert [line.split() for line in lines] == [
-        ["hilsplat,", "field", "25.0%", "-", "1", field],
-        ["hilsplat,", "tree", "75.0%", "100.0%", "2", tree],
+        ["hilsplat,", "field", "25.0%", "-", "1", field["protocol"]],
+        ["hilsplat,", "tree", "75.0%", "100.0%", "2", tree["protocol"]],
     ]
     assert score_summary("photos/desk", {}) == []

@@ -8,21 +8,20 @@ from hilsplat.base.artifacts import read_index, write_index
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
-from hilsplat.evaluate.diagnostics.consistency import (
+from hilsplat.evaluate.diagnostics.world_consistency import (
     Agreement,
-    SharedPoints,
     best_ious,
     mean_agreement,
     neighbours,
     painted,
     pair_disagreement,
+    run_consistency,
     shared_points,
-    thinned,
     view_agreement,
 )
-from hilsplat.evaluate.diagnostics.world_consistency import run_consistency
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.segment.masks import HierarchicalMasks
+from tests.unit.evaluate.builders import box
 
 HEIGHT, WIDTH, FOCAL = 6, 10, 8.0
 
@@ -46,7 +45,9 @@ def test_points_of_a_wall_move_by_its_disparity():
     assert np.array_equal(points.pixel_b, y * WIDTH + x - 2)
     # columns 0 and 1 leave B; the last row has no row below, between which and itself B is read
     assert set(x) == set(range(2, WIDTH))
-    assert len(points) == (HEIGHT - 1) * 8
+    assert len(points) == (HEIGHT - 1) * 8 == 40
+    few = shared_points(A, WALL, B, WALL, most=4)  # evenly spaced
+    assert few.pixel_a.tolist() == points.pixel_a[[0, 13, 26, 39]].tolist()
 
 
 def test_a_slanted_wall_keeps_its_points():
@@ -64,18 +65,16 @@ def test_a_slanted_wall_keeps_its_points():
     assert np.array_equal(points.pixel_b % WIDTH, expected)
 
 
-def test_hidden_points_are_no_evidence():
+def test_hidden_points_are_not_shared():
     # in B something nearer (depth 2) covers columns 3 to 5 and hides the wall there
     hidden = WALL.copy()
     hidden[:, 3:6] = 2.0
     points = shared_points(A, WALL, B, hidden)
-    columns = set(points.pixel_b % WIDTH)
-    assert not columns & {3, 4, 5}
-    # A's pixels land on pixel centres, where no neighbour counts
-    assert columns == {0, 1, 2, 6, 7}
+    # A's pixels are projected to pixel centres, where no neighbour counts
+    assert set(points.pixel_b % WIDTH) == {0, 1, 2, 6, 7}
 
 
-def test_the_sky_and_what_lies_behind_the_camera_are_no_points():
+def test_the_sky_and_surfaces_behind_the_camera_are_not_shared():
     sky = np.full((HEIGHT, WIDTH), np.inf, np.float32)
     assert len(shared_points(A, sky, B, WALL)) == 0
     assert len(shared_points(A, WALL, B, sky)) == 0
@@ -83,30 +82,23 @@ def test_the_sky_and_what_lies_behind_the_camera_are_no_points():
     assert len(shared_points(A, WALL, Camera("back", turned, A.K, A.size_hw), WALL)) == 0
 
 
-def box(left: int, right: int) -> np.ndarray:
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[:, left:right] = True
-    return mask
+def columns(left: int, right: int) -> np.ndarray:
+    return box((0, HEIGHT), (left, right), (HEIGHT, WIDTH))
 
 
 def test_two_views_by_hand():
     points = shared_points(A, WALL, B, WALL)  # columns 2 to 9 of A are columns 0 to 7 of B, 5 rows
-    masks_a = np.stack([box(2, 6), box(6, 10)])  # 20 points each
-    same = view_agreement(masks_a, np.stack([box(0, 4), box(4, 10)]), points)
+    masks_a = np.stack([columns(2, 6), columns(6, 10)])  # 20 points each
+    same = view_agreement(masks_a, np.stack([columns(0, 4), columns(4, 10)]), points)
     assert (same.masks, len(points)) == (2, 40)
     assert (same.best_iou, same.disagreement, same.joined_disagreement) == (1, 0, 0)
     # B's border lies one column further right: 25 and 15 points. IoU 20/25 and 15/20
-    moved = view_agreement(masks_a, np.stack([box(0, 5), box(5, 10)]), points)
+    moved = view_agreement(masks_a, np.stack([columns(0, 5), columns(5, 10)]), points)
     assert moved.best_iou == pytest.approx((0.8 + 0.75) / 2)
     # together in A: 2 * 190 = 380; in B: 300 + 105 = 405; in both: 190 + 10 + 105 = 305; of 780 pairs
     assert moved.disagreement == pytest.approx((380 + 405 - 2 * 305) / 780)
     assert moved.joined_disagreement == pytest.approx(175 / 480)
-
-
-def test_merged_and_absent_masks_by_hand():
-    points = shared_points(A, WALL, B, WALL)
-    masks_a = np.stack([box(2, 6), box(6, 10)])
-    merged = view_agreement(masks_a, box(0, 10)[None], points)
+    merged = view_agreement(masks_a, columns(0, 10)[None], points)
     assert merged.best_iou == pytest.approx(0.5)
     assert merged.disagreement == pytest.approx((780 - 380) / 780)
     absent = view_agreement(masks_a, np.zeros((0, HEIGHT, WIDTH), bool), points)
@@ -128,24 +120,15 @@ def test_pairs_agree_with_counting_them_one_by_one():
     differ = sum(together(labels_a, *pair) != together(labels_b, *pair) for pair in pairs)
     either = sum(together(labels_a, *pair) or together(labels_b, *pair) for pair in pairs)
     assert pair_disagreement(labels_a, labels_b) == pytest.approx((differ / len(pairs), differ / either))
-
-
-def test_no_pair_of_points_has_no_share():
     assert np.isnan(pair_disagreement(np.array([0]), np.array([0]))).all()
     assert np.isnan(pair_disagreement(np.array([-1, -1]), np.array([-1, -1]))[1])
 
 
-def test_small_masks_are_left_out_and_small_ones_paint_over_large_ones():
+def test_very_small_masks_are_not_compared_and_smaller_ones_are_painted_last():
     inside = np.array([[1, 1, 1, 1], [0, 0, 1, 1], [0, 0, 0, 1]], bool)
     assert len(best_ious(inside, inside, min_points=2)) == 2
     assert painted(inside, np.array([4, 2, 1])).tolist() == [0, 0, 1, 2]
     assert painted(inside[:2], np.array([3, 3])).tolist() == [0, 0, 0, 0]
-
-
-def test_points_are_thinned_evenly():
-    points = SharedPoints(np.arange(100), np.arange(100))
-    assert thinned(points, 100) is points
-    assert thinned(points, 4).pixel_a.tolist() == [0, 33, 66, 99]
 
 
 def test_neighbours_are_the_nearest_cameras():
@@ -157,10 +140,10 @@ def test_neighbours_are_the_nearest_cameras():
     assert len(neighbours(cameras, ["0", "1", "3"], 5)) == 6
 
 
-def test_means_leave_out_what_is_undefined():
+def test_means_ignore_undefined_values():
     nan = float("nan")
-    mean = mean_agreement([Agreement(1, 2, 0.5, 0.1, nan), Agreement(1, 0, nan, 0.3, 0.4)])
-    assert mean == Agreement(2, 2, 0.5, 0.2, 0.4)
+    mean = mean_agreement([Agreement(2, 0.5, 0.1, nan), Agreement(0, nan, 0.3, 0.4)])
+    assert mean == Agreement(2, 0.5, 0.2, 0.4)
 
 
 @pytest.fixture
@@ -191,7 +174,7 @@ def world(tmp_path):
     return tmp_path
 
 
-def test_the_table_holds_the_masks_and_the_true_regions(world):
+def test_the_table_has_rows_for_masks_and_true_regions(world):
     text = run_consistency(world / "truth", world / "masks", world / "out.csv", 1)
     lines = (world / "out.csv").read_text().splitlines()[1:]
     for name, found in (("graph", lines[:3]), ("true regions", lines[3:])):

@@ -1,5 +1,7 @@
 """Masks against true regions, by hand, and the picture of where they fail."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,10 @@ from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
 from hilsplat.segment.masks import HierarchicalMasks, region_ious
+from tests.unit.evaluate.builders import box
 
 VIEW = "001.png"
+part = partial(box, size_hw=(64, 64))
 
 
 def masks_of(regions_by_level) -> HierarchicalMasks:
@@ -20,18 +24,12 @@ def masks_of(regions_by_level) -> HierarchicalMasks:
     return HierarchicalMasks.from_dense(np.stack(dense), np.array(level, np.uint8), ones, ones)
 
 
-def box(rows, columns) -> np.ndarray:
-    mask = np.zeros((64, 64), dtype=bool)
-    mask[slice(*rows), slice(*columns)] = True
-    return mask
-
-
 def found_masks() -> HierarchicalMasks:
     """The bear whole, the lower half of the chest and none of it elsewhere; three quarters of the head."""
     return masks_of(
         {
-            Level.WHOLE: [box((8, 56), (8, 40)), box((44, 56), (44, 60)), box((0, 4), (0, 4))],
-            Level.PART: [box((8, 24), (12, 30))],
+            Level.WHOLE: [part((8, 56), (8, 40)), part((44, 56), (44, 60)), part((0, 4), (0, 4))],
+            Level.PART: [part((8, 24), (12, 30))],
         }
     )
 
@@ -48,14 +46,11 @@ def test_ious_by_hand():
 
 def test_levels_are_compared_apart(block_world):
     fit = fit_of_view(found_masks(), block_world.annotations, VIEW)
-    whole, part, subpart = (fit[level] for level in (Level.WHOLE, Level.PART, Level.SUBPART))
-    assert whole.ids.tolist() == [0, 1]
-    assert whole.best == pytest.approx([1, 0.5])
-    assert (whole.masks, whole.fitting) == (3, 2)
-    assert part.best == pytest.approx([0.75, 0])  # the head, the lid
-    assert (part.masks, part.fitting) == (1, 1)
-    assert subpart.ids.tolist() == []  # the nose has 64 px
-    assert subpart.masks == 0
+    found = {level: (one.ids.tolist(), one.masks, one.fitting) for level, one in fit.items()}
+    # bear and chest; head and lid; the nose has only 64 px
+    assert found == {Level.WHOLE: ([0, 1], 3, 2), Level.PART: ([2, 3], 1, 1), Level.SUBPART: ([], 0, 0)}
+    assert fit[Level.WHOLE].best == pytest.approx([1, 0.5])
+    assert fit[Level.PART].best == pytest.approx([0.75, 0])
 
 
 def test_table_and_picture(block_world, tmp_path):
@@ -76,10 +71,10 @@ def test_table_and_picture(block_world, tmp_path):
         assert (np.abs(picture.astype(int) - colour).sum(axis=2) < 90).sum() > 100
 
 
-def test_views_that_are_shown(block_world):
+def test_the_median_and_the_worst_view_are_drawn(block_world):
     perfect = block_world.annotations
     good = fit_of_view(found_masks(), perfect, VIEW)
-    bad = fit_of_view(masks_of({Level.WHOLE: [box((0, 4), (0, 4))]}), perfect, VIEW)
+    bad = fit_of_view(masks_of({Level.WHOLE: [part((0, 4), (0, 4))]}), perfect, VIEW)
     assert median_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
     assert median_and_worst({"a": good}) == ["a"]
 

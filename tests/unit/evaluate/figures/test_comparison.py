@@ -63,7 +63,7 @@ def test_one_part_is_shown_over_views_and_views_without_truth_fill_up(block_worl
     assert shown[1].truth is None
 
 
-def test_equal_nodes_have_equal_colours_and_what_has_none_is_black(block_world):
+def test_equal_nodes_have_equal_colours_and_other_pixels_are_black(block_world):
     picture = node_image(block_world.answers, "001.png", Level.WHOLE)
     bear, chest, nothing = picture[20, 20], picture[50, 50], picture[2, 2]
     assert (picture[40, 10] == bear).all()
@@ -120,17 +120,16 @@ synthetic stand-in,synthetic,theta = 0.6,41.00 ± 0.50,,
 
 def test_curves_take_the_value_from_the_rows_name_and_kinds_stay_apart(tmp_path):
     (tmp_path / "theta.csv").write_text(SWEEP)
-    lines = {(line.kind, line.column): line.points for line in read_lines(tmp_path / "theta.csv", 0.9)}
-    assert lines == {
-        ("reported", "Hi-LERF mIoU"): ((0.6, 38.4), (0.9, 39.1)),
-        ("reported", "Hi-LERF HC"): ((0.6, 56.3), (0.9, 56.9)),
-        ("synthetic stand-in", "Hi-LERF mIoU"): ((0.6, 41.0), (0.9, 42.1)),
+    assert read_lines(tmp_path / "theta.csv", 0.9) == {
+        ("reported", "Hi-LERF mIoU"): [(0.6, 38.4), (0.9, 39.1)],
+        ("reported", "Hi-LERF HC"): [(0.6, 56.3), (0.9, 56.9)],
+        ("synthetic stand-in", "Hi-LERF mIoU"): [(0.6, 41.0), (0.9, 42.1)],
     }
     run_sweep_plot("theta", tmp_path / "theta.csv", tmp_path / "theta.png")
     assert (tmp_path / "theta.pdf").is_file()
 
 
-def test_a_sweep_that_does_not_exist_names_those_that_do(tmp_path):
+def test_an_unknown_sweep_is_an_error_that_lists_the_sweeps(tmp_path):
     with pytest.raises(ArtifactError, match="one of theta, omega"):
         run_sweep_plot("lambda", tmp_path / "theta.csv", tmp_path / "x.png")
     with pytest.raises(ArtifactError, match="build the table first"):

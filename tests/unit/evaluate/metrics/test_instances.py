@@ -66,19 +66,27 @@ def test_perfect_instances_score_one_missing_ones_zero_and_an_absent_class_nothi
     assert ap(result) == 0
 
 
-def test_second_match_of_an_instance_is_a_false_positive_of_the_lower_confidence():
-    # both overlap A by more than 0.5: 3 of 4 and 4 of 4. The surer stays the match, whatever the order.
-    for first, second in (((0, 3, 0.3), (0, 4, 0.9)), ((0, 4, 0.9), (0, 3, 0.3))):
-        matches = match_instances(*scan_of([(A, 4), (VOID, 4)], [first, second]), (CLASS,), 1)
-        at_half = matches.overlap_index == 0
-        found = sorted(
-            zip(matches.confidence[at_half].tolist(), matches.is_match[at_half].tolist(), strict=True)
-        )
-        assert found == [(0.3, False), (0.9, True)]
-        assert matches.misses[0, 0] == 0
+@pytest.mark.parametrize(
+    ("truth", "predictions", "overlap", "entries"),
+    [
+        # both overlap A by more than 0.5, 3 of 4 and 4 of 4: the more confident is the match, in any order
+        ([(A, 4), (VOID, 4)], [(0, 3, 0.3), (0, 4, 0.9)], 0, [(0.3, False), (0.9, True)]),
+        ([(A, 4), (VOID, 4)], [(0, 4, 0.9), (0, 3, 0.3)], 0, [(0.3, False), (0.9, True)]),
+        # at 0.25 the second prediction covers A and B: a false positive on A and the match of B
+        ([(A, 4), (B, 4)], [(0, 4, 0.9), (0, 8, 0.8)], -1, [(0.8, False), (0.8, True), (0.9, True)]),
+    ],
+)
+def test_a_second_match_is_a_false_positive_and_may_be_the_first_of_another(
+    truth, predictions, overlap, entries
+):
+    matches = match_instances(*scan_of(truth, predictions), (CLASS,), 1)
+    kept = matches.overlap_index == range(len(OVERLAPS))[overlap]
+    found = zip(matches.confidence[kept].tolist(), matches.is_match[kept].tolist(), strict=True)
+    assert sorted(found) == entries
+    assert matches.misses[0, overlap] == 0
 
 
-def test_only_a_first_match_uses_a_prediction_up():
+def test_only_the_first_match_marks_a_prediction_as_used():
     # one prediction over A and B overlaps each by 4 of 8 > 0.25: A takes it, B is missed
     matches = match_instances(*scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
     quarter = len(OVERLAPS) - 1
@@ -86,22 +94,26 @@ def test_only_a_first_match_uses_a_prediction_up():
     assert matches.misses[0, quarter] == 1
 
 
-def test_second_match_may_still_be_the_first_of_another_instance():
-    # at 0.25: the second prediction spans A and B, is a false positive on A and the match of B
-    matches = match_instances(*scan_of([(A, 4), (B, 4)], [(0, 4, 0.9), (0, 8, 0.8)]), (CLASS,), 1)
-    entries = matches.overlap_index == len(OVERLAPS) - 1
-    found = sorted(zip(matches.confidence[entries].tolist(), matches.is_match[entries].tolist(), strict=True))
-    assert found == [(0.8, False), (0.8, True), (0.9, True)]
-    assert matches.misses[0, -1] == 0
+HALF_VOID, OTHER = [(A, 4), (VOID, 4)], [(A, 4), (9001, 4)]
 
 
-def test_prediction_is_ignored_only_where_more_than_the_threshold_lies_in_void():
-    # half of the surer prediction lies in void: not more than 0.5, so it is a false positive.
-    # P = 1/2, 0, 1 and R = 1, 0, 0: 1/2 * (1 - 0) / 2
-    truth = [(A, 4), (VOID, 4)]
-    assert ap50(precisions(scan_of(truth, [(0, 4, 0.9), (2, 6, 0.95)]))) == pytest.approx(0.25)
-    # three quarters of it: ignored
-    assert ap50(precisions(scan_of(truth, [(0, 4, 0.9), (3, 7, 0.95)]))) == 1
+@pytest.mark.parametrize(
+    ("truth", "predictions", "class_ids", "expected"),
+    [
+        # half of the more confident one is in void, not more than 0.5: a false positive.
+        # P = 1/2, 0, 1 and R = 1, 0, 0: 1/2 * (1 - 0) / 2
+        (HALF_VOID, [(0, 4, 0.9), (2, 6, 0.95)], (CLASS,), 0.25),
+        (HALF_VOID, [(0, 4, 0.9), (3, 7, 0.95)], (CLASS,), 1),  # three quarters of it: ignored
+        # the more confident one is on an object of another class: P = 1/2 at R = 1
+        (OTHER, [(0, 4, 0.5), (4, 8, 0.9)], (CLASS, 9), 0.25),
+        (OTHER, [(0, 4, 0.5), (4, 8, 0.9)], (CLASS,), 1),  # void if class 9 is not evaluated
+    ],
+)
+def test_predictions_in_void_are_ignored_and_others_are_false_positives(
+    truth, predictions, class_ids, expected
+):
+    result = precisions(scan_of(truth, predictions), class_ids=class_ids)
+    assert ap50(result[:1]) == pytest.approx(expected)
 
 
 def test_small_instances_and_predictions_and_other_classes_do_not_count():
@@ -110,15 +122,6 @@ def test_small_instances_and_predictions_and_other_classes_do_not_count():
     assert precisions(scan, min_points=4).tolist() == [[1.0] * 10]
     scan = scan_of(EXAMPLE, [(0, 3, 0.9), (0, 4, 0.8)], classes=[CLASS, 77])
     assert precisions(scan, min_points=4).tolist() == [[0.0] * 10]
-
-
-def test_prediction_on_an_object_of_another_class_is_a_false_positive():
-    truth = [(A, 4), (9001, 4)]
-    result = precisions(scan_of(truth, [(0, 4, 0.5), (4, 8, 0.9)]), class_ids=(CLASS, 9))
-    # the surer one is wrong: precision 1/2 at recall 1, R = 1, 0, 0 over P = 1/2, 0, 1
-    assert ap50(result[:1]) == pytest.approx(1 / 2 * 1 / 2 + 0 * 1 / 2 + 0)
-    # the same object is void if class 9 is not evaluated
-    assert ap50(precisions(scan_of(truth, [(0, 4, 0.5), (4, 8, 0.9)]))) == 1
 
 
 def test_scans_share_one_curve():

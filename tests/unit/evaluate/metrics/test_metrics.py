@@ -8,15 +8,18 @@ from hypothesis import strategies as st
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.metrics.hierarchy import Family, consistency_per_child, hierarchical_consistency
-from hilsplat.evaluate.metrics.localization import box_of, hits_a_box, hits_the_mask, peak_points
 from hilsplat.evaluate.metrics.masks import (
     argmax_masks,
     best_threshold_iou,
     boundary,
     boundary_iou,
     boundary_width_px,
+    box_of,
     exceeds,
+    hits_a_box,
+    hits_the_mask,
     iou,
+    peak_points,
     pixel_accuracy,
 )
 from hilsplat.evaluate.metrics.relevancy_rule import (
@@ -29,14 +32,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     relevancy_mask,
     threshold_mask,
 )
-
-
-def rectangle(rows, columns, size_hw=(10, 10)):
-    """A mask of half-open row and column ranges."""
-    mask = np.zeros(size_hw, dtype=bool)
-    mask[slice(*rows), slice(*columns)] = True
-    return mask
-
+from tests.unit.evaluate.builders import box
 
 # --- threshold and filter of LangSplat's LERF rule ------------------------------------------------
 
@@ -94,19 +90,6 @@ def test_majority_filter_equals_the_plain_loop_over_windows():
     np.testing.assert_array_equal(majority_smooth(mask), expected)
 
 
-@pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
-def test_equal_levels_go_to_the_finest(level_rule):
-    relevancy = np.zeros((3, 8, 8), dtype=np.float32)
-    relevancy[0, 2, 2] = relevancy[1, 5, 5] = relevancy[2, 1, 1] = 0.9
-    rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule)
-    smoothed = SmoothedRelevancy.of(relevancy, rule)
-    mask, level = relevancy_mask(smoothed, None, rule)
-    assert level is Level.SUBPART  # LangSplat stacks s, m, l, and argmax takes the first
-    assert np.argwhere(mask).tolist() == [[1, 1]]
-    points, level = peak_points(smoothed.filtered, None)
-    assert (points.tolist(), level) == ([[1, 1]], Level.SUBPART)
-
-
 def test_mixing_halves_the_filtered_and_the_raw_map():
     relevancy = np.zeros((3, 6, 6), dtype=np.float32)
     relevancy[:, 2, 3] = 1
@@ -116,7 +99,7 @@ def test_mixing_halves_the_filtered_and_the_raw_map():
     assert smoothed.filtered[0, 3, 4] == pytest.approx(0.25)
 
 
-def test_level_by_mean_in_mask_prefers_the_higher_mean_not_the_higher_value():
+def test_the_mean_in_the_mask_chooses_the_higher_mean_not_the_higher_value():
     relevancy = np.zeros((3, 1, 6), dtype=np.float32)
     relevancy[0, 0, :2] = 0.9, 0.5  # mean 0.7
     relevancy[1, 0, :4] = 0.6, 0.6, 0.6, 0.9  # mean 0.675
@@ -131,41 +114,51 @@ def test_rule_names_what_departs_from_langsplat():
     assert RelevancyRule().departures(RelevancyRule(filter_px=20)) == ("filter scaled",)
 
 
-def test_majority_inside_the_image_sees_the_last_row_and_column():
-    mask = rectangle((4, 8), (4, 8), (8, 8))
+def test_majority_inside_the_image_includes_the_last_row_and_column():
+    mask = box((4, 8), (4, 8), (8, 8))
     # turned by 180 degrees this is the same square at the other corner, and so is the smoothed mask
     turned = majority_smooth(mask[::-1, ::-1], "inside")[::-1, ::-1]
     np.testing.assert_array_equal(majority_smooth(mask, "inside"), turned)
     # at (7, 7) the window holds rows and columns 4 .. 7: all ones. LangSplat's window drops row and column 7.
     assert majority_smooth(mask, "inside")[7, 7]
-    corner = rectangle((7, 8), (0, 8), (8, 8))
+    corner = box((7, 8), (0, 8), (8, 8))
     assert not majority_smooth(corner).any()
 
 
 @pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
-def test_the_level_with_the_highest_value_is_chosen_among_those_of_the_rule(level_rule):
+@pytest.mark.parametrize(
+    ("values", "levels", "chosen", "place"),
+    [
+        ((0.6, 0.7, 0.9), LEVELS, Level.SUBPART, [1, 1]),
+        ((0.6, 0.7, 0.9), LEVELS[:2], Level.PART, [5, 5]),
+        ((0.9, 0.9, 0.9), LEVELS, Level.SUBPART, [1, 1]),  # LangSplat stacks s, m, l; argmax takes the first
+    ],
+)
+def test_the_finest_of_the_levels_with_the_highest_value_is_chosen(level_rule, values, levels, chosen, place):
     relevancy = np.zeros((3, 8, 8), dtype=np.float32)
-    relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = 0.6, 0.7, 0.9
-    for levels, chosen, place in ((LEVELS, Level.SUBPART, [1, 1]), (LEVELS[:2], Level.PART, [5, 5])):
-        rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=levels)
-        mask, level = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
-        assert level is chosen
-        assert np.argwhere(mask).tolist() == [place]
+    relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = values
+    rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=levels)
+    smoothed = SmoothedRelevancy.of(relevancy, rule)
+    mask, level = relevancy_mask(smoothed, None, rule)
+    assert level is chosen
+    assert np.argwhere(mask).tolist() == [place]
+    if levels == LEVELS:
+        points, level = peak_points(smoothed.filtered, None)
+        assert (points.tolist(), level) == ([place], chosen)
 
 
 # --- masks ----------------------------------------------------------------------------------------
 
 
 def test_boundary_iou_of_a_shifted_square():
-    truth, prediction = rectangle((1, 7), (1, 7)), rectangle((1, 7), (2, 8))
+    truth, prediction = box((1, 7), (1, 7)), box((1, 7), (2, 8))
     assert boundary_width_px((10, 10)) == 1
     assert iou(prediction, truth) == pytest.approx(30 / 42)
     assert boundary(truth, 1).sum() == 20
+    assert boundary(np.ones((10, 10), dtype=bool), 1).sum() == 36  # also at the image border
     assert boundary_iou(prediction, truth) == pytest.approx(10 / 30)
-
-
-def test_boundary_counts_pixels_at_the_image_border():
-    assert boundary(np.ones((10, 10), dtype=bool), 1).sum() == 36
+    empty = np.zeros((10, 10), dtype=bool)
+    assert iou(empty, empty) == boundary_iou(empty, empty) == 0
 
 
 @pytest.mark.parametrize(
@@ -182,12 +175,6 @@ def test_one_wide_erosion_equals_many_small_ones():
     padded = np.pad(mask.astype(np.uint8), 1)
     repeated = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=4)[1:-1, 1:-1]
     np.testing.assert_array_equal(boundary(mask, 4), mask & (repeated == 0))
-
-
-def test_iou_of_nothing_with_nothing_is_zero():
-    empty = np.zeros((3, 3), dtype=bool)
-    assert iou(empty, empty) == 0
-    assert boundary_iou(empty, empty) == 0
 
 
 def test_best_threshold_finds_the_best_cut_and_keeps_ties_together():
@@ -208,9 +195,9 @@ def test_best_threshold_equals_trying_every_cut(score, truth):
 
 
 def test_accuracy_of_a_pair_needs_more_than_the_threshold():
-    truth, quarter = rectangle((0, 1), (0, 4)), rectangle((0, 1), (0, 1))  # IoU 1/4
+    truth, quarter = box((0, 1), (0, 4)), box((0, 1), (0, 1))  # IoU 1/4
     assert exceeds(quarter, truth, 0.25) == 0
-    assert exceeds(rectangle((0, 1), (0, 2)), truth, 0.25) == 1
+    assert exceeds(box((0, 1), (0, 2)), truth, 0.25) == 1
 
 
 # --- every pixel a class --------------------------------------------------------------------------
@@ -242,7 +229,7 @@ def test_any_of_several_maxima_may_hit_and_borders_count():
 
 
 def test_mask_hit_is_stricter_than_box_hit():
-    truth = rectangle((0, 1), (0, 5)) | rectangle((0, 5), (0, 1))  # an L; its box holds (3, 3)
+    truth = box((0, 1), (0, 5)) | box((0, 5), (0, 1))  # an L; its box holds (3, 3)
     point = np.array([[3, 3]])
     assert box_of(truth).tolist() == [0, 0, 4, 4]
     assert hits_a_box(point, box_of(truth)[None])
@@ -251,43 +238,25 @@ def test_mask_hit_is_stricter_than_box_hit():
 
 # --- hierarchical consistency ---------------------------------------------------------------------
 
-A, B = rectangle((0, 10), (0, 5)), rectangle((0, 5), (5, 10))
-A1, A2, B1 = rectangle((0, 4), (0, 5)), rectangle((4, 8), (3, 7)), rectangle((0, 2), (5, 10))
-X = rectangle((0, 2), (0, 2))
-
-
-def families(a=A, b=B, a1=A1, a2=A2, b1=B1, x=X):
-    return [[Family(a, (a1, a2), A), Family(b, (b1,), B)], [Family(a1, (x,), A1)]]
-
-
-def test_consistency_of_the_worked_example():
-    # wholes: literal (0.28 + 0.4) / 2, containment (0.75 + 1) / 2; parts: 4/20 and 1
-    assert hierarchical_consistency(families(), "literal") == pytest.approx(0.27)
-    assert hierarchical_consistency(families(), "containment") == pytest.approx(0.9375)
-    assert hierarchical_consistency(families(), "literal", pooled=True) == pytest.approx(0.293333, abs=1e-6)
-    assert hierarchical_consistency(families(), pooled=True) == pytest.approx(0.916667, abs=1e-6)
-    empty = np.zeros((10, 10), dtype=bool)  # an empty child scores 0
-    assert hierarchical_consistency(families(x=empty)) == pytest.approx(0.4375)
-
 
 def test_children_of_a_parent_share_its_weight_unless_counted_alone():
-    left, right = rectangle((0, 10), (0, 5)), rectangle((0, 10), (5, 10))
-    inside = Family(left, (rectangle((0, 2), (0, 2)),), left)
-    outside = Family(right, tuple(rectangle((row, row + 2), (0, 2)) for row in (2, 4, 6)), right)
+    left, right = box((0, 10), (0, 5)), box((0, 10), (5, 10))
+    inside = Family(left, (box((0, 2), (0, 2)),), left)
+    outside = Family(right, tuple(box((row, row + 2), (0, 2)) for row in (2, 4, 6)), right)
     assert hierarchical_consistency([[inside, outside]]) == 0.5
     assert consistency_per_child([[inside, outside]]) == 0.25
-    assert consistency_per_child(families()) == pytest.approx(((1 + 0.5 + 1) / 3 + 1) / 2)
 
 
 def test_perfect_nesting_in_a_view_without_subparts_scores_half():
-    whole = rectangle((0, 10), (0, 10))
-    transitions = [[Family(whole, (rectangle((0, 2), (0, 2)),), whole)], []]
+    whole = box((0, 10), (0, 10))
+    transitions = [[Family(whole, (box((0, 2), (0, 2)),), whole)], []]
     assert hierarchical_consistency(transitions) == consistency_per_child(transitions) == 0.5
 
 
 def test_whole_image_fools_all_readings_but_the_anchored_one():
     full = np.ones((10, 10), dtype=bool)
-    fooled = families(full, full, full, full, full, full)
+    a, b, a1 = box((0, 10), (0, 5)), box((0, 5), (5, 10)), box((0, 4), (0, 5))
+    fooled = [[Family(full, (full, full), a), Family(full, (full,), b)], [Family(full, (full,), a1)]]
     assert hierarchical_consistency(fooled, "containment") == 1
     assert hierarchical_consistency(fooled, "literal") == 1
     # area of the true parents: A 50, B 25, a1 20 of 100 px

@@ -53,7 +53,7 @@ def test_means_of_the_worked_example(mean, expected):
     assert mean(example()) == pytest.approx(expected)
 
 
-def test_class_that_occurs_nowhere_tells_the_means_apart():
+def test_means_differ_for_a_class_that_occurs_nowhere():
     counts = ClassCounts.of(TRUTH, PREDICTION, 5)
     assert miou_over_occurring(counts) == pytest.approx(0.391667, abs=1e-6)
     assert miou_over_all(counts) == pytest.approx((2 / 5 + 2 / 3 + 1 / 2) / 5)
@@ -112,6 +112,7 @@ def test_ious_equal_those_of_the_masks_of_each_class(pairs):
 
 
 def varint(data, place):
+    """The integer at a place, and the next place."""
     value = shift = 0
     while True:
         byte = data[place]
@@ -154,11 +155,6 @@ def frames_of(path):
         assert laser[1] == 1, "the TOP lidar"
         frames[parts[2], parts[3]] = np.concatenate([classes_of(laser[2]), classes_of(laser[3])])
     return frames
-
-
-def test_packed_integers_are_decoded():
-    assert varint(bytes([0x96, 0x01]), 0) == (150, 2)
-    assert list(fields_of(bytes([0x08, 0x96, 0x01, 0x12, 0x02, 0x41, 0x42]))) == [(1, 150), (2, b"AB")]
 
 
 def test_waymo_regression_value():

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.metrics.registry import METRICS
 from hilsplat.evaluate.protocols.cards import (
     CARDS,
     LERF_LANGSPLAT,
@@ -17,7 +16,7 @@ from hilsplat.evaluate.protocols.cards import (
     TREE_NODES,
     card_of,
 )
-from hilsplat.evaluate.protocols.scene_points import class_set
+from hilsplat.evaluate.protocols.points import class_set
 from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.settings import EvaluateSettings
 
@@ -72,28 +71,26 @@ def digest(card):
     return hashlib.sha256(repr(decided).encode()).hexdigest()[:8]
 
 
-def test_what_a_protocol_decides_changes_only_with_its_version():
+def test_a_protocol_changes_only_with_its_version():
     found = {name: digest(card) for name, card in PROTOCOLS.items()}
     # A further metric changes no number, so it needs no new version.
     assert found == DECIDED, "raise the version of a protocol that changed, then write its digest here"
 
 
-def test_names_are_unique_and_say_benchmark_and_variant():
+def test_cards_are_named_after_benchmark_and_variant_and_state_their_source():
     assert len(PROTOCOLS) == len(CARDS)
     for card in CARDS:
-        benchmark, variant = card.name.split("/")
-        assert benchmark
-        assert variant
+        assert re.fullmatch("[^/]+/[^/]+", card.name)
         assert card.full_name == f"{card.name}@{card.version}"
-        assert card.selection
-        assert card.source
+        assert card.selection and card.source
+        assert not card.classes or class_set(card.classes)[1].name == card.classes
 
 
 PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
 TABLES = Path(__file__).parents[4] / "docs" / "tables.md"
 
 
-def test_a_card_names_its_public_function_or_says_that_there_is_none():
+def test_a_card_names_its_public_function_unless_there_is_none():
     for card in CARDS:
         assert bool(card.public) != card.source.startswith("none"), card.name
         assert not card.public or PUBLIC.fullmatch(card.public), card.public
@@ -108,34 +105,27 @@ def test_the_documentation_lists_every_protocol_with_its_public_function():
     assert rows == {card.full_name: card.public or "none" for card in CARDS}
 
 
-def test_protocols_carry_known_metrics_and_every_metric_is_carried():
-    carried = {metric for card in CARDS for metric in card.metrics}
-    assert carried == set(METRICS)
+CHANGED = {"filter_px": 20, "threshold_on": "raw", "node_select": 0.7, "relevancy_scale": 5}
 
 
-def test_classes_of_protocols_exist():
-    for card in CARDS:
-        assert not card.classes or class_set(card.classes)[1].name == card.classes
+@pytest.mark.parametrize(
+    ("card", "method", "settings", "departures"),
+    [
+        (LERF_LANGSPLAT, "field", {}, ""),
+        (TREE_NODES, "tree", {}, ""),
+        (LERF_LANGSPLAT, "field", CHANGED, " (filter 20, raw, relevancy scale 5)"),
+        (TREE_NODES, "tree", {"ancestors": 0}, " (ancestors 0)"),
+        # nodes are not thresholded, so the scale of the threshold doesn't affect them
+        (LEVEL_GIVEN, "tree", CHANGED, " (filter 20, node share 0.7, relevancy scale 5)"),
+        (LEVEL_GIVEN, "truth", CHANGED, ""),
+        (LEVEL_GIVEN, "tree", {"canonical": ("object", "scene")}, " (canonical object+scene)"),
+    ],
+)
+def test_rows_name_the_settings_that_affect_them(card, method, settings, departures):
+    assert label_of(card, method, EvaluateSettings(**settings)) == card.full_name + departures
 
 
-def test_rows_name_what_settings_change():
-    plain = EvaluateSettings()
-    assert label_of(LERF_LANGSPLAT, "field", plain) == "lerf/langsplat@2"
-    assert label_of(TREE_NODES, "tree", plain) == "lerf/tree-nodes@5"
-    changed = EvaluateSettings(filter_px=20, threshold_on="raw", node_select=0.7, relevancy_scale=5)
-    assert (
-        label_of(LERF_LANGSPLAT, "field", changed) == "lerf/langsplat@2 (filter 20, raw, relevancy scale 5)"
-    )
-    assert label_of(TREE_NODES, "tree", EvaluateSettings(ancestors=0)) == "lerf/tree-nodes@5 (ancestors 0)"
-    # nodes are not thresholded, so the scale of the threshold changes nothing of theirs
-    expected = "hierarchy/level-given@5 (filter 20, node share 0.7, relevancy scale 5)"
-    assert label_of(LEVEL_GIVEN, "tree", changed) == expected
-    assert label_of(LEVEL_GIVEN, "truth", changed) == "hierarchy/level-given@5"
-    other = EvaluateSettings(canonical=("object", "scene"))
-    assert label_of(LEVEL_GIVEN, "tree", other) == "hierarchy/level-given@5 (canonical object+scene)"
-
-
-def test_rows_lead_back_to_their_protocol():
+def test_the_label_of_a_row_identifies_its_protocol():
     assert card_of("lerf/langsplat@2 (filter 20, raw)") is LERF_LANGSPLAT
     with pytest.raises(ArtifactError, match=r"no protocol 'lerf/langsplat@9'"):
         card_of("lerf/langsplat@9")

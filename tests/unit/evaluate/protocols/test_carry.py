@@ -1,4 +1,4 @@
-"""What Gaussians know, at points: which ones speak, with what weight, and which are ignored."""
+"""Which Gaussians a point takes its label or feature from, and with what weight."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_vote_weighs_by_opacity_within_the_radius():
     assert vote(points_at(0.9), MEANS, OPAQUE, radius=1.0).labels(np.array([1, 2, 2])).tolist() == [1]
 
 
-def test_radius_includes_its_border_and_nothing_beyond_it_speaks():
+def test_radius_includes_its_border_and_nothing_beyond():
     carried = vote(points_at(2.1, 2.2), MEANS, OPAQUE, radius=2.1 - 2)
     assert carried.labels(LABELS).tolist() == [3, 0]
     assert carried.features(np.eye(3))[1].tolist() == [0, 0, 0]
@@ -63,6 +63,8 @@ def test_density_follows_the_falloff_of_a_gaussian():
     carried = density(points_at(0.5), MEANS, OPAQUE, np.ones((3, 3)), IDENTITY)
     alpha = OPAQUE * np.exp(-np.array([0.25, 0.25, 2.25]) / 2)
     np.testing.assert_allclose(carried.features(np.eye(3))[0], alpha / alpha.sum())
+    far = density(points_at(1e4), MEANS, OPAQUE, np.full((3, 3), 0.01), IDENTITY)
+    assert far.labels(LABELS).tolist() == [3]  # relative weights are used far from all Gaussians
 
 
 def test_density_turns_with_the_gaussian():
@@ -77,11 +79,6 @@ def test_density_turns_with_the_gaussian():
     np.testing.assert_allclose(carried.features(np.eye(2))[0], alpha / alpha.sum())
     unnormalised = density(point, np.zeros((2, 3)), np.full(2, 0.5), scales, 7 * quats)
     np.testing.assert_allclose(unnormalised.weight, carried.weight)
-
-
-def test_density_has_an_answer_far_from_all_gaussians():
-    carried = density(points_at(1e4), MEANS, OPAQUE, np.full((3, 3), 0.01), IDENTITY)
-    assert carried.labels(LABELS).tolist() == [3]
 
 
 coordinates = st.lists(st.tuples(*[st.integers(-5, 5)] * 3), min_size=1, max_size=12)

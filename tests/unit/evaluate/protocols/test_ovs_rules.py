@@ -1,4 +1,4 @@
-"""3D-OVS as LangSplatV2 scores it: against a plain reading of its released rule, and case by case."""
+"""3D-OVS by LangSplatV2's rule, compared with a second implementation and case by case."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.answers import ViewMaps
 from hilsplat.evaluate.protocols.cards import OVS_LANGSPLAT_V2, card_named
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
 
 RULE = OVS_LANGSPLAT_V2.rule
 
@@ -87,12 +87,6 @@ def halves(rows):
     return maps
 
 
-def ious(query: Query, maps, more):
-    cards = [OVS_LANGSPLAT_V2, card_named("3d-ovs/langsplat")]
-    rows = FlatProtocols(cards, None).add("field", maps, None, query, [], ViewMaps(more, more))
-    return {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
-
-
 @pytest.mark.parametrize(
     ("text", "others", "score"), [("wood wall", ["wood table"], 1), ("rabbit", [], 2 / 3)]
 )
@@ -115,6 +109,8 @@ def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path
         asked.extend(texts)
         return halves((20, 30))[None]
 
-    found = ious(query, halves((0, 20)), more)
+    flat = FlatProtocols([OVS_LANGSPLAT_V2, card_named("3d-ovs/langsplat")], None)
+    rows = list(flat.add("field", halves((0, 20)), None, query, [], ViewMaps(more, more)))
+    found = {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
     assert asked == others
     assert found == {"3d-ovs/langsplat-v2": pytest.approx(score), "3d-ovs/langsplat": 1.0}

@@ -11,7 +11,8 @@ from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.protocols.cards import PROTOCOLS
 from hilsplat.evaluate.protocols.points import measure_instances, measure_points, pooled_points
-from hilsplat.evaluate.scores import Score, read_scores, write_scores
+from hilsplat.evaluate.scores import read_scores, write_scores
+from tests.unit.evaluate.builders import score
 
 OPENGAUSSIAN = PROTOCOLS["scannet/opengaussian-19@1"]
 WAYMO = PROTOCOLS["waymo/segmentation@1"]
@@ -47,13 +48,6 @@ def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
     assert list(measure_points(OPENGAUSSIAN, "tree", nothing, PREDICTION, SCANNET_19, "frozen")) == []
 
 
-def scored(rows):
-    return [
-        Score(dataset="waymo", scene="s", variant="default", masks="sam", view="", **vars(row))
-        for row in rows
-    ]
-
-
 def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
     rng = np.random.default_rng(0)
     scenes = [(rng.integers(0, 6, 997), rng.integers(0, 6, 997)) for _ in range(3)]
@@ -63,7 +57,7 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
     expected = pooled_points(WAYMO, [measure_points(WAYMO, "t", *together, WAYMO_22, "x")], WAYMO_22)
     assert pooled_points(WAYMO, rows, WAYMO_22) == expected
     for number, each in enumerate(rows):
-        write_scores(tmp_path / f"{number}.csv", scored(each))
+        write_scores(tmp_path / f"{number}.csv", [score(**vars(row), view="") for row in each])
     read = [read_scores([tmp_path / f"{number}.csv"]).itertuples() for number in range(3)]
     assert pooled_points(WAYMO, read, WAYMO_22) == expected
     # five of 22 classes occur; the other 17 count 1 under Waymo's own mean

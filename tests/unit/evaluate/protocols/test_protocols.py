@@ -8,15 +8,13 @@ import pytest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
-from hilsplat.evaluate.protocols.answers import QueryableScene, Selections
+from hilsplat.evaluate.protocols.answers import Selections
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
-from hilsplat.evaluate.scores import COLUMNS, read_scores, write_scores
 from hilsplat.settings import EvaluateSettings
-from tests.unit.evaluate.tables.test_tables import score
-from tests.unit.evaluate.test_labelled_scenes import region_of
+from tests.unit.evaluate.builders import box, region_of
 
 SIZE = (10, 10)
 
@@ -29,12 +27,6 @@ def annotations_of(folder, nodes, regions, view="v.png", listed=None):
     records = [AnnotatedNode(node, level, parent, text) for node, (text, level, parent) in enumerate(nodes)]
     write_hierarchy(folder, records, {view: labels}, {view: listed or range(len(nodes))})
     return HierarchyAnnotations.load(folder)
-
-
-def mask_of(rows, columns):
-    mask = np.zeros(SIZE, dtype=bool)
-    mask[slice(*rows), slice(*columns)] = True
-    return mask
 
 
 class HandMade:
@@ -74,7 +66,7 @@ def measured(scene, truth, **settings):
 
 
 def test_a_union_of_nodes_is_rendered_once_in_each_view():
-    masks, asked = [mask_of((0, 3), (0, 5)), mask_of((2, 4), (1, 9))], []
+    masks, asked = [box((0, 3), (0, 5)), box((2, 4), (1, 9))], []
 
     class Counted(HandMade):
         def node_masks(self, view, ids):
@@ -108,30 +100,18 @@ def worked_example(tmp_path, without=()):
         if text not in without:
             answers[text, Level(level)] = answers[text, None] = [node]
             answers[annotations.path_of(node)] = [node]
-    scene = HandMade([mask_of(*each) for each in ANSWERED], answers)
+    scene = HandMade([box(*each) for each in ANSWERED], answers)
     return scene, ViewTruth.of(annotations, "v.png", SIZE, 1)
-
-
-def test_fake_and_real_scene_fit_the_protocol(block_world):
-    assert isinstance(HandMade([], {}), QueryableScene)
-    assert isinstance(block_world.answers, QueryableScene)
 
 
 def test_consistency_rows_match_the_worked_example(tmp_path):
     scene, truth = worked_example(tmp_path)
     values = measured(scene, truth, methods=("tree", "tree-path"))
-    for method, protocol in (
-        ("tree", "level-given@5"),
-        ("tree", "level-auto@6"),
-        ("tree", "scene-wide@2"),
-        ("tree-path", "path@3"),
-    ):
-        key = (method, f"hierarchy/{protocol}", "", "")
-        assert values[*key, "hc_containment"] == pytest.approx(0.9375)
-        assert values[*key, "hc_literal"] == pytest.approx(0.27)
-        assert values[*key, "hc_containment_pooled"] == pytest.approx(0.916667, abs=1e-6)
-        assert values[*key, "hc_literal_pooled"] == pytest.approx(0.293333, abs=1e-6)
-        assert values[*key, "hc_containment_per_child"] == pytest.approx(((1 + 0.5 + 1) / 3 + 1) / 2)
+    names = ("containment", "literal", "containment_pooled", "literal_pooled", "containment_per_child")
+    expected = pytest.approx([0.9375, 0.27, 0.916667, 0.293333, ((1 + 0.5 + 1) / 3 + 1) / 2], abs=1e-6)
+    for protocol in ("level-given@5", "level-auto@6", "scene-wide@2", "path@3"):
+        key = ("tree-path" if "path" in protocol else "tree", f"hierarchy/{protocol}", "", "")
+        assert [values[*key, f"hc_{name}"] for name in names] == expected
     # the annotations nest perfectly: a2 is 8 px of A, so literal is ((20 + 8)/50/2 + 10/25)/2 = 0.34
     reference = ("truth", "hierarchy/annotations@1", "", "")
     assert values[*reference, "hc_containment"] == 1
@@ -149,10 +129,7 @@ def test_missing_answer_counts_zero_and_breaks_consistency(tmp_path):
 
 def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
     scene, truth = worked_example(tmp_path)
-    scene.scene_wide = {
-        ("x", Level.SUBPART): [4],
-        ("A", "a1", "x"): [4],
-    }  # b1 is more like it, in another view
+    scene.scene_wide = {("x", Level.SUBPART): [4], ("A", "a1", "x"): [4]}  # b1 is more like it, elsewhere
     values = measured(scene, truth, methods=("tree", "tree-path"))
     assert values["tree-path", "hierarchy/path@3", "x", "subpart", "iou"] == 1
     assert values["tree", "hierarchy/level-given@5", "x", "subpart", "iou"] == 1
@@ -162,14 +139,14 @@ def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
     assert values["tree", "hierarchy/scene-wide@2", "", "", "hc_containment"] == pytest.approx(0.4375)
 
 
-def test_regions_with_the_same_text_are_united(tmp_path):
+def test_regions_with_the_same_text_are_merged(tmp_path):
     nodes = [("cup", 1, -1), ("cup", 1, -1)]
     annotations = annotations_of(tmp_path, nodes, [((0, 4), (0, 4)), ((6, 10), (6, 10))])
     truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
     assert len(truth.queries) == 1
     assert truth.queries[0].truth.sum() == 32
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
-    scene = HandMade([mask_of((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
+    scene = HandMade([box((0, 4), (0, 4))], {("cup", Level.WHOLE): [0], ("cup", None): [0]})
     values = measured(scene, truth, methods=("tree",))
     assert values["tree", "hierarchy/level-given@5", "cup", "whole", "iou"] == pytest.approx(0.5)
     assert not [key for key in values if key[4].startswith("hc_")]  # a view without parents
@@ -179,27 +156,17 @@ def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
     nodes = [("wheel", 1, -1), ("cart", 1, -1), ("wheel", 2, 1)]
     annotations = annotations_of(tmp_path, nodes, [((0, 2), (0, 10)), ((4, 10), (0, 10)), ((8, 10), (0, 5))])
     truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
-    assert [(query.text, query.level) for query in truth.queries] == [
-        ("wheel", Level.WHOLE),
-        ("cart", Level.WHOLE),
-        ("wheel", Level.PART),
-    ]
+    queries = [(query.text, query.level) for query in truth.queries]
+    assert queries == [("wheel", Level.WHOLE), ("cart", Level.WHOLE), ("wheel", Level.PART)]
     category = next(query for query in truth.categories if query.text == "wheel")
     assert category.truth.sum() == 20 + 10
 
 
-def test_small_regions_are_not_scored(tmp_path):
+def test_small_regions_are_not_scored_and_labels_of_another_size_are_refused(tmp_path):
     annotations = annotations_of(tmp_path, NODES, REGIONS)
     truth = ViewTruth.of(annotations, "v.png", SIZE, min_px=9)
     assert [query.text for query in truth.queries] == ["A", "B", "a1", "b1"]  # x has 4 px, a2 has 8
-    assert truth.families() == [
-        [(("A",), [("A", "a1")]), (("B",), [("B", "b1")])],
-        [],
-    ]
-
-
-def test_labels_of_another_size_are_refused(tmp_path):
-    annotations = annotations_of(tmp_path, NODES, REGIONS)
+    assert truth.families() == [[(("A",), [("A", "a1")]), (("B",), [("B", "b1")])], []]
     with pytest.raises(MisalignedArtifactError, match=r"10 x 10"):
         ViewTruth.of(annotations, "v.png", (20, 20), 1)
 
@@ -216,12 +183,10 @@ def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
         f"{name} (filter 1, no majority)"
         for name in ("hierarchy/level-given@5", "hierarchy/level-auto@6", "lerf/langsplat@2")
     )
-    key = ("cup", "whole", "iou")
-    assert values["field", given, *key] == 1
-    assert values["field", auto, *key] == 0
-    assert values["field", lerf, "cup", "", "iou"] == 0
-    assert values["field", lerf, "cup", "", "localization_box"] == 0
-    assert values["field", given, "cup", "whole", "localization_box"] == 1
+    for metric in ("iou", "localization_box"):
+        assert values["field", given, "cup", "whole", metric] == 1
+        assert values["field", auto, "cup", "whole", metric] == 0
+        assert values["field", lerf, "cup", "", metric] == 0
     assert values["field", given, "cup", "whole", "best_threshold_iou"] == 1
 
 
@@ -230,20 +195,12 @@ def test_other_protocols_are_measured_with_their_own_rules():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[0, 2:6, 2:6] = 0.8
     relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
-    truth = ViewTruth.of_regions([region_of(mask_of((2, 6), (2, 6)), "cup")], SIZE)
+    truth = ViewTruth.of_regions([region_of(box((2, 6), (2, 6)), "cup")], SIZE)
     scene = HandMade([], {}, {"cup": relevancy})
     cards = [PROTOCOLS["3d-ovs/langsplat@2"], PROTOCOLS["3d-ovs/langsplat-raw@2"]]
-    rows = list(
-        measure_view(
-            scene,
-            Selections(scene),
-            truth,
-            "v.png",
-            SIZE,
-            EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5),
-            FlatProtocols(cards, None, ["relevancy scale 5"]),
-        )
-    )
+    settings = EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5)
+    flat = FlatProtocols(cards, None, ["relevancy scale 5"])
+    rows = list(measure_view(scene, Selections(scene), truth, "v.png", SIZE, settings, flat))
     ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
     assert ious == {
         "lerf/langsplat@2 (filter 1, no mix, no majority, relevancy scale 5)": 0,
@@ -257,7 +214,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
 def test_a_relevancy_that_is_not_a_number_is_an_error():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[1, 2, 3] = np.nan
-    truth = ViewTruth.of_regions([region_of(mask_of((2, 6), (2, 6)), "cup")], SIZE)
+    truth = ViewTruth.of_regions([region_of(box((2, 6), (2, 6)), "cup")], SIZE)
     with pytest.raises(ArtifactError, match=r"relevancy of view v\.png is not a number at 1 pixels"):
         measured(HandMade([], {}, {"cup": relevancy}), truth, methods=("field",))
 
@@ -268,13 +225,13 @@ def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
     truth = ViewTruth.of(annotations_of(tmp_path, nodes, regions), "v.png", SIZE, 1)
     answers = {("chair", None): [0], ("table", None): [1], ("leg", None): [2, 3]}
     answers |= {("chair", Level.WHOLE): [0], ("table", Level.WHOLE): [1], ("leg", Level.PART): [2, 3]}
-    values = measured(HandMade([mask_of(*each) for each in regions], answers), truth, methods=("tree",))
+    values = measured(HandMade([box(*each) for each in regions], answers), truth, methods=("tree",))
     perfect = values["truth", "hierarchy/annotations@1", "", "", "hc_containment"]
     assert values["tree", "hierarchy/level-given@5", "", "", "hc_containment"] == perfect == 0.5
     assert values["tree", "hierarchy/level-given@5", "", "", "hc_anchored"] == 0.5
 
 
-def test_path_localization_looks_inside_the_parent(tmp_path):
+def test_path_localization_searches_the_parent(tmp_path):
     nodes = [("bear", 1, -1), ("nose", 2, 0)]
     regions = [((0, 10), (0, 5)), ((2, 4), (2, 4))]
     annotations = annotations_of(tmp_path, nodes, regions)
@@ -282,7 +239,7 @@ def test_path_localization_looks_inside_the_parent(tmp_path):
     relevancy = np.full((3, *SIZE), 0.4, np.float32)
     relevancy[1, 2:4, 2:4], relevancy[1, 7, 8] = 0.7, 0.9  # the nose, and something beside the bear
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
-    scene = HandMade([mask_of(*each) for each in regions], answers, {"nose": relevancy})
+    scene = HandMade([box(*each) for each in regions], answers, {"nose": relevancy})
     values = measured(scene, truth, methods=("tree", "tree-path"), filter_px=1)
     assert values["tree", "hierarchy/level-given@5 (filter 1)", "nose", "part", "localization_box"] == 0
     assert values["tree-path", "hierarchy/path@3 (filter 1)", "nose", "part", "localization_box"] == 1
@@ -300,31 +257,6 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     assert {row.value for row in given if row.metric in ("localization_box", "hc_containment")} == {1.0}
     for name in {row.protocol for row in rows}:
         assert {row.metric for row in rows if row.protocol == name} == set(card_of(name).metrics)
-    field = {
-        row.query: row.value
-        for row in rows
-        if (row.method, row.protocol, row.metric) == ("field", "hierarchy/level-given@5", "iou")
-    }
-    assert field["bear"] > 0.9  # exact features; the filter rounds the corners
-
-
-def test_score_files_are_sorted_and_stable(tmp_path):
-    rows = [
-        score("iou", 1 / 3, query="b"),
-        score("iou", 0.5, query="a, or b"),
-        score("boundary_iou", 0.5, query="a"),
-    ]
-    write_scores(tmp_path / "one.csv", rows)
-    write_scores(tmp_path / "two.csv", rows[::-1])
-    text = (tmp_path / "one.csv").read_bytes()
-    assert text == (tmp_path / "two.csv").read_bytes()
-    assert text.decode().splitlines()[0] == ",".join(COLUMNS)
-    frame = read_scores([tmp_path / "one.csv"])
-    assert list(frame["query"]) == ["a", "a, or b", "b"]
-    assert frame["value"].tolist() == [0.5, 0.5, 0.333333]
-
-
-def test_other_columns_are_refused_by_name(tmp_path):
-    (tmp_path / "scores.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ArtifactError, match=r"found     a, b"):
-        read_scores([tmp_path / "scores.csv"])
+    key = ("field", "hierarchy/level-given@5", "iou", "bear")
+    (value,) = [row.value for row in rows if (row.method, row.protocol, row.metric, row.query) == key]
+    assert value > 0.9  # exact features; the filter rounds the corners

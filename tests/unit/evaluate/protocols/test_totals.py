@@ -1,14 +1,13 @@
 """From rows to a table's number: every averaging order by hand."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.protocols.cards import (
     CARDS,
@@ -16,9 +15,8 @@ from hilsplat.evaluate.protocols.cards import (
     LERF_MASK,
     LEVEL_GIVEN,
     OVS_ARGMAX,
-    ProtocolCard,
 )
-from hilsplat.evaluate.protocols.totals import (
+from hilsplat.evaluate.tables.measured import (
     level_averages_of_scenes,
     level_values,
     mean_over_levels,
@@ -28,12 +26,7 @@ from hilsplat.evaluate.protocols.totals import (
 )
 
 
-def rows_of(
-    card: ProtocolCard,
-    values: Sequence[tuple[str, str, str, float]] | Mapping[tuple[str, str], float],
-    metric: str = "iou",
-    **more: object,
-) -> pd.DataFrame:
+def rows_of(card, values, metric="iou", **more):
     """Rows of scores from (scene, view, query, value), or of one scene from (view, query) -> value."""
     if isinstance(values, Mapping):
         values = [("one", view, query, value) for (view, query), value in values.items()]
@@ -53,18 +46,13 @@ def test_pairs_of_a_scene_weigh_equally_but_classes_are_averaged_over_views_firs
 
 @pytest.mark.parametrize(("card", "first"), [(LERF_LANGSPLAT, 0.4), (LERF_MASK, (0.3 + 0.6) / 2)])
 def test_scenes_weigh_equally_whatever_their_rows(card, first):
-    several = [
-        ("one", "f1", "a", 0.2),
-        ("one", "f2", "a", 0.4),
-        ("one", "f1", "b", 0.6),
-        ("two", "f", "a", 0.1),
-    ]
-    rows = rows_of(card, several)
+    one = [("one", "f1", "a", 0.2), ("one", "f2", "a", 0.4), ("one", "f1", "b", 0.6)]
+    rows = rows_of(card, [*one, ("two", "f", "a", 0.1)])
     assert scene_values(rows, "iou").to_dict() == pytest.approx({"one": first, "two": 0.1})
     assert table_value(rows, "iou") == pytest.approx((first + 0.1) / 2)
 
 
-def test_other_metrics_and_levels_stay_out():
+def test_other_metrics_and_levels_are_ignored():
     rows = pd.concat(
         [
             rows_of(LEVEL_GIVEN, PAIRS, level="whole"),
@@ -128,9 +116,3 @@ def test_orders_are_not_mixed_and_pooled_protocols_have_no_number_per_scene():
         if card.averaging == "pooled":
             with pytest.raises(AssertionError, match="pooled"):
                 table_value(rows_of(card, PAIRS), "iou")
-
-
-def test_rows_of_a_protocol_that_no_longer_exists_are_refused():
-    stale = rows_of(LERF_LANGSPLAT, PAIRS, protocol="lerf/langsplat@0")
-    with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplat@0'"):
-        table_value(stale, "iou")

@@ -1,4 +1,4 @@
-"""Time and memory of a row, from the records that the workflow leaves beside its artifacts."""
+"""Time and memory of rows and stages, from the records that the workflow writes beside its artifacts."""
 
 import csv
 import json
@@ -11,17 +11,17 @@ from hilsplat.base.artifacts import provenance_path, read_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.evaluate.scores import write_scores
 from hilsplat.evaluate.tables.build import published_values, run_table
-from hilsplat.evaluate.tables.costs import read_costs, time_queries, write_times
+from hilsplat.evaluate.tables.costs import read_costs, run_efficiency, time_queries, write_times
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import write_record
-from tests.unit.evaluate.tables.test_tables import score
+from tests.unit.evaluate.builders import score
 
 
-def record(folder, stage, seconds, mib):
+def record(folder, stage, seconds, mib, cpu_time=None):
     """A benchmark file as Snakemake writes it."""
     path = folder / "benchmarks" / f"{stage}.jsonl"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"s": seconds, "cpu_time": seconds, "max_rss": mib}) + "\n")
+    path.write_text(json.dumps({"s": seconds, "cpu_time": cpu_time or seconds, "max_rss": mib}) + "\n")
 
 
 @pytest.fixture
@@ -35,18 +35,14 @@ def scene(tmp_path):
         record(default, stage, seconds, 512)
     for variant, seconds in ((default, 12), (other, 72)):
         record(variant, "field", seconds, 1024 if variant is default else 2048)
-        inputs = {
-            name: {"path": str(default / name)}
-            for name in stages
-            if name not in ("coverage_tree", "contributions")
-        }
+        read = ("masks", "clip", "semantic_tree", "autoencoder")
+        inputs = {name: {"path": str(default / name)} for name in read}
         inputs["field"] = {"path": str(variant / "field.safetensors")}
         scores = variant / "scores.csv"
         write_scores(scores, [score("iou", 0.5, scene="table-1", variant=variant.name, method="field")])
         write_record(scores, inputs=inputs)
-        own = {
-            name: {"path": str(default / name)} for name in ("coverage_tree", "contributions", "autoencoder")
-        }
+        of_field = ("coverage_tree", "contributions", "autoencoder")
+        own = {name: {"path": str(default / name)} for name in of_field}
         write_record(variant / "field.safetensors", inputs=own)
         write_times(scores, "synthetic", "table-1", variant.name, {"field": 0.25})
     return [default / "scores.csv", other / "scores.csv"]
@@ -115,9 +111,37 @@ def test_tables_of_numbers_are_the_same_bytes_whatever_the_jobs_took(scene, tmp_
     assert quality == ([] if table == "cost" else ["50.00", "50.00"])
 
 
-def test_a_query_is_text_weights_and_answer():
+def test_query_times_include_text_weights_and_answer():
     asked = []
     scene = SimpleNamespace(encode_texts=asked.append, pixel_weights=asked.append)
     seconds = time_queries(scene, {"tree": asked.append}, "v.png", ["cup", "mug"])
     assert seconds["tree"] > 0
     assert asked == [["cup"], "v.png", "cup", "cup", "mug"]
+
+
+def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):
+    results = tmp_path / "results"
+    record(results / "synthetic/one/default", "field", 2.5, 400.0, 2.0)
+    record(results / "synthetic/two/default", "field", 1.5, 600.0, 1.0)
+    record(results / "synthetic/one", "poses", 10.0, None, "-")
+    record(results, "table-lerf", 1.0, 90.0, 0.5)
+    text = run_efficiency(results, tmp_path / "efficiency.csv")
+    assert text.splitlines()[2:] == [
+        "| poses | 1 | 10.0 | 10.0 | 10.0 | 0.0 | 0 |",
+        "| field | 2 | 2.0 | 2.5 | 4.0 | 3.0 | 600 |",
+        "| table-lerf | 1 | 1.0 | 1.0 | 1.0 | 0.5 | 90 |",
+        "| all | 4 | 3.8 | 10.0 | 15.0 | 3.5 | 600 |",
+    ]
+    lines = (tmp_path / "efficiency.csv").read_text().splitlines()
+    assert lines[1] == "poses,synthetic,one,,10.00,0.00,0"
+    assert lines[2] == "field,synthetic,one,default,2.50,2.00,400"
+    assert (tmp_path / "efficiency.md").read_text() == text
+
+
+def test_missing_and_damaged_benchmarks_are_named(tmp_path):
+    with pytest.raises(ArtifactError, match="run the workflow first"):
+        run_efficiency(tmp_path, tmp_path / "x.csv")
+    record(tmp_path, "masks", 1, 1)
+    (tmp_path / "benchmarks" / "masks.jsonl").write_text("no json\n")
+    with pytest.raises(ArtifactError, match=r"masks\.jsonl is not a valid benchmark file"):
+        run_efficiency(tmp_path, tmp_path / "x.csv")

@@ -1,16 +1,16 @@
-"""3D-OVS and LERF-Mask beside LangSplat's protocol: what is asked, compared and named."""
+"""3D-OVS and LERF-Mask beside LangSplat's protocol: queries, compared pixels and protocol names."""
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.protocols.answers import ViewMaps
+from hilsplat.evaluate.protocols.answers import ViewMaps, mask_rows
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_NODES, card_named
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.rows import mask_rows
 from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
 from hilsplat.query.relevancy import relevancy_of_margins
+from tests.unit.evaluate.builders import box
 
 SIZE = (16, 32)
 
@@ -23,9 +23,7 @@ NO_MORE = ViewMaps(unasked, unasked)
 
 
 def region(columns):
-    mask = np.zeros(SIZE, dtype=bool)
-    mask[:, slice(*columns)] = True
-    return mask
+    return box((0, SIZE[0]), columns, SIZE)
 
 
 def query(text, columns, level=Level.WHOLE):
@@ -73,15 +71,6 @@ def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():
     assert rows["iou", "cup"].protocol == "3d-ovs/argmax@3 (labelled pixels, best level, wholes)"
 
 
-def test_without_levels_every_pixel_is_compared():
-    cup = query("cup", (0, 16), level=None)
-    flat = FlatProtocols([OVS_ARGMAX], None)
-    list(flat.add("tree", maps((0, 16)), None, cup, [], cosines(cup=maps((0, 16)))))
-    rows = {row.metric: row for row in flat.finish()}
-    assert rows["pixel_accuracy"].value == 0.5  # the only text wins everywhere
-    assert rows["iou"].protocol == "3d-ovs/argmax@3 (best level)"
-
-
 def test_canonical_phrases_do_not_choose_the_level():
     # Cosines with one and two are (0.30, 0.20) at the whole and (0.22, 0.26) at the part; the nearest
     # canonical phrase has 0.28 and 0.18 there, so that the highest relevancy is that of two at the part.
@@ -107,8 +96,10 @@ def test_a_text_that_the_view_lacks_competes_and_counts_zero():
     rows = list(flat.add("field", maps((0, 16)), None, cup, [], found))
     assert {row.query for row in rows} == {"cup"}
     assert not list(flat.add("field", maps((8, 32)), None, fork, [], found))
-    values = {(row.metric, row.query): row.value for row in flat.finish()}
+    rows = {(row.metric, row.query): row for row in flat.finish()}
+    values = {key: row.value for key, row in rows.items()}
     assert values == {("iou", "cup"): 0.5, ("iou", "fork"): 0.0, ("pixel_accuracy", ""): 0.25}
+    assert rows["iou", "cup"].protocol == "3d-ovs/argmax@3 (best level)"  # every pixel is compared
 
 
 def test_a_pixel_that_no_level_answers_is_a_miss():
@@ -120,10 +111,16 @@ def test_a_pixel_that_no_level_answers_is_a_miss():
     assert {row.metric: row.value for row in flat.finish()} == {"iou": 0.75, "pixel_accuracy": 0.75}
 
 
-def test_parts_are_not_asked_on_a_stand_in():
-    handle = query("handle", (0, 4), level=Level.PART)
-    flat = FlatProtocols([LERF_MASK, OVS_ARGMAX], Level.WHOLE)
-    assert list(flat.add("field", maps((0, 4)), None, handle, [handle], NO_MORE)) == []
+@pytest.mark.parametrize(
+    ("text", "level", "cards"),
+    [
+        ("handle", Level.PART, [LERF_MASK, OVS_ARGMAX]),  # parts are not queried on a stand-in
+        ("cup", Level.WHOLE, [card_named("lerf/opengaussian"), card_named("lerf/tree-nodes")]),  # no map rule
+    ],
+)
+def test_parts_of_a_stand_in_and_protocols_without_a_map_rule_have_no_rows(text, level, cards):
+    one, flat = query(text, (0, 4), level), FlatProtocols(cards, Level.WHOLE)
+    assert list(flat.add("field", maps((0, 4)), None, one, [one], NO_MORE)) == []
     assert list(flat.finish()) == []
 
 
@@ -138,24 +135,9 @@ def test_a_tree_answers_with_its_own_nodes_and_a_field_with_its_mask_or_not_at_a
     assert {row.protocol for row in tree + field} == {f"{card.full_name} (wholes)"}
 
 
-def test_protocols_without_a_rule_for_maps_are_not_scored_from_maps():
-    cup = query("cup", (0, 16))
-    flat = FlatProtocols([card_named("lerf/opengaussian"), card_named("lerf/tree-nodes")], Level.WHOLE)
-    assert list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE)) == []
-
-
 def test_rows_of_a_mask_have_the_metrics_of_the_protocol():
     cup, metrics = query("cup", (0, 16)), ("iou", "acc_25", "acc_50")
     rows = mask_rows("m", cup, "p", region((0, 8)), metrics=metrics)
     assert [(row.level, row.metric, row.value) for row in rows] == [
         ("whole", metric, value) for metric, value in zip(metrics, (0.5, 1, 0), strict=True)
     ]
-
-
-def test_rules_of_3d_ovs_are_applied_to_the_maps_of_either_method():
-    cup = query("cup", (0, 16))
-    flat = FlatProtocols([card_named("3d-ovs/langsplat")], Level.WHOLE, ["relevancy scale 5"])
-    for method in ("field", "tree"):
-        rows = list(flat.add(method, maps((0, 16)), None, cup, [cup], NO_MORE))
-        assert {row.metric: row.value for row in rows} == {"iou": 1.0, "boundary_iou": 1.0}
-        assert {row.protocol for row in rows} == {"3d-ovs/langsplat@2 (wholes, relevancy scale 5)"}

@@ -1,4 +1,4 @@
-"""Classes and instances of labelled points, asked of the block world, whose tree and field are exact."""
+"""Classes and instances of labelled points in the block world, whose tree and field are exact."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,13 @@ import pytest
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.asked import STAND_INS, Asked
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
 from hilsplat.evaluate.metrics.instances import average_precision
 from hilsplat.evaluate.protocols.cards import card_named
 from hilsplat.evaluate.protocols.carry import carried_to
-from hilsplat.evaluate.protocols.scene_points import measure_scene_points, node_instances, point_classes
+from hilsplat.evaluate.protocols.points import measure_scene_points, node_instances, point_classes
 from hilsplat.evaluate.scores import Measured, read_instances, write_instances
 from hilsplat.scene.cameras import Cameras
 
@@ -100,21 +101,16 @@ def test_cameras_on_a_line_still_fix_the_similarity():
     assert camera_error(true, found, off) == pytest.approx(2)
 
 
-def test_every_stand_in_names_protocols_that_exist():
+def test_stand_ins_and_data_sets_name_protocols_that_exist():
     for kind in STAND_INS:
         asked = Asked.of_world(kind)
         assert len(asked.flat) + len(asked.points) == len(STAND_INS[kind])
-    assert Asked.of_world("") == Asked.of_world("").__class__((), (), asked.level)
-    with pytest.raises(SceneError, match="one of tabletop, room, street"):
-        Asked.of_world("table")
-
-
-def test_every_data_set_names_protocols_that_exist():
-    from hilsplat.datasets.registry import DATASETS
-
-    for name, dataset in DATASETS.items():
-        asked = Asked.of_dataset(name)
+    assert not Asked.of_world("").flat and not Asked.of_world("").points
+    for dataset in DATASETS.values():
+        asked = Asked.of(dataset.protocols)
         assert len(asked.flat) + len(asked.points) == len(dataset.protocols)
         assert bool(asked.points) == (dataset.labels == "points" and bool(dataset.protocols))
+    with pytest.raises(SceneError, match="one of tabletop, room, street"):
+        Asked.of_world("table")
     with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplatt'"):
         card_named("lerf/langsplatt")
