@@ -10,14 +10,7 @@ from jsonschema import Draft202012Validator
 from snakemake.utils import update_config
 
 from hilsplat.base.errors import SettingsError
-from hilsplat.configuration import (
-    SECTIONS,
-    config_schema,
-    knob_table,
-    parse_run,
-    parse_section,
-    read_config,
-)
+from hilsplat.configuration import SECTIONS, config_schema, knob_table, parse_run, parse_section, read_config
 
 
 def load(project: Path, name: str) -> dict:

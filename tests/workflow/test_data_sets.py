@@ -97,13 +97,6 @@ def test_a_dry_run_ends_with_what_the_run_would_take(planned):
     assert table[5].split()[1:3] == ["3", counted[1]]
 
 
-def test_without_a_data_root_the_run_says_so_and_stops(project, tmp_path):
-    copy = copy_project(project, tmp_path / "project", results=False)
-    printed = run(copy, "groups=[lerf,scannet]")
-    assert "scannet/scene0000_00 is skipped: data_root is not set" in printed
-    assert "no scene to run" in printed
-
-
 def test_tables_of_a_run_without_data_carry_the_line(project, tmp_path):
     copy = copy_project(project, tmp_path / "project", results=False)
     command = [sys.executable, "-m", "snakemake", "-n", "-p", "results/tables/replica.csv"]

@@ -26,11 +26,6 @@ def drawn(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
     return made
 
 
-def planned(project: Project, *words: str) -> str:
-    """Return what a dry run of `hilsplat run` prints."""
-    return project.hilsplat_run(*words, IMAGES, "--", "-n").stdout
-
-
 def forget(project: Project) -> None:
     """Remove Snakemake's own records."""
     for record in (project.root / ".snakemake/metadata").iterdir():
@@ -58,18 +53,6 @@ def test_damage_is_repaired_even_without_snakemakes_records(
     assert f"{IMAGES} is made again" in made.stderr
     assert drawn.files(IMAGES) == before
     assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
-
-
-def test_other_settings_count_even_without_snakemakes_records(drawn: Project) -> None:
-    forget(drawn)
-    config = drawn.root / "config/config.yaml"
-    text = config.read_text()
-    try:
-        drawn.edit("config/config.yaml", "world: {views: 12,", "world: {views: 13,")
-        assert "rule world:" in planned(drawn)
-    finally:
-        config.write_text(text)
-    assert "rule world:" not in planned(drawn)
 
 
 def test_an_unusable_setting_is_refused_before_any_job(drawn: Project) -> None:
@@ -140,17 +123,6 @@ def test_the_next_run_recovers_from_a_kill(drawn: Project) -> None:
     assert drawn.files(IMAGES) == before
     assert not list((drawn.root / "results").rglob(".writing-*"))
     assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
-
-
-def test_plain_snakemake_after_a_kill_asks_for_unlock(drawn: Project) -> None:
-    log = f"{SCENE}/logs/world.log"
-    with job_of(drawn, log, *SNAKEMAKE, IMAGES, "--forcerun", IMAGES) as run:
-        os.killpg(run.pid, signal.SIGKILL)
-        run.wait()
-        refused = drawn.snakemake(IMAGES, check=False)
-        assert refused.returncode != 0 and "--unlock" in refused.stderr
-        drawn.snakemake("--unlock")
-        drawn.snakemake("--rerun-incomplete", IMAGES)
 
 
 def test_the_locks_of_a_live_run_are_never_removed(copy_of_finished: Project) -> None:

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pillow_heif
 import pytest
@@ -46,8 +47,6 @@ def test_sixteen_bits_are_scaled_and_not_clipped(tmp_path, suffix):
 
 
 def test_sixteen_bit_colour_is_read(tmp_path):
-    import cv2
-
     deep = np.zeros((2, 3, 3), np.uint16)
     deep[..., 2] = 40000  # cv2 writes blue, green, red
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
@@ -72,12 +71,7 @@ def red_and_green_swapped() -> bytes:
 
 @pytest.mark.parametrize(
     ("suffix", "options"),
-    [
-        (".png", {}),
-        (".tif", {}),
-        (".jpg", {"quality": 100, "subsampling": 0}),
-        (".heic", {"quality": 100}),
-    ],
+    [(".png", {}), (".tif", {}), (".jpg", {"quality": 100, "subsampling": 0}), (".heic", {"quality": 100})],
 )
 def test_colours_of_an_embedded_profile_become_srgb(tmp_path, suffix, options):
     red = Image.new("RGB", (16, 16), (250, 10, 40))

@@ -9,7 +9,6 @@ from hilsplat.base.lanes import (
     first_bit,
     lane_max,
     lane_sum,
-    lanes,
     larger,
     load,
     load_same,
@@ -105,12 +104,6 @@ def test_sums_of_several_vectors_fill_their_places_and_no_other():
     np.testing.assert_allclose(out[2:11], values.sum(axis=1), rtol=1e-5, atol=1e-6)
     assert (out[:2] == 7).all()
     assert (out[11:] == 7).all()
-
-
-def test_a_number_fills_all_lanes():
-    out = np.empty(16, np.float32)
-    numba.njit(lambda out: store(out, 0, lanes(np.float32(2.5))))(out)
-    assert (out == 2.5).all()
 
 
 @numba.njit

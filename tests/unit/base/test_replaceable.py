@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import lock_path, provenance_path
@@ -12,7 +13,6 @@ from hilsplat.base.provenance import SOFTWARE, require_beginning, require_own_pi
 from hilsplat.cli.main import app
 from hilsplat.cli.stage import stage
 from tests.unit.artifact_changes import write_record
-from tests.unit.finished_desk import HEIGHT
 
 
 @pytest.fixture
@@ -121,9 +121,7 @@ def test_a_stage_replaces_its_output_again(tmp_path):
 
 
 def test_pictures_replace_pictures_of_this_package_alone(tmp_path):
-    import numpy as np
-
-    pixels = np.zeros((HEIGHT, HEIGHT, 3), np.uint8)
+    pixels = np.zeros((8, 8, 3), np.uint8)
     picture, photograph, text = (tmp_path / name for name in ("picture.png", "photograph.png", "thesis.md"))
     require_own_picture(picture)
     write_png(picture, pixels, text=SOFTWARE)

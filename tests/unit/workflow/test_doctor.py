@@ -15,7 +15,7 @@ from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
 from hilsplat.cli.main import app
 from hilsplat.models.folder import ModelFolder
-from hilsplat.splat.rasterise import api, parity
+from hilsplat.splat.rasterise import api, device
 from hilsplat.workflow import doctor
 from tests.unit.models.test_store import lay
 
@@ -30,11 +30,6 @@ def fresh():
     is_installed.cache_clear()
 
 
-def only(check):
-    (finding,) = check()
-    return finding
-
-
 def test_a_sound_machine_has_no_fault(project, monkeypatch):
     monkeypatch.chdir(project)
     findings = list(doctor.examine())
@@ -44,7 +39,7 @@ def test_a_sound_machine_has_no_fault(project, monkeypatch):
 
 def test_an_old_python_is_a_fault(monkeypatch):
     monkeypatch.setattr("platform.python_version", lambda: "3.9.1")
-    found = only(doctor.python)
+    [found] = doctor.python()
     assert found.state == "fault" and "3.9.1" in found.found
 
 
@@ -62,19 +57,19 @@ def install(monkeypatch, missing: str, **versions: str) -> None:
 
 def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
     install(monkeypatch, "scipy", numpy="1.20.0")
-    found = only(doctor.libraries)
+    [found] = doctor.libraries()
     assert found.state == "fault"
     assert "scipy is missing" in found.found and "numpy 1.20.0 is not >=2.1" in found.found
 
 
 def test_the_gpu_build_of_onnxruntime_takes_the_place_of_the_other(monkeypatch):
     install(monkeypatch, "onnxruntime", **{"onnxruntime-gpu": "1.20"})
-    assert only(doctor.libraries).state == "ok"
+    assert [found.state for found in doctor.libraries()] == ["ok"]
 
 
 def test_two_builds_of_onnxruntime_are_a_fault(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.0")
-    found = only(doctor.onnx)
+    [found] = doctor.onnx()
     assert found.state == "fault" and "overwrite" in found.found
 
 
@@ -84,8 +79,8 @@ def test_two_builds_of_onnxruntime_are_a_fault(monkeypatch):
 )
 def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apart, state):
     monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: problem)
-    monkeypatch.setattr("hilsplat.splat.rasterise.parity.cuda_disagreement", lambda: apart)
-    assert only(doctor.cuda).state == state
+    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_disagreement", lambda: apart)
+    assert [found.state for found in doctor.cuda()] == [state]
 
 
 def test_kernels_that_draw_something_else_are_a_fault(monkeypatch):
@@ -97,13 +92,13 @@ def test_kernels_that_draw_something_else_are_a_fault(monkeypatch):
         return seen if len(calls) == 1 else replace(seen, image=seen.image + np.float32(0.1))
 
     monkeypatch.setattr(api, "draw", bent)
-    found = only(doctor.kernels)
+    [found] = doctor.kernels()
     assert found.state == "fault" and "image by 0.1" in found.found
 
 
 def test_a_missing_codec_is_named(monkeypatch):
     monkeypatch.setattr(doctor, "_codec", lambda name, mode: name != "libx264")
-    found = only(doctor.video)
+    [found] = doctor.video()
     assert found.state == "fault" and "libx264" in found.found
 
 
@@ -167,9 +162,9 @@ def test_a_check_that_fails_unexpectedly_does_not_stop_the_others(monkeypatch):
 
 def test_the_self_test_of_cuda_is_drawn_once(monkeypatch, tmp_path):
     drawn = []
-    monkeypatch.setattr(parity, "disagreement", lambda one, other: drawn.append(other))
+    monkeypatch.setattr(device, "disagreement", lambda one, other: drawn.append(other))
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "gsplat", SimpleNamespace(__version__="1.5"))
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a GPU")
-    assert parity.cuda_disagreement() is None and parity.cuda_disagreement() is None
+    assert device.cuda_disagreement() is None and device.cuda_disagreement() is None
     assert drawn == ["cuda"]

@@ -17,10 +17,7 @@ from hilsplat.workflow.stages import stage_code
 
 MASKS = Path("results/d/s/default/masks")
 TREE = Path("results/d/s/default/coverage_tree")
-EXPECTED = {
-    MASKS: Expected("masks"),
-    TREE: Expected("coverage_tree", {"theta": 0.9}, 7),
-}
+EXPECTED = {MASKS: Expected("masks"), TREE: Expected("coverage_tree", {"theta": 0.9}, 7)}
 
 
 def write(artifact: Path, text: str = "one", stage: str = "", **inputs: Path) -> None:
@@ -156,7 +153,7 @@ def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
     folder = "results/synthetic/one"
     assert found[f"{folder}/world"].output == f"{folder}/world/images"
     assert found[f"{folder}/lifted/field.safetensors"].stage == "method"
-    assert found[f"{folder}/lifted/field.safetensors"].plugins == ("hilsplat.methods.lifted:METHOD",)
+    assert found[f"{folder}/lifted/field.safetensors"].plugins == ("hilsplat.methods.lifted:fit",)
     assert set(found[f"{folder}/truth/masks"].settings) == {"masks", "perturb"}
     assert f"{folder}/lifted/masks" not in found, "it shares those of the default variant"
     assert "results/tables/lerf.csv" in found
