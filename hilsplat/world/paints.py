@@ -237,18 +237,19 @@ class PaintBox:
         self._rng = rng
         self._left: list[str] = []
 
-    def draw(self, group: str, *colours: str, scale: float = 1.0) -> Paint:
+    def draw(self, spec: str, scale: float = 1.0) -> Paint:
         """Draw a random paint of a material group.
 
         Args:
-            group: one of `GROUPS`.
-            colours: colour words to choose from; by default all unused ones.
+            spec: one of `GROUPS`, then the colour words to choose from, as in "plain red blue"; without
+                words, all unused colours.
             scale: factor on the pattern's number of cells per unit.
         """
         rng = self._rng
+        group, *colours = spec.split()
         kinds, specular, shininess = GROUPS[group]
         kind = str(rng.choice(kinds))
-        choice = colours or (WOOD_COLOURS if kind == "wood" else ())
+        choice = tuple(colours) or (WOOD_COLOURS if kind == "wood" else ())
         self._left = self._left or list(COLOURS)
         fresh = [colour for colour in choice or COLOURS if colour in self._left] or list(choice)
         colour = str(rng.choice(fresh))

@@ -270,9 +270,19 @@ def loft(sections: Sequence[Sequence[Point] | np.ndarray]) -> Mesh:
     return _flat(solid)
 
 
+def plate(outline: Sequence[tuple[Number, Number]], back: Number, front: Number) -> Mesh:
+    """Return a closed plate over a convex outline of (y, z) points, from x = back to x = front."""
+    return loft([[(x, y, z) for y, z in outline] for x in (back, front)])
+
+
 def disc(radius: Number, back: Number, front: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
     """Return a closed cylinder about x, from x = back to x = front, for discs on an object's front."""
     return cylinder(radius, back, front, segments, bevel).turned("y", 90)
+
+
+def roller(radius: Number, low: Number, high: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
+    """Return a closed cylinder about y, from y = -high to y = -low, such as a wheel."""
+    return cylinder(radius, low, high, segments, bevel).turned("x", 90)
 
 
 def ring(

@@ -71,7 +71,13 @@ class ObjectModel:
 
 
 class Node(NamedTuple):
-    """A node of an unfinished object; `at` is the preposition before its parent."""
+    """A node of an unfinished object.
+
+    Attributes:
+        word: its name without the object's.
+        aliases: other names.
+        at: preposition before its parent, as in "knob on the kettle lid".
+    """
 
     builder: "Builder"
     row: int
@@ -81,25 +87,31 @@ class Node(NamedTuple):
     aliases: tuple[str, ...]
     at: str = "on"
 
-    def subpart(self, word: str, *aliases: str, at: str = "on") -> "Node":
-        """Add a subpart and return it; `at` is the preposition, as in "knob on the kettle lid"."""
-        return self.builder.added(3, self.row, word, aliases, at)
+    def subpart(self, names: str, paint: Paint | str = "", *meshes: Mesh, at: str = "on") -> "Node":
+        """Add a subpart and return it; for the arguments, see `Builder.part`."""
+        return self.builder.added(3, self.row, names, at).put(paint, *meshes)
 
-    def put(self, paint: Paint, *meshes: Mesh) -> "Node":
-        """Add meshes to the node and return it."""
-        self.builder.pieces.append((self.row, joined(*meshes), paint))
+    def put(self, paint: Paint | str, *meshes: Mesh) -> "Node":
+        """Add meshes to the node and return it; for the arguments, see `Builder.part`."""
+        if meshes:
+            drawn = self.builder.paint(paint) if isinstance(paint, str) else paint
+            self.builder.pieces.append((self.row, joined(*meshes), drawn))
         return self
 
 
 class Builder:
-    """Nodes and meshes of one object while its maker runs."""
+    """Nodes and meshes of one object while it is being drawn.
 
-    def __init__(self, name: str, aliases: tuple[str, ...], rng: np.random.Generator) -> None:
-        self.name, self.aliases, self.rng = name, aliases, rng
+    Args:
+        names: class and its aliases, separated by ", ".
+    """
+
+    def __init__(self, names: str, rng: np.random.Generator) -> None:
+        self.rng = rng
         self.paint = PaintBox(rng).draw
         self.nodes: list[Node] = []
         self.pieces: list[tuple[int, Mesh, Paint]] = []
-        self.added(1, NONE, name, aliases)
+        self.added(1, NONE, names)
 
     def between(self, low: float | int, high: float | int) -> float:
         """Draw a uniform random number."""
@@ -109,13 +121,20 @@ class Builder:
         """Return True with the given probability."""
         return bool(self.rng.random() < probability)
 
-    def part(self, word: str, *aliases: str) -> Node:
-        """Add a part and return it; `word` is its name without the object's."""
-        return self.added(2, 0, word, aliases)
+    def part(self, names: str, paint: Paint | str = "", *meshes: Mesh) -> Node:
+        """Add a part and return it.
 
-    def added(self, level: int, parent: int, word: str, aliases: tuple[str, ...], at: str = "on") -> Node:
+        Args:
+            names: the part's name without the object's, and its aliases, separated by ", ".
+            paint: paint of the meshes; a string draws a new one (`PaintBox.draw`).
+            meshes: its shape, if it has one besides those of its subparts.
+        """
+        return self.added(2, 0, names).put(paint, *meshes)
+
+    def added(self, level: int, parent: int, names: str, at: str = "on") -> Node:
         """Add a node and return it."""
-        self.nodes.append(Node(self, len(self.nodes), level, parent, word, aliases, at))
+        word, *aliases = names.split(", ")
+        self.nodes.append(Node(self, len(self.nodes), level, parent, word, tuple(aliases), at))
         return self.nodes[-1]
 
     def turn(self, degrees: float | int) -> None:
@@ -139,7 +158,7 @@ class Builder:
         triangles = np.concatenate([mesh.triangles for _, mesh, _ in pieces])
         triangles[..., 2] -= triangles[..., 2].min()
         return ObjectModel(
-            self.name,
+            self.nodes[0].word,
             tuple(self._described(node, area[node.row]) for node in self.nodes),
             triangles,
             np.concatenate([mesh.normals for _, mesh, _ in pieces]),
@@ -199,14 +218,15 @@ class Builder:
 
     def _described(self, node: Node, area: dict[Paint, float]) -> ModelNode:
         """Return a node with its texts: the canonical name, then aliases, relations and attributes."""
-        text, others = self.name, list(self.aliases)
+        whole = self.nodes[0]
+        text, others = whole.word, list(whole.aliases)
         if node.level > 1:
-            text = f"{self.name} {node.word}"
-            others = [f"{self.name} {alias}" for alias in node.aliases]
-            others += [f"{name} of the {self.name}" for name in (node.word, *node.aliases)]
-            others += [f"{node.word} of the {alias}" for alias in self.aliases]
+            text = f"{whole.word} {node.word}"
+            others = [f"{whole.word} {alias}" for alias in node.aliases]
+            others += [f"{name} of the {whole.word}" for name in (node.word, *node.aliases)]
+            others += [f"{node.word} of the {alias}" for alias in whole.aliases]
         if node.level == 3:
-            others.append(f"{node.word} {node.at} the {self.name} {self.nodes[node.parent].word}")
+            others.append(f"{node.word} {node.at} the {whole.word} {self.nodes[node.parent].word}")
         colour, coloured = _prevailing(area, _PREVAILS[node.level], lambda paint: paint.colour)
         material, made = _prevailing(area, _PREVAILS[node.level], lambda paint: paint.adjective)
         if coloured:
@@ -252,15 +272,3 @@ def _prevailing(
         per_word[word_of(paint)] += size
     word = max(per_word, key=per_word.__getitem__)
     return word, per_word[word] >= least * sum(per_word.values())
-
-
-class Maker(NamedTuple):
-    """Generator of random objects of a class.
-
-    Attributes:
-        draw: adds parts, subparts and meshes to a builder; sizes and paints are random.
-        aliases: other names of the class.
-    """
-
-    draw: Callable[[Builder], None]
-    aliases: tuple[str, ...]

@@ -1,10 +1,22 @@
-"""Full-size seats, beds, tables, a lamp and a rug, in metres. Backs face -x, fronts +x."""
+"""Full-size furniture and fixtures, in metres. Fronts face +x; the backs of fixtures are at x = 0."""
 
 import numpy as np
 
-from hilsplat.world.objects.builder import CORNERS, Builder, Maker
+from hilsplat.world.objects.builder import CORNERS, Builder
 from hilsplat.world.paints import Paint
-from hilsplat.world.shapes import Mesh, box, cylinder, ellipsoid, joined, lathe, sweep
+from hilsplat.world.shapes import (
+    Mesh,
+    box,
+    cylinder,
+    disc,
+    ellipsoid,
+    extrude,
+    joined,
+    lathe,
+    roller,
+    sphere,
+    sweep,
+)
 
 
 def _legs(b: Builder, x: float, y: float, top: float, paint: Paint, foot_paint: Paint, width: float) -> None:
@@ -12,12 +24,10 @@ def _legs(b: Builder, x: float, y: float, top: float, paint: Paint, foot_paint: 
     foot_height = max(0.05, 0.22 * top)
     for px in (-x, x):
         for py in (-y, y):
-            leg = b.part("leg").put(
-                paint, box((width, width, top - foot_height), (px, py, (top + foot_height) / 2), 0.008)
-            )
-            leg.subpart("foot", "leg tip").put(
-                foot_paint, box((width * 1.3, width * 1.3, foot_height), (px, py, foot_height / 2), 0.01)
-            )
+            shape = box((width, width, top - foot_height), (px, py, (top + foot_height) / 2), 0.008)
+            leg = b.part("leg", paint, shape)
+            shape = box((width * 1.3, width * 1.3, foot_height), (px, py, foot_height / 2), 0.01)
+            leg.subpart("foot, leg tip", foot_paint, shape)
 
 
 def _pillow(size: tuple[float, float, float]) -> Mesh:
@@ -26,243 +36,288 @@ def _pillow(size: tuple[float, float, float]) -> Mesh:
     return joined(box(size, bevel=0.42 * min(size)), ellipsoid((0.44 * x, 0.44 * y, 0.62 * z)))
 
 
-def _bed(b: Builder) -> None:
+def bed(b: Builder) -> None:
     wood, sheet, blanket_paint = b.paint("wood"), b.paint("plain"), b.paint("cloth")
     length, width = b.between(1.85, 2.0), b.between(1.1, 1.45)
     frame_z, mattress = 0.32, b.between(0.17, 0.22)
-    frame = b.part("frame", "bedstead").put(wood, box((length, width, 0.2), (0, 0, 0.22), 0.02))
+    frame = b.part("frame, bedstead", wood, box((length, width, 0.2), (0, 0, 0.22), 0.02))
     for x, y in CORNERS:
         frame.put(wood, box((0.09, 0.09, 0.14), (x * (length / 2 - 0.06), y * (width / 2 - 0.06), 0.07)))
     top = b.between(0.85, 1.0)
-    frame.subpart("headboard", "head end").put(
-        b.paint("cloth"), box((0.07, width + 0.06, top - 0.1), (-length / 2 - 0.03, 0, (top + 0.1) / 2), 0.03)
-    )
-    frame.subpart("footboard", "foot end").put(
-        b.paint("wood"), box((0.05, width + 0.02, 0.44), (length / 2 + 0.02, 0, 0.25), 0.02)
-    )
+    shape = box((0.07, width + 0.06, top - 0.1), (-length / 2 - 0.03, 0, (top + 0.1) / 2), 0.03)
+    frame.subpart("headboard, head end", "cloth", shape)
+    shape = box((0.05, width + 0.02, 0.44), (length / 2 + 0.02, 0, 0.25), 0.02)
+    frame.subpart("footboard, foot end", "wood", shape)
     middle = frame_z + mattress / 2
-    bedding = b.part("mattress").put(
-        sheet, box((length - 0.04, width - 0.05, mattress), (0, 0, middle), 0.05)
-    )
+    bedding = b.part("mattress", sheet, box((length - 0.04, width - 0.05, mattress), (0, 0, middle), 0.05))
     share = b.between(0.56, 0.64)
     start = length / 2 - share * length
     size = (share * length - 0.03, width + 0.02, mattress + 0.02)
     place = (start + share * length / 2 - 0.02, 0, middle + 0.025)
-    bedding.subpart("blanket", "duvet", "comforter").put(blanket_paint, box(size, place, 0.05))
-    bedding.subpart("fold", "turned sheet").put(
-        b.paint("plain"), box((0.2, width + 0.03, mattress + 0.05), (start, 0, middle + 0.025), 0.05)
-    )
+    bedding.subpart("blanket, duvet, comforter", blanket_paint, box(size, place, 0.05))
+    shape = box((0.2, width + 0.03, mattress + 0.05), (start, 0, middle + 0.025), 0.05)
+    bedding.subpart("fold, turned sheet", "plain", shape)
     case, trim = b.paint("cloth"), b.paint("plain")
     for y in (-1, 1):
         w = width * 0.42
         z = frame_z + mattress + 0.07
-        pillow = b.part("pillow", "head pillow").put(
-            case, _pillow((0.4, w, 0.15)).moved(-length / 2 + 0.27, y * width * 0.235, z)
-        )
-        pillow.subpart("band", "ribbon").put(
-            trim, box((0.44, w * 0.2, 0.19), (-length / 2 + 0.27, y * width * 0.235, z + 0.005), 0.07)
-        )
+        shape = _pillow((0.4, w, 0.15)).moved(-length / 2 + 0.27, y * width * 0.235, z)
+        pillow = b.part("pillow, head pillow", case, shape)
+        shape = box((0.44, w * 0.2, 0.19), (-length / 2 + 0.27, y * width * 0.235, z + 0.005), 0.07)
+        pillow.subpart("band, ribbon", trim, shape)
 
 
-def _sofa(b: Builder) -> None:
+def sofa(b: Builder) -> None:
     cloth, cushion, wood = b.paint("cloth"), b.paint("plain"), b.paint("wood")
     depth, seats = b.between(0.82, 0.92), 2 if b.chance(0.5) else 3
     inner, arm_w = seats * b.between(0.54, 0.62), b.between(0.14, 0.2)
     width, seat_z, top = inner + 2 * arm_w, b.between(0.28, 0.32), b.between(0.78, 0.88)
     for x, y in CORNERS:
         profile = [(0, 0), (0.03, 0), (0.045, 0.1), (0, 0.1)]
-        b.part("leg", "foot").put(
-            wood, lathe(profile, 16).moved(x * (depth / 2 - 0.08), y * (width / 2 - 0.08), 0)
-        )
-    seat = b.part("seat", "base").put(
-        cloth, box((depth - 0.02, inner + 0.02, seat_z - 0.09), (0, 0, (seat_z + 0.09) / 2), 0.02)
-    )
+        b.part("leg, foot", wood, lathe(profile, 16).moved(x * (depth / 2 - 0.08), y * (width / 2 - 0.08), 0))
+    shape = box((depth - 0.02, inner + 0.02, seat_z - 0.09), (0, 0, (seat_z + 0.09) / 2), 0.02)
+    seat = b.part("seat, base", cloth, shape)
     front = depth / 2 - 0.01
     for i in range(seats):
         y = (i - (seats - 1) / 2) * inner / seats
-        seat.subpart("cushion", "seat cushion").put(
-            cushion, box((depth - 0.24, inner / seats - 0.012, 0.16), (0.12, y, seat_z + 0.075), 0.045)
-        )
-    back = b.part("back", "backrest").put(
-        cloth,
-        box((0.18, width - 2 * arm_w + 0.02, top - 0.09), (-depth / 2 + 0.09, 0, (top + 0.09) / 2), 0.04),
-    )
+        shape = box((depth - 0.24, inner / seats - 0.012, 0.16), (0.12, y, seat_z + 0.075), 0.045)
+        seat.subpart("cushion, seat cushion", cushion, shape)
+    shape = box((0.18, width - 2 * arm_w + 0.02, top - 0.09), (-depth / 2 + 0.09, 0, (top + 0.09) / 2), 0.04)
+    back = b.part("back, backrest", cloth, shape)
     back_paint = b.paint("cloth")
     for i in range(seats):
         y = (i - (seats - 1) / 2) * inner / seats
-        back.subpart("back cushion", "back pad").put(
-            back_paint,
-            box(
-                (0.15, inner / seats - 0.03, top - seat_z - 0.15),
-                (-depth / 2 + 0.25, y, (top + seat_z) / 2 + 0.1),
-                0.06,
-            ),
-        )
+        size = (0.15, inner / seats - 0.03, top - seat_z - 0.15)
+        shape = box(size, (-depth / 2 + 0.25, y, (top + seat_z) / 2 + 0.1), 0.06)
+        back.subpart("back cushion, back pad", back_paint, shape)
     pad_paint = b.paint("wood")
     arm_z = b.between(0.54, 0.62)
     for side in (-1, 1):
         y = side * (width - arm_w) / 2
-        arm = b.part("arm", "armrest").put(
-            cloth, box((depth, arm_w, arm_z - 0.09), (0, y, (arm_z + 0.09) / 2), 0.035)
-        )
-        arm.subpart("arm pad", "arm cover").put(
-            pad_paint, box((depth * 0.7, arm_w + 0.03, 0.05), (0.08, y, arm_z + 0.005), 0.015)
-        )
+        shape = box((depth, arm_w, arm_z - 0.09), (0, y, (arm_z + 0.09) / 2), 0.035)
+        arm = b.part("arm, armrest", cloth, shape)
+        shape = box((depth * 0.7, arm_w + 0.03, 0.05), (0.08, y, arm_z + 0.005), 0.015)
+        arm.subpart("arm pad, arm cover", pad_paint, shape)
     side = -1 if b.chance(0.5) else 1
     place = (front - 0.42, side * (inner / 2 - 0.19), seat_z + 0.34)
-    pillow = b.part("pillow", "throw pillow").put(
-        b.paint("cloth"), _pillow((0.13, 0.38, 0.38)).turned("y", -14).moved(*place)
-    )
-    pillow.subpart("button", "knot").put(
-        b.paint("plain"), ellipsoid((0.04, 0.075, 0.075), (0.08, 0, 0)).turned("y", -14).moved(*place)
-    )
+    shape = _pillow((0.13, 0.38, 0.38)).turned("y", -14).moved(*place)
+    pillow = b.part("pillow, throw pillow", "cloth", shape)
+    shape = ellipsoid((0.04, 0.075, 0.075), (0.08, 0, 0)).turned("y", -14).moved(*place)
+    pillow.subpart("button, knot", "plain", shape)
 
 
-def _table(b: Builder) -> None:
+def table(b: Builder) -> None:
     wood, leg_paint, foot = b.paint("wood"), b.paint("plain"), b.paint("metal")
     depth, width, height = b.between(0.52, 0.62), b.between(0.85, 1.05), b.between(0.42, 0.5)
-    top = b.part("top", "board").put(wood, box((depth, width, 0.05), (0, 0, height - 0.025), 0.012))
-    edge = top.subpart("edge", "rim")
+    top = b.part("top, board", wood, box((depth, width, 0.05), (0, 0, height - 0.025), 0.012))
+    edge = top.subpart("edge, rim")
     paint = b.paint("plain")
     for side in (-1, 1):
-        edge.put(
-            paint, box((0.035, width + 0.05, 0.07), (side * (depth / 2 + 0.008), 0, height - 0.032), 0.01)
-        )
-        edge.put(
-            paint, box((depth + 0.05, 0.035, 0.07), (0, side * (width / 2 + 0.008), height - 0.032), 0.01)
-        )
-    top.subpart("runner", "tablecloth").put(
-        b.paint("cloth"), box((depth * 0.46, width * 0.86, 0.012), (0, 0, height + 0.002), 0.003)
-    )
+        shape = box((0.035, width + 0.05, 0.07), (side * (depth / 2 + 0.008), 0, height - 0.032), 0.01)
+        edge.put(paint, shape)
+        shape = box((depth + 0.05, 0.035, 0.07), (0, side * (width / 2 + 0.008), height - 0.032), 0.01)
+        edge.put(paint, shape)
+    shape = box((depth * 0.46, width * 0.86, 0.012), (0, 0, height + 0.002), 0.003)
+    top.subpart("runner, tablecloth", "cloth", shape)
     _legs(b, depth / 2 - 0.07, width / 2 - 0.07, height - 0.05, leg_paint, foot, 0.07)
 
 
-def _desk(b: Builder) -> None:
+def desk(b: Builder) -> None:
     wood, front, metal = b.paint("wood"), b.paint("plain"), b.paint("metal")
     depth, width, height = b.between(0.6, 0.7), b.between(1.15, 1.35), b.between(0.72, 0.76)
-    top = b.part("top", "board").put(wood, box((depth, width, 0.045), (0, 0, height - 0.0225), 0.01))
-    top.subpart("pad", "writing mat").put(
-        b.paint("cloth"), box((0.32, width * 0.42, 0.012), (depth / 2 - 0.18, -width * 0.1, height + 0.002))
-    )
+    top = b.part("top, board", wood, box((depth, width, 0.045), (0, 0, height - 0.0225), 0.01))
+    shape = box((0.32, width * 0.42, 0.012), (depth / 2 - 0.18, -width * 0.1, height + 0.002))
+    top.subpart("pad, writing mat", "cloth", shape)
     unit_w = 0.38
     y = width / 2 - unit_w / 2 - 0.03
-    unit = b.part("drawers", "drawer unit").put(
-        b.paint("wood"), box((depth - 0.08, unit_w, height - 0.05), (0, y, (height - 0.045) / 2), 0.01)
-    )
+    shape = box((depth - 0.08, unit_w, height - 0.05), (0, y, (height - 0.045) / 2), 0.01)
+    unit = b.part("drawers, drawer unit", "wood", shape)
     each = (height - 0.1) / 3
     for i in range(3):
         z = 0.04 + each * (i + 0.5)
-        unit.subpart("drawer", "drawer front").put(
-            front, box((0.03, unit_w - 0.05, each - 0.03), (depth / 2 - 0.03, y, z), 0.008)
-        )
-        unit.subpart("handle", "pull").put(
-            metal, box((0.035, 0.16, 0.035), (depth / 2 - 0.005, y, z + 0.02), 0.008)
-        )
+        shape = box((0.03, unit_w - 0.05, each - 0.03), (depth / 2 - 0.03, y, z), 0.008)
+        unit.subpart("drawer, drawer front", front, shape)
+        shape = box((0.035, 0.16, 0.035), (depth / 2 - 0.005, y, z + 0.02), 0.008)
+        unit.subpart("handle, pull", metal, shape)
     leg_paint, foot_paint = b.paint("metal"), b.paint("plain")
     for x in (-1, 1):
         place = (x * (depth / 2 - 0.06), -width / 2 + 0.06)
-        leg = b.part("leg").put(
-            leg_paint, box((0.06, 0.06, height - 0.15), (*place, (height + 0.06) / 2), 0.008)
-        )
-        leg.subpart("foot", "leg tip").put(foot_paint, box((0.085, 0.085, 0.11), (*place, 0.055), 0.01))
+        leg = b.part("leg", leg_paint, box((0.06, 0.06, height - 0.15), (*place, (height + 0.06) / 2), 0.008))
+        leg.subpart("foot, leg tip", foot_paint, box((0.085, 0.085, 0.11), (*place, 0.055), 0.01))
 
 
-def _nightstand(b: Builder) -> None:
+def nightstand(b: Builder) -> None:
     wood, front, metal = b.paint("wood"), b.paint("plain"), b.paint("metal")
     depth, width, height = b.between(0.38, 0.44), b.between(0.42, 0.5), b.between(0.5, 0.58)
-    body = b.part("body", "case").put(
-        wood, box((depth, width, height - 0.16), (0, 0, height / 2 + 0.05), 0.01)
-    )
-    body.subpart("top", "board").put(
-        b.paint("stone"), box((depth + 0.05, width + 0.05, 0.045), (0, 0, height - 0.022), 0.012)
-    )
+    body = b.part("body, case", wood, box((depth, width, height - 0.16), (0, 0, height / 2 + 0.05), 0.01))
+    shape = box((depth + 0.05, width + 0.05, 0.045), (0, 0, height - 0.022), 0.012)
+    body.subpart("top, board", "stone", shape)
     each = (height - 0.2) / 2
     for i in range(2):
         z = 0.155 + each * (i + 0.5)
-        drawer = b.part("drawer").put(
-            front, box((0.03, width - 0.07, each - 0.025), (depth / 2 + 0.012, 0, z), 0.008)
-        )
-        drawer.subpart("handle", "pull").put(
-            metal, box((0.04, width * 0.36, 0.045), (depth / 2 + 0.04, 0, z), 0.01)
-        )
+        shape = box((0.03, width - 0.07, each - 0.025), (depth / 2 + 0.012, 0, z), 0.008)
+        drawer = b.part("drawer", front, shape)
+        shape = box((0.04, width * 0.36, 0.045), (depth / 2 + 0.04, 0, z), 0.01)
+        drawer.subpart("handle, pull", metal, shape)
     _legs(b, depth / 2 - 0.05, width / 2 - 0.05, 0.14, b.paint("wood"), b.paint("plain"), 0.055)
 
 
-def _floor_lamp(b: Builder) -> None:
+def floor_lamp(b: Builder) -> None:
     metal, cloth, accent = b.paint("metal"), b.paint("cloth"), b.paint("ceramic")
     height, radius = b.between(1.45, 1.65), b.between(0.2, 0.25)
-    base = b.part("base", "foot").put(
-        accent, lathe([(0, 0), (0.19, 0), (0.19, 0.03), (0.06, 0.06), (0, 0.06)])
-    )
-    base.subpart("button", "switch").put(
-        b.paint("plastic"), ellipsoid((0.045, 0.055, 0.03), (0.13, 0, 0.045))
-    )
-    pole = b.part("pole", "stem").put(metal, cylinder(0.022, 0.05, height - 0.1, 16))
-    pole.subpart("ball", "joint").put(
-        b.paint("ceramic"), ellipsoid((0.06, 0.06, 0.07), (0, 0, height * 0.45))
-    )
+    base = b.part("base, foot", accent, lathe([(0, 0), (0.19, 0), (0.19, 0.03), (0.06, 0.06), (0, 0.06)]))
+    base.subpart("button, switch", "plastic", ellipsoid((0.045, 0.055, 0.03), (0.13, 0, 0.045)))
+    pole = b.part("pole, stem", metal, cylinder(0.022, 0.05, height - 0.1, 16))
+    pole.subpart("ball, joint", "ceramic", ellipsoid((0.06, 0.06, 0.07), (0, 0, height * 0.45)))
     low, upper = height - 0.34, radius * b.between(0.6, 0.75)
-    shade = b.part("shade", "lampshade").put(
-        cloth,
-        lathe([(radius, low), (upper, height), (upper - 0.01, height), (radius - 0.01, low), (radius, low)]),
-    )
+    profile = [(radius, low), (upper, height), (upper - 0.01, height), (radius - 0.01, low), (radius, low)]
+    shade = b.part("shade, lampshade", cloth, lathe(profile))
     higher = radius + (upper - radius) * 0.09 / 0.34
-    profile = [
-        (radius - 0.012, low - 0.012),
-        (radius + 0.013, low - 0.012),
-        (higher + 0.013, low + 0.09),
-        (higher - 0.004, low + 0.095),
-    ]
-    shade.subpart("border", "trim").put(b.paint("plain"), lathe(profile))
-    profile = [
-        (0, height - 0.03),
-        (upper - 0.005, height - 0.015),
-        (0.04, height + 0.01),
-        (0.045, height + 0.05),
-        (0, height + 0.08),
-    ]
-    shade.subpart("finial", "top knob").put(accent, lathe(profile))
+    profile = [(radius - 0.012, low - 0.012), (radius + 0.013, low - 0.012)]
+    profile += [(higher + 0.013, low + 0.09), (higher - 0.004, low + 0.095)]
+    shade.subpart("border, trim", "plain", lathe(profile))
+    profile = [(0, height - 0.03), (upper - 0.005, height - 0.015)]
+    profile += [(0.04, height + 0.01), (0.045, height + 0.05), (0, height + 0.08)]
+    shade.subpart("finial, top knob", accent, lathe(profile))
 
 
-def _rug(b: Builder) -> None:
+def rug(b: Builder) -> None:
     width, depth = b.between(1.35, 1.6), b.between(0.95, 1.1)
-    border = b.part("border", "edge").put(b.paint("plain"), box((depth, width, 0.012), (0, 0, 0.006), 0.004))
-    fringe, fringe_paint = border.subpart("fringe", "tassels"), b.paint("plain")
+    border = b.part("border, edge", "plain", box((depth, width, 0.012), (0, 0, 0.006), 0.004))
+    fringe, fringe_paint = border.subpart("fringe, tassels"), b.paint("plain")
     for side in (-1, 1):
         for i in range(15):
             x = (i - 7) / 15 * depth
             fringe.put(fringe_paint, box((depth / 24, 0.07, 0.008), (x, side * (width / 2 + 0.03), 0.004)))
-    field = b.part("field", "middle").put(
-        b.paint("cloth"), box((depth - 0.24, width - 0.24, 0.014), (0, 0, 0.008), 0.003)
-    )
-    field.subpart("medallion", "star").put(b.paint("plain"), cylinder(0.2, 0.005, 0.018, 8))
+    field = b.part("field, middle", "cloth", box((depth - 0.24, width - 0.24, 0.014), (0, 0, 0.008), 0.003))
+    field.subpart("medallion, star", "plain", cylinder(0.2, 0.005, 0.018, 8))
 
 
-def _stool(b: Builder) -> None:
+def stool(b: Builder) -> None:
     wood, cloth, foot_paint = b.paint("wood"), b.paint("cloth"), b.paint("plain")
     r, height = b.between(0.2, 0.24), b.between(0.46, 0.58)
-    seat = b.part("seat", "top").put(wood, cylinder(r, height - 0.09, height - 0.04, 36, bevel=0.01))
-    seat.subpart("cushion", "pad").put(cloth, cylinder(r * 0.94, height - 0.05, height, 36, bevel=0.02))
+    seat = b.part("seat, top", wood, cylinder(r, height - 0.09, height - 0.04, 36, bevel=0.01))
+    seat.subpart("cushion, pad", cloth, cylinder(r * 0.94, height - 0.05, height, 36, bevel=0.02))
     angle = np.linspace(0, 2 * np.pi, 25)
     hoop = np.stack([0.84 * r * np.cos(angle), 0.84 * r * np.sin(angle), np.full(25, height * 0.36)], axis=1)
-    b.part("ring", "footrest").put(b.paint("metal"), sweep(list(hoop), 0.016, 10))
+    b.part("ring, footrest", "metal", sweep(list(hoop), 0.016, 10))
     leg_paint = b.paint("plain")
     for x, y in CORNERS:
         corner = np.array([x, y]) / np.sqrt(2)
-        top, knee, floor = (
-            np.array([*(corner * r * out), z]) for out, z in ((0.7, height - 0.08), (0.9, 0.1), (0.96, 0.0))
-        )
-        leg = b.part("leg").put(leg_paint, sweep([knee, (knee + top) / 2, top], 0.024))
-        leg.subpart("foot", "leg tip").put(foot_paint, sweep([floor, (knee + floor) / 2, knee], 0.032))
+        ends = ((0.7, height - 0.08), (0.9, 0.1), (0.96, 0.0))
+        top, knee, floor = (np.array([*(corner * r * out), z]) for out, z in ends)
+        leg = b.part("leg", leg_paint, sweep([knee, (knee + top) / 2, top], 0.024))
+        leg.subpart("foot, leg tip", foot_paint, sweep([floor, (knee + floor) / 2, knee], 0.032))
 
 
-MAKERS: dict[str, Maker] = {
-    "bed": Maker(_bed, ("sleeping bed",)),
-    "sofa": Maker(_sofa, ("couch", "settee")),
-    "table": Maker(_table, ("coffee table", "low table")),
-    "desk": Maker(_desk, ("writing desk", "work desk")),
-    "nightstand": Maker(_nightstand, ("bedside table", "night table")),
-    "lamp": Maker(_floor_lamp, ("floor lamp", "standing lamp", "light")),
-    "rug": Maker(_rug, ("carpet", "mat")),
-    "stool": Maker(_stool, ("footstool", "bar stool")),
-}
+def door(b: Builder) -> None:
+    frame_paint, leaf_paint, metal = b.paint("plain"), b.paint("wood"), b.paint("metal")
+    width, height = b.between(0.84, 0.92), b.between(2.0, 2.06)
+    frame = b.part("frame, casing")
+    for side in (-1, 1):
+        shape = box((0.06, 0.09, height), (0.03, side * (width / 2 + 0.045), height / 2), 0.01)
+        frame.put(frame_paint, shape)
+    frame.subpart("lintel, head", "wood", box((0.07, width + 0.24, 0.11), (0.035, 0, height + 0.055), 0.012))
+    leaf = b.part("leaf, wing", leaf_paint, box((0.04, width, height - 0.005), (0.02, 0, height / 2)))
+    panel_paint = b.paint("plain")
+    for y in (-1.0, 1.0):
+        for low, high in ((0.14, 0.44), (0.5, 0.94)):
+            size = (0.02, width * 0.36, (high - low) * height)
+            place = (0.042, y * width * 0.23, (low + high) / 2 * height)
+            leaf.subpart("panel, inlay", panel_paint, box(size, place, 0.008))
+    y = -width / 2 + 0.07
+    handle = b.part("handle, latch", metal, box((0.02, 0.055, 0.22), (0.048, y, 1.02), 0.006))
+    path = [(0.05, y, 1.05), (0.1, y, 1.05), (0.105, y + 0.06, 1.05), (0.1, y + 0.15, 1.05)]
+    handle.subpart("lever, knob", "metal", sweep(path, 0.018))
+
+
+def window(b: Builder) -> None:
+    frame_paint, sky = b.paint("plain"), b.paint("plain blue teal white")
+    width, height = b.between(1.15, 1.35), b.between(1.1, 1.25)
+    frame = b.part("frame, casing")
+    for side in (-1, 1):
+        frame.put(frame_paint, box((0.06, 0.08, height), (0.03, side * (width / 2 - 0.04), height / 2), 0.01))
+        shape = box((0.06, width, 0.08), (0.03, 0, height / 2 + side * (height / 2 - 0.04)), 0.01)
+        frame.put(frame_paint, shape)
+    frame.subpart("sill, ledge", "stone", box((0.11, width + 0.08, 0.05), (0.055, 0, 0.0), 0.01))
+    bar_paint = b.paint("wood")
+    hill_paint = b.paint("plain green brown")
+    metal = b.paint("metal")
+    w, h = width / 2 - 0.08, height - 0.16
+    for side in (-1, 1):
+        sash = b.part("sash, wing")
+        y = side * (w / 2 + 0.002)
+        for edge in (-1, 1):
+            sash.put(bar_paint, box((0.045, 0.05, h), (0.025, y + edge * (w / 2 - 0.025), height / 2), 0.006))
+            sash.put(bar_paint, box((0.045, w, 0.05), (0.025, y, height / 2 + edge * (h / 2 - 0.025)), 0.006))
+        sash.subpart("pane, glass", sky, box((0.016, w - 0.08, h - 0.08), (0.012, y, height / 2)))
+        shape = box((0.016, w - 0.085, h * b.between(0.22, 0.32)), (0.015, y, 0.13 + h * 0.14))
+        sash.subpart("view, landscape", hill_paint, shape)
+        shape = box((0.04, 0.035, 0.14), (0.055, side * 0.028, height / 2), 0.008)
+        sash.subpart("catch, window handle", metal, shape)
+
+
+def curtain(b: Builder) -> None:
+    cloth, metal, trim = b.paint("cloth"), b.paint("metal"), b.paint("plain")
+    opening, drop, folds = b.between(1.49, 1.55), b.between(1.38, 1.46), 4
+    fold = b.between(0.085, 0.1)
+    reach = opening / 2 + folds * fold + 0.05
+    rod = b.part("rod, rail", metal, roller(0.018, -reach, reach, 14).moved(0.075, 0, drop + 0.05))
+    for side in (-1, 1):
+        rod.put(metal, box((0.075, 0.02, 0.02), (0.037, side * (reach - 0.02), drop + 0.05)))
+        shape = sphere(0.04, (0.075, side * (reach + 0.02), drop + 0.05), 16)
+        rod.subpart("finial, rod end", "ceramic", shape)
+    hem_height = 0.11
+    for side in (-1, 1):
+        panel = b.part("panel, drape")
+        hem = panel.subpart("hem, border")
+        for i in range(folds):
+            y = side * (opening / 2 + (i + 0.5) * fold)
+            swell = float(b.rng.uniform(0.8, 1.1))
+            oval = (0.036 * swell / 0.06, fold * 0.6 / 0.06, 1.0)
+            panel.put(cloth, cylinder(0.06, hem_height, drop + 0.065, 18).scaled(*oval).moved(0.075, y, 0))
+            hem.put(trim, cylinder(0.063, 0, hem_height + 0.004, 18).scaled(*oval).moved(0.075, y, 0))
+        middle = side * (opening / 2 + folds * fold / 2)
+        shape = box((0.1, folds * fold + 0.035, 0.075), (0.075, middle, drop * 0.42), 0.02)
+        panel.subpart("tie, tieback", "plain", shape)
+
+
+def picture(b: Builder) -> None:
+    wood, accent = b.paint("wood"), b.paint("metal")
+    width, height = b.between(0.6, 0.85), b.between(0.48, 0.62)
+    border = 0.055
+    frame = b.part("frame, border")
+    for side in (-1.0, 1.0):
+        frame.put(wood, box((0.04, border, height), (0.02, side * (width - border) / 2, height / 2), 0.012))
+        shape = box((0.04, width, border), (0.02, 0, height / 2 + side * (height - border) / 2), 0.012)
+        frame.put(wood, shape)
+    corner = frame.subpart("corners, ornaments")
+    for y, z in CORNERS:
+        place = (0.024, y * (width - border) / 2, height / 2 + z * (height - border) / 2)
+        corner.put(accent, box((0.05, border * 1.35, border * 1.35), place, 0.012))
+    shape = box((0.02, width - border, height - border), (0.01, 0, height / 2))
+    canvas = b.part("canvas, painting", "plain blue pink yellow beige teal white", shape)
+    low, inner_w, inner_h = border, width - 2 * border, height - 2 * border
+    peak = b.between(0.4, 0.6)
+    ridge = np.array([(0.0, 0.0), (1.0, 0.0), (0.86, 0.22), (peak, 0.62), (0.16, 0.3)])
+    outline = [(float((u - 0.5) * inner_w), float(low + v * inner_h)) for u, v in ridge]
+    canvas.subpart("hill, mountain", "plain", extrude(outline, 0.01).turned("z", 90).moved(0.021))
+    side = 0.3 if peak < 0.5 else -0.3
+    shape = disc(inner_h * 0.14, 0, 0.012, 28).moved(0.018, side * inner_w, low + inner_h * 0.76)
+    canvas.subpart("sun, moon", "plain", shape)
+
+
+def mirror(b: Builder) -> None:
+    rim_paint, glass = b.paint("metal"), b.paint("plain grey white blue teal")
+    r = b.between(0.26, 0.32)
+    profile = [(r - 0.04, 0), (r, 0), (r, 0.03), (r - 0.02, 0.045), (r - 0.05, 0.04), (r - 0.05, 0.0)]
+    rim = b.part("frame, rim", rim_paint, lathe(profile, 48).turned("y", 90).moved(0, 0, r))
+    knobs = rim.subpart("beads, studs")
+    bead = b.paint("ceramic")
+    for i in range(8):
+        a = np.pi / 4 * i
+        shape = sphere(0.034, (0.035, float((r - 0.025) * np.cos(a)), float(r + (r - 0.025) * np.sin(a))), 16)
+        knobs.put(bead, shape)
+    pane = b.part("glass, looking glass", glass, disc(r - 0.045, 0.0, 0.02, 40).moved(0, 0, r))
+    shape = box((0.008, 0.07, r * 1.1), (0.02, 0, 0)).turned("x", 32).moved(0, 0.02, r)
+    pane.subpart("glint, reflection", "plain white yellow beige", shape)

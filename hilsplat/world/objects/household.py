@@ -1,59 +1,58 @@
-"""Miniature household objects: each function draws one class of object."""
+"""Miniature household objects, gadgets and instruments: each function draws one class of object."""
 
 import numpy as np
 
-from hilsplat.world.objects.builder import CORNERS, Builder, Maker
-from hilsplat.world.shapes import box, cylinder, ellipsoid, lathe, sphere, sweep
+from hilsplat.world.objects.builder import CORNERS, Builder
+from hilsplat.world.shapes import (
+    box,
+    cylinder,
+    disc,
+    ellipsoid,
+    extrude,
+    lathe,
+    loft,
+    plate,
+    ring,
+    roller,
+    sphere,
+    sweep,
+)
 
 
-def _chair(b: Builder) -> None:
+def chair(b: Builder) -> None:
     wood, cloth, accent = b.paint("wood"), b.paint("cloth"), b.paint("plain")
     w, seat_z, top = b.between(0.50, 0.60), b.between(0.42, 0.50), b.between(1.0, 1.15)
-    seat = b.part("seat").put(wood, box((w, w, 0.07), (0, 0, seat_z), 0.015))
-    seat.subpart("cushion", "pillow").put(
-        cloth, box((w * 0.86, w * 0.86, 0.11), (0.01, 0, seat_z + 0.085), 0.04)
-    )
-    back = b.part("back", "backrest")
+    seat = b.part("seat", wood, box((w, w, 0.07), (0, 0, seat_z), 0.015))
+    seat.subpart("cushion, pillow", cloth, box((w * 0.86, w * 0.86, 0.11), (0.01, 0, seat_z + 0.085), 0.04))
+    back = b.part("back, backrest")
     for side in (-1, 1):
         size = (0.075, 0.085, top - seat_z)
         place = (-w / 2 + 0.04, side * (w / 2 - 0.045), (top + seat_z) / 2)
         back.put(wood, box(size, place, 0.015))
-    back.subpart("top rail", "headrest").put(
-        accent, box((0.09, w + 0.04, 0.17), (-w / 2 + 0.04, 0, top - 0.05), 0.03)
-    )
-    slats = back.subpart("slats", "bars")
+    shape = box((0.09, w + 0.04, 0.17), (-w / 2 + 0.04, 0, top - 0.05), 0.03)
+    back.subpart("top rail, headrest", accent, shape)
+    slats = back.subpart("slats, bars")
     slat_paint = b.paint("plain")
     low, high = seat_z + 0.06, top - 0.14
     for i in range(3):
-        slats.put(
-            slat_paint,
-            box((0.05, 0.10, high - low), (-w / 2 + 0.04, (i - 1) * w * 0.26, (low + high) / 2), 0.01),
-        )
+        shape = box((0.05, 0.10, high - low), (-w / 2 + 0.04, (i - 1) * w * 0.26, (low + high) / 2), 0.01)
+        slats.put(slat_paint, shape)
     for x, y in CORNERS:
         px, py = x * (w / 2 - 0.05), y * (w / 2 - 0.05)
-        leg = b.part("leg").put(wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012))
-        leg.subpart("foot", "leg tip").put(accent, box((0.13, 0.13, 0.16), (px, py, 0.08), 0.02))
+        leg = b.part("leg", wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012))
+        leg.subpart("foot, leg tip", accent, box((0.13, 0.13, 0.16), (px, py, 0.08), 0.02))
 
 
-def _cabinet(b: Builder) -> None:
+def cabinet(b: Builder) -> None:
     wood, front, metal = b.paint("wood"), b.paint("plain"), b.paint("metal")
     d, w, h = b.between(0.42, 0.5), b.between(0.62, 0.75), b.between(0.75, 0.9)
-    body = b.part("body", "case", "frame").put(wood, box((d, w, h - 0.1), (0, 0, h / 2 + 0.05), 0.012))
-    body.put(
-        wood,
-        *[
-            box((0.09, 0.09, 0.12), (x * (d / 2 - 0.06), y * (w / 2 - 0.06), 0.05))
-            for x in (-1, 1)
-            for y in (-1, 1)
-        ],
-    )
-    body.subpart("top", "board").put(
-        b.paint("stone"), box((d + 0.08, w + 0.08, 0.08), (0, 0, h + 0.03), 0.02)
-    )
-    body.subpart("back panel", "back").put(
-        b.paint("plain"), box((0.04, w * 0.80, h * 0.62), (-d / 2 - 0.005, 0, h * 0.52), 0.01)
-    )
-    inlays = body.subpart("side panels", "sides")
+    body = b.part("body, case, frame", wood, box((d, w, h - 0.1), (0, 0, h / 2 + 0.05), 0.012))
+    shapes = [box((0.09, 0.09, 0.12), (x * (d / 2 - 0.06), y * (w / 2 - 0.06), 0.05)) for x, y in CORNERS]
+    body.put(wood, *shapes)
+    body.subpart("top, board", "stone", box((d + 0.08, w + 0.08, 0.08), (0, 0, h + 0.03), 0.02))
+    shape = box((0.04, w * 0.80, h * 0.62), (-d / 2 - 0.005, 0, h * 0.52), 0.01)
+    body.subpart("back panel, back", "plain", shape)
+    inlays = body.subpart("side panels, sides")
     inlay = b.paint("wood")
     for side in (-1, 1):
         inlays.put(inlay, box((d * 0.62, 0.04, h * 0.56), (0, side * (w / 2 + 0.003), h * 0.52), 0.01))
@@ -61,196 +60,298 @@ def _cabinet(b: Builder) -> None:
     for side in (-1, 1):
         door_w, door_h = w / 2 - 0.05, split - 0.17
         y, z = side * (w / 4 - 0.003), 0.13 + door_h / 2
-        door = b.part("door").put(front, box((0.05, door_w, door_h), (x + 0.02, y, z), 0.012))
-        door.subpart("panel", "inlay").put(
-            b.paint("cloth"),
-            box((0.05, door_w * 0.52, door_h * 0.66), (x + 0.04, y + side * door_w * 0.13, z), 0.015),
-        )
-        door.subpart("knob", "doorknob").put(metal, sphere(0.072, (x + 0.08, y - side * door_w * 0.34, z)))
+        door = b.part("door", front, box((0.05, door_w, door_h), (x + 0.02, y, z), 0.012))
+        shape = box((0.05, door_w * 0.52, door_h * 0.66), (x + 0.04, y + side * door_w * 0.13, z), 0.015)
+        door.subpart("panel, inlay", "cloth", shape)
+        door.subpart("knob, doorknob", metal, sphere(0.072, (x + 0.08, y - side * door_w * 0.34, z)))
     z = (split + h) / 2 - 0.01
-    drawer = b.part("drawer").put(
-        b.paint("plain"), box((0.05, w - 0.09, h - split - 0.07), (x + 0.02, 0, z), 0.012)
-    )
-    drawer.subpart("handle", "pull").put(metal, box((0.07, w * 0.40, 0.085), (x + 0.075, 0, z), 0.025))
+    drawer = b.part("drawer", "plain", box((0.05, w - 0.09, h - split - 0.07), (x + 0.02, 0, z), 0.012))
+    drawer.subpart("handle, pull", metal, box((0.07, w * 0.40, 0.085), (x + 0.075, 0, z), 0.025))
 
 
-def _lamp(b: Builder) -> None:
+def lamp(b: Builder) -> None:
     metal, cloth, accent = b.paint("metal"), b.paint("cloth"), b.paint("ceramic")
     h, shade_r = b.between(0.95, 1.15), b.between(0.32, 0.40)
-    base = b.part("base", "foot").put(
-        accent, lathe([(0, 0), (0.28, 0), (0.28, 0.07), (0.20, 0.13), (0, 0.14)])
-    )
-    base.subpart("button", "switch").put(b.paint("plastic"), ellipsoid((0.09, 0.11, 0.075), (0.205, 0, 0.12)))
-    pole = b.part("pole", "stem").put(metal, cylinder(0.055, 0.1, h - 0.22))
-    pole.subpart("ball", "joint").put(b.paint("ceramic"), sphere(b.between(0.13, 0.155), (0, 0, 0.34)))
+    base = b.part("base, foot", accent, lathe([(0, 0), (0.28, 0), (0.28, 0.07), (0.20, 0.13), (0, 0.14)]))
+    base.subpart("button, switch", "plastic", ellipsoid((0.09, 0.11, 0.075), (0.205, 0, 0.12)))
+    pole = b.part("pole, stem", metal, cylinder(0.055, 0.1, h - 0.22))
+    pole.subpart("ball, joint", b.paint("ceramic"), sphere(b.between(0.13, 0.155), (0, 0, 0.34)))
     low, upper = h - 0.46, shade_r * b.between(0.55, 0.7)
 
     def radius(z: float) -> float:
         return shade_r + (upper - shade_r) * (z - low) / 0.46
 
-    shade = b.part("shade", "lampshade").put(
-        cloth, lathe([(shade_r, low), (upper, h), (upper - 0.03, h), (shade_r - 0.03, low), (shade_r, low)])
-    )
+    profile = [(shade_r, low), (upper, h), (upper - 0.03, h), (shade_r - 0.03, low), (shade_r, low)]
+    shade = b.part("shade, lampshade", cloth, lathe(profile))
     trim = b.paint("cloth")
-    profile = [
-        (shade_r - 0.035, low - 0.01),
-        (shade_r + 0.022, low - 0.01),
-        (radius(low + 0.115) + 0.022, low + 0.115),
-        (radius(low + 0.115), low + 0.12),
-    ]
-    shade.subpart("border", "trim").put(trim, lathe(profile))
-    shade.subpart("finial", "top knob").put(
-        accent,
-        lathe([(0, h - 0.03), (upper - 0.01, h - 0.03), (0.06, h + 0.01), (0.075, h + 0.07), (0, h + 0.12)]),
-    )
+    profile = [(shade_r - 0.035, low - 0.01), (shade_r + 0.022, low - 0.01)]
+    profile += [(radius(low + 0.115) + 0.022, low + 0.115), (radius(low + 0.115), low + 0.12)]
+    shade.subpart("border, trim", trim, lathe(profile))
+    profile = [(0, h - 0.03), (upper - 0.01, h - 0.03), (0.06, h + 0.01), (0.075, h + 0.07), (0, h + 0.12)]
+    shade.subpart("finial, top knob", accent, lathe(profile))
 
 
-def _shelf(b: Builder) -> None:
+def shelf(b: Builder) -> None:
     wood, back = b.paint("wood"), b.paint("plain")
     d, w, h = b.between(0.32, 0.38), b.between(0.66, 0.8), b.between(0.85, 1.0)
-    frame = b.part("frame", "case")
-    for side in (-1, 1):
-        frame.put(wood, box((d, 0.06, h), (0, side * (w / 2 - 0.03), h / 2), 0.012))
-    frame.subpart("back wall", "backboard").put(
-        back, box((0.04, w - 0.12, h - 0.04), (-d / 2 + 0.02, 0, h / 2))
-    )
-    braces = frame.subpart("braces", "back bars")
-    brace_paint = b.paint("plain")
-    for z in (h * 0.28, h * 0.72):
-        braces.put(brace_paint, box((0.04, w - 0.04, 0.13), (-d / 2 - 0.005, 0, z), 0.01))
-    boards = frame.subpart("boards", "planks")
-    board_paint = b.paint("wood")
-    for z in (0.05, h * 0.5, h - 0.035):
-        boards.put(board_paint, box((d + 0.03, w - 0.11, 0.07), (0.015, 0, z), 0.012))
-    books = b.part("books", "row of books")
+    frame = b.part("frame, case")
+    frame.put(wood, *[box((d, 0.06, h), (0, side * (w / 2 - 0.03), h / 2), 0.012) for side in (-1, 1)])
+    frame.subpart("back wall, backboard", back, box((0.04, w - 0.12, h - 0.04), (-d / 2 + 0.02, 0, h / 2)))
+    shapes = [box((0.04, w - 0.04, 0.13), (-d / 2 - 0.005, 0, z), 0.01) for z in (h * 0.28, h * 0.72)]
+    frame.subpart("braces, back bars", "plain", *shapes)
+    shapes = [box((d + 0.03, w - 0.11, 0.07), (0.015, 0, z), 0.012) for z in (0.05, h * 0.5, h - 0.035)]
+    frame.subpart("boards, planks", "wood", *shapes)
+    books = b.part("books, row of books")
     y, bottom = -w / 2 + 0.08, h * 0.5 + 0.035
     while y < 0.04:
         thick, tall = b.between(0.085, 0.12), b.between(0.27, 0.34)
-        books.subpart("book").put(
-            b.paint("cloth"),
-            box((d * b.between(0.72, 0.9), thick, tall), (0.02, y + thick / 2, bottom + tall / 2), 0.01),
-        )
+        cover, deep = b.paint("cloth"), d * b.between(0.72, 0.9)
+        shape = box((deep, thick, tall), (0.02, y + thick / 2, bottom + tall / 2), 0.01)
+        books.subpart("book", cover, shape)
         y += thick + 0.006
     vy, vz = w / 2 - 0.18, bottom
-    vase = b.part("vase", "pot").put(
-        b.paint("ceramic"),
-        lathe([(0, 0), (0.08, 0), (0.135, 0.10), (0.11, 0.20), (0.05, 0.25)]).moved(0.03, vy, vz),
-    )
-    vase.subpart("rim", "mouth").put(
-        b.paint("ceramic"), lathe([(0.05, 0.19), (0.14, 0.28), (0.13, 0.345), (0, 0.31)]).moved(0.03, vy, vz)
-    )
+    shape = lathe([(0, 0), (0.08, 0), (0.135, 0.10), (0.11, 0.20), (0.05, 0.25)]).moved(0.03, vy, vz)
+    vase = b.part("vase, pot", "ceramic", shape)
+    shape = lathe([(0.05, 0.19), (0.14, 0.28), (0.13, 0.345), (0, 0.31)]).moved(0.03, vy, vz)
+    vase.subpart("rim, mouth", "ceramic", shape)
     crate_w = w * 0.52
     cy = b.between(-0.06, 0.06)
-    crate = b.part("box", "basket").put(
-        b.paint("cloth"), box((d * 0.85, crate_w, h * 0.30), (0.03, cy, 0.085 + h * 0.15), 0.015)
-    )
-    crate.subpart("label", "tag").put(
-        b.paint("plain"),
-        box((0.03, crate_w * 0.5, h * 0.14), (0.03 + d * 0.425, cy, 0.085 + h * 0.15), 0.008),
-    )
+    shape = box((d * 0.85, crate_w, h * 0.30), (0.03, cy, 0.085 + h * 0.15), 0.015)
+    crate = b.part("box, basket", "cloth", shape)
+    shape = box((0.03, crate_w * 0.5, h * 0.14), (0.03 + d * 0.425, cy, 0.085 + h * 0.15), 0.008)
+    crate.subpart("label, tag", "plain", shape)
 
 
-def _plant(b: Builder) -> None:
+def plant(b: Builder) -> None:
     clay, rim_paint = b.paint("ceramic"), b.paint("ceramic")
-    leaf = b.paint("plain", "green", "teal")
-    stem_paint = b.paint("wood", "brown")
-    petal = b.paint("plain", "red", "pink", "yellow", "purple", "orange", "white", "blue")
+    leaf = b.paint("plain green teal")
+    stem_paint = b.paint("wood brown")
+    petal = b.paint("plain red pink yellow purple orange white blue")
     r, h = b.between(0.24, 0.30), b.between(0.30, 0.38)
-    pot = b.part("pot", "flowerpot").put(clay, lathe([(0, 0), (r * 0.72, 0), (r, h)]))
-    pot.subpart("rim", "edge").put(
-        rim_paint,
-        lathe([(r, h - 0.10), (r + 0.05, h - 0.09), (r + 0.05, h), (r - 0.03, h), (r - 0.04, h - 0.05)]),
-    )
-    pot.subpart("soil", "earth").put(
-        b.paint("plain", "brown", "black"), lathe([(r - 0.02, h - 0.04), (r * 0.5, h - 0.015), (0, h)])
-    )
+    pot = b.part("pot, flowerpot", clay, lathe([(0, 0), (r * 0.72, 0), (r, h)]))
+    profile = [(r, h - 0.10), (r + 0.05, h - 0.09), (r + 0.05, h), (r - 0.03, h), (r - 0.04, h - 0.05)]
+    pot.subpart("rim, edge", rim_paint, lathe(profile))
+    profile = [(r - 0.02, h - 0.04), (r * 0.5, h - 0.015), (0, h)]
+    pot.subpart("soil, earth", "plain brown black", lathe(profile))
     top = h + b.between(0.26, 0.34)
-    stem = b.part("stem", "trunk").put(
-        stem_paint,
-        sweep([(0, 0, h - 0.05), (0.02, 0.02, (h + top) / 2), (0, 0, top + 0.05)], [0.06, 0.05, 0.05]),
-    )
-    stem.subpart("ring", "ribbon").put(
-        b.paint("cloth"),
-        lathe([(0.05, -0.065), (0.095, -0.05), (0.095, 0.05), (0.05, 0.065)]).moved(0.01, 0.01, h + 0.11),
-    )
+    path = [(0, 0, h - 0.05), (0.02, 0.02, (h + top) / 2), (0, 0, top + 0.05)]
+    stem = b.part("stem, trunk", stem_paint, sweep(path, [0.06, 0.05, 0.05]))
+    shape = lathe([(0.05, -0.065), (0.095, -0.05), (0.095, 0.05), (0.05, 0.065)]).moved(0.01, 0.01, h + 0.11)
+    stem.subpart("ring, ribbon", "cloth", shape)
     size = b.between(0.26, 0.31)
-    crown = b.part("crown", "leaves", "foliage").put(
-        leaf, ellipsoid((size, size, size * 0.92), (0, 0, top + size * 0.7))
-    )
+    shape = ellipsoid((size, size, size * 0.92), (0, 0, top + size * 0.7))
+    crown = b.part("crown, leaves, foliage", leaf, shape)
     for i in range(5):
         a = 2 * np.pi * i / 5 + b.between(0, 0.8)
-        crown.put(
-            leaf,
-            sphere(
-                size * 0.52,
-                (size * 0.72 * np.cos(a), size * 0.72 * np.sin(a), top + size * b.between(0.35, 0.75)),
-            ),
-        )
+        place = (size * 0.72 * np.cos(a), size * 0.72 * np.sin(a), top + size * b.between(0.35, 0.75))
+        crown.put(leaf, sphere(size * 0.52, place))
     for i in range(5):
         a, up = 2 * np.pi * i / 5 + b.between(0, 0.5), b.between(0.15, 1.0)
         flat = size * 1.1 * np.cos(up)
         place = (flat * np.cos(a), flat * np.sin(a), top + size * 0.75 + size * np.sin(up) * 0.95)
-        crown.subpart("flower", "blossom").put(petal, sphere(0.085, place, 16))
+        crown.subpart("flower, blossom", petal, sphere(0.085, place, 16))
 
 
-def _clock(b: Builder) -> None:
+def clock(b: Builder) -> None:
     case_paint = b.paint("plastic")
-    face_paint = b.paint("plain", "white", "beige", "yellow", "pink")
-    dark = b.paint("plastic", "black", "blue", "red", "purple")
+    face_paint = b.paint("plain white beige yellow pink")
+    dark = b.paint("plastic black blue red purple")
     accent = b.paint("plastic")
     metal = b.paint("metal")
     r, depth = b.between(0.36, 0.42), b.between(0.22, 0.28)
     z = r + 0.13
-    case = b.part("case", "body", "housing").put(
-        case_paint, cylinder(r, -depth / 2, depth / 2 - 0.02, 36, 0.03).turned("y", 90).moved(z=z)
-    )
-    ring = lathe(
-        [(r + 0.01, -0.01), (r + 0.03, 0.0), (r + 0.03, 0.06), (r - 0.07, 0.07), (r - 0.08, 0.0)], 36
-    )
-    case.subpart("frame", "ring").put(accent, ring.turned("y", 90).moved(depth / 2 - 0.03, 0, z))
-    feet = case.subpart("feet", "stand")
+    shape = disc(r, -depth / 2, depth / 2 - 0.02, 36, 0.03).moved(z=z)
+    case = b.part("case, body, housing", case_paint, shape)
+    profile = [(r + 0.01, -0.01), (r + 0.03, 0.0), (r + 0.03, 0.06), (r - 0.07, 0.07), (r - 0.08, 0.0)]
+    shape = lathe(profile, 36).turned("y", 90).moved(depth / 2 - 0.03, 0, z)
+    case.subpart("frame, ring", accent, shape)
+    feet = case.subpart("feet, stand")
     for side in (-1, 1):
-        feet.put(
-            metal, sweep([(0, side * r * 0.55, z - r * 0.72), (0, side * r * 0.72, 0.05)], [0.06, 0.085])
-        )
-    case.subpart("key", "winder").put(
-        metal,
-        box((0.10, 0.24, 0.11), (-depth / 2 - 0.07, 0, z), 0.03),
-        cylinder(0.05, 0, 0.06).turned("y", -90).moved(-depth / 2, 0, z),
-    )
-    case.subpart("back cover", "battery cover").put(
-        b.paint("plain"),
-        cylinder(r * 0.72, -0.03, 0.0, 32, 0.01).turned("y", 90).moved(-depth / 2 + 0.005, 0, z),
-    )
+        path = [(0, side * r * 0.55, z - r * 0.72), (0, side * r * 0.72, 0.05)]
+        feet.put(metal, sweep(path, [0.06, 0.085]))
+    shapes = [box((0.10, 0.24, 0.11), (-depth / 2 - 0.07, 0, z), 0.03)]
+    shapes += [cylinder(0.05, 0, 0.06).turned("y", -90).moved(-depth / 2, 0, z)]
+    case.subpart("key, winder", metal, *shapes)
+    shape = disc(r * 0.72, -0.03, 0.0, 32, 0.01).moved(-depth / 2 + 0.005, 0, z)
+    case.subpart("back cover, battery cover", "plain", shape)
     x = depth / 2 - 0.015
-    face = b.part("face", "dial").put(
-        face_paint, cylinder(r - 0.07, 0, 0.03, 36).turned("y", 90).moved(x - 0.02, 0, z)
-    )
-    marks = face.subpart("hour marks", "numbers")
+    face = b.part("face, dial", face_paint, disc(r - 0.07, 0, 0.03, 36).moved(x - 0.02, 0, z))
+    marks = face.subpart("hour marks, numbers")
     for i in range(4):
         marks.put(dark, box((0.03, 0.075, 0.13), (x + 0.015, 0, r - 0.16)).turned("x", 90 * i).moved(z=z))
-    hands = face.subpart("hands", "pointers")
+    hands = face.subpart("hands, pointers")
     for angle, length, width in ((b.between(0, 360), 0.56, 0.07), (b.between(0, 360), 0.36, 0.09)):
-        hands.put(
-            accent,
-            box((0.03, width, r * length), (x + 0.045, 0, r * length / 2 - 0.03), 0.01)
-            .turned("x", angle)
-            .moved(z=z),
-        )
-    hands.put(accent, cylinder(0.07, 0, 0.05, 16, 0.01).turned("y", 90).moved(x + 0.02, 0, z))
+        shape = box((0.03, width, r * length), (x + 0.045, 0, r * length / 2 - 0.03), 0.01)
+        hands.put(accent, shape.turned("x", angle).moved(z=z))
+    hands.put(accent, disc(0.07, 0, 0.05, 16, 0.01).moved(x + 0.02, 0, z))
     for side in (-1, 1):
         place = (0, side * r * 0.62, z + r * 0.86)
         dome = lathe([(0, 0), (0.19, 0), (0.175, 0.09), (0.10, 0.16), (0, 0.18)]).turned("x", -side * 32)
-        bell = b.part("bell", "alarm bell").put(metal, dome.moved(*place))
+        bell = b.part("bell, alarm bell", metal, dome.moved(*place))
         top = np.array(place) + np.array([0, side * np.sin(np.radians(32)), np.cos(np.radians(32))]) * 0.19
-        bell.subpart("knob", "button").put(dark, sphere(0.078, tuple(top)))
+        bell.subpart("knob, button", dark, sphere(0.078, tuple(top)))
 
 
-MAKERS: dict[str, Maker] = {
-    "chair": Maker(_chair, ("dining chair", "side chair")),
-    "cabinet": Maker(_cabinet, ("cupboard", "sideboard")),
-    "lamp": Maker(_lamp, ("table lamp", "light")),
-    "shelf": Maker(_shelf, ("shelving unit", "book rack")),
-    "plant": Maker(_plant, ("potted plant", "flower plant")),
-    "clock": Maker(_clock, ("alarm clock", "timepiece")),
-}
+def guitar(b: Builder) -> None:
+    wood, side_paint = b.paint("wood"), b.paint("plastic")
+    dark, metal = b.paint("plain black brown white"), b.paint("metal")
+    wide, depth = b.between(0.30, 0.34), b.between(0.15, 0.19)
+    upper, z, z2 = wide * 0.74, wide + 0.02, wide * 2.15
+    shapes = [disc(wide, -depth / 2, depth / 2, 36).moved(z=z)]
+    shapes += [disc(upper, -depth / 2, depth / 2, 32).moved(z=z2)]
+    body = b.part("body, sound box", wood, *shapes)
+    shapes = [disc(wide + 0.018, -depth / 2 + 0.03, depth / 2 - 0.03, 36).moved(z=z)]
+    shapes += [disc(upper + 0.018, -depth / 2 + 0.03, depth / 2 - 0.03, 32).moved(z=z2)]
+    body.subpart("side, binding", side_paint, *shapes, at="of")
+    x = depth / 2
+    shape = disc(0.125, x - 0.01, x + 0.012, 24).moved(z=wide * 1.62)
+    body.subpart("sound hole, rosette", "plain black", shape)
+    body.subpart("bridge, saddle", dark, box((0.07, 0.32, 0.12), (x + 0.02, 0, wide * 0.66), 0.02))
+    outline = [(0.02, wide * 0.78), (0.24, wide * 0.85), (0.25, wide * 1.25)]
+    outline += [(0.14, wide * 1.50), (0.10, wide * 1.2)]
+    body.subpart("pickguard, scratch plate", "plastic", plate(outline, x - 0.01, x + 0.018))
+    shape = box((0.03, 0.16, wide * 1.9), (-x - 0.005, 0, wide * 1.5), 0.01)
+    body.subpart("back plate, back panel", "plain", shape)
+    low, high = z2 + upper * 0.6, z2 + upper + b.between(0.52, 0.60)
+    neck = b.part("neck", "wood", box((0.085, 0.125, high - low), (x - 0.05, 0, (low + high) / 2), 0.025))
+    start = wide * 2.1
+    shape = box((0.035, 0.115, high - start), (x + 0.01, 0, (start + high) / 2), 0.008)
+    neck.subpart("fretboard, fingerboard", dark, shape)
+    outline = [(-0.075, high - 0.01), (0.075, high - 0.01), (0.13, high + 0.26), (-0.13, high + 0.26)]
+    head = b.part("headstock, head", "plain", plate(outline, x - 0.08, x - 0.01))
+    pegs = head.subpart("tuning pegs, tuners, pegs")
+    for side in (-1, 1):
+        for k in range(2):
+            y, up = side * (0.14 + 0.025 * k), high + 0.08 + 0.12 * k
+            pegs.put(metal, box((0.08, 0.13, 0.095), (x - 0.045, y, up), 0.02))
+    paint = b.paint("metal")
+    shapes = [box((0.42, 0.52, 0.05), (0, 0, 0.025), 0.015)]
+    shapes += [box((0.06, 0.06, 0.5), (-x - 0.05, 0, 0.27), 0.01)]
+    stand = b.part("stand, foot, support", paint, *shapes)
+    shapes = [box((0.30, 0.10, 0.14), (0, side * 0.2, 0.09), 0.03) for side in (-1, 1)]
+    stand.subpart("pads, cushions", "plastic", *shapes)
+
+
+def radio(b: Builder) -> None:
+    case = b.paint("wood") if b.chance(0.4) else b.paint("plastic")
+    cloth = b.paint("cloth")
+    metal = b.paint("metal")
+    w, h, d = b.between(0.82, 0.95), b.between(0.46, 0.54), b.between(0.28, 0.34)
+    body = b.part("case, cabinet, housing", case, box((d, w, h), (0, 0, h / 2 + 0.05), 0.04))
+    x, z = d / 2, h / 2 + 0.05
+    body.subpart("feet, base", "plastic", box((d * 0.9, w * 0.92, 0.075), (0, 0, 0.035), 0.01), at="of")
+    shape = box((0.04, w * 0.66, h * 0.6), (-x - 0.005, 0, z), 0.012)
+    body.subpart("back panel, battery door", "plain", shape)
+    y = -w * 0.23
+    r = min(h * 0.40, w * 0.22)
+    speaker = b.part("speaker, loudspeaker", cloth, disc(r, -0.02, 0.03, 32, 0.01).moved(x, y, z))
+    speaker.subpart("ring, frame", metal, ring(r, 0.035, (x + 0.012, y, z), "x", 32), at="around")
+    speaker.subpart("cone, centre", "plain", disc(r * 0.42, 0, 0.055, 20, 0.02).moved(x, y, z), at="of")
+    y2 = w * 0.24
+    shape = box((0.04, w * 0.42, h * 0.82), (x + 0.005, y2, z), 0.012)
+    panel = b.part("tuning panel, control panel", "plain", shape)
+    shape = box((0.04, w * 0.34, h * 0.26), (x + 0.022, y2, z + h * 0.20), 0.01)
+    panel.subpart("display, tuning scale, window", "plastic yellow white teal green black", shape)
+    knobs = panel.subpart("knobs, dials")
+    for side in (-1, 1):
+        knobs.put(metal, disc(0.085, 0, 0.085, 20, 0.015).moved(x + 0.015, y2 + side * 0.10, z - h * 0.17))
+    up = h + 0.05
+    shapes = [box((0.07, 0.06, 0.18), (0, side * w * 0.36, up + 0.07), 0.015) for side in (-1, 1)]
+    handle = b.part("handle, carrying handle", metal, *shapes)
+    handle.subpart("grip, bar", "plastic", box((0.105, w * 0.78, 0.085), (0, 0, up + 0.17), 0.03), at="of")
+    y = w * 0.44
+    path = [(-d * 0.35, y, up - 0.02), (-d * 0.35, y + 0.10, up + 0.52)]
+    aerial = b.part("antenna, aerial", metal, sweep(path, 0.026))
+    aerial.subpart("tip, end", "plastic", sphere(0.065, (-d * 0.35, y + 0.105, up + 0.55)), at="of")
+
+
+def camera(b: Builder) -> None:
+    leather = b.paint("cloth black brown red green blue beige")
+    metal = b.paint("metal")
+    dark = b.paint("plain black")
+    w, h, d = b.between(0.78, 0.9), b.between(0.46, 0.52), b.between(0.26, 0.30)
+    body = b.part("body, case", leather, box((d, w, h), (0, 0, h / 2), 0.03))
+    shape = box((d + 0.03, w + 0.02, 0.12), (0, 0, h + 0.02), 0.03)
+    body.subpart("top plate, top cover", metal, shape, at="of")
+    shape = box((0.13, 0.17, h * 0.88), (d / 2 + 0.03, -w * 0.40, h * 0.46), 0.05)
+    body.subpart("grip, handgrip", "plastic", shape, at="of")
+    shape = box((0.04, w * 0.56, h * 0.62), (-d / 2 - 0.01, -0.04, h * 0.48), 0.012)
+    body.subpart("screen, display", "plastic black blue teal grey", shape)
+    r, z, x = h * 0.43, h * 0.48, d / 2
+    lens = b.part("lens, objective", dark, disc(r, -0.02, 0.30, 32, 0.015).moved(x, 0.05, z))
+    lens.subpart("focus ring, zoom ring", "plastic", disc(r + 0.025, 0.06, 0.18, 32).moved(x, 0.05, z))
+    shape = lathe([(r * 0.74, 0), (r * 0.5, 0.04), (0, 0.06)], 28).turned("y", 90).moved(x + 0.295, 0.05, z)
+    lens.subpart("glass, front glass", "ceramic blue teal purple white green", shape, at="of")
+    sections = []
+    for back, front, half, high in ((-0.11, 0.13, 0.15, h + 0.06), (-0.09, 0.11, 0.10, h + 0.22)):
+        sections.append([(back, -half, high), (front, -half, high), (front, half, high), (back, half, high)])
+    finder = b.part("viewfinder, prism", metal, loft(sections).moved(0, 0.05))
+    shape = box((0.06, 0.23, 0.12), (0.13, 0, h + 0.14), 0.015).moved(0, 0.05)
+    finder.subpart("flash, flash lamp", "plain white yellow", shape)
+    shape = box((0.08, 0.20, 0.14), (-0.12, 0, h + 0.13), 0.02).moved(0, 0.05)
+    finder.subpart("eyepiece, eyecup", "plastic", shape)
+    shape = cylinder(0.105, h + 0.06, h + 0.15, 24, 0.012).moved(0, w * 0.36, 0)
+    dial = b.part("dial, mode dial", "metal", shape)
+    shape = cylinder(0.08, h + 0.13, h + 0.20, 20, 0.015).moved(0, w * 0.36, 0)
+    dial.subpart("cap, centre", "plastic", shape, at="of")
+    shape = cylinder(0.085, h + 0.07, h + 0.16, 20, 0.025).moved(0.03, -w * 0.34, 0)
+    b.part("shutter button, release button", "plastic red orange yellow green", shape)
+
+
+def toaster(b: Builder) -> None:
+    shell = b.paint("metal") if b.chance(0.5) else b.paint("ceramic")
+    metal = b.paint("metal")
+    dark = b.paint("plain black")
+    length, w, h = b.between(0.74, 0.84), b.between(0.46, 0.52), b.between(0.46, 0.52)
+    outline = [(-w / 2, 0.09), (w / 2, 0.09), (w / 2, h * 0.82), (w * 0.40, h * 0.96)]
+    outline += [(w * 0.30, h), (-w * 0.30, h), (-w * 0.40, h * 0.96), (-w / 2, h * 0.82)]
+    body = b.part("body, case", shell, extrude(outline, length))
+    body.subpart("base, foot", "plastic", box((w + 0.04, length + 0.04, 0.11), (0, 0, 0.055), 0.02), at="of")
+    slots = body.subpart("slots, openings")
+    panel, inlay = body.subpart("side panels, panels"), b.paint("plastic")
+    for side in (-1, 1):
+        slots.put(dark, box((0.10, length * 0.76, 0.03), (side * w * 0.17, 0, h - 0.005)))
+        panel.put(inlay, box((0.03, length * 0.62, h * 0.42), (side * w / 2, 0, h * 0.50), 0.01))
+    crumb = b.paint("plain beige yellow white")
+    crust = b.paint("plain brown orange")
+    for side in (-1, 1):
+        x, y, high = side * w * 0.17, 0.0, h + b.between(0.22, 0.30)
+        wide = length * 0.62
+        shape = box((0.075, wide - 0.10, 0.40), (x, y, high - 0.24), 0.01)
+        toast = b.part("toast, bread slice, slice of bread", crumb, shape)
+        upper = box((0.065, wide, 0.085), (x, y, high - 0.02), 0.02)
+        edges = [y + end * (wide / 2 - 0.04) for end in (-1, 1)]
+        sides = [box((0.065, 0.085, 0.44), (x, edge, high - 0.22), 0.015) for edge in edges]
+        toast.subpart("crust, edge", crust, upper, *sides, at="of")
+    end = length / 2
+    lever = b.part("lever, push lever", metal, box((0.07, 0.05, h * 0.56), (0, end + 0.015, h * 0.56), 0.012))
+    lever.subpart("knob, handle", "plastic", box((0.20, 0.13, 0.10), (0, end + 0.08, h * 0.62), 0.03))
+    shape = roller(0.125, 0, 0.07, 24, 0.015).moved(0, -end + 0.01, h * 0.50)
+    dial = b.part("dial, timer, browning knob", "metal", shape)
+    dial.subpart("pointer, mark", "plastic", box((0.085, 0.06, 0.25), (0, -end - 0.07, h * 0.50), 0.015))
+    b.turn(35)  # so that lever and side are visible from the front
+
+
+def headphones(b: Builder) -> None:
+    frame = b.paint("plastic")
+    pad = b.paint("cloth")
+    shell = b.paint("plastic")
+    metal = b.paint("metal")
+    r, z = b.between(0.34, 0.39), 0.62
+    stand = b.part("stand, holder", "wood", box((0.10, 0.12, z + r - 0.06), (0, 0, (z + r) / 2), 0.02))
+    stand.subpart("base, foot", "stone", cylinder(0.25, 0, 0.075, 32, 0.02), at="of")
+    angle = np.radians(np.linspace(-8, 188, 19))
+    path = [(0, r * np.cos(a), z + r * np.sin(a)) for a in angle]
+    band = b.part("headband, band, bow", frame, sweep(path, 0.055))
+    cushion = np.radians(np.linspace(50, 130, 10))
+    path = [(0, r * 1.01 * np.cos(a), z + r * 1.01 * np.sin(a)) for a in cushion]
+    band.subpart("cushion, padding", pad, sweep(path, 0.09))
+    yoke = band.subpart("sliders, hinges")
+    for side in (-1, 1):
+        yoke.put(metal, box((0.13, 0.10, 0.16), (0, side * r, z + 0.06), 0.025))
+        round_cup = roller(0.20, -0.08, 0.08, 28, 0.03).moved(0, side * (r + 0.03), z - 0.18)
+        cup = b.part("ear cup, earpiece, speaker", shell, round_cup)
+        cup.subpart("pad, ear cushion", pad, ring(0.145, 0.075, (0, side * (r - 0.08), z - 0.18), "y"))
+        shape = roller(0.125, -0.025, 0.025, 24, 0.01).moved(0, side * (r + 0.12), z - 0.18)
+        cup.subpart("cap, logo plate", metal, shape)
+    b.turn(b.between(35, 60))  # so that both cups show their outside or inside to the front

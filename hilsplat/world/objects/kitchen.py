@@ -1,143 +1,227 @@
-"""Kitchen objects: each function draws one class of object."""
+"""Kitchen objects and food: each function draws one class of object."""
 
 import numpy as np
 
-from hilsplat.world.objects.builder import Builder, Maker
-from hilsplat.world.shapes import arc, cylinder, ellipsoid, lathe, sphere, sweep
+from hilsplat.world.objects.builder import Builder
+from hilsplat.world.shapes import arc, box, cylinder, ellipsoid, extrude, lathe, ring, sphere, sweep
 
 
-def _mug(b: Builder) -> None:
+def mug(b: Builder) -> None:
     glaze, inner, accent = b.paint("ceramic"), b.paint("ceramic"), b.paint("ceramic")
     r, h = b.between(0.36, 0.44), b.between(0.80, 1.0)
     flare = b.between(0.94, 1.08)
     top = r * flare
-    cup = b.part("cup", "body").put(glaze, lathe([(0, 0), (r * 0.92, 0), (r, 0.06), (top, h * 0.86)]))
-    cup.subpart("inside", "interior").put(inner, lathe([(top - 0.05, h), (r - 0.05, 0.12), (0, 0.12)]))
-    profile = [
-        (top, h * 0.86),
-        (top + 0.035, h * 0.88),
-        (top + 0.035, h),
-        (top - 0.05, h),
-        (top - 0.06, h - 0.04),
-    ]
-    cup.subpart("rim", "edge").put(accent, lathe(profile))
+    cup = b.part("cup, body", glaze, lathe([(0, 0), (r * 0.92, 0), (r, 0.06), (top, h * 0.86)]))
+    cup.subpart("inside, interior", inner, lathe([(top - 0.05, h), (r - 0.05, 0.12), (0, 0.12)]))
+    profile = [(top, h * 0.86), (top + 0.035, h * 0.88)]
+    profile += [(top + 0.035, h), (top - 0.05, h), (top - 0.06, h - 0.04)]
+    cup.subpart("rim, edge", accent, lathe(profile))
     low, high = h * 0.34, h * 0.54
-    cup.subpart("band", "stripe").put(
-        b.paint("ceramic"), lathe([(r, low), (r * 1.05, low + 0.02), (r * 1.05, high - 0.02), (r, high)])
-    )
+    profile = [(r, low), (r * 1.05, low + 0.02), (r * 1.05, high - 0.02), (r, high)]
+    cup.subpart("band, stripe", "ceramic", lathe(profile))
     path = [(x + r * 0.94, y, z + h * 0.47) for x, y, z in arc((r * 0.75, h * 0.30), -88, 88)]
-    handle = b.part("handle").put(accent, sweep(path, 0.065).turned("z", 90))
-    handle.subpart("thumb rest", "knob").put(inner, ellipsoid((0.13, 0.14, 0.085), (0, r * 1.5, h * 0.77)))
+    handle = b.part("handle", accent, sweep(path, 0.065).turned("z", 90))
+    handle.subpart("thumb rest, knob", inner, ellipsoid((0.13, 0.14, 0.085), (0, r * 1.5, h * 0.77)))
 
 
-def _kettle(b: Builder) -> None:
+def kettle(b: Builder) -> None:
     metal, accent, dark = b.paint("metal"), b.paint("ceramic"), b.paint("plastic")
     r, h = b.between(0.40, 0.46), b.between(0.50, 0.62)
-    body = b.part("body", "pot").put(
-        metal, lathe([(0, 0.05), (r, 0.05), (r * 1.04, h * 0.35), (r * 0.9, h * 0.75), (r * 0.62, h), (0, h)])
-    )
-    body.subpart("base", "bottom ring").put(
-        dark, lathe([(0, 0), (r * 1.06, 0), (r * 1.08, 0.10), (r * 1.0, 0.13)])
-    )
-    lid = b.part("lid", "cover").put(
-        accent, lathe([(r * 0.70, h - 0.02), (r * 0.70, h + 0.03), (r * 0.5, h + 0.10), (0, h + 0.13)])
-    )
-    lid.subpart("knob", "button").put(dark, ellipsoid((0.12, 0.12, 0.10), (0, 0, h + 0.20)))
+    profile = [(0, 0.05), (r, 0.05), (r * 1.04, h * 0.35), (r * 0.9, h * 0.75), (r * 0.62, h), (0, h)]
+    body = b.part("body, pot", metal, lathe(profile))
+    body.subpart("base, bottom ring", dark, lathe([(0, 0), (r * 1.06, 0), (r * 1.08, 0.10), (r * 1.0, 0.13)]))
+    profile = [(r * 0.70, h - 0.02), (r * 0.70, h + 0.03), (r * 0.5, h + 0.10), (0, h + 0.13)]
+    lid = b.part("lid, cover", accent, lathe(profile))
+    lid.subpart("knob, button", dark, ellipsoid((0.12, 0.12, 0.10), (0, 0, h + 0.20)))
     start = np.array([r * 0.85, 0, h * 0.35])
     path = [start, start + np.array([0.18, 0, 0.10]), start + np.array([0.27, 0, 0.26])]
-    spout = b.part("spout").put(metal, sweep(path, [0.14, 0.10, 0.075]))
+    spout = b.part("spout", metal, sweep(path, [0.14, 0.10, 0.075]))
     lip = [start + np.array([0.255, 0, 0.235]), start + np.array([0.33, 0, 0.37])]
-    spout.subpart("tip", "mouth").put(accent, sweep(lip, [0.085, 0.10]))
-    handle = b.part("handle").put(
-        dark, sweep([(x, 0, z + h * 0.72) for x, _, z in arc((r * 0.92, 0.50), 4, 176)], 0.045)
-    )
-    handle.subpart("grip").put(
-        accent, sweep([(x, 0, z + h * 0.72) for x, _, z in arc((r * 0.92, 0.50), 55, 125)], 0.075)
-    )
+    spout.subpart("tip, mouth", accent, sweep(lip, [0.085, 0.10]))
+    path = [(x, 0, z + h * 0.72) for x, _, z in arc((r * 0.92, 0.50), 4, 176)]
+    handle = b.part("handle", dark, sweep(path, 0.045))
+    path = [(x, 0, z + h * 0.72) for x, _, z in arc((r * 0.92, 0.50), 55, 125)]
+    handle.subpart("grip", accent, sweep(path, 0.075))
 
 
-def _bottle(b: Builder) -> None:
-    glass = b.paint("ceramic", "green", "teal", "blue", "brown", "purple", "red")
-    label_paint = b.paint("plain", "white", "beige", "yellow", "orange", "pink")
+def bottle(b: Builder) -> None:
+    glass = b.paint("ceramic green teal blue brown purple red")
+    label_paint = b.paint("plain white beige yellow orange pink")
     cap_paint = b.paint("metal")
     r, h = b.between(0.22, 0.26), b.between(0.62, 0.72)
     neck_r = b.between(0.085, 0.10)
-    body = b.part("body").put(
-        glass,
-        lathe([(0, 0), (r * 0.93, 0), (r, 0.04), (r, h * 0.78), (r * 0.86, h * 0.9), (neck_r * 1.15, h)]),
-    )
-    body.subpart("label", "sticker").put(
-        label_paint, lathe([(r, h * 0.28), (r * 1.035, h * 0.29), (r * 1.035, h * 0.64), (r, h * 0.65)])
-    )
-    body.subpart("base", "bottom").put(
-        b.paint("ceramic"),
-        lathe([(0, -0.005), (r * 1.04, -0.005), (r * 1.05, 0.10), (r, 0.11)]).moved(z=0.005),
-    )
+    profile = [(0, 0), (r * 0.93, 0), (r, 0.04), (r, h * 0.78), (r * 0.86, h * 0.9), (neck_r * 1.15, h)]
+    body = b.part("body", glass, lathe(profile))
+    profile = [(r, h * 0.28), (r * 1.035, h * 0.29), (r * 1.035, h * 0.64), (r, h * 0.65)]
+    body.subpart("label, sticker", label_paint, lathe(profile))
+    shape = lathe([(0, -0.005), (r * 1.04, -0.005), (r * 1.05, 0.10), (r, 0.11)]).moved(z=0.005)
+    body.subpart("base, bottom", "ceramic", shape)
     top = h + b.between(0.20, 0.26)
-    neck = b.part("neck").put(glass, lathe([(neck_r * 1.15, h), (neck_r, h + 0.04), (neck_r, top)]))
-    neck.subpart("collar", "ring").put(
-        b.paint("ceramic"),
-        lathe([(neck_r, h + 0.04), (neck_r + 0.05, h + 0.06), (neck_r + 0.05, h + 0.13), (neck_r, h + 0.15)]),
-    )
-    cap = b.part("cap", "lid").put(cap_paint, cylinder(neck_r + 0.045, top - 0.03, top + 0.10, bevel=0.015))
-    cap.subpart("knob", "stopper").put(
-        b.paint("plastic"), ellipsoid((neck_r * 0.9, neck_r * 0.9, 0.07), (0, 0, top + 0.13))
-    )
+    neck = b.part("neck", glass, lathe([(neck_r * 1.15, h), (neck_r, h + 0.04), (neck_r, top)]))
+    profile = [(neck_r, h + 0.04), (neck_r + 0.05, h + 0.06), (neck_r + 0.05, h + 0.13), (neck_r, h + 0.15)]
+    neck.subpart("collar, ring", "ceramic", lathe(profile))
+    cap = b.part("cap, lid", cap_paint, cylinder(neck_r + 0.045, top - 0.03, top + 0.10, bevel=0.015))
+    cap.subpart("knob, stopper", "plastic", ellipsoid((neck_r * 0.9, neck_r * 0.9, 0.07), (0, 0, top + 0.13)))
 
 
-def _cake(b: Builder) -> None:
-    sponge = b.paint("plain", "brown", "beige", "pink", "yellow", "teal")
-    icing = b.paint("snow", "white", "pink", "beige", "purple", "red", "teal")
+def cake(b: Builder) -> None:
+    sponge = b.paint("plain brown beige pink yellow teal")
+    icing = b.paint("snow white pink beige purple red teal")
     cream = b.paint("plain")
     plate_paint = b.paint("ceramic")
-    cherry = b.paint("plastic", "red", "purple", "orange", "green")
+    cherry = b.paint("plastic red purple orange green")
     r, h = b.between(0.36, 0.42), b.between(0.22, 0.27)
-    plate = b.part("plate", "dish").put(
-        plate_paint, lathe([(0, 0.0), (r * 0.8, 0.0), (r + 0.10, 0.05), (r + 0.10, 0.07), (0, 0.06)])
-    )
-    plate.subpart("rim", "edge").put(
-        b.paint("ceramic"),
-        lathe([(r + 0.03, 0.045), (r + 0.15, 0.06), (r + 0.15, 0.09), (r + 0.04, 0.085)], 36),
-    )
-    lower = b.part("bottom tier", "lower layer").put(sponge, cylinder(r, 0.06, 0.06 + h))
+    profile = [(0, 0.0), (r * 0.8, 0.0), (r + 0.10, 0.05), (r + 0.10, 0.07), (0, 0.06)]
+    plate = b.part("plate, dish", plate_paint, lathe(profile))
+    profile = [(r + 0.03, 0.045), (r + 0.15, 0.06), (r + 0.15, 0.09), (r + 0.04, 0.085)]
+    plate.subpart("rim, edge", "ceramic", lathe(profile, 36))
+    lower = b.part("bottom tier, lower layer", sponge, cylinder(r, 0.06, 0.06 + h))
     top = 0.06 + h
-    profile = [
-        (r, top - 0.09),
-        (r + 0.03, top - 0.08),
-        (r + 0.03, top),
-        (r - 0.02, top + 0.03),
-        (0, top + 0.03),
-    ]
-    lower.subpart("icing", "frosting").put(icing, lathe(profile))
+    profile = [(r, top - 0.09), (r + 0.03, top - 0.08), (r + 0.03, top)]
+    profile += [(r - 0.02, top + 0.03), (0, top + 0.03)]
+    lower.subpart("icing, frosting", icing, lathe(profile))
     r2, top2 = r * b.between(0.55, 0.64), top + 0.03 + h * 0.85
-    upper = b.part("top tier", "upper layer").put(cream, cylinder(r2, top + 0.02, top2))
-    profile = [
-        (r2, top2 - 0.07),
-        (r2 + 0.03, top2 - 0.06),
-        (r2 + 0.03, top2),
-        (r2 - 0.02, top2 + 0.03),
-        (0, top2 + 0.03),
-    ]
-    upper.subpart("glaze", "topping").put(b.paint("snow"), lathe(profile))
-    cherries = lower.subpart("cherries", "berries")
+    upper = b.part("top tier, upper layer", cream, cylinder(r2, top + 0.02, top2))
+    profile = [(r2, top2 - 0.07), (r2 + 0.03, top2 - 0.06)]
+    profile += [(r2 + 0.03, top2), (r2 - 0.02, top2 + 0.03), (0, top2 + 0.03)]
+    upper.subpart("glaze, topping", "snow", lathe(profile))
+    cherries = lower.subpart("cherries, berries")
     for i in range(6):
         a = 2 * np.pi * i / 6
-        cherries.put(
-            cherry,
-            sphere(
-                0.068, ((r + r2) / 2 * np.cos(a) * 1.02, (r + r2) / 2 * np.sin(a) * 1.02, top + 0.075), 16
-            ),
-        )
-    candle = b.part("candle").put(b.paint("ceramic"), cylinder(0.062, top2 + 0.02, top2 + 0.25))
-    candle.subpart("flame", "fire").put(
-        b.paint("plain", "yellow", "orange"),
-        lathe([(0, 0), (0.09, 0.07), (0.065, 0.14), (0, 0.24)]).moved(z=top2 + 0.25),
-    )
+        place = ((r + r2) / 2 * np.cos(a) * 1.02, (r + r2) / 2 * np.sin(a) * 1.02, top + 0.075)
+        cherries.put(cherry, sphere(0.068, place, 16))
+    candle = b.part("candle", "ceramic", cylinder(0.062, top2 + 0.02, top2 + 0.25))
+    shape = lathe([(0, 0), (0.09, 0.07), (0.065, 0.14), (0, 0.24)]).moved(z=top2 + 0.25)
+    candle.subpart("flame, fire", "plain yellow orange", shape)
 
 
-MAKERS: dict[str, Maker] = {
-    "mug": Maker(_mug, ("coffee mug", "tea mug")),
-    "kettle": Maker(_kettle, ("teapot", "tea kettle")),
-    "bottle": Maker(_bottle, ("flask", "glass bottle")),
-    "cake": Maker(_cake, ("birthday cake", "torte")),
-}
+def frying_pan(b: Builder) -> None:
+    metal, inner = b.paint("metal"), b.paint("plain black grey teal brown")
+    r, h = b.between(0.40, 0.45), b.between(0.13, 0.17)
+    pan = b.part("pan, body, dish", metal, lathe([(0, 0), (r * 0.82, 0), (r, h)], 36))
+    profile = [(r - 0.02, h - 0.01), (r * 0.80, 0.035), (0, 0.03)]
+    pan.subpart("inside, cooking surface", inner, lathe(profile, 36), at="of")
+    pan.subpart("rim, edge", "ceramic", ring(r + 0.005, 0.042, (0, 0, h), segments=36), at="of")
+    white = b.paint("snow white")
+    blobs = ((0.20, -0.05, -0.03), (0.14, 0.07, 0.07), (0.13, -0.06, 0.12))
+    shapes = [ellipsoid((size, size * 0.85, 0.035), (x, y, 0.055)) for size, x, y in blobs]
+    egg = b.part("fried egg, egg", white, *shapes)
+    shape = ellipsoid((0.13, 0.13, 0.085), (-0.02, 0.02, 0.085))
+    egg.subpart("yolk, egg yellow", "plastic yellow orange", shape)
+    bacon = b.part("bacon, bacon strip")
+    strip = b.paint("plain red brown pink")
+    fat = b.paint("plain beige white yellow orange")
+    for k in range(5):
+        x = -0.18 + 0.09 * k
+        bacon.put(strip, box((0.095, 0.13, 0.05), (x, -0.26 + 0.02 * (k % 2), 0.075 + 0.02 * (k % 2)), 0.01))
+    bacon.subpart("fat, fat stripe", fat, box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01))
+    path = [(r * 0.9, 0, h * 0.7), (r + 0.12, 0, h + 0.07), (r + 0.22, 0, h + 0.11)]
+    handle = b.part("handle", "metal", sweep(path, [0.07, 0.065, 0.065]))
+    end = r + 0.46
+    path = [(r + 0.17, 0, h + 0.10), (r + 0.32, 0, h + 0.15), (end, 0, h + 0.16)]
+    handle.subpart("grip", "plastic", sweep(path, [0.08, 0.105, 0.08]), at="of")
+    handle.subpart("hanging ring, ring", "metal", ring(0.085, 0.04, (end + 0.08, 0, h + 0.16)))
+
+
+def burger(b: Builder) -> None:
+    bread = b.paint("plain orange beige brown")
+    seeds = b.paint("snow white beige black yellow")
+    meat, cheese = b.paint("plain brown red black"), b.paint("plain yellow orange")
+    r = b.between(0.38, 0.42)
+    profile = [(0, 0), (r * 0.9, 0), (r + 0.12, 0.06), (r + 0.10, 0.075), (0, 0.05)]
+    plate = b.part("plate, dish", "ceramic", lathe(profile, 36))
+    profile = [(r + 0.03, 0.04), (r + 0.17, 0.065), (r + 0.17, 0.095), (r + 0.04, 0.085)]
+    plate.subpart("rim, edge", "ceramic", lathe(profile, 36), at="of")
+    profile = [(0, 0.05), (r * 0.92, 0.05), (r, 0.10), (r, 0.17), (0, 0.18)]
+    low = b.part("bottom bun, lower bun", bread, lathe(profile, 32))
+    leaf = ellipsoid((0.15, 0.18, 0.04)).turned("y", 14).moved(r * 0.94, 0, 0.20)
+    low.subpart("lettuce, salad leaf", "plain green", *[leaf.turned("z", a) for a in range(0, 360, 45)])
+    profile = [(0, 0.19), (r * 0.98, 0.20), (r * 1.04, 0.25), (r * 1.04, 0.31), (r * 0.96, 0.35), (0, 0.36)]
+    patty = b.part("patty, meat", meat, lathe(profile, 32))
+    slab = box((r * 1.62, r * 1.62, 0.045), (0, 0, 0.365), 0.01)
+    corner = extrude([(-0.16, 0), (0.16, 0), (0, -0.14)], 0.04).turned("z", 90).moved(r * 0.98, 0, 0.385)
+    corners = [corner.turned("z", a) for a in (0, 90, 180, 270)]
+    patty.subpart("cheese, cheese slice", cheese, slab, *corners)
+    slab = cylinder(0.20, 0.385, 0.445, 24, 0.02)
+    shapes = [slab.moved(r * 0.60 * np.cos(a), r * 0.60 * np.sin(a)) for a in (0.5, 2.6, 4.7)]
+    patty.subpart("tomato, tomato slices", "plastic red pink purple", *shapes)
+    profile = [(0, 0.44), (r * 0.98, 0.45), (r * 1.02, 0.52), (r * 0.92, 0.64), (r * 0.6, 0.75), (0, 0.80)]
+    top = b.part("top bun, upper bun", bread, lathe(profile, 32))
+    seed = ellipsoid((0.055, 0.045, 0.03)).turned("y", 38).moved(r * 0.68, 0, 0.73)
+    shapes = [seed.turned("z", a) for a in range(0, 360, 45)]
+    for a in (0.4, 2.5, 4.6):
+        shapes.append(ellipsoid((0.05, 0.06, 0.03), (r * 0.28 * np.cos(a), r * 0.28 * np.sin(a), 0.785)))
+    top.subpart("seeds, sesame", seeds, *shapes)
+    pick = b.part("skewer, toothpick", "wood", cylinder(0.03, 0.75, 1.12, 14))
+    pick.subpart("flag, paper flag", "cloth", box((0.04, 0.24, 0.17), (0, 0.12, 1.02), 0.008))
+    pick.subpart("olive, ball", "plastic green red purple", sphere(0.085, (0, 0, 0.86)))
+
+
+def fruit_basket(b: Builder) -> None:
+    straw, trim = b.paint("cloth beige brown orange white"), b.paint("wood")
+    r, h = b.between(0.38, 0.42), b.between(0.24, 0.28)
+    profile = [(0, 0), (r * 0.74, 0), (r * 0.92, h * 0.5), (r, h), (r - 0.05, h), (r * 0.7, 0.10), (0, 0.10)]
+    basket = b.part("bowl, basket", straw, lathe(profile, 36))
+    basket.subpart("rim, edge", trim, ring(r - 0.01, 0.052, (0, 0, h), segments=36), at="of")
+    profile = [(r * 0.80, h * 0.24), (r * 0.88, h * 0.25), (r * 0.965, h * 0.56), (r * 0.93, h * 0.57)]
+    basket.subpart("band, stripe", "cloth", lathe(profile, 36))
+    path = [(0, y, h + z) for y, _, z in arc((r, 0.50), 0, 180)]
+    handle = b.part("handle", trim, sweep(path, 0.042))
+    shapes = [sphere(0.075, (0, 0, h + 0.50))]
+    for side in (-1, 1):
+        shapes.append(ellipsoid((0.055, 0.14, 0.09)).turned("x", side * 15).moved(0, side * 0.16, h + 0.51))
+    handle.subpart("ribbon, bow", "cloth", *shapes)
+    apple_paint = b.paint("plastic red green yellow pink")
+    stem = b.paint("plain green brown black")
+    for x, y in ((0.17, -0.17), (0.20, 0.14)):
+        z = h + 0.07
+        apple = b.part("apple", apple_paint, ellipsoid((0.16, 0.16, 0.15), (x, y, z)))
+        shapes = [cylinder(0.022, z + 0.12, z + 0.22, 10).moved(x, y)]
+        shapes += [ellipsoid((0.10, 0.06, 0.025), (x + 0.07, y, z + 0.19))]
+        apple.subpart("leaf, stalk", stem, *shapes)
+    orange = b.part("orange, tangerine", "plain orange", sphere(0.15, (-0.19, -0.13, h + 0.06)))
+    shape = ellipsoid((0.105, 0.105, 0.035)).turned("y", -30).moved(-0.26, -0.13, h + 0.178)
+    orange.subpart("sticker, label", "plain blue white green", shape)
+    curve = [
+        (-0.19 + 0.13 * np.sin(a), 0.02 + 0.30 * np.sin(1.2 * a) * 0.8, h + 0.30 - 0.24 * np.cos(a))
+        for a in np.linspace(-1.1, 1.1, 9)
+    ]
+    shape = sweep(curve, [0.05, 0.07, 0.085, 0.09, 0.09, 0.09, 0.085, 0.07, 0.05])
+    banana = b.part("banana, bananas", "plain yellow green", shape)
+    dark = b.paint("plain brown black")
+    shapes = [sphere(0.068, tuple(curve[0])), sphere(0.068, tuple(curve[-1]))]
+    banana.subpart("tips, ends", dark, *shapes, at="of")
+
+
+def ice_cream(b: Builder) -> None:
+    waffle, cup = b.paint("plain orange brown beige"), b.paint("ceramic")
+    r, h = b.between(0.24, 0.28), b.between(0.50, 0.58)
+    profile = [(0, 0), (r * 1.25, 0), (r * 1.25, 0.05), (r * 0.55, 0.10)]
+    profile += [(r * 0.55, 0.22), (r * 0.9, 0.34), (r * 0.7, 0.34), (0, 0.25)]
+    stand = b.part("holder, stand", cup, lathe(profile, 32))
+    stand.subpart("ring, band", "metal", ring(r * 0.62, 0.055, (0, 0, 0.16)), at="of")
+    low = 0.24
+    cone = b.part("cone, waffle", waffle, lathe([(0, low), (r * 0.45, low + 0.05), (r, low + h)], 32))
+    profile = [(r * 0.86, low + h - 0.12), (r * 1.08, low + h - 0.10)]
+    profile += [(r * 1.14, low + h + 0.03), (r * 0.8, low + h + 0.03)]
+    cone.subpart("rim, edge", "plain", lathe(profile, 32), at="of")
+    z = low + h + 0.10
+    taste, crumb = b.paint("snow"), b.paint("plastic")
+    for side in (-1, 1):
+        scoop = b.part("scoop, ball, lower scoop", taste, sphere(r * 0.72, (0, side * r * 0.55, z)))
+        sprinkles = scoop.subpart("sprinkles, crumbs")
+        for a, e in ((0.2, 0.1), (1.1, 0.5), (2.2, 0.1), (3.3, 0.5), (4.3, 0.1), (5.3, 0.4)):
+            x, y = r * 0.72 * np.cos(a) * np.cos(e), side * r * 0.55 + r * 0.72 * np.sin(a) * np.cos(e)
+            sprinkles.put(crumb, sphere(0.055, (x, y, z + r * 0.72 * np.sin(e)), 10))
+    top = b.part("top scoop, upper scoop", "snow", sphere(r * 0.74, (0, 0, z + r * 0.85)))
+    profile = [(r * 0.80, -0.06), (r * 0.74, 0.05), (r * 0.45, 0.17), (0, 0.21)]
+    shapes = [lathe(profile, 28).moved(z=z + r * 0.86 + 0.02)]
+    for a in (0.3, 1.6, 2.8, 4.1, 5.2):
+        place = (r * 0.72 * np.cos(a), r * 0.72 * np.sin(a), z + r * 0.72)
+        shapes.append(ellipsoid((0.06, 0.06, 0.10), place))
+    top.subpart("sauce, syrup", "plastic brown red purple black", *shapes)
+    top.subpart("cherry, berry", "plastic red pink green", sphere(0.10, (0, 0, z + r * 1.62 + 0.02)))
+    shape = cylinder(0.055, 0, 0.46, 16).turned("y", -24).moved(-0.10, 0.03, z + 0.16)
+    wafer = b.part("wafer, wafer stick", "plain beige brown yellow", shape)
+    shape = cylinder(0.07, 0.34, 0.48, 16, 0.01).turned("y", -24).moved(-0.10, 0.03, z + 0.16)
+    wafer.subpart("tip, end", "plain", shape, at="of")

@@ -388,7 +388,7 @@ def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None
     floor = paints.draw(str(rng.choice(["wood", "wood", "stone", "collage", "cloth"])), scale=0.45).paled(
         FLOOR_PALE
     )
-    ceiling = paints.draw("plain", "white", "beige", scale=0.4).paled(CEILING_PALE)
+    ceiling = paints.draw("plain white beige", scale=0.4).paled(CEILING_PALE)
     skirting = paints.draw("wood")
     plane = _plane(w, d)
     assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(plane, floor)])

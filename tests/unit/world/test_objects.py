@@ -150,8 +150,8 @@ def test_a_subpart_differs_in_colour_from_the_part_it_sits_on(name):
 
 
 def test_two_parts_of_one_paint_become_two_shades_where_they_touch():
-    builder = Builder("thing", (), np.random.default_rng(0))
-    paint = builder.paint("plain", "red")
+    builder = Builder("thing", np.random.default_rng(0))
+    paint = builder.paint("plain red")
     builder.part("left").put(paint, box((1, 1, 1), (0, -0.5, 0.5)))
     builder.part("right").put(paint, box((1, 1, 1), (0, 0.5, 0.5)))
     builder.part("far").put(paint, box((1, 1, 1), (0, 5.0, 0.5)))
