@@ -68,11 +68,7 @@ SECTIONS: dict[str, type[Section]] = {name: type(section) for name, section in S
 
 
 def parse_section(name: str, text: str) -> Any:
-    """Parse one section from JSON, as passed from a rule to a stage.
-
-    Raises:
-        SettingsError: a key is unknown, or a value has the wrong type or is out of range.
-    """
+    """Parse a section from JSON; raise SettingsError if a key is unknown or a value is invalid."""
     try:
         return SECTIONS[name].model_validate_json(text or "{}")
     except ValidationError as error:
@@ -260,11 +256,7 @@ def _parts_of(name: str) -> tuple[str, int]:
 
 
 def parse_run(config: dict[str, Any]) -> RunSettings:
-    """Validate a whole configuration, including variants and overrides.
-
-    Raises:
-        SettingsError: keys cannot be used; the message names each of them.
-    """
+    """Validate a configuration with variants and overrides; raise SettingsError, which names each bad key."""
     if "\\u0000" in json.dumps(config, default=str):
         raise SettingsError(
             "a text of the configuration has a null byte", fix="take it out: no command takes it"
@@ -324,11 +316,7 @@ class _UniqueKeys(yaml.SafeLoader):
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read a configuration file.
-
-    Raises:
-        SettingsError: the file is missing or is not a YAML mapping.
-    """
+    """Read a configuration file; raise SettingsError if it is missing or not a YAML mapping."""
     try:
         found = yaml.load(Path(path).read_text(encoding="utf-8"), _UniqueKeys)
     except yaml.MarkedYAMLError as error:

@@ -19,8 +19,7 @@ from hilsplat.base.artifacts import atomic_path, parse_json, read_npz, remake
 from hilsplat.base.errors import ArtifactError
 
 Made = TypeVar("Made")
-Limits = Mapping[str, tuple[int | float, int | float]]
-"""Array name -> smallest and largest allowed value."""
+Limits = Mapping[str, tuple[int | float, int | float]]  # array name -> smallest and largest allowed value
 
 
 def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
@@ -106,11 +105,7 @@ def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) ->
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays of a .safetensors file and the information stored with them.
-
-    Raises:
-        ArtifactError: the file is missing or damaged, or was not written by `write_tensors`.
-    """
+    """Read what `write_tensors` wrote: arrays and information; raise ArtifactError for any other file."""
     try:
         with safe_open(path, framework="np") as file:
             about = parse_json(file.metadata()[TENSORS_KEY])

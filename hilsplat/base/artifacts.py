@@ -23,11 +23,9 @@ import numpy as np
 from hilsplat.base.errors import ArtifactError, DiskSpaceError, HilsplatError
 from hilsplat.base.processes import FORMER, UNFINISHED, is_unfinished, unfinished_folder
 
-ZIP64_BYTES = 2**30
-"""Arrays above this size get an archive entry that may exceed 2 GiB."""
+ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exceed 2 GiB
 
-INDEX = "index.json"
-"""Written last into a folder artifact: its presence means that the folder is complete."""
+INDEX = "index.json"  # written last into a folder artifact: its presence means that the folder is complete
 
 DAMAGE: tuple[type[Exception], ...] = (EOFError, MemoryError, NotImplementedError, OSError, SyntaxError)
 DAMAGE += (TokenError, ValueError, zipfile.BadZipFile, zlib.error, AttributeError)  # last: .npy for .npz
@@ -55,10 +53,7 @@ def remake(path: Path) -> str:
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary file that replaces `path` when the block ends without error.
 
-    A `durable` file is flushed to the disk, to survive a power failure.
-
-    Raises:
-        DiskSpaceError: the disk is full.
+    A `durable` file is flushed to the disk, to survive a power failure. Raise DiskSpaceError if it is full.
     """
     path = Path(path)
     if is_unfinished(path):  # the file is in a hidden folder that is flushed to the disk later
@@ -92,11 +87,7 @@ def _keep_mode(path: Path) -> Iterator[None]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder that replaces `path` when the block ends without error.
-
-    Raises:
-        DiskSpaceError: the disk is full.
-    """
+    """Yield a temporary folder that replaces `path` at the end; raise DiskSpaceError if the disk is full."""
     path = Path(path)
     durable = not is_unfinished(path)
     with work_folder(path) as folder:
@@ -120,11 +111,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def work_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`, deleted at the end.
-
-    Raises:
-        DiskSpaceError: the disk is full.
-    """
+    """Yield a temporary folder beside `path`, deleted at the end; raise DiskSpaceError on a full disk."""
     path = Path(path)
     with explain_full_disk(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,8 +131,7 @@ def _flush(path: Path) -> None:
 
 
 _renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-AT_FDCWD, RENAME_EXCHANGE = -100, 2
-"""From Linux's <stdio.h>, <fcntl.h> and <linux/fs.h>."""
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # from Linux's <stdio.h>, <fcntl.h> and <linux/fs.h>
 
 
 def _exchange(one: Path, other: Path) -> bool:
@@ -171,11 +157,7 @@ a full disk: COLMAP does not report one."""
 
 @contextmanager
 def explain_full_disk(path: Path) -> Iterator[None]:
-    """Convert an error caused by a full disk while writing `path` into one that names the disk and the fix.
-
-    Raises:
-        DiskSpaceError: the disk is full.
-    """
+    """Raise DiskSpaceError, with disk and fix, for an error caused by a full disk while `path` is written."""
     try:
         yield
     except HilsplatError:
@@ -204,11 +186,7 @@ def existing_folder(folder: Path) -> Path:
 
 
 def require_free_space(folder: Path, needed_mib: float) -> None:
-    """Check that the disk has space for an output.
-
-    Raises:
-        DiskSpaceError: less than `needed_mib` MiB is free on the folder's disk.
-    """
+    """Raise DiskSpaceError if less than `needed_mib` MiB is free on the folder's disk."""
     folder = existing_folder(Path(folder))
     free_mib = shutil.disk_usage(folder).free / 2**20
     if free_mib < needed_mib:
@@ -232,11 +210,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON.
-
-    Raises:
-        ArtifactError: the file is missing or is not valid JSON.
-    """
+    """Read JSON; raise ArtifactError if the file is missing or invalid."""
     try:
         return parse_json(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -246,11 +220,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON from outside the package.
-
-    Raises:
-        ValueError: the text is not JSON, or is nested too deeply.
-    """
+    """Parse JSON from outside the package; raise ValueError if it is invalid or nested too deeply."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -286,11 +256,7 @@ def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durabl
 
 
 def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
-    """Read an .npz file into a dict, without unpickling anything.
-
-    Raises:
-        ArtifactError: the file is missing or damaged, contains objects, or lacks a needed array.
-    """
+    """Read an .npz file without unpickling; raise ArtifactError if it is damaged or lacks a needed array."""
     with _readable(path):
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
@@ -312,11 +278,7 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read one array of numbers from an .npy file, without unpickling anything.
-
-    Raises:
-        ArtifactError: the file is missing or damaged, or contains anything else.
-    """
+    """Read an array of numbers from an .npy file, never pickles; raise ArtifactError for anything else."""
     with _readable(path):
         array = np.load(path, allow_pickle=False)
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
@@ -375,11 +337,7 @@ SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """Read a folder artifact's index.
-
-    Raises:
-        ArtifactError: the index is missing (so the folder is missing or incomplete) or was changed.
-    """
+    """Read a folder's index; raise ArtifactError if the folder is incomplete or the index was changed."""
     return copy.deepcopy(_index(Path(folder)))
 
 
@@ -407,11 +365,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
 
 
 def sealed(folder: Path, name: str) -> Path:
-    """Return the path of an artifact's file, after comparing its bytes with the index.
-
-    Raises:
-        ArtifactError: the file is missing, or was changed after it was written.
-    """
+    """Return the path of an artifact's file; raise ArtifactError if its bytes are not those in the index."""
     path = Path(folder) / name
     sums = _index(Path(folder))["crc32"]
     if not path.is_file():
@@ -443,11 +397,7 @@ def _crc32_of_file(path: Path) -> int:
 
 
 def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
-    """Read a folder artifact's index and check that it has the given entries.
-
-    Raises:
-        ArtifactError: the index is missing, or was written by another version of the program.
-    """
+    """Read a folder artifact's index; raise ArtifactError if it is missing or lacks one of the entries."""
     index = read_index(folder)
     if missing := [entry for entry in entries if entry not in index]:
         raise ArtifactError(
@@ -507,13 +457,10 @@ class ViewCache:
 
 @contextmanager
 def output_lock(output: Path) -> Iterator[None]:
-    """Lock an output for writing, and refuse a second writer.
+    """Lock an output for writing; raise ArtifactError if another process is writing it.
 
     If a writer fails or is killed, its lock file is left non-empty: the output may then match neither its
     provenance nor the inputs of that writer.
-
-    Raises:
-        ArtifactError: another process is writing the output.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)

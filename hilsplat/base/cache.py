@@ -42,9 +42,6 @@ def prune_cache(
 
     Returns:
         Number of deleted entries, and their size in MiB.
-
-    Raises:
-        HilsplatError: `stages` contains a name that is not a cache that can be pruned.
     """
     known = (*VIEW_CACHES, CHECKPOINTS)
     if unknown := sorted(set(stages) - set(known)):

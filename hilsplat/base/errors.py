@@ -44,11 +44,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
 
 
 def require_working_directory() -> None:
-    """Check that the working directory exists; a shell may still be in a deleted one.
-
-    Raises:
-        HilsplatError: it does not exist.
-    """
+    """Raise HilsplatError if the working directory was deleted."""
     try:
         Path.cwd()
     except FileNotFoundError:

@@ -16,8 +16,7 @@ from hilsplat.base.errors import ImageError
 
 logger = logging.getLogger(__name__)
 
-DEEP_MAX = 65535
-"""Largest value of a 16-bit channel; 257 of its steps equal one 8-bit step."""
+DEEP_MAX = 65535  # largest value of a 16-bit channel; 257 of its steps equal one 8-bit step
 
 
 def open_image(path: Path) -> Image.Image:

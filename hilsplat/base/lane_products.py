@@ -17,8 +17,7 @@ _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
 """With AVX-512, a core has 32 registers of 16 numbers, otherwise 16 registers of at most 8."""
 
 MOST_ROWS = 8 if _HAS_AVX512 else 6
-WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH
-"""Rows and columns whose sums fit into the registers."""
+WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH  # rows and columns whose sums fit into the registers
 
 
 def rows_of_products(rows: int) -> Any:

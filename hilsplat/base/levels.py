@@ -27,5 +27,4 @@ class Level(IntEnum):
 
 LEVELS: tuple[Level, ...] = (Level.WHOLE, Level.PART, Level.SUBPART)
 
-NONE = -1
-"""Index that means "no such row": a root's parent, a pixel without a mask, an unassigned Gaussian."""
+NONE = -1  # index that means "no such row": a root's parent, a pixel without a mask, an unassigned Gaussian

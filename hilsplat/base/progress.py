@@ -19,8 +19,7 @@ logger = logging.getLogger(__name__)
 LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 """Log format of a stage that a run starts; `last_progress` and `warnings_in` parse it."""
 
-LOG_EVERY_S = 5.0
-"""Seconds between progress lines if stderr is not a terminal."""
+LOG_EVERY_S = 5.0  # seconds between progress lines if stderr is not a terminal
 
 LOG_TAIL_BYTES = 20_000
 PROGRESS = re.compile(

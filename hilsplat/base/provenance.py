@@ -32,11 +32,7 @@ SOFTWARE = {"Software": "hilsplat"}
 
 
 class Inputs:
-    """Inputs of a stage, by name, with their digests from before it ran.
-
-    Raises:
-        HilsplatError: an input is missing.
-    """
+    """Inputs of a stage and their digests from before it ran; a missing one raises HilsplatError."""
 
     def __init__(self, stage: str, paths: Mapping[str, Path | Sequence[Path]]) -> None:
         self.stage = stage
@@ -50,11 +46,7 @@ class Inputs:
         self.records = {name: self._record(path) for name, path in paths.items()}
 
     def require_unchanged(self) -> None:
-        """Check that no input changed; only files with another size, time or inode are read again.
-
-        Raises:
-            HilsplatError: an input changed; the message names the file.
-        """
+        """Raise HilsplatError if an input changed; files of the same size, time and inode are not read."""
         now = self._signatures()
         for name, path in self._paths.items():
             before, after = self._files[name], now[name]
@@ -167,11 +159,7 @@ class Provenance(BaseModel):
 
 
 def read_provenance(artifact: Path) -> Provenance | None:
-    """Read the provenance of an artifact; None if it has none.
-
-    Raises:
-        ArtifactError: the record is damaged.
-    """
+    """Return the provenance of an artifact, or None; raise ArtifactError if the record is damaged."""
     path = provenance_path(artifact)
     if not path.is_file():
         return None
@@ -247,11 +235,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Check that a picture, and a file always written `beside` it, replace only earlier ones of this program.
-
-    Raises:
-        ArtifactError: the name does not end in .png, or an unrelated file exists at `path` or `beside`.
-    """
+    """Raise ArtifactError if a PNG, or a file always written `beside` it, would replace others' files."""
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not named as a PNG", expected="a name that ends in .png")
     if _is_something(path) and not _is_own_picture(path):
@@ -269,11 +253,7 @@ def _is_own_picture(path: Path) -> bool:
 
 
 def require_beginning(path: Path, line: str) -> None:
-    """Check that a table replaces only one that begins with the same line.
-
-    Raises:
-        ArtifactError: an unrelated file exists at this path.
-    """
+    """Raise ArtifactError unless a table replaces only one that begins with the same line."""
     if not _is_something(path):
         return
     try:

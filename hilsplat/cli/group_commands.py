@@ -43,7 +43,7 @@ def world_show(
     results: Results = Path("results"),
 ) -> None:
     """Draw a contact sheet beside the scene: views, labels by level, the tree with its texts."""
-    from hilsplat.world.sheet import show_world
+    from hilsplat.world.pictures import show_world
 
     target = results / scene / "world.png"
     show_world(results / scene / "world", target)
@@ -53,7 +53,7 @@ def world_show(
 @world_app.command("classes")
 def world_classes(out: Annotated[Path, typer.Option(help="PNG")] = Path("world_classes.png")) -> None:
     """Draw one object of each class."""
-    from hilsplat.world.gallery import draw_classes
+    from hilsplat.world.pictures import draw_classes
 
     draw_classes(out)
     typer.echo(f"wrote {out}")
@@ -65,7 +65,7 @@ def world_gallery(
     seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
 ) -> None:
     """Draw one view of each scene, with its true labels by level, as world_KIND.png."""
-    from hilsplat.world.gallery import draw_scenes
+    from hilsplat.world.pictures import draw_scenes
 
     target = Path(f"world_{kind}.png")
     draw_scenes(kind, seeds, target)

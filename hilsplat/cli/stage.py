@@ -59,8 +59,7 @@ Results = Annotated[Path, typer.Option(help="results folder")]
 DataRoot = Annotated[Path, typer.Option(help="folder that holds the data sets")]
 
 DEFAULT_CACHE = Path("results/.cache")
-MIN_FREE_MIB = 200.0
-"""Minimum free disk space to start a stage."""
+MIN_FREE_MIB = 200.0  # minimum free disk space to start a stage
 
 
 def start_logging(*, timestamps: bool = False) -> None:
@@ -174,11 +173,7 @@ def model_input(section: Any) -> dict[str, Path]:
 
 
 def json_option(option: str, text: str, kind: type) -> Any:
-    """Parse an option in JSON: a list of texts, or texts by name.
-
-    Raises:
-        SettingsError: it is not JSON, or has another type.
-    """
+    """Parse an option in JSON, a list of texts or texts by name; raise SettingsError for anything else."""
     try:
         value = parse_json(text)
     except ValueError as error:

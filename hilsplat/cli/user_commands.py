@@ -69,11 +69,7 @@ def query(
 
 
 def scene_folder(scene: str, results: Path) -> Path:
-    """Return the folder of a scene, given as name, dataset/scene, or path.
-
-    Raises:
-        SettingsError: several data sets have a scene of this name.
-    """
+    """Return the folder of a scene, given as name (SettingsError if ambiguous), dataset/scene, or path."""
     named, path = results / scene, Path(scene)
     if "/" not in scene:
         found = sorted(folder.parent for folder in results.glob(f"*/{glob.escape(scene)}/scene"))

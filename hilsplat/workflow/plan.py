@@ -51,11 +51,7 @@ class Plan:
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        """Validate a configuration and read the scene sheet.
-
-        Raises:
-            HilsplatError: a setting, a method or a line of the sheet is invalid, or no scene is left.
-        """
+        """Read the sheet; raise HilsplatError if it or the configuration is invalid or no scene is left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
         for name in run.every_variant():
@@ -255,11 +251,7 @@ class Plan:
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
     def masks_truth(self, job: VariantJob) -> list[str]:
-        """Return the input of masks: the true labels, for the diagnostic segmenter only.
-
-        Raises:
-            SettingsError: it is chosen for a scene without true labels.
-        """
+        """Return the input of masks: the diagnostic's true labels; SettingsError if the scene has none."""
         if self.masks_stage(job) != "truth_masks":
             return []
         row = self.row(job)
@@ -318,11 +310,7 @@ class Plan:
         return [self.path(job, "scene"), self.path(job, "gaussians.ply"), self.shared("masks", "masks")(job)]
 
     def first_field(self, job: VariantJob) -> list[str]:
-        """Return the input of field: LangSplat's field on the same masks and code, if it starts from that.
-
-        Raises:
-            SettingsError: no variant makes one.
-        """
+        """Return the input of field: LangSplat's, to start from; SettingsError if no variant makes one."""
         stages, scopes = self.stages(job), self.scopes(self.row(job))
         if stages.field.start != "langsplat":
             return []

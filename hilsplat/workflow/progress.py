@@ -27,11 +27,9 @@ from hilsplat.workflow.scene_data import Job
 REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_info"})
 """Events that are not printed, besides the start and end of a job."""
 
-SELECTING = "Select jobs to execute..."
-"""Message without an event that is not printed."""
+SELECTING = "Select jobs to execute..."  # message without an event that is not printed
 
-TARGETS = ("all", "everything", "tables", "total")
-"""Entries of the job counts that are not jobs."""
+TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
 
 LOOPS = {
     "world": "rendered views",

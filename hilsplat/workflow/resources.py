@@ -39,8 +39,7 @@ RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job star
 
 COMPARED_MB = (450, 4)  # memory of `comparison` per method: base, and per thousand Gaussians
 
-TIME_FACTOR, LEAST_MINUTES = 6, 10
-"""Time limit of a job divided by its estimate, and the lowest limit."""
+TIME_FACTOR, LEAST_MINUTES = 6, 10  # time limit of a job divided by its estimate, and the lowest limit
 
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 

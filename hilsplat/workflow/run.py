@@ -35,8 +35,7 @@ from hilsplat.workflow.records import outdated
 
 logger = logging.getLogger(__name__)
 
-STATE = Path(".hilsplat")
-"""Folder in the working folder for locks and markers."""
+STATE = Path(".hilsplat")  # folder in the working folder for locks and markers
 
 UNREGISTERED = "HILSPLAT_UNREGISTERED"
 """Environment variable of a Snakemake process that takes no lock of ours, such as the one that unlocks."""
@@ -52,14 +51,11 @@ _marks: list[TextIOWrapper] = []  # the marker of this process's run, if one is 
 
 
 def prepare_process() -> TextIOWrapper | None:
-    """Prepare a process that reads the Snakefile: the interpreter and end of its jobs, and a lock.
+    """Prepare a process that reads the Snakefile, and return a lock to keep (None in a read-only folder).
 
     Jobs use the interpreter that runs Snakemake, whether or not its environment is activated, and end with
     Snakemake. The lock is shared and is taken before Snakemake's own locks, which record no owner. If no
     process holds it, Snakemake's locks are left over from a dead run.
-
-    Returns:
-        The locked file, to keep until the process ends; None in a read-only folder.
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     jobs_end_with_this_process()
@@ -252,18 +248,14 @@ def _all_cores() -> int:
 
 
 def _recover(command: Sequence[str], results: Path) -> None:
-    """Remove leftovers of a killed run: unfinished files and, if no process is alive, Snakemake's locks.
-
-    Raises:
-        HilsplatError: another run is alive; Snakemake would remove that run's locks at the end of this one.
-    """
+    """Remove unfinished files of a killed run and, if no process is alive, Snakemake's locks."""
     markers = sorted(STATE.glob("run-*"))
     if not markers:
         return
     for marker in markers:
         try:
             _locked(marker.name, fcntl.LOCK_EX | fcntl.LOCK_NB).close()
-        except BlockingIOError as error:
+        except BlockingIOError as error:  # when this run ends, Snakemake would remove the other's locks
             raise HilsplatError(
                 f"another Snakemake runs in {Path.cwd()}", fix="wait until it ends, or stop it"
             ) from error

@@ -41,14 +41,7 @@ STAGES: dict[str, str] = {
 
 
 def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
-    """Return the digest of the code that a stage runs.
-
-    Args:
-        plugins: readers or baselines that the stage uses in this run (see `base.plugins`).
-
-    Raises:
-        HilsplatError: there is no such stage.
-    """
+    """Return the digest of the code of a stage and of the readers or baselines that it uses in this run."""
     if stage not in STAGES:
         raise HilsplatError(f"unknown stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
     return code_digest(STAGES[stage], *plugins)

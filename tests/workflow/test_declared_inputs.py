@@ -31,8 +31,7 @@ OUTPUTS = {
     "sweep_plot": "results/figures/sweep-theta.png",
 }
 """One output of each rule that has inputs."""
-TIMED = {"results/synthetic/tiny/default/times.csv"}
-"""Outputs that hold times, which differ from run to run."""
+TIMED = {"results/synthetic/tiny/default/times.csv"}  # outputs that hold times, which differ from run to run
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,8 @@ from tests.workflow.conftest import SCENE, Project
 
 TABLES = ("hierarchy", "lerf", "3dovs", "ablation", "theta", "omega", "frames-hi-lerf", "frames-hi-3dovs")
 TABLES += ("efficiency", "pruning", "cost-seconds", "efficiency-seconds", "pruning-seconds")
-OWN = ("components",)
-"""Tables without a row of the paper."""
-REPORTED = ("cost", "replica", "scannet", "waymo")
-"""Tables in which the tiny scene has no row."""
+OWN = ("components",)  # tables without a row of the paper
+REPORTED = ("cost", "replica", "scannet", "waymo")  # tables in which the tiny scene has no row
 FOLDERS = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder")
 
 

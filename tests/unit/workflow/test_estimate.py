@@ -25,7 +25,7 @@ def resources(tmp_path, monkeypatch):
 
 def test_jobs_are_summed_by_data_set(resources):
     run = RunEstimate(resources)
-    assert run.lines() == [], "nothing would run"
+    assert run.lines() == []
     for scene in SCENES:
         run.add("poses", scene, 1000)
         run.add("gaussians", scene, 4000)

@@ -64,17 +64,13 @@ def display(run: RunProgress, stream: io.StringIO) -> ProgressDisplay:
     return ProgressDisplay(stream, logging.Formatter().format, run)
 
 
-def tell(
-    shown: ProgressDisplay, event: str | None = None, text: str = "a block", level: int = 20, **more
-) -> None:
+def tell(shown: ProgressDisplay, event: str = "", text: str = "a block", level: int = 20, **more) -> None:
     record = logging.LogRecord("snakemake", level, __file__, 1, text, None, None)
     record.__dict__.update(more, **({"event": event} if event else {}))
     shown.show(record)
 
 
-def start(
-    shown: ProgressDisplay, number: int, rule: str, log: Path | None = None, variant: str = "default"
-) -> None:
+def start(shown: ProgressDisplay, number: int, rule: str, log: Path | None = None, variant="default") -> None:
     wildcards = {"dataset": "photos", "scene": "desk", "variant": variant}
     logs = [str(log)] if log else []
     tell(shown, "job_info", jobid=number, rule_name=rule, wildcards=wildcards, threads=2, log=logs)
@@ -218,17 +214,6 @@ def test_a_long_last_job_is_not_divided_among_the_cores(run, clock):
     start(shown, 1, "gaussians")
     run.running[1] = progress.RunningJob("gaussians", {}, 1, None, 0.0)
     assert run.seconds_left() == 600
-
-
-def test_a_redraw_costs_the_same_for_any_number_of_jobs(run, monkeypatch):
-    asked = []
-    seconds = Estimates.seconds
-    monkeypatch.setattr(Estimates, "seconds", lambda self, rule: asked.append(rule) or seconds(self, rule))
-    run.begin({"masks": 1000, "field": 20_000})
-    start(display(run, io.StringIO()), 1, "masks")
-    asked.clear()
-    run.line()
-    assert sorted(asked) == ["field", "masks", "masks"]
 
 
 @pytest.mark.parametrize("rule", LOOPS)

@@ -5,8 +5,7 @@ import sys
 
 from hilsplat.workflow.stages import STAGES
 
-TRAINING = {"models"}
-"""Stages whose losses are torch's."""
+TRAINING = {"models"}  # stages whose losses are torch's
 
 
 def test_only_stages_that_train_load_torch_which_takes_longer_than_most_of_them():
