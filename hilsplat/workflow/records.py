@@ -55,18 +55,10 @@ def expected_artifacts(plan: Plan) -> dict[str, Expected]:
     for row in plan.scenes:
         readers = plan.data.label_readers(row)
 
-        def add(
-            name: str,
-            stage: str,
-            job: Any,
-            *,
-            seed: int | None = None,
-            plugins: tuple[str, ...] = (),
-            **more: Any,
-        ) -> None:
+        def add(name: str, stage: str, job: Any, **how: Any) -> None:
             variant = [job.variant] if hasattr(job, "variant") else []
-            settings = more.pop("settings", None) or plan.values(stage, job)
-            found.setdefault(plan.path(job, *variant, name), Expected(stage, settings, seed, plugins, **more))
+            how.setdefault("settings", plan.values(stage, job))
+            found.setdefault(plan.path(job, *variant, name), Expected(stage, **how))
 
         if row.world:
             add("world", "world", row, output=plan.path(row, "world/images"))

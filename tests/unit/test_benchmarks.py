@@ -1,4 +1,4 @@
-"""Benchmarks run, untimed; and a case is slower only if every pair of runs says so, and clearly."""
+"""Benchmarks run, untimed; a case counts as slower only if it clearly is in every pair of runs."""
 
 import subprocess
 import sys
@@ -9,8 +9,8 @@ from benchmarks.compare import paired
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_every_room_runs():
-    """Once and untimed, so that a change of what they call is noticed before somebody wants to time it."""
+def test_every_benchmark_runs():
+    """Run them untimed, so that a changed interface is noticed."""
     command = [
         sys.executable,
         "-m",
@@ -29,7 +29,7 @@ def verdicts(before: list[dict[str, float]], now: list[dict[str, float]]) -> dic
     return {each.case: each.verdict for each in paired(before, now)}
 
 
-def test_only_what_every_pair_shows_counts():
+def test_a_difference_must_be_in_every_pair():
     before = [{"a": 10.0, "b": 10.0, "c": 10.0, "d": 10.0}] * 3
     now = [
         {"a": 12.0, "b": 14.0, "c": 10.3, "d": 8.0},
@@ -39,7 +39,7 @@ def test_only_what_every_pair_shows_counts():
     assert verdicts(before, now) == {"a": "slower", "b": "", "c": "", "d": "faster"}
 
 
-def test_pairs_are_compared_with_their_own_partner():
+def test_versions_are_compared_within_pairs():
     """The machine became twice as slow after the first pair; the code did not."""
     assert verdicts([{"a": 10.0}, {"a": 20.0}], [{"a": 10.1}, {"a": 19.9}]) == {"a": ""}
 

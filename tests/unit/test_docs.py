@@ -1,4 +1,4 @@
-"""What the documentation names exists: links, commands, options, knobs, configurations, files, functions."""
+"""Links, commands, options, settings, configurations, files and functions in the documentation exist."""
 
 import ast
 import re
@@ -74,7 +74,7 @@ def command_of(words: list[str]) -> tuple[Any, list[str]]:
 
 
 @of_every_page
-def test_every_relative_link_leads_somewhere(page: Path) -> None:
+def test_every_relative_link_has_a_target(page: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
         if re.match(r"[a-z]+:", target):
             continue
@@ -112,7 +112,7 @@ def test_every_configuration_and_forced_rule_exists(page: Path) -> None:
 
 
 @of_every_page
-def test_every_knob_exists(page: Path) -> None:
+def test_every_setting_exists(page: Path) -> None:
     """`section.knob`, alone or before its value; the changelog also names those that were removed."""
     if page.name == "CHANGELOG.md":
         return
@@ -179,7 +179,7 @@ def test_every_place_in_the_architecture_exists() -> None:
             scope = definitions[part]
 
 
-def test_every_room_is_in_the_architecture_and_holds_at_most_twenty_files() -> None:
+def test_every_package_is_in_the_architecture_and_has_at_most_twenty_files() -> None:
     named = set(inline_code(PROJECT / "docs/architecture.md"))
     rooms = {path.parent for path in (PROJECT / "hilsplat").glob("*/__init__.py")}
     assert {f"hilsplat/{room.name}/" for room in rooms} <= named

@@ -1,4 +1,4 @@
-"""What counts as a difference from the recorded run."""
+"""Tolerances of the comparison with the recorded run."""
 
 from dataclasses import replace
 
@@ -17,13 +17,13 @@ def changed(by: float, name: str = NAME, **more: str) -> list[str]:
     )
 
 
-def test_a_point_of_iou_counts_if_the_gaussians_are_the_recorded_ones():
+def test_an_iou_may_differ_by_a_point_if_the_gaussians_are_the_recorded_ones():
     assert changed(0.0) == changed(0.009) == changed(-0.009) == []
     assert len(changed(0.011)) == len(changed(-0.011)) == 1
     assert changed(float("nan")) != []
 
 
-def test_other_gaussians_may_move_it_further():
+def test_it_may_differ_more_with_other_gaussians():
     assert changed(-0.1, gaussians_sha256="other") == []
     [sentence] = changed(-0.13, gaussians_sha256="other")
     assert sentence.startswith(f"{NAME} is ") and sentence.endswith("tolerance 0.12")
@@ -34,7 +34,7 @@ def test_every_recorded_number_has_a_tolerance():
         assert changed(0.0, name) == [] and len(changed(1e4, name)) == 1, name
 
 
-def test_numbers_that_come_or_go_are_named():
+def test_missing_and_new_numbers_are_named():
     known = tiny.recorded()
     without = replace(known, numbers={name: v for name, v in known.numbers.items() if name != NAME})
     assert list(tiny.differences(without, known)) == [f"{NAME} is missing"]

@@ -1,4 +1,4 @@
-"""Settings: one default per knob, errors that name the key, shared variants."""
+"""Settings: one default each, errors that name the key, overrides and variants."""
 
 import json
 from pathlib import Path
@@ -124,14 +124,14 @@ def test_only_random_variants_are_repeated_per_seed() -> None:
 
 
 @pytest.mark.parametrize("name", SECTIONS)
-def test_a_section_describes_its_knobs_and_round_trips_through_json(name: str) -> None:
+def test_a_section_describes_its_settings_and_round_trips_through_json(name: str) -> None:
     for knob, field in SECTIONS[name].model_fields.items():
         assert field.description and field.json_schema_extra["origin"], knob
     section = SECTIONS[name]()
     assert parse_section(name, section.model_dump_json()) == section
 
 
-def test_the_manual_names_the_choices_or_the_range_of_a_knob() -> None:
+def test_the_manual_lists_the_choices_or_the_range_of_a_setting() -> None:
     manual = knob_table()
     assert "poses.mapper = 'incremental'  (incremental|global; origin: COLMAP)" in manual
     assert "poses.test_every = 8  (>= 0; views; origin: 3DGS)" in manual
@@ -157,6 +157,6 @@ def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None
     assert stages.autoencoder.latent == 3
 
 
-def test_a_single_name_stands_for_a_list_of_one() -> None:
+def test_a_single_name_is_read_as_a_list() -> None:
     run = parse_run({"only": "desk", "groups": "photos"})
     assert (run.only, run.groups) == (("desk",), ("photos",))

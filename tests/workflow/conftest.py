@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 MODELS = ("models/sam-tiny", "models/clip-tiny")
-"""Of the checkout's models the tests see these alone, whatever was fetched."""
+"""The only models of the checkout that tests use."""
 PLUGIN = "snakemake_logger_plugin_hilsplat"
 PARTS = ("Snakefile", "rules", "workflow", "profiles", "config", "hilsplat", PLUGIN, *MODELS)
 SCENE = Path("results/synthetic/tiny")

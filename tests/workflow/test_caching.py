@@ -1,4 +1,4 @@
-"""What an edit reruns, and what it leaves alone."""
+"""Stages that an edit reruns."""
 
 import ast
 
@@ -11,11 +11,7 @@ BEFORE_CLIP = {"masks", "coverage_tree", "contributions", "semantic_tree"}
 FROM_CLIP = {"clip", "names", "autoencoder", "method"} | AFTER_FIELD
 
 
-def test_nothing_is_planned_after_a_finished_run(copy_of_finished: Project) -> None:
-    assert copy_of_finished.planned() == set()
-
-
-def test_prose_and_what_no_stage_reaches_rerun_nothing(copy_of_finished: Project) -> None:
+def test_edits_of_prose_and_unreached_code_rerun_nothing(copy_of_finished: Project) -> None:
     for path in ("hilsplat/segment/coverage.py", "hilsplat/field/field.py", "hilsplat/base/images.py"):
         file = copy_of_finished.root / path
         file.write_text(file.read_text() + "\n# a comment\nUNUSED = 1\n")
@@ -45,18 +41,14 @@ def test_an_edit_reruns_its_stage_and_what_follows(
     assert copy_of_finished.planned() == expected
 
 
-def test_omega_reruns_fields_and_later_only(copy_of_finished: Project) -> None:
+def test_settings_and_models_rerun_the_stages_that_read_them(copy_of_finished: Project) -> None:
     copy_of_finished.edit("config/config.yaml", "omega: 10", "omega: 5")
     assert copy_of_finished.planned() == AFTER_FIELD
-
-
-def test_theta_reruns_trees_and_later_only(copy_of_finished: Project) -> None:
     copy_of_finished.edit("config/config.yaml", "theta: 0.9", "theta: 0.8")
     by_head = ("--config", "theta_variants=[]", "omega_variants=[]")  # theta decides levels in the others
     assert copy_of_finished.planned(*by_head) == ({"coverage_tree"} | AFTER_FIELD) - {"sweep_plot"}
-
-
-def test_a_model_that_changed_reruns_what_reads_it(copy_of_finished: Project) -> None:
+    copy_of_finished.edit("config/config.yaml", "theta: 0.8", "theta: 0.9")
+    copy_of_finished.edit("config/config.yaml", "omega: 5", "omega: 10")
     card = copy_of_finished.root / "models/clip-tiny/config.json"
     card.write_text(card.read_text() + "\n")
     assert copy_of_finished.planned() == FROM_CLIP

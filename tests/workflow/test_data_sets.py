@@ -67,7 +67,7 @@ def blocks(planned: str) -> Iterator[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("label", LABEL_OF.values())
-def test_labels_are_inputs_of_evaluation_and_figures_alone(planned, label):
+def test_labels_are_inputs_of_evaluation_and_figures_only(planned, label):
     readers = {rule for rule, text in blocks(planned) if label in text.partition("output:")[0]}
     assert readers == {"evaluate", "figures", "comparison"}
 
@@ -79,7 +79,7 @@ def test_a_scan_is_exported_before_its_poses_are_imported(planned):
     assert "aggregation.json" not in exported[0]
 
 
-def test_what_is_absent_is_named_with_the_reason(planned):
+def test_absent_scenes_are_listed_with_the_reason(planned):
     assert "lerf/ramen is skipped: scene ramen of LERF-OVS is incomplete" in planned
     assert re.search(r"replica/room_0 is skipped: .*one level too deep", planned)
 
@@ -89,7 +89,7 @@ def test_tables_list_what_was_not_measured(planned):
     assert len(tables) == len(TABLES)
 
 
-def test_a_dry_run_ends_with_what_the_run_would_take(planned):
+def test_a_dry_run_ends_with_the_estimate_table(planned):
     table = planned.partition("This run would take about:\n")[2].splitlines()
     assert table[0].split() == ["scenes", "jobs", "disk", "memory", "hours,", "2", "cores", "hours,", "GPU"]
     assert [row.split()[0] for row in table[1:6]] == ["3d_ovs", "lerf", "scannet", "tables", "all"]
@@ -97,7 +97,7 @@ def test_a_dry_run_ends_with_what_the_run_would_take(planned):
     assert table[5].split()[1:3] == ["3", counted[1]]
 
 
-def test_tables_of_a_run_without_data_carry_the_line(project, tmp_path):
+def test_tables_without_data_list_the_absent_scenes(project, tmp_path):
     copy = copy_project(project, tmp_path / "project", results=False)
     command = [sys.executable, "-m", "snakemake", "-n", "-p", "results/tables/replica.csv"]
     printed = copy.run(*command, "--configfile", "config/ci.yaml").stdout

@@ -12,7 +12,7 @@ def masks_jobs(project: Project, *words: str) -> dict[str, str]:
     return {block.split("variant=")[1].split()[0]: block.split("\n\n")[0] for block in blocks}
 
 
-def test_truth_is_an_input_of_the_diagnostic_segmenter_alone(plain: Project) -> None:
+def test_truth_is_an_input_only_of_the_diagnostic_segmenter(plain: Project) -> None:
     jobs = masks_jobs(plain, *ASKED)
     assert not [variant for variant, job in jobs.items() if "truth" in job and variant != "truth-exact"]
     assert "--truth results/synthetic/tiny/world/truth" in jobs["truth-exact"]

@@ -1,4 +1,4 @@
-"""What the run of the tiny scene answered, written as files, scores what the run scored."""
+"""The answers of the tiny scene, written as files, have the scores of the run."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def write_answers(folder: Path, scene_folder: Path, method: str) -> None:
 
 
 @pytest.mark.parametrize(("method", "flat"), [("tree", "lerf/tree-nodes"), ("field", "lerf/langsplat")])
-def test_files_of_the_run_score_what_the_run_scored(
+def test_answers_written_as_files_have_the_scores_of_the_run(
     finished: Project, tmp_path: Path, method: str, flat: str
 ) -> None:
     write_answers(tmp_path / "masks", finished.root / SCENE, method)

@@ -29,7 +29,7 @@ def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finishe
     assert "has a mask" in failed.stderr.partition("Logfile")[2]
 
 
-def test_verbose_leaves_snakemakes_own_output(copy_of_finished: Project) -> None:
+def test_verbose_restores_snakemakes_own_output(copy_of_finished: Project) -> None:
     project = copy_of_finished
     shutil.rmtree(project.root / SCENE / "default/coverage_tree")
     printed = project.snakemake(f"{SCENE}/default/coverage_tree", "--verbose").stderr

@@ -21,7 +21,7 @@ DESK = Path("results/photos/desk")
 
 
 def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
-    """Put the embedded networks on the hub as released ones: no word says that they know one world alone."""
+    """Put the embedded networks on the hub, without the note that they know only one world."""
     repository_of = {release.name: release.repository for release in RELEASES}
     for name, embedded in zip(RECOMMENDED, ("sam-tiny", "clip-tiny"), strict=True):
         shutil.copytree(project / "models" / embedded, folder / name)

@@ -108,7 +108,7 @@ def free_mib(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     ids=repr,
 )
 @pytest.mark.parametrize("writer", [artifacts.atomic_path, artifacts.atomic_folder, artifacts.work_folder])
-def test_errors_of_a_full_disk_name_it_and_the_way_out(
+def test_errors_on_a_full_disk_name_the_disk_and_the_fix(
     tmp_path, free_mib, writer, error, free, is_full
 ) -> None:
     free_mib(free)
@@ -124,7 +124,7 @@ def test_errors_of_a_full_disk_name_it_and_the_way_out(
     assert list((tmp_path / "new").iterdir()) == []
 
 
-def test_errors_inside_a_new_folder_name_places_that_stay(tmp_path: Path, free_mib) -> None:
+def test_errors_inside_a_new_folder_name_the_final_path(tmp_path: Path, free_mib) -> None:
     free_mib(0.5)
     message = rf"no space left while writing out in {tmp_path}\n"
     with pytest.raises(DiskSpaceError, match=message), artifacts.atomic_folder(tmp_path / "out"):

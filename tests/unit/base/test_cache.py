@@ -50,7 +50,7 @@ def test_no_cache_yet_is_no_error(tmp_path):
     assert prune_cache(tmp_path / "nowhere", [], days=0.0) == (0, 0)
 
 
-def test_old_entries_go_and_what_is_no_view_stays(cache):
+def test_only_old_view_entries_are_deleted(cache):
     assert prune_cache(cache, [], days=2.0) == (3, 3.0)
     assert left(cache) == [
         "masks/.writing-00000000-x/new.npz",
@@ -60,7 +60,7 @@ def test_old_entries_go_and_what_is_no_view_stays(cache):
     ]
 
 
-def test_the_longest_unused_go_until_the_rest_is_small_enough(cache):
+def test_the_least_recently_used_entries_are_deleted_first(cache):
     assert prune_cache(cache, ["masks"], max_mib=2.5) == (2, 2.0)
     assert "masks/1/1.npz" in left(cache)
     assert "masks/2/2.npz" not in left(cache)

@@ -1,4 +1,4 @@
-"""The identity of code follows what a function can reach, and nothing else."""
+"""A code digest covers exactly the definitions that a function can reach."""
 
 import ast
 import shutil
@@ -64,7 +64,7 @@ BASE = {
         ("from hilsplat.b import f", "from hilsplat.b import unused as f", True),
     ],
 )
-def test_what_is_reached_counts_and_what_is_not_does_not(tmp_path, old, new, counts):
+def test_only_reached_definitions_change_the_digest(tmp_path, old, new, counts):
     edited = {name: text.replace(old, new) for name, text in BASE.items()}
     assert edited != BASE
     assert same(tmp_path, BASE, edited) is not counts
@@ -91,7 +91,7 @@ def test_what_is_reached_counts_and_what_is_not_does_not(tmp_path, old, new, cou
         ("    y: int = x\n    return y", "int", "float", False),
     ],
 )
-def test_words_for_people_do_not_count(tmp_path, code, old, new, counts):
+def test_messages_and_descriptions_do_not_change_the_digest(tmp_path, code, old, new, counts):
     one = {"a": f"def g(x, y):\n{code}\n"}
     other = {"a": one["a"].replace(old, new)}
     assert one != other
@@ -104,7 +104,7 @@ def test_imports_inside_functions_relative_ones_and_attributes_of_modules_are_fo
     assert found(tmp_path, a=a, b=b, c="def h():\n    return 1\n") == {"a:g", "b:f", "c:h"}
 
 
-def test_a_module_that_is_handed_around_counts_as_a_whole(tmp_path):
+def test_a_module_that_is_passed_around_counts_as_a_whole(tmp_path):
     a = "from hilsplat import b\n\ndef g():\n    return vars(b)\n"
     assert found(tmp_path, a=a, b="def f():\n    return 1\n\nX = 1\n") == {"a:g", "b:f", "b:X"}
 
@@ -117,7 +117,7 @@ def test_names_that_a_package_exports_lead_to_their_module(tmp_path):
     assert reached("hilsplat.a:g", root=root) == ["hilsplat.a:g", "hilsplat.sub.b:f"]
 
 
-def test_a_local_name_hides_the_module_s(tmp_path):
+def test_a_local_name_hides_a_module_level_name(tmp_path):
     a = (
         "def x():\n    return 1\n\ndef y():\n    return 1\n\ndef z():\n    return 1\n\n"
         "def g(x):\n    y = 2\n    return x, y, [z for z in (1, 2)]\n"
@@ -134,7 +134,7 @@ def test_methods_see_the_module_and_not_the_names_of_their_class(tmp_path):
     assert found(tmp_path, a=a) == {"a:g", "a:C", "a:f", "a:D"}
 
 
-def test_annotations_count_for_roots_alone(tmp_path):
+def test_annotations_count_only_for_roots(tmp_path):
     a = "class D:\n    pass\n\ndef f(d: D) -> D:\n    return d\n\ndef g():\n    return f(1)\n"
     assert found(tmp_path, a=a) == {"a:g", "a:f"}
 
@@ -149,7 +149,7 @@ def test_annotations_count_for_roots_alone(tmp_path):
         ("TABLE = {1: 2}", False),
     ],
 )
-def test_what_importing_a_reached_module_runs_counts(tmp_path, statement, counts):
+def test_statements_that_run_on_import_count(tmp_path, statement, counts):
     one = {"a": "from hilsplat.b import f\n\ndef g():\n    return f()\n", "b": "def f():\n    return 1\n"}
     other = {**one, "b": f"{one['b']}\n{statement}\n"}
     assert same(tmp_path, one, other) is not counts
@@ -179,7 +179,7 @@ def test_both_branches_that_bind_a_name_count(tmp_path):
         ("hilsplat.a:g", "from hilsplat.a import *\n\ndef g():\n    x()\n", r"a star import of hilsplat\.a"),
     ],
 )
-def test_what_does_not_exist_is_named(tmp_path, root, a, message):
+def test_missing_modules_and_names_are_named(tmp_path, root, a, message):
     with pytest.raises(HilsplatError, match=message):
         code_digest(root, root=package(tmp_path, a=a))
 
@@ -268,7 +268,7 @@ def test_an_edit_reruns_exactly_the_stages_that_can_reach_it(copy, project, plac
     assert changed(copy, project) == expected
 
 
-def test_a_reader_and_a_baseline_count_for_the_jobs_that_use_them_alone(copy, project):
+def test_readers_and_baselines_count_only_for_jobs_that_use_them(copy, project):
     edit_function(copy, "datasets/images/lerf_ovs.py:open_scene")
     edit_function(copy, "methods/lifted.py:fit")
     assert changed(copy, project) == set()
@@ -304,12 +304,12 @@ def test_a_command_only_calls_the_function_of_its_stage(project):
 
 
 def forget() -> None:
-    """Forget what this process knows, as a new one would."""
+    """Clear the caches, as in a new process."""
     for cached in (identity._digest, identity._state, definitions.module_of, definitions.path_of):
         cached.cache_clear()
 
 
-def test_a_digest_is_found_once_until_a_module_changes(tmp_path, monkeypatch):
+def test_a_digest_is_computed_once_until_a_module_changes(tmp_path, monkeypatch):
     root = package(tmp_path, **BASE)
     first = code_digest("hilsplat.a:g", root=root)
     forget()
@@ -327,7 +327,7 @@ def test_a_digest_is_found_once_until_a_module_changes(tmp_path, monkeypatch):
     forget()
 
 
-def test_a_package_that_may_not_be_written_to_is_digested_all_the_same(tmp_path):
+def test_a_read_only_package_has_a_digest(tmp_path):
     root = package(tmp_path, **BASE)
     (root / "__pycache__").write_text("no folder")
     other = package(tmp_path / "other", **BASE)

@@ -36,7 +36,7 @@ def relative_error(operation, exact: np.ndarray, values: np.ndarray = MANY) -> f
     return float(np.abs(out / exact - 1).max())
 
 
-def test_functions_of_one_number_are_right_to_float32():
+def test_functions_of_one_number_have_float32_accuracy():
     exact = MANY.astype(np.float64)
     assert relative_error(numba.njit(lambda x: reciprocal(x)), 1 / exact) < 3e-7
     assert relative_error(numba.njit(lambda x: root(x)), np.sqrt(exact)) < 1e-7
@@ -54,7 +54,7 @@ def _compare(left, right, low, high):
     return bits_ge(load(left, 0), load(right, 0))
 
 
-def test_comparisons_count_what_is_not_a_number_as_reached():
+def test_comparisons_treat_nan_as_reached():
     left, right = np.random.default_rng(1).normal(size=(2, 16)).astype(np.float32)
     low, high = np.empty((2, 16), np.float32)
     bits = _compare(left, right, low, high)
@@ -97,7 +97,7 @@ def _nine_sums(values, out, at):
     )
 
 
-def test_sums_of_several_vectors_fill_their_places_and_no_other():
+def test_sums_of_several_vectors_are_stored_at_their_indices_only():
     values = np.random.default_rng(2).normal(size=(9, 16)).astype(np.float32)
     out = np.full(16, 7.0, np.float32)
     _nine_sums(values.reshape(-1), out, 2)
@@ -112,7 +112,7 @@ def _reduced(values):
     return lane_sum(row), lane_max(row), lane_sum(load_same(values, 18))
 
 
-def test_a_row_is_summed_and_its_largest_and_a_repeated_number_are_found():
+def test_lane_sum_lane_max_and_load_same():
     values = np.random.default_rng(1).permutation(64).astype(np.float32)
     row = values[16:32]
     assert _reduced(values) == (row.sum(), row.max(), 16 * values[18])
@@ -123,7 +123,7 @@ def _transposed(source, target):
     transpose(source, 5, 20, target, 3, 18)
 
 
-def test_a_block_is_transposed_between_rows_of_other_lengths():
+def test_a_block_is_transposed_between_arrays_with_different_row_lengths():
     source = np.arange(5 + 16 * 20, dtype=np.float32)
     target = np.full(3 + 16 * 18, -1, np.float32)
     _transposed(source, target)

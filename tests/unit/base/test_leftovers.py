@@ -86,14 +86,14 @@ def after_kills(kind: str, folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "folder without exchange"])
-def test_an_artifact_is_the_former_or_the_new_one_wherever_its_writer_is_killed(tmp_path, kind):
+def test_an_artifact_is_the_old_or_the_new_version_wherever_its_writer_is_killed(tmp_path, kind):
     versions = {"old", "new"} if kind == "file" else {"old+old", "new+new"}
     found = after_kills(kind, tmp_path)
     assert set(found) == versions
     assert found == sorted(found, reverse=True), "the new version never disappears again"
 
 
-def test_a_former_version_never_returns_in_part(tmp_path):
+def test_an_old_version_is_never_partly_restored(tmp_path):
     """A clean-up is killed while it deletes a former version, and then the artifact is deleted."""
     assert set(after_kills("clean-up", tmp_path)) == {"old+old", "nothing"}
 
@@ -173,7 +173,7 @@ def test_every_name_that_fits_a_folder_can_be_written(tmp_path):
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
-def test_the_former_folder_stays_until_the_new_one_is_whole(tmp_path, monkeypatch, can_exchange):
+def test_the_old_folder_remains_until_the_new_one_is_complete(tmp_path, monkeypatch, can_exchange):
     if not can_exchange:
         monkeypatch.setattr(artifacts, "_renameat2", None)
     out = tmp_path / "out"
@@ -187,7 +187,7 @@ def test_the_former_folder_stays_until_the_new_one_is_whole(tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_the_former_folder_returns_if_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+def test_the_old_folder_is_restored_if_the_new_one_cannot_replace_it(tmp_path, monkeypatch):
     write_text(tmp_path / "out/former", "text")
     monkeypatch.setattr(artifacts, "_renameat2", None)
     rename = Path.rename

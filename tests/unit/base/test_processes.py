@@ -1,4 +1,4 @@
-"""Work in processes: order, and no process where one would do."""
+"""Pools of processes, and jobs that end with their workflow."""
 
 import os
 import select
@@ -20,7 +20,7 @@ def square(base: int, number: int) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_results_come_in_the_order_of_the_items(workers):
+def test_results_are_in_the_order_of_the_items(workers):
     assert list(in_processes(square, [], workers)) == []
     results = list(in_processes(partial(square, 10), [(3,), (1,), (2,)], workers))
     assert [value for value, _ in results] == [19, 11, 14]
@@ -73,7 +73,7 @@ def test_a_job_does_not_start_once_its_workflow_has_ended():
     assert job.returncode == 1 and job.stdout == b""
 
 
-def test_a_command_of_a_person_outlives_the_shell():
+def test_a_command_started_by_a_user_outlives_the_shell():
     script = f"{shlex.join([sys.executable, '-c', JOB])} & echo $!"
     shell = subprocess.Popen(["sh", "-c", script], stdout=subprocess.PIPE)
     lines = {shell.stdout.readline(), shell.stdout.readline()}
@@ -107,7 +107,7 @@ def test_the_processes_of_a_pool_end_with_it(tmp_path):
     assert ended(pool.stdout)
 
 
-def test_a_library_that_ends_its_process_is_an_error_of_ours():
+def test_a_library_that_ends_its_process_raises_an_error():
     assert in_own_process(sorted, [2, 1]) == [1, 2]
     with pytest.raises(ChildProcessError, match="was ended by a library"):
         in_own_process(os.abort)

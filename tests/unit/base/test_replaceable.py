@@ -33,7 +33,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_what_is_missing_or_empty_may_be_written(tmp_path):
+def test_missing_or_empty_outputs_may_be_written(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder/.snakemake_timestamp").touch()
     (tmp_path / "file").touch()
@@ -47,7 +47,7 @@ def test_an_earlier_output_of_the_same_stage_may_be_replaced(photographs, tmp_pa
         require_replaceable([photographs], "clip", [])
 
 
-def test_further_outputs_are_those_of_the_record(photographs, tmp_path):
+def test_further_outputs_must_be_in_the_record(photographs, tmp_path):
     out = tmp_path / "gaussians.ply"
     out.write_text("ply")
     record(out, "gaussians", "report")
@@ -58,13 +58,13 @@ def test_further_outputs_are_those_of_the_record(photographs, tmp_path):
         require_replaceable([out, photographs], "gaussians", [])
 
 
-def test_what_a_killed_writer_left_may_be_replaced(photographs):
+def test_outputs_of_a_killed_writer_may_be_replaced(photographs):
     lock_path(photographs).write_text("unfinished\n")
     require_replaceable([photographs], "masks", [])
 
 
 @pytest.mark.parametrize("broken", ["", "{", "[]", '{"stage": "masks"}', '{"stage": "masks", "outputs": 3}'])
-def test_a_broken_record_is_none(photographs, broken):
+def test_a_broken_record_counts_as_missing(photographs, broken):
     provenance_path(photographs).write_text(broken)
     with pytest.raises(ArtifactError, match="did not write it"):
         require_replaceable([photographs], "masks", [])
@@ -101,7 +101,7 @@ def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch
         ["gaussians", "--scene", "scene", "--out", "gaussians.ply", "--report", "photographs"],
     ],
 )
-def test_commands_leave_what_is_not_theirs(photographs, tmp_path, monkeypatch, words):
+def test_commands_do_not_replace_unrelated_files(photographs, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene/index.json").write_text("{}")
@@ -120,7 +120,7 @@ def test_a_stage_replaces_its_output_again(tmp_path):
     assert out.read_text() == "second" and json.loads(provenance_path(out).read_text())["stage"] == "table"
 
 
-def test_pictures_replace_pictures_of_this_package_alone(tmp_path):
+def test_pictures_replace_only_pictures_of_this_package(tmp_path):
     pixels = np.zeros((8, 8, 3), np.uint8)
     picture, photograph, text = (tmp_path / name for name in ("picture.png", "photograph.png", "thesis.md"))
     require_own_picture(picture)
@@ -139,7 +139,7 @@ def test_pictures_replace_pictures_of_this_package_alone(tmp_path):
         require_own_picture(tmp_path / "other.png", beside=tmp_path / "selection.ply")
 
 
-def test_tables_replace_tables_with_the_same_head_alone(tmp_path):
+def test_tables_replace_only_tables_with_the_same_header(tmp_path):
     table = tmp_path / "efficiency.csv"
     require_beginning(table, "stage,seconds")
     table.write_text("stage,seconds\nmasks,3\n")

@@ -39,7 +39,7 @@ def test_a_quarter_turn_about_z_by_hand():
     np.testing.assert_allclose(rotate(quarter, np.array([[1.0, 0, 0]]))[0], [0, 1, 0], atol=1e-15)
 
 
-def test_matrices_are_scipys():
+def test_matrices_equal_scipys():
     np.testing.assert_allclose(rotation_matrices(RANDOM), by_scipy(RANDOM), atol=1e-14)
     single = RANDOM.astype(np.float32)
     np.testing.assert_allclose(rotation_matrices(single), by_scipy(single.astype(float)), atol=1e-14)
@@ -51,19 +51,19 @@ def test_compiled_loops_have_the_same_matrices_to_the_bit():
     np.testing.assert_array_equal(out, rotation_matrices(RANDOM))
 
 
-def test_a_matrix_has_its_quaternion_back_but_for_its_sign():
+def test_a_matrix_gives_its_quaternion_up_to_the_sign():
     for matrix, quat in zip(by_scipy(RANDOM), unit_quaternions(RANDOM), strict=True):
         found = quaternion_of(matrix)
         np.testing.assert_allclose(found * np.sign(found @ quat), quat, atol=1e-12)
 
 
-def test_turning_by_a_quaternion_is_turning_by_its_matrix():
+def test_rotation_by_a_quaternion_equals_rotation_by_its_matrix():
     vectors = np.random.default_rng(4).normal(size=(50, 3))
     turned = np.einsum("nij,nj->ni", rotation_matrices(RANDOM), vectors)
     np.testing.assert_allclose(rotate(unit_quaternions(RANDOM), vectors), turned, atol=1e-12)
 
 
-def test_a_product_turns_first_by_the_right_and_keeps_its_length():
+def test_a_product_rotates_by_the_right_factor_first():
     left = np.array([0.5, -0.5, 0.1, 2.0])
     both = multiply(left, RANDOM)
     expected = rotation_matrices(left[None]) @ rotation_matrices(RANDOM)
@@ -83,7 +83,7 @@ def test_a_product_turns_first_by_the_right_and_keeps_its_length():
         np.zeros_like,
     ],
 )
-def test_what_is_not_a_rotation_is_found_among_rotations(spoil):
+def test_matrices_that_are_no_rotations_are_found(spoil):
     matrices = by_scipy(RANDOM[:5])
     assert are_rotations(matrices, 1e-12).all()
     matrices[2] = spoil(matrices[2])

@@ -1,4 +1,4 @@
-"""Each check of `hilsplat doctor` passes here and says what to do where it does not."""
+"""Each check of `hilsplat doctor` passes on this machine, and reports a fault with its fix."""
 
 import importlib.metadata
 import json
@@ -62,7 +62,7 @@ def test_a_library_that_is_missing_or_old_is_named(monkeypatch):
     assert "scipy is missing" in found.found and "numpy 1.20.0 is not >=2.1" in found.found
 
 
-def test_the_gpu_build_of_onnxruntime_takes_the_place_of_the_other(monkeypatch):
+def test_onnxruntime_gpu_replaces_onnxruntime(monkeypatch):
     install(monkeypatch, "onnxruntime", **{"onnxruntime-gpu": "1.20"})
     assert [found.state for found in doctor.libraries()] == ["ok"]
 
@@ -83,7 +83,7 @@ def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apar
     assert [found.state for found in doctor.cuda()] == [state]
 
 
-def test_kernels_that_draw_something_else_are_a_fault(monkeypatch):
+def test_kernels_that_render_a_different_image_are_a_fault(monkeypatch):
     draw, calls = api.draw, []
 
     def bent(*args, **options):
@@ -160,7 +160,7 @@ def test_a_check_that_fails_unexpectedly_does_not_stop_the_others(monkeypatch):
     assert [finding.state for finding in doctor.examine()] == ["fault", "ok"]
 
 
-def test_the_self_test_of_cuda_is_drawn_once(monkeypatch, tmp_path):
+def test_the_cuda_self_test_runs_once(monkeypatch, tmp_path):
     drawn = []
     monkeypatch.setattr(device, "disagreement", lambda one, other: drawn.append(other))
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)

@@ -91,7 +91,7 @@ def test_without_key_views_there_is_one_time(photographs):
     assert line.startswith("photos/desk: all photographs in about 13 min.")
 
 
-def test_scenes_that_answer_and_synthetic_scenes_have_no_forecast(photographs, monkeypatch):
+def test_scenes_that_are_ready_and_synthetic_scenes_have_no_forecast(photographs, monkeypatch):
     monkeypatch.chdir(photographs)
     found = test_plan.plan(
         photographs, groups=["photos", "benchmark"], variants={}, main_variants=["default"]

@@ -12,13 +12,13 @@ def stages(**sections: dict) -> StageSettings:
     return StageSettings.model_validate(sections)
 
 
-def test_the_default_settings_can_be_met():
+def test_the_default_settings_work_on_this_machine():
     check_models(stages(), "d/s")
     check_device(stages(), "d/s")
 
 
 @pytest.mark.parametrize("section", ["gaussians", "contributions"])
-def test_a_device_that_is_not_here_is_refused(section):
+def test_a_missing_device_is_refused(section):
     if cuda_problem() is None:
         pytest.skip("this machine has CUDA")
     with pytest.raises(HilsplatError, match=rf"^{section}\.device of d/s, variant v: (.|\n)*device: cuda"):
@@ -40,7 +40,7 @@ def test_a_model_folder_that_cannot_be_used_is_refused(section, model, words):
         check_models(stages(**{section: {"model": model}}), "d/s")
 
 
-def test_a_model_that_nothing_runs_is_not_looked_at():
+def test_an_unused_model_is_not_checked():
     check_models(stages(masks={"segmenter": "graph", "model": "models/nope"}), "d/s")
 
 
@@ -55,6 +55,6 @@ def test_numbers_that_are_not_finite_are_refused(value):
 @pytest.mark.parametrize(
     "config", [{"seed": 2**31}, {"gaussians": {"iterations": 10**30}}, {"perturb": {"seed": 2**64}}]
 )
-def test_numbers_beyond_what_the_libraries_take_are_refused(config):
+def test_numbers_too_large_for_the_libraries_are_refused(config):
     with pytest.raises(SettingsError, match="less than or equal to 2000000000"):
         parse_run(config)

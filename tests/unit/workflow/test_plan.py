@@ -1,4 +1,4 @@
-"""What the rules ask the plan of a run."""
+"""Inputs, parameters and targets that the rules take from the plan of a run."""
 
 import json
 import re
@@ -75,7 +75,7 @@ def test_segments_of_waymo_are_run_without_a_row(tmp_path):
     assert "incomplete" in found.absent["waymo/one"]  # the test has no other component
 
 
-def test_a_run_without_scenes_says_what_there_is(tmp_path):
+def test_a_run_without_scenes_lists_the_known_scenes(tmp_path):
     with pytest.raises(SettingsError, match=r"no scene to run(.|\n)*rooms/room \(benchmark\)"):
         plan(tmp_path, groups=["ci"])
 
@@ -124,7 +124,7 @@ def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage
     assert plan(tmp_path, seeds=2).shared(stage, "file")(job) == f"results/synthetic/one/{owner}/file"
 
 
-def test_what_variants_share_keeps_its_place_when_the_tables_change(tmp_path):
+def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
     variants = {**VARIANTS, "langsplat": {"autoencoder": NETWORK, "method": {"name": "langsplat"}}}
     found = plan(tmp_path, main_variants=["langsplat"], variants=variants)
     job = Job("synthetic", "one", "langsplat")
@@ -143,7 +143,7 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     assert found.shared_variant("masks", Job("synthetic", "one", "levels")) == "levels"
 
 
-def test_a_literal_trainer_reads_what_it_renders_and_a_field_may_go_on_from_langsplat(tmp_path):
+def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(tmp_path):
     shared = {"autoencoder": NETWORK}
     variants = {
         "langsplat": {**shared, "method": {"name": "langsplat"}},
@@ -180,14 +180,14 @@ def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
     assert variants_in(found.compared_scores(job)) == ["default", "theta", "network"]
 
 
-def test_fields_are_ours_or_a_baseline_s(tmp_path):
+def test_variants_have_our_field_or_a_baselines(tmp_path):
     found = plan(tmp_path)
     assert found.variants(by_baseline=True) == "lifted"
     assert found.variants(by_baseline=False) == "default|network|theta|truth"
     assert found.baseline(Job("synthetic", "one", "lifted")) == ("hilsplat.methods.lifted:fit",)
 
 
-def test_true_labels_reach_masks_of_the_diagnostic_segmenter_alone(tmp_path):
+def test_true_labels_are_inputs_of_masks_only_for_the_diagnostic_segmenter(tmp_path):
     found = plan(tmp_path)
     truth = Job("synthetic", "one", "truth")
     assert found.masks_truth(Job("synthetic", "one")) == [] and found.masks_stage(truth) == "truth_masks"
@@ -199,7 +199,7 @@ def test_true_labels_reach_masks_of_the_diagnostic_segmenter_alone(tmp_path):
         found.masks_truth(Job("photos", "desk", "truth"))
 
 
-def test_key_views_of_photographs_answer_before_a_real_sam_segments_the_others(tmp_path, monkeypatch):
+def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_path, monkeypatch):
     for number in range(16):
         (tmp_path / "desk").mkdir(exist_ok=True)
         (tmp_path / f"desk/{number}.jpg").touch()
@@ -246,7 +246,7 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     assert found.data.poses_option(Job("synthetic", "one")) == "--render"
 
 
-def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_path):
+def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
     for part in ("lerf_ovs/figurines/images", "lerf_ovs/figurines/sparse/0", "lerf_ovs/label/figurines"):
         (tmp_path / part).mkdir(parents=True)
     (tmp_path / "lerf_ovs/label/figurines/frame_1.json").touch()
@@ -261,7 +261,7 @@ def test_labels_of_a_published_scene_bring_their_reader_and_their_options(tmp_pa
     assert found.data.label_readers(Job("rooms", "room")) == ()
 
 
-def test_tables_take_the_scenes_and_variants_that_are_theirs(tmp_path):
+def test_tables_have_their_own_scenes_and_variants(tmp_path):
     found = plan(tmp_path, main_variants=["default"], theta_variants=["theta"], sweep_scenes=["two"], seeds=2)
     assert targets.scores(found, "replica") == ["results/rooms/room/default/scores.csv"]
     assert targets.scores(found, "theta") == ["results/synthetic/two/theta/scores.csv"]
@@ -297,7 +297,7 @@ def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
     assert json.loads(found.queries(Job("photos", "other"))) == ["cup"]
 
 
-def test_a_model_folder_counts_by_its_bytes(tmp_path):
+def test_the_digest_of_a_model_folder_depends_on_its_bytes(tmp_path):
     found = plan(tmp_path, masks={"segmenter": "graph"}, clip={"model": str(tmp_path / "none")})
     assert found.model("masks")(Job("synthetic", "one")) == "none"
     assert found.model("clip")(Job("synthetic", "one")) == f"{tmp_path}/none is missing"
@@ -371,7 +371,7 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path):
         assert models_of_photographs(file, "desk") == [line]
 
 
-def test_names_match_themselves_alone():
+def test_a_pattern_matches_only_its_names():
     assert any_of([]) == "(?!)"
     assert any_of(["b", "a.c"]) == r"a\.c|b"
     assert some(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"

@@ -104,7 +104,7 @@ def test_the_query_commands_are_printed_once_tree_and_vectors_exist(run, tmp_pat
     assert stream.getvalue().count('hilsplat query photos/desk "..."') == 1
 
 
-def test_answers_of_key_views_are_announced_and_then_those_of_all(run, tmp_path):
+def test_queries_of_key_views_are_announced_before_those_of_all_views(run, tmp_path):
     scene = tmp_path / "photos/desk"
     write_index(scene / "scene", {name: {"split": "test" if name == "c" else "train"} for name in "abc"})
     write_index(scene / "key-views/masks", {"a": {}})
@@ -145,7 +145,7 @@ def test_a_target_is_not_a_job(run):
     assert stream.getvalue() == "\n" and run.counts() == "0 of 0 done"
 
 
-def test_a_terminal_has_a_last_line_below_the_others(run, clock):
+def test_a_terminal_has_a_status_line_below_the_others(run, clock):
     stream = Terminal()
     shown = display(run, stream)
     tell(shown, "run_info", "", stats=JOBS)
@@ -228,7 +228,7 @@ def test_the_loop_of_a_rule_is_one_that_its_stage_runs(rule):
 @pytest.mark.parametrize(
     ("seconds", "text"), [(44, "40 s"), (500, "8 min"), (7700, "2 h 10 min"), (10700, "3 h")]
 )
-def test_a_time_is_no_more_exact_than_an_estimate(seconds, text):
+def test_durations_are_rounded_to_the_accuracy_of_an_estimate(seconds, text):
     assert duration(float(seconds)) == f"about {text}"
     assert duration(3.0) == "less than 10 s"
 

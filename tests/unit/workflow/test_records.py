@@ -159,7 +159,7 @@ def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
     assert outdated(Plan(config)) == {f"{folder}/default/masks": "it has no provenance"}
 
 
-def test_a_whole_folder_is_whole_wherever_it_is(results, tmp_path):
+def test_a_moved_folder_is_still_whole(results, tmp_path):
     assert verify(results) == ("2 artifacts in results: 2 whole", True)
     shutil.rmtree(tmp_path / "photos")
     copy = shutil.copytree(results, tmp_path / "elsewhere/copy")

@@ -1,4 +1,4 @@
-"""What a job asks for: above what was measured, more for a larger scene, twice as much after a kill."""
+"""Resources of jobs: above measured peaks, larger for larger scenes, doubled after a kill."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def wildcards(scene: int = 0, variant: str = "default") -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("rule", "views", "view_mp", "gaussians", "peak_mb"), RECORDS)
-def test_memory_lies_above_every_peak_that_was_measured(
+def test_requested_memory_exceeds_every_measured_peak(
     tmp_path, monkeypatch, rule, views, view_mp, gaussians, peak_mb
 ):
     found = JobResources(plan(tmp_path))
@@ -56,7 +56,7 @@ def test_every_rule_declares_memory_and_time():
     assert text.count("mem_mb=") == text.count("runtime=") == text.count("shell:\n")
 
 
-def test_an_attempt_after_a_kill_asks_for_twice_as_much(tmp_path):
+def test_a_retry_requests_twice_as_much(tmp_path):
     found = JobResources(plan(tmp_path))
     for rule in COSTS:
         for of in (found.memory_mb(rule), found.minutes(rule)):
@@ -113,7 +113,7 @@ def test_networks_request_a_gpu_with_onnxruntimes_gpu_build(
     assert [found.gpus(section)(wildcards()) for section in ("masks", "clip")] == expected
 
 
-def test_a_ply_that_replaces_the_fit_says_how_many_gaussians_there_are(tmp_path):
+def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):
     header = b"ply\nformat binary_little_endian 1.0\nelement vertex 812430\nproperty float x\nend_header\n"
     (tmp_path / "existing.ply").write_bytes(header + bytes(10))
     assert vertex_count(tmp_path / "existing.ply") == 812_430
@@ -138,8 +138,8 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
         assert small.memory_mb("masks")(wildcards(), 32, 1) < 1000 + RUNNER_MB
 
 
-def test_a_plan_of_many_scenes_reads_and_validates_no_more_than_one_of_few(tmp_path, monkeypatch):
-    """A plan is asked by every job of every scene: what it does once per job, a thousand scenes wait for."""
+def test_reads_and_validations_do_not_grow_with_the_number_of_scenes(tmp_path, monkeypatch):
+    """Every job of every scene uses the plan, so work per job would be slow with a thousand scenes."""
     made, opened = 0, 0
     stages = RunSettings.stages
 
@@ -167,7 +167,7 @@ def test_a_plan_of_many_scenes_reads_and_validates_no_more_than_one_of_few(tmp_p
 
 
 def ask_everything(chosen: Plan, scenes: int) -> None:
-    """What Snakemake asks for each job."""
+    """Call what Snakemake calls for each job."""
     expected_artifacts(chosen), targets.default(chosen)
     targets.scores(chosen, "lerf"), targets.scores(chosen, "theta")
     asked = JobResources(chosen)

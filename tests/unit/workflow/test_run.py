@@ -95,7 +95,7 @@ def test_a_misspelt_scene_is_refused(folder, started):
     assert started == []
 
 
-def test_what_the_targets_need_and_does_not_match_is_made_again(folder, started, monkeypatch):
+def test_needed_outputs_that_do_not_match_their_provenance_are_rebuilt(folder, started, monkeypatch):
     folder = Path("results/synthetic/one")
     folder.mkdir(parents=True)
     (folder / "gaussians.ply").write_text("")
