@@ -57,9 +57,14 @@ class LabelledRegion:
     def mask(
         self, size_hw: tuple[int, int] | None = None, *, any_grey: bool = False
     ) -> Bool[np.ndarray, "H W"]:
-        """Return the region at the label's size, or resized by nearest neighbour."""
+        """Return the region at the label's size, or resized by nearest neighbour.
+
+        It takes the old pixel under each new pixel's corner, as public evaluators do (OpenCV's nearest).
+        """
         mask = self.any_grey() if any_grey and self.any_grey else self.pixels()
-        return mask if size_hw is None else resize_nearest(mask, size_hw)
+        if size_hw is None or mask.shape == tuple(size_hw):
+            return mask
+        return cv2.resize(mask.astype(np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
         """Return boxes with borders included; the region's own extent if none is annotated.
@@ -146,13 +151,6 @@ class LabelledScene:
             facts["posed views"] = len(posed)
             self.check_posed(posed)
         return SceneReport(facts, tuple(warnings))
-
-
-def resize_nearest(mask: Bool[np.ndarray, "H W"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Resize by the old pixel under each new pixel's corner, as public evaluators do (OpenCV's nearest)."""
-    if mask.shape == tuple(size_hw):
-        return mask
-    return cv2.resize(mask.astype(np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def images_by_view(folder: Path) -> dict[str, Path]:

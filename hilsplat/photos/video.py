@@ -71,25 +71,22 @@ class Decoding:
 
 
 def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str]:
-    """Write selected frames of videos as photographs to a folder, with `origin.json`.
+    """Write selected frames of videos as photographs to a folder, with `origin.json`; return notes.
 
     The camera path through all videos, measured by the displacement of image corners, is divided into `count`
-    sections of equal length, and the sharpest frame of each is selected (variance of the Laplacian,
-    Pech-Pacheco et al. 2000). A camera at rest gives one frame; a short path gives fewer frames. Frames are
-    rotated upright according to the stream's display matrix and stored as 0001.jpg, 0002.jpg, ... at full
-    size and quality 95.
+    sections of equal length, and the sharpest frame of each is selected. A camera at rest gives one frame; a
+    short path gives fewer frames. Frames are rotated upright according to the stream's display matrix and
+    stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same videos give the same bytes.
 
     A video is decoded twice, once to select and once to write frames, so that memory contains only small
-    copies. The same videos give the same bytes.
-
-    Return notes for the user: damaged parts, and fewer frames than requested.
+    copies.
 
     Raises:
         SceneError: a video cannot be read or has no intact frame.
     """
     notes: list[str] = []
     candidates: list[Frame] = []
-    decodings = []
+    decoded_videos = []
     for position, video in enumerate(videos):
         decoding = Decoding()
         candidates += _candidates(video, position, CANDIDATES_PER_FRAME * count, decoding)
@@ -99,19 +96,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
                 found=f"{decoding.num_damaged} damaged packets, {video.stat().st_size} bytes",
                 fix="play it to see whether it is intact; copy it again, or convert it to H.264 in an .mp4",
             )
-        decodings.append(decoding)
-        notes += _damage(video, decoding)
-    chosen = choose_frames(candidates, count)
-    if len(chosen) < count:
-        notes.append(
-            f"{len(chosen)} frames instead of {count}: no more of them differ enough from each other"
-        )
-    named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
-    for position, video in enumerate(videos):
-        names = {frame.number: name for name, frame in named.items() if frame.video == position}
-        _write_frames(video, names, folder)
-    origin = {
-        "videos": [
+        decoded_videos.append(
             {
                 "file": video.name,
                 "sha256": sha256_of_file(video),
@@ -119,8 +104,23 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
                 "frames": decoding.num_frames,
                 "damaged": decoding.num_damaged,
             }
-            for video, decoding in zip(videos, decodings, strict=True)
-        ],
+        )
+        if decoding.num_damaged:
+            notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were left out")
+        if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
+            notes.append(
+                f"{video.name} ends after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only that "
+                "part is used; copy it again if the rest matters"
+            )
+    chosen = choose_frames(candidates, count)
+    if len(chosen) < count:
+        notes.append(f"{len(chosen)} frames instead of {count}: the others differ too little from these")
+    named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
+    for position, video in enumerate(videos):
+        names = {frame.number: name for name, frame in named.items() if frame.video == position}
+        _write_frames(video, names, folder)
+    origin = {
+        "videos": decoded_videos,
         "settings": {"frames": count, "min_step": MIN_STEP, "jpeg_quality": JPEG_QUALITY},
         "frames": {
             name: {
@@ -133,19 +133,6 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
         "notes": notes,
     }
     write_json(folder / "origin.json", origin)
-    return notes
-
-
-def _damage(video: Path, decoding: Decoding) -> list[str]:
-    """Return notes about the damage of a partly decoded video."""
-    notes = []
-    if decoding.num_damaged:
-        notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were left out")
-    if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
-        notes.append(
-            f"{video.name} breaks off after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only that "
-            "part is used; copy it again if the rest matters"
-        )
     return notes
 
 
@@ -192,11 +179,8 @@ def _decoded(
     packets = container.demux(stream)
     while True:
         try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            frames = packet.decode()
-        except av.error.EOFError:
+            frames = next(packets).decode()
+        except (av.error.EOFError, StopIteration):
             return
         except av.error.FFmpegError as error:
             logger.debug("%s", error)

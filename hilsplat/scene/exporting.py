@@ -1,10 +1,11 @@
 """Export of a scene for other programs (COLMAP, nerfstudio), in the coordinates of the scene's source."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from hilsplat.base.artifacts import atomic_folder
 from hilsplat.scene.assemble import move_cameras
@@ -37,9 +38,19 @@ def write_colmap(scene: Scene, out: Path) -> None:
 def add_colmap(scene: Scene, folder: Path) -> None:
     """Write `images/` and a COLMAP model in `sparse/0` (binary; points without tracks) to a folder."""
     (folder / "images").mkdir()
+    for view in scene.views():
+        shutil.copyfile(scene.image_path(view), folder / "images" / view)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model = pinhole_model(source_images(scene), source_points(scene), scene.points_rgb)
+    model.write_binary(folder / "sparse" / "0")
+
+
+def pinhole_model(
+    images: Sequence[PosedImage], xyz: Float64[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]
+) -> pycolmap.Reconstruction:
+    """Return a COLMAP model of pinhole cameras and points without tracks."""
     model = pycolmap.Reconstruction()
-    for number, posed in enumerate(source_images(scene), start=1):
-        shutil.copyfile(scene.image_path(posed.name), folder / "images" / posed.name)
+    for number, posed in enumerate(images, start=1):
         (height, width), K = posed.size_hw, posed.K
         lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
         model.add_camera_with_trivial_rig(
@@ -47,10 +58,9 @@ def add_colmap(scene: Scene, folder: Path) -> None:
         )
         image = pycolmap.Image(name=posed.name, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(posed.cam_from_world[:3]))
-    for xyz, rgb in zip(source_points(scene), scene.points_rgb, strict=True):
-        model.add_point3D(xyz, pycolmap.Track(), rgb)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    model.write_binary(folder / "sparse" / "0")
+    for position, colour in zip(xyz, rgb, strict=True):
+        model.add_point3D(position, pycolmap.Track(), colour)
+    return model
 
 
 def write_nerfstudio(scene: Scene, out: Path) -> None:

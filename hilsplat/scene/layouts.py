@@ -159,7 +159,7 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
             return KnownPoses(folder, kind, export)
     if (folder / "sparse").is_dir():
         raise SceneError(
-            f"{folder / 'sparse'} does not hold a complete COLMAP model",
+            f"{folder / 'sparse'} does not contain a complete COLMAP model",
             expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
             found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
             fix="complete the model, or rename sparse/ to have the poses computed",

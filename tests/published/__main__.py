@@ -33,12 +33,12 @@ from tests.unit.datasets.writers.labelled import (
     write_lerf_mask,
     write_lerf_ovs,
 )
-from tests.unit.datasets.writers.true_world import TrueWorld
-from tests.unit.datasets.writers.world import (
+from tests.unit.datasets.writers.points import (
     write_room_as_replica,
     write_room_as_scannet,
     write_street_as_waymo,
 )
+from tests.unit.datasets.writers.true_world import TrueWorld
 from tests.workflow.conftest import copy_project
 
 WORLD = WorldSettings(views=12, image_px=128, arc_deg=100, objects=3, samples=1)

@@ -68,11 +68,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def held_out_views(folder: Path) -> tuple[str, ...]:
-    """Return the posed images that are not in `images_train`, by view name, sorted by stem.
-
-    Raises:
-        SceneError: there are none.
-    """
+    """Return the posed images that are not in `images_train`, by view name, sorted by stem; at least one."""
     train = images_by_view(folder / "images_train")
     posed = posed_images(folder, "LERF-Mask")
     test = tuple(view for view in posed if view not in train)

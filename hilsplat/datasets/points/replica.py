@@ -52,7 +52,7 @@ def layout_of(folder: Path) -> tuple[str, str, str]:
             return poses, images, prefix
     inner = sorted(path.parent for poses, _, _ in LAYOUTS for path in folder.glob(f"*/{poses}"))
     raise SceneError(
-        f"{folder} does not hold a rendered sequence",
+        f"{folder} does not contain a rendered sequence",
         expected="traj.txt with results/, or traj_w_c.txt with rgb/",
         found=listing(folder),
         fix=f"use the folder {inner[0]} instead" if inner else "unpack the rendered sequences there",
@@ -72,16 +72,6 @@ def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
             fix=UNPACK_AGAIN,
         ) from error
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
-
-
-def default_lens(image: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """Return K of every Replica rendering: focal length half the width, principal point in the middle.
-
-    The centre in the files, 599.5 of 1200 px, is relative to the first pixel's centre.
-    """
-    height, width = image_size_hw(image)
-    K = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
-    return K, (height, width)
 
 
 def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
@@ -112,7 +102,11 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
         )
     lens = folder.parent / "cam_params.json"
     own = pose_file == LAYOUTS[0][0] and lens.is_file()
-    K, size_hw = read_lens(lens) if own else default_lens(frames[0][1])
+    if own:
+        K, size_hw = read_lens(lens)
+    else:  # the centre stated by the renderings, 599.5 of 1200 px, is relative to the first pixel's centre
+        size_hw = height, width = image_size_hw(frames[0][1])
+        K = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
     images = []
     for number, image in frames[::every]:
         pose = np.linalg.inv(rigid_pose(poses[number], f"{path}, line {number + 1}"))
@@ -217,7 +211,7 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
     try:
         labels = np.array(path.read_text(encoding="utf-8").split(), dtype=np.int32)
     except ValueError as error:
-        raise SceneError(f"{path} does not hold whole numbers: {error}", fix=UNPACK_AGAIN) from error
+        raise SceneError(f"{path} does not contain whole numbers: {error}", fix=UNPACK_AGAIN) from error
     if len(labels) != num_vertices:
         raise SceneError(
             f"{path} does not label the vertices of its mesh",

@@ -124,7 +124,11 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     frames = by_number(list_images(folder / "color"))
     K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL
     lost, without, images = [], [], []
-    size_hw = _stated_size(folder, scan, frames[0][1]) if frames else (0, 0)
+    size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
+    if (folder / f"{scan}.txt").is_file():
+        info = read_scan_info(folder / f"{scan}.txt")
+        if "colorHeight" in info and "colorWidth" in info:
+            size_hw = int(info["colorHeight"]), int(info["colorWidth"])
     for number, path in frames[::every]:
         pose = folder / "pose" / f"{number}.txt"
         if not pose.is_file():
@@ -149,15 +153,6 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     if without:
         warnings.append(f"{len(without)} images have no file in pose/ and are skipped, first {without[0]}")
     return tuple(images), tuple(warnings)
-
-
-def _stated_size(folder: Path, scan: str, image: Path) -> tuple[int, int]:
-    """Return the image size of the intrinsics: from the scan's text file, or else of its first image."""
-    if (folder / f"{scan}.txt").is_file():
-        info = read_scan_info(folder / f"{scan}.txt")
-        if "colorHeight" in info and "colorWidth" in info:
-            return int(info["colorHeight"]), int(info["colorWidth"])
-    return image_size_hw(image)
 
 
 def read_truth(

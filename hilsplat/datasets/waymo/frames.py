@@ -157,18 +157,6 @@ def range_image_points(
     return sensor @ vehicle_from_lidar[:3, :3].T + vehicle_from_lidar[:3, 3]
 
 
-def to_world(
-    points: Float[np.ndarray, "H W 3"], pixel_pose: Float[np.ndarray, "H W 6"]
-) -> Float[np.ndarray, "H W 3"]:
-    """Transform points from the vehicle's frame at the time of each pixel to the world, metres.
-
-    `pixel_pose` has roll, pitch, yaw (radians), x, y, z (metres) of the vehicle in the world.
-    """
-    pose = pixel_pose.astype(np.float64)
-    turned = np.einsum("hwij,hwj->hwi", rotation_of(pose[..., :3]), points)
-    return turned + pose[..., 3:]
-
-
 def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]) -> LabelledPoints:
     """Return the labelled points of a frame: first return, then second, each row by row.
 
@@ -193,7 +181,9 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
         hit = part.image[..., 0] > 0
         range_m = part.image[..., 0].astype(np.float64)
         in_vehicle = range_image_points(range_m, frame.inclinations, frame.vehicle_from_lidar)
-        places = to_world(in_vehicle, frame.pixel_pose)[hit]
+        pose = frame.pixel_pose.astype(np.float64)  # of the vehicle at the time of each pixel
+        turned = np.einsum("hwij,hwj->hwi", rotation_of(pose[..., :3]), in_vehicle)
+        places = (turned + pose[..., 3:])[hit]
         xyz = places @ segment_from_world[:3, :3].T + segment_from_world[:3, 3]
         labels = part.labels[hit]
         visible = None if part.projection is None else part.projection[hit][:, 0] > 0

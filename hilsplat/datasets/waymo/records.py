@@ -121,7 +121,7 @@ def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     """Return the vehicle's pose in the world at the first frame."""
     for where, frame in frames(path):
         return _transform(frame.pose, where)
-    raise SceneError(f"{path} does not hold any frame", fix=UNPACK_AGAIN)
+    raise SceneError(f"{path} has no frame", fix=UNPACK_AGAIN)
 
 
 def _transform(message: Any, where: str) -> np.ndarray:

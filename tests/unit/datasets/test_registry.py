@@ -18,7 +18,7 @@ def data_root(tmp_path, true_world):
 
 
 @pytest.mark.parametrize("dataset", DATASETS.values(), ids=DATASETS)
-def test_every_data_set_says_what_a_user_must_know(dataset):
+def test_every_data_set_is_described(dataset):
     assert DATASETS[dataset.name] is dataset and dataset.labels in ("images", "points")
     for text in (dataset.title, dataset.licence, dataset.terms, dataset.citation, dataset.layout):
         assert text.strip()
@@ -38,9 +38,6 @@ def test_published_lists_have_the_published_counts():
     assert [len(texts) for texts in PROMPTS["lerf_mask"].values()] == [7, 6, 10]
     assert PAIRS.keys() == FRAMES["lerf_ovs"].keys()
     assert not any("." in text for texts in PROMPTS["lerf_mask"].values() for text in texts)
-
-
-def test_frames_of_hi_lerf_contain_those_of_lerf_ovs():
     for scene, frames in FRAMES["lerf_ovs"].items():
         assert set(frames) < set(FRAMES["hi_lerf"][scene])
 
@@ -50,7 +47,7 @@ def test_a_folder_one_level_too_deep_is_detected(data_root):
     (data_root / "lerf_ovs").rename(data_root / "moved")
     inner.parent.mkdir()
     (data_root / "moved").rename(inner)
-    with pytest.raises(SceneError, match=r"one level too deep.*\n.*\n.*them in .*LERF-OVS\n.*move"):
+    with pytest.raises(SceneError, match=r"one level too deep.*\n.*\n.*its scenes in .*LERF-OVS\n.*move"):
         DATASETS["lerf_ovs"].locate(data_root)
 
 

@@ -1,4 +1,4 @@
-"""What the workflow asks of published data sets at its start: what is absent, which files label a scene."""
+"""Published data sets at the start of the workflow: which are missing, and which files label a scene."""
 
 from pathlib import Path
 
@@ -66,22 +66,16 @@ def test_segments_on_disk_without_a_row_are_listed(root):
 
 
 def test_a_scene_is_scored_against_all_labels_on_its_images(root):
-    assert label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == (
-        "lerf_ovs/figurines",
-        "hi_lerf/figurines",
-    )
+    both = ("lerf_ovs/figurines", "hi_lerf/figurines")
+    assert label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == both
     assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed",)
     assert label_sets("data:lerf_ovs/ramen", str(root), "lerf/ramen") == ()
 
 
 def test_label_files_are_those_that_only_evaluation_reads(root):
-    assert label_files("lerf_ovs/figurines", str(root)) == (
-        root / "lerf_ovs/label/figurines/frame_00041.json",
-    )
-    assert label_files("3d_ovs/bed", str(root)) == (
-        root / "3d_ovs/bed/segmentations/00/banana.png",
-        root / "3d_ovs/bed/segmentations/classes.txt",
-    )
+    label, masks = root / "lerf_ovs/label/figurines/frame_00041.json", root / "3d_ovs/bed/segmentations"
+    assert label_files("lerf_ovs/figurines", str(root)) == (label,)
+    assert label_files("3d_ovs/bed", str(root)) == (masks / "00/banana.png", masks / "classes.txt")
 
 
 def test_scenes_with_labelled_points_are_exported_first(root):
@@ -93,12 +87,9 @@ def test_scenes_with_labelled_points_are_exported_first(root):
     assert files == (scan / "color/0.jpg", scan / "pose/0.txt")  # labels are read by evaluation alone
 
 
-def test_images_that_lie_in_a_folder_need_no_export(root, monkeypatch):
+def test_images_in_a_folder_need_no_export_and_labels_need_a_scene(root, monkeypatch):
+    with pytest.raises(SceneError, match="names no scene"):
+        open_labels("scannet", Path())
     monkeypatch.setattr("hilsplat.datasets.sources.open_labels", lambda *_: object())
     with pytest.raises(SceneError, match="needs no export"):
         export_images("lerf_ovs/figurines", root, root / "out")
-
-
-def test_labels_need_a_scene():
-    with pytest.raises(SceneError, match="names no scene"):
-        open_labels("scannet", Path())

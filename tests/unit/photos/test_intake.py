@@ -1,4 +1,4 @@
-"""Videos, archives and folders become a folder of photographs and a row of the sheet, or nothing at all."""
+"""Videos, archives and folders become a folder of photographs and a row of the sheet."""
 
 import json
 import stat
@@ -58,7 +58,7 @@ def test_a_folder_of_videos_is_one_capture(tmp_path, sheet):
     assert add_scene(sheet, "desk", tmp_path / "clips", frames=10).num_readable == 10
 
 
-def test_a_video_in_which_nothing_moves_leaves_nothing_behind(tmp_path, sheet):
+def test_a_static_video_is_refused_and_leaves_no_files(tmp_path, sheet):
     video = write_video(tmp_path / "still.mp4", pan([0] * 20))
     with pytest.raises(SceneError, match=r"too few photographs(.|\n)*1 different(.|\n)*film longer"):
         add_scene(sheet, "desk", video)
@@ -66,7 +66,7 @@ def test_a_video_in_which_nothing_moves_leaves_nothing_behind(tmp_path, sheet):
     assert not (tmp_path / "project/photos/desk").exists()
 
 
-def test_what_is_in_the_way_stays(tmp_path, sheet):
+def test_an_existing_folder_is_kept(tmp_path, sheet):
     mine = tmp_path / "project/photos/desk"
     write_noise(mine, 1)
     with pytest.raises(SceneError, match=r"photos/desk already exists"):
@@ -83,7 +83,7 @@ def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):
     assert sorted(path.stat().st_mtime_ns for path in made.glob("*.*")) == before
 
 
-def test_live_photos_are_read_as_photographs_and_said(tmp_path, sheet):
+def test_videos_of_live_photos_are_ignored_and_reported(tmp_path, sheet):
     import pillow_heif
 
     pillow_heif.register_heif_opener()
@@ -99,9 +99,6 @@ def test_other_files_are_refused(tmp_path, sheet):
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(SceneError, match=r"notes\.txt is a file of an unknown kind(.|\n)*a \.zip"):
         add_scene(sheet, "desk", tmp_path / "notes.txt")
-
-
-# ---- archives -------------------------------------------------------------------------------------
 
 
 def test_a_zip_is_unpacked_and_its_only_folder_unwrapped(tmp_path, sheet):
@@ -129,7 +126,7 @@ OUTSIDE = [(name, "leads out") for name in ("../evil.jpg", "a/../../evil.jpg", "
     ("entry", "problem"), [*OUTSIDE, (link("evil.jpg"), "is a link"), ("0.jpg", "is there twice")]
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_archives_that_could_write_elsewhere_are_refused_whole(tmp_path, sheet, entry, problem):
+def test_archives_that_could_write_elsewhere_are_refused(tmp_path, sheet, entry, problem):
     entries = photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
     bad = zipped(tmp_path / "bad.zip", [*entries, (entry, b"x")])
     with pytest.raises(SceneError, match=rf"bad\.zip: entry '.*(evil|0)\.jpg' {problem}"):
@@ -138,7 +135,7 @@ def test_archives_that_could_write_elsewhere_are_refused_whole(tmp_path, sheet, 
     assert not list(tmp_path.rglob("*evil*"))
 
 
-def test_archives_that_state_too_much_are_refused(tmp_path, sheet, monkeypatch):
+def test_too_large_archives_are_refused(tmp_path, sheet, monkeypatch):
     entries = photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
     good = zipped(tmp_path / "good.zip", entries)
     for limit, value, message in (("MAX_TOTAL_GIB", 1e-6, "GiB"), ("MAX_FILES", 3, r"3 files(.|\n)*4 files")):
@@ -147,7 +144,7 @@ def test_archives_that_state_too_much_are_refused(tmp_path, sheet, monkeypatch):
             add_scene(sheet, "desk", good)
 
 
-def test_an_archive_that_lies_about_a_size_writes_no_more_than_it_states(tmp_path):
+def test_an_archive_writes_at_most_the_declared_size(tmp_path):
     bomb = zipped(tmp_path / "bomb.zip", [("a.jpg", bytes(1_000_000))])
     content = bytearray(bomb.read_bytes())
     at = content.index(b"PK\x01\x02") + 24  # uncompressed size in the central directory
@@ -160,9 +157,8 @@ def test_an_archive_that_lies_about_a_size_writes_no_more_than_it_states(tmp_pat
 
 
 def test_damaged_and_encrypted_archives_are_refused(tmp_path, sheet):
-    whole = zipped(
-        tmp_path / "a.zip", photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
-    ).read_bytes()
+    entries = photo_entries(write_noise(tmp_path / "source", 4, suffix=".jpg"))
+    whole = zipped(tmp_path / "a.zip", entries).read_bytes()
     (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
     hurt = bytearray(whole)
     hurt[200:300] = bytes(100)

@@ -1,4 +1,4 @@
-"""The focal length of EXIF starts the estimate of the lens, whatever the format and the size."""
+"""The focal length in EXIF is read from every format and scaled to the picture's size."""
 
 import pillow_heif
 import pytest
@@ -31,7 +31,7 @@ def test_the_35_mm_equivalent_is_read_from_every_format(tmp_path, suffix):
     assert exif_focal_px(path, (300, 400)) == pytest.approx(500 * 26 / 43.2666)
 
 
-def test_it_follows_the_picture_when_that_is_shrunk_and_turned(tmp_path):
+def test_it_is_scaled_with_a_picture_that_is_shrunk_and_rotated(tmp_path):
     path = photograph(tmp_path / "a.heic", size=(800, 600), orientation=6, focal_35=26)
     (image,) = prepare_images([path], tmp_path / "work", max_side_px=400)
     assert image.size_hw == (400, 300)
@@ -39,24 +39,20 @@ def test_it_follows_the_picture_when_that_is_shrunk_and_turned(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "resolution"), [(2, 2540.0), (3, 1000.0), (4, 100.0), (None, 2540.0)])
-def test_without_it_focal_length_and_sensor_decide(tmp_path, unit, resolution):
-    """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250."""
-    tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution)), "stored": 400}
-    path = photograph(tmp_path / "a.jpg", **tags, **({"unit": unit} if unit else {}))
+def test_without_it_focal_length_and_sensor_resolution_are_used(tmp_path, unit, resolution):
+    """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250, in a tenth-size copy 50."""
+    tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution))} | (
+        {"unit": unit} if unit else {}
+    )
+    path = photograph(tmp_path / "a.jpg", stored=400, **tags)
     assert exif_focal_px(path, (300, 400)) == pytest.approx(500)
     assert exif_focal_px(path, (150, 200)) == pytest.approx(250)
-
-
-def test_a_shrunk_copy_keeps_the_resolution_of_its_original(tmp_path):
-    path = photograph(
-        tmp_path / "a.jpg", focal=IFDRational(5), resolution=IFDRational(1000), unit=3, stored=4000
-    )
-    # the original of 4000 px had 100 px per mm, so 500 px; this copy of 400 px has a tenth
-    assert exif_focal_px(path, (300, 400)) == pytest.approx(50)
+    shrunk = photograph(tmp_path / "a.jpg", stored=4000, **tags)
+    assert exif_focal_px(shrunk, (300, 400)) == pytest.approx(50)
 
 
 @pytest.mark.parametrize(
     "tags", [{}, {"focal": IFDRational(5)}, {"focal_35": 0}, {"focal": IFDRational(1, 0)}]
 )
-def test_nothing_is_made_up(tmp_path, tags):
+def test_without_usable_tags_there_is_none(tmp_path, tags):
     assert exif_focal_px(photograph(tmp_path / "a.jpg", **tags), (300, 400)) is None

@@ -1,4 +1,4 @@
-"""Matches are those of every descriptor compared with every other; pairs pass the check that COLMAP makes."""
+"""Matches equal a comparison of every descriptor with every other; pairs are verified like COLMAP's."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_matches_are_the_mutual_nearest_of_all(monkeypatch, multiplied):
     assert matches == compared_one_by_one(one, other) and 200 < len(matches) <= 300
 
 
-def test_a_feature_that_two_others_resemble_alike_has_no_match():
+def test_a_feature_with_two_equally_near_ones_has_no_match():
     descriptors = descriptors_of(np.random.default_rng(5).exponential(1, (40, 128)))
     twice = view_of(np.concatenate([descriptors, descriptors[[7, 31]]]))
     matched = mutual_matches(view_of(descriptors), twice)
@@ -64,7 +64,7 @@ def test_a_feature_that_two_others_resemble_alike_has_no_match():
     assert len(mutual_matches(view_of(descriptors[:0]), twice)) == 0
 
 
-def test_pairs_are_entered_with_what_passes_the_check_for_any_number_of_threads(tmp_path):
+def test_verified_matches_are_written_whatever_the_number_of_threads(tmp_path):
     database = tmp_path / "features.db"
     rng = np.random.default_rng(8)
     descriptors = descriptors_of(rng.exponential(1, (60, 128)))

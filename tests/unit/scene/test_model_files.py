@@ -1,4 +1,4 @@
-"""Damaged models of COLMAP are refused before pycolmap reads them, and poses that no camera can have."""
+"""Damaged COLMAP models are refused before pycolmap reads them, and so are impossible poses and lenses."""
 
 import struct
 from dataclasses import replace
@@ -26,7 +26,7 @@ def model(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_that_is_cut_off_anywhere_is_damaged(model, name):
+def test_a_file_truncated_anywhere_is_damaged(model, name):
     require_whole_files(model)
     whole = (model / name).read_bytes()
     for length in range(len(whole)):
@@ -46,18 +46,18 @@ def test_a_count_that_is_too_large_is_damaged(model, name, more):
 
 
 def test_bytes_after_the_last_record_are_damage(model):
-    (model / "images.bin").write_bytes((model / "images.bin").read_bytes() + b"\0")
+    with (model / "images.bin").open("ab") as stream:
+        stream.write(b"\0")
     with pytest.raises(SceneError, match="1 bytes follow its 3 records"):
         require_whole_files(model)
 
 
-def view(name: str = "a.png", **changes) -> KnownView:
-    camera = pycolmap.Camera(model="PINHOLE", width=40, height=30, params=[50, 50, 20, 15])
-    return replace(KnownView(name, None, camera, np.eye(4)), **changes)
-
-
 def lens(*params: float, width: int = 40) -> pycolmap.Camera:
     return pycolmap.Camera(model="PINHOLE", width=width, height=30, params=params)
+
+
+def view(name: str = "a.png", **changes) -> KnownView:
+    return replace(KnownView(name, None, lens(50, 50, 20, 15), np.eye(4)), **changes)
 
 
 def pose(rotation: np.ndarray | float = 1.0, position: float = 0.0) -> np.ndarray:
@@ -79,10 +79,9 @@ FAULTY_LENSES += [lens(50, 50, np.nan, 15), lens(50, 50, 20, 15, width=0)]
         ({"cam_from_source": pose(position=1e30)}, "position"),
     ],
 )
-def test_what_no_camera_can_have_is_refused(changes, fault):
-    known = KnownPoses(Path(), "colmap", (Path("model"),))
+def test_impossible_lenses_and_poses_are_refused(changes, fault):
     with pytest.raises(SceneError, match=rf"the {fault} of b\.png"):
-        checked([view(), view("b.png", **changes)], known)
+        checked([view(), view("b.png", **changes)], KnownPoses(Path(), "colmap", (Path("model"),)))
 
 
 def test_views_that_all_have_one_pose_are_refused():

@@ -63,12 +63,9 @@ def plane_views(folder, views=5, size=160, step_deg=9):
     return np.array(centres), {"fl_x": focal, "w": size, "h": size, "frames": frames}
 
 
-def test_two_photographs_are_too_few(tmp_path):
+def test_too_few_or_damaged_photographs_are_refused_with_all_names(tmp_path):
     with pytest.raises(SceneError, match=r"at least 3 overlapping(.|\n)*found +2"):
         pose_photos(write_noise(tmp_path / "photos", 2), tmp_path / "scene")
-
-
-def test_damaged_photographs_are_all_named(tmp_path):
     folder = write_noise(tmp_path / "photos", 3)
     (folder / "empty.jpg").touch()
     with pytest.raises(ImageError, match=r"empty\.jpg cannot be read"):
@@ -79,16 +76,14 @@ def test_damaged_photographs_are_all_named(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]  # no scene, no work folder
 
 
-def test_work_images_hold_the_pixels_of_the_photographs_upright_and_shrunk(tmp_path):
+def test_work_images_are_the_photographs_upright_and_shrunk(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
     turned = Image.Exif()
     turned[EXIF_ORIENTATION] = 6
     picture, folder = Image.fromarray(pixels), tmp_path / "photos"
     folder.mkdir()
-    picture.save(folder / "plain.png")
     picture.save(folder / "turned.png", exif=turned)
-    picture.convert("L").save(folder / "grey.png")
-    picture.save(folder / "photo.tif")
+    picture.convert("L").save(folder / "grey.tif")
     Image.fromarray(np.concatenate([pixels, pixels])).save(folder / "tall.png")
     sources = sorted(folder.iterdir())
     images = prepare_images(sources, tmp_path / "work", 30)
@@ -100,21 +95,12 @@ def test_work_images_hold_the_pixels_of_the_photographs_upright_and_shrunk(tmp_p
             assert not written.getexif()
 
 
-def test_noise_registers_nowhere_and_every_photograph_has_its_reason(tmp_path):
-    with pytest.raises(
-        RegistrationError, match=r"no camera pose(.|\n)*0\.png: (too few matches|no features)"
-    ):
-        pose_photos(write_noise(tmp_path / "photos", 3), tmp_path / "scene")
-    assert not (tmp_path / "scene").exists()
-
-
 def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_path):
     true_centres, _ = plane_views(tmp_path / "renders")
-    for out, threads in (("first", 1), ("second", 2)):
-        run_poses(
-            tmp_path / "renders", tmp_path / out, "world/corner", "metre", True, PosesSettings(), 0, threads
-        )
-    scene = Scene.load(tmp_path / "first")
+    renders, first = tmp_path / "renders", tmp_path / "first"
+    for out, threads in ((first, 1), (tmp_path / "second", 2)):
+        run_poses(renders, out, "world/corner", "metre", True, PosesSettings(), 0, threads)
+    scene = Scene.load(first)
     assert scene.views("train") == [f"{number}.png" for number in range(5)]  # too few for a test view
     assert scene.unit == "arbitrary"  # structure from motion cannot recover the metre
     np.testing.assert_array_equal(scene.image("2.png"), read_image(tmp_path / "renders" / "2.png"))
@@ -123,12 +109,11 @@ def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_pa
     found = np.linalg.norm(centres[1:] - centres[0], axis=1)
     true = np.linalg.norm(true_centres[1:] - true_centres[0], axis=1)
     np.testing.assert_allclose(found / found[-1], true / true[-1], rtol=0.05)
-    report = json.loads((tmp_path / "first" / "registration.json").read_text())
+    report = json.loads((first / "registration.json").read_text())
     assert (report["images"], report["registered"], report["models"]) == (5, 5, [5])
     assert report["mean_reprojection_error_px"] < 1
-    files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
-    for file in files:
-        assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes(), file
+    for file in first.rglob("*.*"):
+        assert file.read_bytes() == (tmp_path / "second" / file.relative_to(first)).read_bytes(), file
 
 
 def test_points_are_triangulated_from_known_poses(tmp_path):
@@ -176,14 +161,8 @@ def test_photographs_share_a_camera_when_size_and_focal_length_agree(tmp_path):
 
 
 def found(registered, models):
-    views = {
-        f"{number}.png": {
-            "file": f"{number}.jpg",
-            "registered": number < registered,
-            "why_not": "no features",
-        }
-        for number in range(10)
-    }
+    lost = {"registered": False, "why_not": "no features"}
+    views = {f"{n}.png": {**lost, "file": f"{n}.jpg", "registered": n < registered} for n in range(10)}
     return {"images": 10, "registered": registered, "models": models, "warnings": [], "views": views}
 
 
@@ -194,13 +173,13 @@ def found(registered, models):
             found(7, [7]),
             found(6, [6, 4]),
             {"min_registered_share": 0.7},
-            r"at least 70% of 10(.|\n)*6 \(60\.0%\); models of 6, 4 (.|\n)*9\.jpg: no features(.|\n)*0\.60",
+            r"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*0\.60",
         ),
-        (found(8, [8]), found(8, [8, 3]), {"several_models": "stop"}, r"2 separate models(.|\n)*8\.jpg"),
-        (found(8, [8, 3]), found(0, []), {}, r"no camera pose could be found(.|\n)*0\.jpg: no features"),
+        (found(8, [8]), found(8, [8, 3]), {"several_models": "stop"}, r"2 separate models.*8\.jpg"),
+        (found(8, [8, 3]), found(0, []), {}, r"no camera pose could be found.*0\.jpg: no features"),
     ],
 )
 def test_too_few_views_and_separate_models_are_refused_as_configured(accepted, refused, settings, message):
     check_registration(Path("photos"), "photos/test", accepted, PosesSettings(**settings))
-    with pytest.raises(RegistrationError, match=message):
+    with pytest.raises(RegistrationError, match=f"(?s){message}"):
         check_registration(Path("photos"), "photos/test", refused, PosesSettings(**settings))

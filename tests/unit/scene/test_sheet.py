@@ -1,4 +1,4 @@
-"""The scene sheet refuses what would fail later, with the place and the fix; new scenes are appended."""
+"""The scene sheet: errors name the cell and the fix; new scenes are appended."""
 
 import shutil
 from pathlib import Path
@@ -42,7 +42,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
         return [row.name for row in choose_scenes(rows, ["benchmark"], only)]
 
     assert chosen() == ["a/one", "a/two"]
-    assert chosen("two") == ["a/two"]  # of the groups, as they have one
+    assert chosen("two") == ["a/two"]  # in the groups
     assert chosen("b/two") == ["b/two"]
     assert chosen("three", "a/one") == ["a/one", "a/three"]
     with pytest.raises(SceneError, match=r"only names 'tow'(.|\n)*a/one, a/two"):
@@ -92,17 +92,17 @@ def test_a_bad_cell_is_refused_with_line_and_column(tmp_path, column, cell, prob
         assert len(read_sheet(sheet, checked_groups=("ci",))) == 1  # a group that is not run
 
 
-def test_names_that_differ_only_in_case_count_as_duplicates(tmp_path):
-    rows = [("world", name, *WORLD[2:]) for name in ("desk", "Desk")]
-    with pytest.raises(SceneError, match=r"line 3, column scene: world/Desk is listed twice(.|\n)*line 2"):
-        read_sheet(write_sheet(tmp_path, *rows))
-
-
-def test_missing_and_misspelt_columns_are_named(tmp_path):
-    with pytest.raises(SceneError, match=r"line 1(.|\n)*missing: 'unit'; unknown: 'units'"):
-        read_sheet(write_sheet(tmp_path, columns=(*COLUMNS[:4], "units")))
-    with pytest.raises(SceneError, match="wrong number of columns"):
-        read_sheet(write_sheet(tmp_path, WORLD[:4]))
+@pytest.mark.parametrize(
+    ("rows", "columns", "message"),
+    [
+        ((WORLD, ("world", "A", *WORLD[2:])), COLUMNS[:5], "line 3, .*world/A is listed twice.*line 2"),
+        ((), (*COLUMNS[:4], "units"), "line 1.*missing: 'unit'; unknown: 'units'"),
+        ((WORLD[:4],), COLUMNS[:5], "wrong number of columns"),
+    ],
+)
+def test_repeated_names_and_wrong_columns_are_refused(tmp_path, rows, columns, message):
+    with pytest.raises(SceneError, match=f"(?s){message}"):
+        read_sheet(write_sheet(tmp_path, *rows, columns=columns))
 
 
 def test_optional_columns_may_be_empty_or_missing_and_paths_start_at_the_project(tmp_path):
@@ -130,7 +130,7 @@ def test_data_sources_are_below_the_data_root(tmp_path):
 # ---- new scenes -----------------------------------------------------------------------------------
 
 
-def lay_files(folder: Path, *paths: str) -> None:
+def write_files(folder: Path, *paths: str) -> None:
     for path in paths:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_bytes(b"ply\n")
@@ -139,7 +139,7 @@ def lay_files(folder: Path, *paths: str) -> None:
 def langsplat_scene(folder: Path) -> Path:
     """Photographs, and beside them what COLMAP, 3DGS and LangSplat write."""
     write_noise(folder / "images", 3)
-    lay_files(
+    write_files(
         folder,
         *(f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")),
         *(f"output/a/point_cloud/iteration_{steps}/point_cloud.ply" for steps in (7000, 30000)),
@@ -150,7 +150,7 @@ def langsplat_scene(folder: Path) -> Path:
     return folder
 
 
-def test_what_3dgs_and_langsplat_left_is_found_named_and_recorded(tmp_path):
+def test_files_of_3dgs_and_langsplat_are_found_reported_and_recorded(tmp_path):
     folder = langsplat_scene(tmp_path / "theirs")
     sheet = write_sheet(tmp_path, WORLD)
     report = str(add_scene(sheet, "desk", folder))
@@ -164,9 +164,9 @@ def test_what_3dgs_and_langsplat_left_is_found_named_and_recorded(tmp_path):
     assert new.gaussians == folder / "output/a/point_cloud/iteration_30000/point_cloud.ply"
 
 
-def test_what_was_found_can_be_left_out_or_replaced(tmp_path):
+def test_found_files_can_be_ignored_or_replaced(tmp_path):
     folder, none = langsplat_scene(tmp_path / "theirs"), Path("none")
-    lay_files(tmp_path, "other.ply")
+    write_files(tmp_path, "other.ply")
     sheet = write_sheet(tmp_path)
     add_scene(sheet, "plain", folder, gaussians=none, features=none, labels=none)
     assert not (tmp_path / "annotated").exists()
@@ -180,7 +180,7 @@ def test_what_was_found_can_be_left_out_or_replaced(tmp_path):
         add_scene(sheet, "lost", folder, features=Path("gone"))
 
 
-def test_poses_can_be_ignored_or_named_and_gaussians_without_known_poses_are_not_taken(tmp_path):
+def test_poses_can_be_ignored_or_named_and_gaussians_need_known_poses(tmp_path):
     folder, other = langsplat_scene(tmp_path / "theirs"), langsplat_scene(tmp_path / "other")
     sheet = write_sheet(tmp_path)
     assert "poses: structure from motion" in str(add_scene(sheet, "own", folder, poses=Path("none")))
@@ -198,7 +198,7 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     folder = tmp_path / "theirs"
     write_noise(folder / "images", 3)
     runs = [f"outputs/desk/splatfacto/2026-0{month}-01/dataparser_transforms.json" for month in (2, 1)]
-    lay_files(folder, "exports/splat/splat.ply", "transforms.json", *runs)
+    write_files(folder, "exports/splat/splat.ply", "transforms.json", *runs)
     sheet = write_sheet(tmp_path)
     report = str(add_scene(sheet, "desk", folder))
     latest = folder / runs[0]

@@ -18,8 +18,7 @@ from hilsplat.datasets.points.replica import (
 )
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.posed_images import PosedImage
-from tests.unit.datasets.writers.ply import write_ply
-from tests.unit.datasets.writers.replica import write_sequence
+from tests.unit.datasets.writers.points import write_ply, write_sequence
 from tests.unit.datasets.writers.true_world import flat_images
 
 # Three quads in a row, of objects 2, 1 and 3:   0--1--2--3
@@ -58,7 +57,7 @@ def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> P
     return folder
 
 
-def test_vertices_take_the_object_of_most_faces_and_of_equally_many_the_smallest(tmp_path):
+def test_vertices_take_the_object_of_most_faces_and_the_smallest_id_on_ties(tmp_path):
     points = read_semantic_mesh(make_habitat(tmp_path))
     # vertices 1 and 5 lie on objects 2 and 1, vertices 2 and 6 on 1 and 3: object 1 both times
     assert points.instance_id.tolist() == [3, 2, 2, 0, 3, 2, 2, 0]
@@ -74,14 +73,14 @@ def test_quads_become_two_triangles_unless_a_corner_repeats():
     assert triangles_of(np.array([[0, 1, 2, 2]], np.int32)).tolist() == [[0, 1, 2]]
 
 
-def test_unpadded_frames_are_sorted_by_number_and_pictures_beside_them_are_left(tmp_path):
+def test_frames_are_sorted_by_number_and_other_pictures_are_ignored(tmp_path):
     images, warnings = read_images(make_semantic_nerf(tmp_path / "seq", 12, lines=15))
     assert [image.name for image in images] == [f"rgb_{number}.png" for number in range(12)]
     assert [image.world_from_cam[0, 3] for image in images] == list(range(12))
     assert warnings == ("3 poses have no image and are skipped",)
 
 
-def test_lens_is_half_the_width_unless_the_sequence_says(tmp_path):
+def test_focal_length_is_half_the_width_without_cam_params(tmp_path):
     images, _ = read_images(make_semantic_nerf(tmp_path / "seq", 1))
     assert images[0].K.tolist() == [[5, 0, 5], [0, 5, 3], [0, 0, 1]]  # of 10 x 6 px
     write_sequence(tmp_path / "slam" / "room0", make_images(tmp_path / "own", 2))
@@ -123,34 +122,59 @@ def test_a_scene_is_read_from_either_sequence(tmp_path):
     assert DATASETS["replica"].found(tmp_path) == ("room_0",)
 
 
-def refuse(message):
-    return pytest.raises(SceneError, match=message)
+def info_of(habitat: Path, **content) -> Path:
+    (habitat / "info_semantic.json").write_text(json.dumps(content))
+    return habitat
 
 
-def test_damage_is_answered_by_a_sentence_that_says_what_to_do(tmp_path):
-    habitat = make_habitat(tmp_path / "a", labels=(-2, 20))
-    with refuse(r"do not belong together\n  expected  object ids 0 to 1\n  found     1 to 3"):
-        read_semantic_mesh(habitat)
-    habitat = make_habitat(tmp_path / "b", labels=(-2, 20, 205, 93))
-    with refuse(r"classes that Replica does not(.|\n)*found     class id 205"):
-        read_semantic_mesh(habitat)
-    info = {"classes": [{"id": 20, "name": "sofa"}], "id_to_label": [0, 1, 2, 3]}
-    (habitat / "info_semantic.json").write_text(json.dumps(info))
-    with refuse(r"found     20 sofa"):
-        read_semantic_mesh(habitat)
-    (habitat / "info_semantic.json").write_text("{}")
-    with refuse(r"expected  an object with classes, id_to_label"):
-        read_semantic_mesh(habitat)
-    (habitat / "info_semantic.json").unlink()
-    with refuse(r"info_semantic\.json is missing\n  found     mesh_semantic\.ply"):
-        read_semantic_mesh(habitat)
-    with refuse(r"1 lines, 3 images, the first without a line is frame 1"):
-        read_images(make_semantic_nerf(tmp_path / "short", 3, lines=1))
-    make_semantic_nerf(tmp_path / "deep" / "room0" / "room0", 1)
-    with refuse(r"not hold a rendered sequence(.|\n)*fix       use the folder .*room0/room0"):
-        read_images(tmp_path / "deep" / "room0")
-    (tmp_path / "short" / "traj_w_c.txt").write_text("1 0 0 0\n")
-    with refuse(r"line 1: cannot be read\n  expected  16 numbers"):
-        read_images(tmp_path / "short")
-    with refuse(r"room_1 of Replica has no labels(.|\n)*mesh_semantic\.ply, or semantic_labels_room1\.txt"):
-        open_scene(tmp_path, "room_1")
+def sequence_with(folder: Path, poses: str) -> Path:
+    (make_semantic_nerf(folder, 1) / "traj_w_c.txt").write_text(poses)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        (
+            lambda at: read_semantic_mesh(make_habitat(at, labels=(-2, 20))),
+            "do not belong together\n  expected  object ids 0 to 1\n  found     1 to 3",
+        ),
+        (
+            lambda at: read_semantic_mesh(make_habitat(at, labels=(-2, 20, 205, 93))),
+            "classes that Replica does not.*found     class id 205",
+        ),
+        (
+            lambda at: read_semantic_mesh(
+                info_of(make_habitat(at), classes=[{"id": 20, "name": "sofa"}], id_to_label=[0, 1, 2, 3])
+            ),
+            "found     20 sofa",
+        ),
+        (
+            lambda at: read_semantic_mesh(info_of(make_habitat(at))),
+            "expected  an object with classes, id_to_label",
+        ),
+        (
+            lambda at: (make_habitat(at) / "info_semantic.json").unlink() or read_semantic_mesh(at),
+            r"info_semantic\.json is missing\n  found     mesh_semantic\.ply",
+        ),
+        (
+            lambda at: read_images(make_semantic_nerf(at, 3, lines=1)),
+            "1 lines, 3 images, the first without a line is frame 1",
+        ),
+        (
+            lambda at: read_images(make_semantic_nerf(at / "room0", 1).parent),
+            "not contain a rendered sequence.*fix       use the folder .*room0",
+        ),
+        (
+            lambda at: read_images(sequence_with(at, "1 0 0 0\n")),
+            "line 1: cannot be read\n  expected  16 numbers",
+        ),
+        (
+            lambda at: open_scene(at, "room_1"),
+            r"room_1 of Replica has no labels.*mesh_semantic\.ply, or semantic_labels_room1\.txt",
+        ),
+    ],
+)
+def test_unusable_scenes_are_refused_with_a_fix(tmp_path, read, message):
+    with pytest.raises(SceneError, match=f"(?s){message}"):
+        read(tmp_path)

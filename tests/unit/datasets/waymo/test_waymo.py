@@ -24,12 +24,10 @@ from hilsplat.datasets.waymo.frames import (
 from hilsplat.datasets.waymo.reader import RECORD, open_segment
 from hilsplat.datasets.waymo.records import MESSAGES, matrix, message_classes
 from tests.conftest import PROJECT
-from tests.unit.datasets.writers.waymo import write_segment
+from tests.unit.datasets.writers.points import write_segment
 
 SEGMENT = "1_2_000_3_000"
 SQRT2 = np.sqrt(2.0)
-LENS = np.array([2000.0, 2000, 960, 640, 0, 0, 0, 0, 0])
-POINT = np.array([[10.0, 1.0, -0.5]])
 
 
 def turned(degrees: float, x: float = 0.0) -> np.ndarray:
@@ -39,10 +37,8 @@ def turned(degrees: float, x: float = 0.0) -> np.ndarray:
     return pose
 
 
-def camera(**changes) -> WaymoCamera:
-    lens = LENS.copy()
-    for name, value in changes.items():
-        lens[["f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3"].index(name)] = value
+def camera(*distortion: float) -> WaymoCamera:
+    lens = np.array([2000.0, 2000, 960, 640, *(distortion or np.zeros(5))])
     return WaymoCamera("FRONT", lens, np.eye(4), (1280, 1920))
 
 
@@ -81,9 +77,6 @@ def make_shots(vehicle: np.ndarray) -> list[CameraShot]:
     ]
 
 
-# --- geometry -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("turn", [0, 30, 148])
 def test_four_columns_at_range_two_look_from_the_left_back_round_to_the_right_back(turn):
     azimuths = np.degrees(column_azimuths(4, turned(turn)))  # in the lidar's own frame
@@ -115,11 +108,11 @@ def test_opencv_axes_give_the_same_pixel():
     """Half a pixel: Waymo's 0 is the left edge of the first pixel, as here, so K is taken unchanged."""
     vehicle = turned(40, x=7.0)
     lens = replace(camera(), vehicle_from_cam=turned(90))
-    in_world = vehicle @ turned(90) @ [*POINT[0], 1]
+    in_world = vehicle @ turned(90) @ [10, 1, -0.5, 1]
     x, y, z, _ = lens.cam_from_world(vehicle) @ in_world
     np.testing.assert_allclose([x, y, z], [-1, 0.5, 10], atol=1e-12)
     np.testing.assert_allclose((lens.K @ [x, y, z])[:2] / z, [760, 740])
-    assert camera(k1=1, k2=2, p1=3, p2=4, k3=5).distortion == (1, 2, 3, 4, 5)
+    assert camera(1, 2, 3, 4, 5).distortion == (1, 2, 3, 4, 5)
 
 
 def test_each_return_has_its_own_mask_and_channel_one_is_the_class():
@@ -161,20 +154,12 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     assert truth.class_id.tolist() == one.class_id.tolist() * 2
     assert truth.instance_id.tolist() == one.instance_id.tolist() * 2
     assert truth.visible.tolist() == one.visible.tolist() * 2
-    assert [image.name for image in scene.images[:3]] == [
-        "1000_FRONT.jpg",
-        "1000_SIDE_LEFT.jpg",
-        "2000_FRONT.jpg",
-    ]
+    names = [image.name for image in scene.images]
+    assert names[:3] == ["1000_FRONT.jpg", "1000_SIDE_LEFT.jpg", "2000_FRONT.jpg"]
     assert scene.images[2].image == b"jpeg 2000" and scene.images[1].size_hw == (886, 1920)
     np.testing.assert_allclose(scene.images[0].cam_from_world @ [10, 1, -0.5, 1], [-1, 0.5, 10, 1], atol=1e-9)
-    assert [image.name for image in open_segment(root, SEGMENT, every=2).images[::2]] == [
-        "1000_FRONT.jpg",
-        "3000_FRONT.jpg",
-    ]
-
-
-def test_registry_finds_and_checks_the_segments_that_are_there(root):
+    alternate = [image.name for image in open_segment(root, SEGMENT, every=2).images]
+    assert alternate[::2] == ["1000_FRONT.jpg", "3000_FRONT.jpg"]
     dataset = DATASETS["waymo"]
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
@@ -195,23 +180,19 @@ def test_damaged_components_are_answered_by_a_sentence(root):
     def path(tag: str) -> Path:
         return root / "validation" / tag / f"{SEGMENT}.parquet"
 
-    whole = path("lidar_pose").read_bytes()
-    path("lidar_pose").write_bytes(whole[:200])
-    with pytest.raises(SceneError, match=r"cannot be read(.|\n)*found     a file of 200 bytes(.|\n)*fix "):
-        open_segment(root, SEGMENT)
+    def refused(message: str) -> None:
+        with pytest.raises(SceneError, match=f"(?s){message}"):
+            open_segment(root, SEGMENT)
+
+    path("lidar_pose").write_bytes(path("lidar_pose").read_bytes()[:200])
+    refused("cannot be read.*found     a file of 200 bytes.*fix ")
     path("lidar_pose").write_bytes(path("lidar").read_bytes())
-    with pytest.raises(SceneError, match=r"is not the component lidar_pose of release 2"):
-        open_segment(root, SEGMENT)
+    refused("is not the component lidar_pose of release 2")
     path("lidar_pose").unlink()
-    with pytest.raises(
-        SceneError, match=r"component lidar_pose of segment .* is missing(.|\n)*fix       download"
-    ):
-        open_segment(root, SEGMENT)
-    (root / "validation").rename(root / "waymo")
+    refused("component lidar_pose of segment .* is missing.*fix       download")
     (root / "all").mkdir()
-    (root / "waymo").rename(root / "all" / "validation")
-    with pytest.raises(SceneError, match=r"one level too deep\n  fix       move .*all/validation to"):
-        open_segment(root, SEGMENT)
+    (root / "validation").rename(root / "all" / "validation")
+    refused("one level too deep\n  fix       move .*all/validation to")
 
 
 def test_images_and_classes_that_do_not_fit_are_refused():
@@ -305,20 +286,17 @@ def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
     shots = make_shots(np.eye(4))
     record = encoded(make_frame(), shots, labelled=False)
     path = write_records(tmp_path / RECORD.format(split="validation", segment=SEGMENT), [record])
-    with pytest.raises(SceneError, match=r"no frame with labels of the top lidar"):
-        open_segment(tmp_path, SEGMENT)
-    path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(SceneError, match=r"record 0 is damaged or cut off(.|\n)*expected  a TFRecord file"):
-        open_segment(tmp_path, SEGMENT)
-    path.write_bytes(b"no record at all")
-    with pytest.raises(SceneError, match=r"record 0 is damaged"):
-        open_segment(tmp_path, SEGMENT)
-    write_records(path, [b"\x0b"])
-    with pytest.raises(SceneError, match=r"frame 0 cannot be read: Error parsing message"):
-        open_segment(tmp_path, SEGMENT)
-    write_records(path, [])
-    with pytest.raises(SceneError, match=r"does not hold any frame"):
-        open_segment(tmp_path, SEGMENT)
+    whole, damaged = path.read_bytes(), write_records(tmp_path / "damaged", [b"\x0b"]).read_bytes()
+    for content, message in (
+        (whole, "no frame with labels of the top lidar"),
+        (whole[:-30], "record 0 is damaged or cut off.*expected  a TFRecord file"),
+        (b"no record at all", "record 0 is damaged"),
+        (damaged, "frame 0 cannot be read: Error parsing message"),
+        (b"", "has no frame"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(SceneError, match=f"(?s){message}"):
+            open_segment(tmp_path, SEGMENT)
 
 
 def test_published_label_file_holds_all_classes():

@@ -1,7 +1,4 @@
-"""A finished synthetic scene as source for writers of data set layouts.
-
-Readers are tested on scenes that were written here: what is read must be what is true.
-"""
+"""A finished synthetic scene as source for writers of data set layouts: readers must return its truth."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,23 +10,19 @@ from PIL import Image
 
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
+from hilsplat.datasets.points.point_files import ply_column, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
-from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.exporting import pinhole_model
 from hilsplat.scene.posed_images import PosedImage
 
 MAX_POINTS = 5000
-"""Sparse points that are written into a COLMAP model, taken evenly from the mesh."""
+"""Maximum number of sparse points in a COLMAP model, sampled evenly from the mesh."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrueWorld:
-    """Images, true cameras and annotations of a synthetic scene.
-
-    Attributes:
-        images: folder of images, by view name.
-        points_xyz: places on the surface that cameras see, scene units; none without a mesh.
-    """
+    """Images (a folder), true cameras, annotations and visible surface points of a synthetic scene."""
 
     images: Path
     cameras: Cameras
@@ -66,11 +59,8 @@ class TrueWorld:
 
 
 def _mesh_points(path: Path) -> Float64[np.ndarray, "P 3"]:
-    from plyfile import PlyData
-
-    vertex = PlyData.read(path)["vertex"].data
-    seen = vertex[vertex["views"] > 0]
-    xyz = np.stack([seen[axis] for axis in ("x", "y", "z")], axis=1).astype(np.float64)
+    mesh = read_ply(path, 3)
+    xyz = ply_places(path, mesh)[ply_column(path, mesh, "vertex", "views") > 0].astype(np.float64)
     return xyz[:: max(1, -(-len(xyz) // MAX_POINTS))]
 
 
@@ -85,22 +75,9 @@ def write_sparse(
 ) -> None:
     """Write a COLMAP model (binary) of pinhole cameras and grey points without tracks."""
     folder.mkdir(parents=True, exist_ok=True)
-    model = pycolmap.Reconstruction()
-    for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
-        K = camera.K
-        lens = pycolmap.Camera(
-            model="PINHOLE",
-            width=camera.size_hw[1],
-            height=camera.size_hw[0],
-            params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-            camera_id=number,
-        )
-        model.add_camera_with_trivial_rig(lens)
-        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.cam_from_world[:3]))
-    for xyz in points_xyz:
-        model.add_point3D(xyz, pycolmap.Track(), np.full(3, 128, np.uint8))
-    model.write(folder)
+    pairs = zip(names, cameras, strict=True)
+    images = [PosedImage(name, folder, each.cam_from_world, each.K, each.size_hw) for name, each in pairs]
+    pinhole_model(images, points_xyz, np.full(points_xyz.shape, 128, np.uint8)).write(folder)
 
 
 def stems_from(world: TrueWorld, pattern: str, first: int) -> Mapping[str, str]:

@@ -1,0 +1,349 @@
+"""LERF-OVS, Hi-LERF, Hi-3DOVS and own annotations: label files of polygons."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from hilsplat.base.errors import SceneError
+from hilsplat.base.images import write_png
+from hilsplat.base.levels import Level
+from hilsplat.datasets.images.hi import ANNOTATED, HI_3DOVS, HI_LERF
+from hilsplat.datasets.images.isat import read_isat
+from hilsplat.datasets.images.lerf_ovs import open_scene
+from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
+from hilsplat.datasets.labelled import posed_images
+from hilsplat.datasets.published import PAIRS, PROMPTS
+from hilsplat.datasets.registry import open_labelled
+from hilsplat.datasets.sources import label_files, label_sets
+from tests.conftest import PROJECT
+from tests.unit.datasets.writers.labelled import LERF_STEMS, OVS_STEMS, write_hi, write_lerf_ovs
+
+SQUARE = [[2.0, 3.0], [5.0, 3.0], [5.0, 6.0], [2.0, 6.0]]
+LABELLED = (("001.png", "frame_00002.png"), ("003.png", "frame_00004.png"))
+"""Labelled views of the small world, and their names in the data sets."""
+
+
+def thing(category="knife", segmentation=SQUARE, **keys):
+    return {"category": category, "segmentation": segmentation, "group": 1, "iscrowd": 0, **keys}
+
+
+def label_file(folder, objects, size_wh=(20, 10), name="frame_00001"):
+    path = folder / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    info = {"folder": "x", "name": f"{name}.jpg", "width": size_wh[0], "height": size_wh[1], "note": ""}
+    path.write_text(json.dumps({"info": info, "objects": objects}))
+    return path
+
+
+@pytest.fixture
+def lerf(tmp_path, true_world):
+    """The small world as LERF-OVS's scene `figurines`, its second and fourth view labelled."""
+    write_lerf_ovs(true_world, tmp_path / "lerf_ovs", "figurines", [name for name, _ in LABELLED])
+    return tmp_path / "lerf_ovs"
+
+
+@pytest.fixture
+def hi(tmp_path, true_world):
+    """The small world as Hi-LERF's scene `ramen`, its second and fourth view labelled."""
+    views = [name for name, _ in LABELLED]
+    write_hi(true_world, tmp_path / "hi_lerf", tmp_path / "lerf_ovs", "ramen", views, LERF_STEMS)
+    return tmp_path / "hi_lerf"
+
+
+@pytest.fixture
+def annotated(tmp_path):
+    """A data root with one annotated photograph of photos/desk: a mug with a rim."""
+    mug = {"id": 4, "level": 1, "parent": None, "segmentation": [[2, 2], [11, 2], [11, 9], [2, 9]]}
+    rim = {"id": 7, "level": 2, "parent": 4, "segmentation": [[[2, 2], [5, 2], [5, 3], [2, 3]]]}
+    objects = [thing("mug", **mug), thing("rim", **rim)]
+    label_file(tmp_path / "annotated/photos/desk", objects, (16, 12), "DSC_1")
+    return tmp_path
+
+
+def test_polygons_are_filled_with_border_by_whole_vertices_and_even_odd():
+    triangle, angle = np.array([[0.9, 0.2], [2, 0], [0, 2.7]]), 4 * np.pi * np.arange(5) / 5
+    filled = ["###.", "##..", "#...", "...."]
+    assert np.where(fill_polygons([triangle], (4, 4)), "#", ".").tolist() == [list(row) for row in filled]
+    star = fill_polygons([50 + 45 * np.stack([np.sin(angle), -np.cos(angle)], axis=1)], (100, 100))
+    assert not star[50, 50] and star[20, 50]
+    square = np.array([[1, 1], [5, 1], [5, 5], [1, 5]])
+    assert fill_polygons([square, square + 2], (9, 9)).sum() == 25 + 25 - 9  # their overlap is filled
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_traced_polygons_fill_the_same_pixels(seed):
+    rng = np.random.default_rng(seed)
+    values = rng.random(rng.integers(1, 40, 2))
+    if seed % 2:  # large shapes with holes instead of noise
+        values = cv2.GaussianBlur(values, (5, 5), 0).reshape(values.shape)
+    mask = values < rng.random()
+    polygons = trace_polygons(mask)
+    np.testing.assert_array_equal(fill_polygons(polygons, mask.shape), mask)
+    areas = [np.count_nonzero(fill_polygons([polygon], mask.shape)) for polygon in polygons]
+    assert sum(areas) == np.count_nonzero(mask)  # without common pixels
+    assert all(len(polygon) >= 3 for polygon in polygons)
+
+
+# ---- LERF-OVS -------------------------------------------------------------------------------------
+
+
+def test_a_world_written_as_lerf_ovs_is_read_back_equal(true_world, lerf):
+    scene = open_scene(lerf, "figurines")
+    assert list(scene.images) == [f"frame_0000{n}.png" for n in (1, 2, 3, 4)]  # numbered from 1
+    assert list(scene.views) == [view for _, view in LABELLED]
+    for name, view in LABELLED:
+        nodes = true_world.nodes(name)
+        assert {region.text for region in scene.views[view]} == set(nodes)
+        for region in scene.views[view]:
+            assert region.size_hw == (24, 40)
+            assert np.array_equal(region.mask(), true_world.mask(name, nodes[region.text]))
+    assert scene.prompts == ("Ring", "bear", "head", "nose", "paw")
+    assert scene.num_pairs == 9  # the fourth view does not show the ring
+    (paw,) = [region for region in scene.views["frame_00002.png"] if region.text == "paw"]
+    # One region with both boxes: rows 14 to 17, columns 3 to 6 and 13 to 18.
+    assert paw.boxes().tolist() == [[3, 14, 6, 17], [13, 14, 18, 17]]
+    for name, posed in zip(
+        true_world.cameras.names, posed_images(lerf / "figurines", "").values(), strict=True
+    ):
+        camera = true_world.cameras[name]
+        assert np.allclose(posed.cam_from_source, camera.cam_from_world, atol=1e-12)
+        assert np.array_equal(posed.camera.calibration_matrix(), camera.K)
+    reported = "; ".join(scene.report().warnings)
+    assert "published frames without label: frame_00041.png, frame_00105.png, frame_00152.png" in reported
+    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in reported
+
+
+def test_boxes_keep_the_whole_pixels_inside(tmp_path):
+    for box, whole in (([2.0, 3.0, 5.0, 6.0], [2, 3, 5, 6]), ([2.5, 3.5, 5.5, 6.5], [3, 4, 5, 6])):
+        polygon = [[box[0], box[1]], [box[2], box[1]], [box[2], box[3]]]
+        (found,) = read_isat(label_file(tmp_path, [thing(segmentation=polygon, bbox=box)])).objects
+        assert found.box_xyxy.tolist() == whole
+
+
+@pytest.mark.parametrize("iscrowd", [0, 1, False, True])
+def test_iscrowd_may_be_number_or_boolean(tmp_path, iscrowd):
+    assert len(read_isat(label_file(tmp_path, [thing(iscrowd=iscrowd)])).objects) == 1
+
+
+def test_categories_differ_by_case(lerf):
+    label_file(lerf / "label" / "figurines", [thing("Pot"), thing("pot")], (40, 24), "frame_00001")
+    assert [r.text for r in open_scene(lerf, "figurines").views["frame_00001.png"]] == ["Pot", "pot"]
+
+
+def test_labels_are_matched_by_name_even_if_an_earlier_image_is_missing(lerf):
+    before = open_scene(lerf, "figurines").views["frame_00004.png"][0].mask()
+    (lerf / "figurines" / "images" / "frame_00003.jpg").unlink()
+    scene = open_scene(lerf, "figurines")
+    assert scene.images["frame_00004.png"].name == "frame_00004.jpg"
+    assert np.array_equal(scene.views["frame_00004.png"][0].mask(), before)
+    scene.check_posed(["frame_00002.png", "frame_00004.png"])
+    with pytest.raises(SceneError, match=r"have no pose: frame_00004\.png\n"):
+        scene.check_posed(["frame_00002.png", "frame_00003.png"])
+
+
+def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_path):
+    labels = read_isat(label_file(tmp_path, [thing(segmentation=[[15, 2], [25, 2], [25, 4], [15, 4]])]))
+    assert labels.objects[0].mask((10, 20)).sum() == 3 * 5  # columns 15 to 19
+    assert len(labels.warnings) == 1 and "reaches 5 px outside the image; clipped" in labels.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"info": ', "cannot be read"),
+        ("[]", "has no list `objects`"),
+        ('{"shapes": []}', "has no list `objects`"),
+        ('{"info": {}, "objects": []}', "does not give the size"),
+    ],
+)
+def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
+    path = tmp_path / "frame_00001.json"
+    path.write_text(text)
+    with pytest.raises(SceneError, match=rf"frame_00001.json .*{message}"):
+        read_isat(path)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (thing(category=None), "has no category"),
+        (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is not a polygon"),
+        (thing(segmentation=[]), "segmentation is not a polygon"),
+        (thing(segmentation="x"), "segmentation is not a polygon"),
+        (thing(segmentation=[[30, 2], [35, 2], [35, 4]]), r"\(knife\): a polygon is outside the image"),
+        (thing(bbox=[1, 2, 3]), "bbox cannot be used"),
+        (thing(segmentation=[[4, 3], [8, 3], [8, 6]], bbox=[4, 3, 4, 3]), r"bbox is not \[x1, y1, x2, y2\]"),
+    ],
+)
+def test_malformed_objects_are_refused_by_number(tmp_path, entry, message):
+    with pytest.raises(SceneError, match=rf"object 0.*{message}"):
+        read_isat(label_file(tmp_path, [entry]))
+
+
+def test_a_label_of_a_scaled_copy_is_resized_and_reported(lerf):
+    for _, view in LABELLED:
+        (lerf / "figurines" / "images" / view).with_suffix(".jpg").unlink()
+        write_png(lerf / "figurines" / "images" / view, np.zeros((12, 20, 3), np.uint8))
+    scene = open_scene(lerf, "figurines")
+    assert sum("resized by nearest neighbour" in sentence for sentence in scene.warnings) == 2
+    (bear,) = [region for region in scene.views["frame_00002.png"] if region.text == "bear"]
+    assert bear.mask((12, 20)).sum() * 4 == pytest.approx(bear.mask().sum(), rel=0.2)
+    # Columns 3 to 18 and rows 6 to 17 of 40 x 24, at half the size.
+    assert bear.boxes((12, 20)).tolist() == [[1, 3, 9, 8]]
+
+
+def test_labels_without_their_image_or_of_another_release_are_refused(lerf):
+    image = lerf / "figurines" / "images" / "frame_00002.jpg"
+    image.unlink()
+    with pytest.raises(SceneError, match=r"labelled views have no image: frame_00002\.png\n"):
+        open_scene(lerf, "figurines")
+    write_png(image.with_suffix(".png"), np.zeros((26, 40, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"frame_00002.json does not fit its image\n.*40 x 26 px"):
+        open_scene(lerf, "figurines")
+
+
+def test_a_wrong_count_of_pairs_is_reported_for_whole_published_scenes(tmp_path, true_world):
+    root = tmp_path / "lerf_ovs"
+    write_lerf_ovs(true_world, root, "figurines", [])
+    for frame in (41, 105, 152, 195):
+        name = f"frame_{frame:05d}"
+        write_png(root / "figurines" / "images" / f"{name}.png", np.zeros((10, 20, 3), np.uint8))
+        objects = [thing(text) for text in PROMPTS["lerf_ovs"]["figurines"][:14]]
+        label_file(root / "label" / "figurines", objects, name=name)
+    assert open_scene(root, "figurines").num_pairs == PAIRS["figurines"] == 56
+    assert not open_scene(root, "figurines").warnings
+    label_file(root / "label" / "figurines", [thing("bag")], name="frame_00041")
+    (warning,) = open_scene(root, "figurines").warnings
+    assert warning.startswith("43 pairs of frame and category")
+
+
+# ---- levels and parents ---------------------------------------------------------------------------
+
+
+def edit(root, change):
+    """Change the objects of a label file in place, given by id and as a list."""
+    path = root / "label" / "ramen" / "frame_00002.json"
+    content = json.loads(path.read_text())
+    change({each["id"]: each for each in content["objects"]}, content["objects"])
+    path.write_text(json.dumps(content))
+
+
+def test_a_world_written_as_hi_lerf_is_read_back_equal(true_world, hi):
+    scene = HI_LERF.open(hi, "ramen")
+    nodes = true_world.annotations.nodes
+    for name, view in LABELLED:
+        shown = true_world.annotations.views[name]
+        assert len(scene.views[view]) == len(shown)
+        for region, node in zip(scene.views[view], shown, strict=True):
+            assert (region.text, region.level) == (nodes[node].text, Level(nodes[node].level))
+            assert region.path == true_world.annotations.path_of(node)
+            assert np.array_equal(region.mask(), true_world.mask(name, [node]))
+            rows, columns = np.nonzero(region.mask())
+            assert region.boxes().tolist() == [[columns.min(), rows.min(), columns.max(), rows.max()]]
+    assert not any("parent" in line for line in scene.warnings)
+
+
+def test_hi_3dovs_takes_images_of_3d_ovs(tmp_path, true_world):
+    write_hi(true_world, tmp_path / "hi_3dovs", tmp_path / "3d_ovs", "bed", ["001.png"], OVS_STEMS)
+    scene = HI_3DOVS.open(tmp_path / "hi_3dovs", "bed")
+    assert scene.images["01.png"] == tmp_path / "3d_ovs" / "bed" / "images" / "01.jpg"
+    assert HI_3DOVS.check(tmp_path / "hi_3dovs", "bed").facts["posed views"] == 4
+    assert "published frames without label: 06.png, 11.png, 20.png, 28.png, 36.png" in scene.warnings
+
+
+def test_listed_frames_without_image_or_label_are_reported(hi):
+    (hi.parent / "lerf_ovs" / "ramen" / "images" / "frame_00004.jpg").unlink()
+    scene = HI_LERF.open(hi, "ramen")
+    assert list(scene.views) == ["frame_00002.png"]
+    reported = "; ".join(scene.warnings)
+    assert "frame_00004.json has no image" in reported
+    for what in ("image", "label"):
+        assert f"published frames without {what}: frame_00006.png, frame_00024.png" in reported
+
+
+def test_invalid_parents_and_children_outside_their_parent_are_reported(hi):
+    def change(by_id, objects):
+        by_id[1]["parent"], by_id[2]["parent"] = 99, [0]
+        by_id[4]["parent"] = 0  # a subpart below a whole
+        square = [[0, 0], [9, 0], [9, 9], [0, 9]]
+        beside = [square, [[10, 0], [10, 0], [10, 0]]]  # 101 px, one of them outside the square
+        wide = [[0, 0], [10, 0], [10, 9], [0, 9]]  # 110 px, ten of them outside
+        objects.append(thing("a", square, id=90, level=1))
+        for number, text, polygon in ((91, "b", beside), (92, "c", wide)):
+            objects.append(thing(text, polygon, id=number, level=2, parent=90))
+
+    edit(hi, change)
+    scene = HI_LERF.open(hi, "ramen")
+    reported = "; ".join(scene.warnings)
+    assert "frame_00002.json, id 1 (head): its parent 99 does not exist" in reported
+    assert "id 2 (paw): its parent [0] does not exist" in reported
+    assert "id 4 (nose), level 3: its parent 0 is of level 1" in reported
+    assert "id 92 (c): 9.1% of its area is outside its parent 90 (a)" in reported
+    assert "id 91" not in reported  # one percent can be due to rasterisation
+    paths = {region.text: region.path for region in scene.views["frame_00002.png"]}
+    assert paths["head"] == ("head",) and paths["nose"] == ("nose",) and paths["paw"] == ("bear", "paw")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("id", 0, r"object 1 \(head\): id cannot be used"),
+        ("id", "1", r"object 1 \(head\): id cannot be used\n.*\n.*'1'"),
+        ("level", 4, r"object 1 \(head\): level cannot be used"),
+        ("level", None, r"plain LERF-OVS labels have no levels"),
+        ("level", True, r"object 1 \(head\): level cannot be used"),
+    ],
+)
+def test_unusable_ids_and_levels_are_refused(hi, key, value, message):
+    edit(hi, lambda by_id, _: by_id[1].update({key: value}))
+    with pytest.raises(SceneError, match=message):
+        HI_LERF.open(hi, "ramen")
+
+
+def test_missing_images_of_the_other_data_set_are_named(hi):
+    (hi.parent / "lerf_ovs").rename(hi.parent / "lerf")
+    with pytest.raises(SceneError, match=r"also ../lerf_ovs/ramen/images"):
+        HI_LERF.open(hi, "ramen")
+
+
+# ---- own annotations ------------------------------------------------------------------------------
+
+
+def test_own_annotations_are_found_and_read_without_proposals(annotated):
+    scene = open_labelled("annotated/photos/desk", annotated)
+    mug, rim = scene.views["DSC_1.png"]
+    assert (mug.text, mug.level, mug.path) == ("mug", Level.WHOLE, ("mug",))
+    assert (rim.text, rim.level, rim.path) == ("rim", Level.PART, ("mug", "rim"))
+    assert np.count_nonzero(mug.mask()) == 80 and np.count_nonzero(rim.mask()) == 8
+    assert ANNOTATED.found(annotated / "annotated") == ("photos/desk",)
+    assert label_sets("photos/desk", str(annotated), "photos/desk") == ("annotated/photos/desk",)
+    assert label_sets("photos/desk", str(annotated), "photos/shelf") == ()
+    with pytest.raises(SceneError, match=r"also photos/shelf"):
+        open_labelled("annotated/photos/shelf", annotated)
+    (path,) = label_files("annotated/photos/desk", str(annotated))
+    assert path.name == "DSC_1.json"
+    content = json.loads(path.read_text())
+    content["objects"][1]["origin"] = "proposed"
+    path.write_text(json.dumps(content))
+    scene = open_labelled("annotated/photos/desk", annotated)
+    assert [region.text for region in scene.views["DSC_1.png"]] == ["mug"]
+    assert scene.warnings == ("DSC_1.json: proposals not accepted, left out: 1",)
+
+
+def test_the_annotation_of_the_bedroom_has_ten_objects_whose_children_are_inside_them():
+    """Drawn with `hilsplat annotate` in four photographs, which are not part of the project."""
+    bedroom = open_labelled("annotated/photos/plush_bedroom", PROJECT / "tests")
+    assert bedroom.warnings == ()
+    regions = [region for regions in bedroom.views.values() for region in regions]
+    counts = [sum(region.level == level for region in regions) for level in Level]
+    assert (len(bedroom.views), counts) == (4, [23, 38, 31])
+    wholes = {region.text for region in regions if region.level is Level.WHOLE}
+    assert len(wholes) == 10 and {"plush doll", "black piano", "fox plush toy"} < wholes
+    for labelled in bedroom.views.values():
+        masks = {region.path: np.zeros(region.size_hw, bool) for region in labelled}
+        for region in labelled:  # two eyes have one path
+            masks[region.path] |= region.mask()
+        for path, mask in masks.items():
+            assert mask.any() and not (len(path) > 1 and (mask & ~masks[path[:-1]]).any()), path

@@ -1,0 +1,410 @@
+"""Write scenes, also synthetic rooms and streets, in the layouts of ScanNet, Replica and Waymo."""
+
+import io
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
+from jaxtyping import Float, Float32, Int32
+from PIL import Image
+
+from hilsplat.base.artifacts import read_npz, write_json, write_text
+from hilsplat.base.images import read_image
+from hilsplat.datasets.classes.replica import NAMES
+from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
+from hilsplat.datasets.points.scannet import LABEL_TABLE
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.synthetic.world_labels import replica_id, scannet_ids, waymo_labels
+from hilsplat.datasets.waymo.frames import (
+    CAMERAS,
+    CV_FROM_WAYMO,
+    TOP,
+    CameraShot,
+    LidarFrame,
+    LidarReturn,
+    WaymoCamera,
+    column_azimuths,
+    rotation_of,
+)
+from hilsplat.datasets.waymo.parquet import CAMERA, FRAME, INTRINSIC, LASER, component_path
+from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage
+
+PLY_TYPES = {"f4": "float", "u1": "uchar", "u2": "ushort", "i4": "int"}
+
+
+def write_ply(
+    path: Path, vertices: Mapping[str, np.ndarray], faces: np.ndarray, of_faces: Mapping[str, np.ndarray]
+) -> None:
+    """Write a binary little-endian mesh: columns of vertices, corners of faces, columns of faces.
+
+    Written without plyfile, which reads it back and would take a Python step per face.
+    """
+    rows = np.rec.fromarrays([*vertices.values()], names=[*vertices])
+    corners = [("count", "u1"), ("corners", "<i4", faces.shape[1:])]
+    polygons = np.empty(len(faces), [*corners, *((name, column.dtype) for name, column in of_faces.items())])
+    polygons["count"], polygons["corners"] = faces.shape[1], faces
+    for name, column in of_faces.items():
+        polygons[name] = column
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in vertices.items()),
+        f"element face {len(polygons)}",
+        "property list uchar int vertex_indices",
+        *(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in of_faces.items()),
+        "end_header\n",
+    ]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes() + polygons.tobytes())
+
+
+SEGMENT_STEP = 7
+"""Segment ids are not contiguous in real scans; neither are ours."""
+GREY = 128
+
+
+def write_label_table(root: Path, categories: Mapping[str, tuple[int, int]]) -> None:
+    """Write `scannetv2-labels.combined.tsv`, given raw category -> (id, NYU40 id)."""
+    rows = [f"{number}\t{category}\t{category}\t{nyu40}" for category, (number, nyu40) in categories.items()]
+    write_text(root / LABEL_TABLE, "\n".join(["id\traw_category\tcategory\tnyu40id", *rows, ""]))
+
+
+def write_scan(
+    root: Path,
+    scan: str,
+    images: Sequence[PosedImage],
+    xyz: Float32[np.ndarray, "P 3"],
+    faces: Int32[np.ndarray, "F 3"],
+    object_of_vertex: Int32[np.ndarray, " P"],
+    objects: Sequence[str],
+    categories: Mapping[str, tuple[int, int]],
+    lost: Sequence[int] = (),
+) -> None:
+    """Write `scans/<scan>`: frames numbered 0, 1, ..., mesh, labels, segments and aggregation.
+
+    Args:
+        images: all share K and size, as ScanNet's do.
+        object_of_vertex: row of `objects`, -1 for none.
+        objects: raw category of each object.
+        categories: raw category -> (id, NYU40 id).
+        lost: frames that get the infinite pose of lost tracking.
+    """
+    folder = root / "scans" / scan
+    for name in ("color", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    for number, image in enumerate(images):
+        assert isinstance(image.image, Path)
+        shutil.copyfile(image.image, folder / "color" / f"{number}{image.image.suffix}")
+        pose = np.full((4, 4), -np.inf) if number in lost else image.world_from_cam
+        np.savetxt(folder / "pose" / f"{number}.txt", pose)
+    K = np.eye(4)
+    K[:3, :3] = images[0].K - HALF_PIXEL
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", K)
+    height, width = images[0].size_hw
+    info = f"colorHeight = {height}\ncolorWidth = {width}\nsceneType = Synthetic room\n"
+    write_text(folder / f"{scan}.txt", info)
+    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
+    grey = np.full(len(xyz), GREY, dtype=np.uint8)
+    colours = dict.fromkeys(("red", "green", "blue", "alpha"), grey)
+    write_ply(folder / f"{scan}_vh_clean_2.ply", {**places, **colours}, faces, {})
+    of_object = np.array([categories[name][1] for name in objects] + [0], dtype=np.uint16)
+    labels = of_object[object_of_vertex]  # -1, none, is the last
+    write_ply(folder / f"{scan}_vh_clean_2.labels.ply", {**places, **colours, "label": labels}, faces, {})
+    # Two segments per object, on either side of its middle.
+    segment = np.zeros(len(xyz), dtype=np.int64)
+    groups = []
+    for number, category in enumerate(objects):
+        rows = np.flatnonzero(object_of_vertex == number)
+        if not rows.size:
+            continue
+        side = xyz[rows, 0] > np.median(xyz[rows, 0])
+        segment[rows] = SEGMENT_STEP * (2 * number + 1 + side)
+        members = np.unique(segment[rows]).tolist()
+        groups.append({"id": len(groups), "objectId": number, "segments": members, "label": category})
+    name = f"{scan}_vh_clean_2.0.010000.segs.json"
+    record = {"params": {}, "sceneId": scan, "segIndices": segment.tolist()}
+    write_text(folder / name, json.dumps(record))
+    whole = {"sceneId": f"scannet.{scan}", "segGroups": groups, "segmentsFile": f"scannet.{name}"}
+    write_text(folder / f"{scan}.aggregation.json", json.dumps(whole))
+
+
+UNDEFINED, NO_OBJECT = -1, -2
+"""Class of an object that none of Replica's fits, and of object 0, which is none."""
+
+
+def write_semantic_mesh(
+    habitat: Path,
+    xyz: Float32[np.ndarray, "P 3"],
+    faces: Int32[np.ndarray, "F 3"],
+    object_of_face: Int32[np.ndarray, " F"],
+    classes: Sequence[int],
+) -> None:
+    """Write `mesh_semantic.ply` and `info_semantic.json` of a scene.
+
+    Args:
+        faces: triangles; each becomes a quad whose last corner occurs twice.
+        object_of_face: row of `classes`, -1 for none. In the files objects count from 1.
+        classes: Replica's class id of each object, 0 if it has none for it.
+    """
+    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
+    colours = dict.fromkeys(("red", "green", "blue"), np.full(len(xyz), 128, dtype=np.uint8))
+    quads = faces[:, [0, 1, 2, 2]]
+    of_face = (object_of_face + 1).astype(np.int32)
+    labels = [NO_OBJECT, *(number or UNDEFINED for number in classes)]
+    objects = [
+        {"id": row, "class_id": number, "class_name": NAMES.get(number, "undefined")}
+        for row, number in enumerate(labels)
+        if row
+    ]
+    info = {
+        "classes": [{"id": n, "name": name, "children": [], "parents": []} for n, name in NAMES.items()],
+        "gravity_dir": [0.0, 0.0, -1.0],
+        "id_to_label": labels,
+        "objects": objects[::-1],  # real files do not sort them either
+    }
+    habitat.mkdir(parents=True)
+    write_ply(habitat / "mesh_semantic.ply", {**places, **colours}, quads, {"object_id": of_face})
+    (habitat / "info_semantic.json").write_text(json.dumps(info, indent=1))
+
+
+def write_sequence(folder: Path, images: Sequence[PosedImage]) -> None:
+    """Write a sequence in the layout of NICE-SLAM: `traj.txt`, `results/`, and `cam_params.json` beside it.
+
+    The lens in the folder above is that of all its sequences, so all images must share K and size.
+    """
+    K, (height, width) = images[0].K - HALF_PIXEL, images[0].size_hw
+    lens = {"w": width, "h": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    write_json(folder.parent / "cam_params.json", {"camera": {**lens, "scale": 6553.5}})
+    (folder / "results").mkdir(parents=True)
+    for number, image in enumerate(images):
+        assert isinstance(image.image, Path)
+        shutil.copyfile(image.image, folder / "results" / f"frame{number:06d}{image.image.suffix}")
+    np.savetxt(folder / "traj.txt", [image.world_from_cam.ravel() for image in images])
+
+
+def write_segment(
+    split: Path, segment: str, frames: Sequence[LidarFrame], shots: Sequence[CameraShot]
+) -> None:
+    """Write the components of a segment of release 2 to a folder such as `validation`.
+
+    All frames have the lidar pose and inclinations of the first, and each camera has the calibration of its
+    first image.
+    """
+
+    def write(tag: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        _write_component(component_path(split, tag, segment), rows)
+
+    pose = "[VehiclePoseComponent].world_from_vehicle.transform"
+    write("vehicle_pose", [{FRAME: f.timestamp_micros, pose: f.world_from_vehicle.ravel()} for f in frames])
+    base = "[LiDARCalibrationComponent]"
+    beams = frames[0].inclinations[::-1]
+    calibration = {
+        LASER: TOP,
+        f"{base}.extrinsic.transform": frames[0].vehicle_from_lidar.ravel(),
+        f"{base}.beam_inclination.min": float(beams[0]),
+        f"{base}.beam_inclination.max": float(beams[-1]),
+        f"{base}.beam_inclination.values": beams.astype(np.float64),
+    }
+    write("lidar_calibration", [calibration])
+    for tag, component, part, kind in (
+        ("lidar", "LiDARComponent", "image", np.float32),
+        ("lidar_segmentation", "LiDARSegmentationLabelComponent", "labels", np.int32),
+        ("lidar_camera_projection", "LiDARCameraProjectionComponent", "projection", np.float32),
+    ):
+        images = [[getattr(each, part).astype(kind) for each in frame.returns] for frame in frames]
+        write(tag, [_cells(component, *pair) for pair in zip(frames, images, strict=True)])
+    write("lidar_pose", [_cells("LiDARPoseComponent", frame, [frame.pixel_pose]) for frame in frames])
+    camera_of = {shot.camera.name: shot.camera for shot in reversed(shots)}
+    write("camera_calibration", [_calibration(camera) for camera in camera_of.values()])
+    write(
+        "camera_image",
+        [
+            {
+                FRAME: shot.timestamp_micros,
+                CAMERA: CAMERAS.index(shot.camera.name) + 1,
+                "[CameraImageComponent].image": shot.encoded,
+                "[CameraImageComponent].pose.transform": shot.world_from_vehicle.ravel(),
+            }
+            for shot in shots
+        ],
+    )
+
+
+def _cells(component: str, frame: LidarFrame, images: Sequence[np.ndarray]) -> dict[str, Any]:
+    """A row of range images: values and shape of the first and second return, null if there is none."""
+    row: dict[str, Any] = {FRAME: frame.timestamp_micros, LASER: TOP}
+    for number in (1, 2):
+        image = images[number - 1] if len(images) >= number else None
+        name = f"[{component}].range_image_return{number}"
+        row[f"{name}.values"] = None if image is None else image.ravel()
+        row[f"{name}.shape"] = None if image is None else np.array(image.shape, dtype=np.int32)
+    return row
+
+
+def _calibration(camera: WaymoCamera) -> dict[str, Any]:
+    base = "[CameraCalibrationComponent]"
+    height, width = camera.size_hw
+    lens = {f"{base}.intrinsic.{name}": float(v) for name, v in zip(INTRINSIC, camera.intrinsic, strict=True)}
+    return {
+        CAMERA: CAMERAS.index(camera.name) + 1,
+        **lens,
+        f"{base}.extrinsic.transform": camera.vehicle_from_cam.ravel(),
+        f"{base}.width": width,
+        f"{base}.height": height,
+    }
+
+
+def _write_component(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """One row group, columns typed as the release types them."""
+    small = {CAMERA: pa.int8(), LASER: pa.int8(), FRAME: pa.int64()}
+    columns = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        kind = small.get(name)
+        if isinstance(values[0], np.ndarray):
+            kind = pa.list_(pa.from_numpy_dtype(values[0].dtype))
+        columns[name] = pa.array(values, type=kind)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(pa.table(columns), path)
+
+
+VEHICLE_FROM_CAM = np.array([[1.0, 0, 0, 1.5], [0, 1, 0, 0], [0, 0, 1, 2.1], [0, 0, 0, 1]])
+LIDAR_AT = (1.4, 0.0, 2.2)
+"""Place of the lidar on the vehicle, metres; that of the true drive is in its poses."""
+LIDAR_TURN_DEG = 148.0
+"""The lidar is mounted turned, as Waymo's is: columns are counted from the vehicle's back all the same."""
+AZIMUTH_STEPS, BEAMS = 400, 64
+"""Directions per turn of the scan, and evenly spaced beams: columns and rows of the range images."""
+FRAME_MICROS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledMesh:
+    """The labelled surface of a synthetic scene; `whole` is a row of `texts`, -1 for none."""
+
+    xyz: Float32[np.ndarray, "P 3"]
+    whole: Int32[np.ndarray, " P"]
+    faces: Int32[np.ndarray, "F 3"]
+    whole_of_face: Int32[np.ndarray, " F"]
+    texts: tuple[str, ...]
+
+    @staticmethod
+    def open(world: Path) -> "LabelledMesh":
+        """Read `truth/mesh.ply` and the texts of `truth/annotations.json`."""
+        path = world / "truth" / "mesh.ply"
+        mesh = read_ply(path, 3)
+        nodes = HierarchyAnnotations.load(path.parent).nodes
+        return LabelledMesh(
+            ply_places(path, mesh),
+            ply_column(path, mesh, "vertex", "whole").astype(np.int32),
+            ply_faces(path, mesh),
+            ply_column(path, mesh, "face", "whole").astype(np.int32),
+            tuple(node.text for node in nodes),
+        )
+
+
+def posed_images(world: Path) -> list[PosedImage]:
+    """Images of a synthetic scene with their true cameras."""
+    cameras = Cameras.load(world / "truth" / "cameras.npz")
+    return [
+        PosedImage(name, world / "images" / name, camera.cam_from_world, camera.K, camera.size_hw)
+        for name, camera in ((name, cameras[name]) for name in cameras.names)
+    ]
+
+
+def write_room_as_scannet(world: Path, root: Path, scan: str) -> None:
+    """Write a room as `scans/<scan>`; nodes count as objects in their order."""
+    mesh = LabelledMesh.open(world)
+    categories = {text: scannet_ids(text) for text in mesh.texts}
+    write_label_table(root, categories)
+    write_scan(root, scan, posed_images(world), mesh.xyz, mesh.faces, mesh.whole, mesh.texts, categories)
+
+
+def write_room_as_replica(world: Path, root: Path, scene: str) -> None:
+    """Write a room as a scene of Replica with the sequence in the layout of NICE-SLAM."""
+    mesh = LabelledMesh.open(world)
+    classes = [replica_id(text) for text in mesh.texts]
+    write_semantic_mesh(root / scene / "habitat", mesh.xyz, mesh.faces, mesh.whole_of_face, classes)
+    write_sequence(root / scene.replace("_", ""), posed_images(world))
+
+
+def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
+    """Write a street as a segment of Waymo's release 2: range images of its scan, its views as FRONT."""
+    scan = read_npz(world / "truth" / "lidar.npz")
+    nodes = HierarchyAnnotations.load(world / "truth").nodes
+    labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
+    images = posed_images(world)
+    shots = [_shot(image, FRAME_MICROS * (number + 1)) for number, image in enumerate(images)]
+    centres = np.stack([image.world_from_cam[:3, 3] for image in images])
+    up = np.arcsin((scan["points"] - scan["origins"][scan["pose_index"]])[:, 2] / scan["range_m"])
+    slope, start = np.polyfit(scan["beam"], up.astype(np.float64), 1)
+    inclinations = (start + slope * np.arange(BEAMS))[::-1]
+    frames = []
+    for pose, origin in enumerate(scan["origins"]):
+        view = int(np.linalg.norm(centres - origin, axis=1).argmin())
+        rows = scan["pose_index"] == pose
+        turn = {name: scan[name][rows] for name in ("points", "range_m", "beam")}
+        frames.append(_lidar_frame(turn, labels[rows], origin, inclinations, shots[view]))
+    write_segment(split, segment, frames, shots)
+
+
+def _shot(image: PosedImage, time: int) -> CameraShot:
+    """A view as an image of the front camera."""
+    assert isinstance(image.image, Path)
+    K = image.K
+    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0, 0, 0, 0], dtype=np.float64)
+    stream = io.BytesIO()
+    Image.fromarray(read_image(image.image)).save(stream, format="JPEG", quality=95)
+    world_from_vehicle = image.world_from_cam @ CV_FROM_WAYMO @ np.linalg.inv(VEHICLE_FROM_CAM)
+    camera = WaymoCamera("FRONT", lens, VEHICLE_FROM_CAM, image.size_hw)
+    return CameraShot(time, camera, stream.getvalue(), world_from_vehicle)
+
+
+def _lidar_frame(
+    scan: dict[str, np.ndarray],
+    labels: np.ndarray,
+    origin: Float[np.ndarray, " 3"],
+    inclinations: Float[np.ndarray, " H"],
+    shot: CameraShot,
+) -> LidarFrame:
+    """One turn of the scan as a range image. The vehicle heads along the axis x of the world."""
+    height, width = len(inclinations), AZIMUTH_STEPS
+    turn = np.radians(LIDAR_TURN_DEG)
+    vehicle_from_lidar = np.eye(4)
+    vehicle_from_lidar[:3, :3] = rotation_of(np.array([0.0, 0.0, turn]))
+    vehicle_from_lidar[:3, 3] = LIDAR_AT
+    world_from_vehicle = np.eye(4)
+    world_from_vehicle[:3, 3] = origin - np.array(LIDAR_AT)
+    away = scan["points"] - origin
+    azimuth = np.arctan2(away[:, 1], away[:, 0])
+    first = column_azimuths(width, vehicle_from_lidar)[0] + turn
+    column = (first - azimuth) / (2 * np.pi / width)
+    assert np.abs(column - column.round()).max(initial=0) < 0.1  # the scan has the directions of the columns
+    place = height - 1 - scan["beam"], column.round().astype(int) % width
+    image = np.zeros((height, width, 4), dtype=np.float32)
+    image[..., 0] = -1
+    image[*place, 0] = scan["range_m"]
+    of_pixel = np.zeros((height, width, 2), dtype=np.int32)
+    of_pixel[place] = labels
+    in_camera = shot.camera.cam_from_world(shot.world_from_vehicle)
+    local = scan["points"].astype(np.float64) @ in_camera[:3, :3].T + in_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixel = (local @ shot.camera.K.T)[:, :2] / local[:, 2:]  # the front camera has no distortion
+    rows, columns = shot.camera.size_hw
+    inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < [columns, rows]).all(axis=1)
+    cells = np.zeros((height, width, 6), dtype=np.int32)
+    cells[place] = np.where(
+        inside[:, None], np.stack([inside, *np.floor(pixel.T), *np.zeros((3, len(pixel)))], axis=1), 0
+    )
+    pose = np.tile(np.float32([0, 0, 0, *world_from_vehicle[:3, 3]]), (height, width, 1))
+    returns = (LidarReturn(image, of_pixel, cells),)
+    return LidarFrame(
+        shot.timestamp_micros, world_from_vehicle, vehicle_from_lidar, inclinations, pose, returns
+    )
