@@ -7,23 +7,17 @@ import numpy as np
 
 from hilsplat.base.compiled import compiled
 
-BETA1, BETA2 = 0.9, 0.999
-"""Decay rates of the moments, as in torch."""
+BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
 
 
 @dataclass
 class Adam:
-    """Adam for one array of parameters, which `step` changes in place.
+    """Adam for one array of parameters, which `step` changes in place."""
 
-    Attributes:
-        values: parameters, float32, contiguous.
-        rate: step size; it may change between steps.
-        eps: number added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS and
-            in published code of language fields.
-    """
-
-    values: np.ndarray
-    rate: float
+    values: np.ndarray  # parameters, float32, contiguous
+    rate: float  # step size; it may change between steps
+    # number added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS and in
+    # published code of language fields
     eps: float = 1e-15
 
     def __post_init__(self) -> None:

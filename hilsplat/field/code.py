@@ -17,19 +17,14 @@ from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_product
 from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import require_same_masks
 
-CHUNK_ROWS = 4096
-"""Rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache."""
-
+CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
-NORM_EPS = 1e-5
-"""Epsilon added to the variances of BatchNorm, as in torch."""
+NORM_EPS = 1e-5  # epsilon added to the variances of BatchNorm, as in torch
 
-ROWS = 2 * WIDE_COLUMNS
-"""Rows that pass through the layers together, so that weights are read from the L2 cache once for all."""
+ROWS = 2 * WIDE_COLUMNS  # rows that pass through the layers together: weights are read from L2 once for all
 
-UNITS = MOST_ROWS
-"""Outputs of a layer that are summed together; layers are padded to a multiple."""
+UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple
 
 _add_products = rows_of_products(UNITS)
 
@@ -39,11 +34,8 @@ class LinearCode:
 
     It involves no training and no randomness. Unlike with a network, the code of an average is the average
     of the codes, and a cosine with any vector takes d products, so relevancy needs no decoding. A network,
-    however, can adapt its d numbers nonlinearly to the vectors of the scene.
-
-    Args:
-        mean: m.
-        basis: U, with orthonormal rows.
+    however, can adapt its d numbers nonlinearly to the vectors of the scene. The mean is m, and the basis U,
+    with orthonormal rows.
     """
 
     def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
@@ -95,12 +87,9 @@ class PackedLayers(NamedTuple):
 
     The values stay in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
     the registers. The order of the sums of a row does not depend on the other rows.
-
-    Attributes:
-        widths: number of inputs, then of each layer's outputs.
     """
 
-    widths: Int64[np.ndarray, " L_plus_1"]
+    widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then of each layer's outputs
     weights: Float32[np.ndarray, " W"]
     biases: Float32[np.ndarray, " V"]
 
@@ -165,35 +154,28 @@ def _through(rows, widths, weights, biases, out):
 
 
 class Layer(NamedTuple):
-    """A linear layer, with the normalisation and activation before it.
+    """A linear layer, with the normalisation and activation before it."""
 
-    Attributes:
-        name: name of its weights in the file.
-        norm: name of the BatchNorm before it; empty if there is none.
-        relu: whether a ReLU is applied to its inputs, after the BatchNorm.
-    """
-
-    name: str
-    norm: str
-    relu: bool
+    name: str  # name of its weights in the file
+    norm: str  # name of the BatchNorm before it; empty if there is none
+    relu: bool  # whether a ReLU is applied to its inputs, after the BatchNorm
     inputs: int
     outputs: int
 
 
 def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
     """Return the layers of encoder and decoder; no layer is wider than the vectors."""
-    sides = []
-    for side, widths, norm in (("encoder", ENCODER_WIDTHS, True), ("decoder", DECODER_WIDTHS, False)):
-        between = [min(width, channels) for width in widths]
-        ends = [channels, *between, latent] if norm else [latent, *between, channels]
-        every = 3 if norm else 2  # numbering of torch's nn.Sequential, which counts norms and ReLUs
-        sides.append(
-            [
-                Layer(f"{side}.{every * k}", f"{side}.{every * k - 2}" if norm and k else "", k > 0, *sizes)
-                for k, sizes in enumerate(pairwise(ends))
-            ]
-        )
-    return sides[0], sides[1]
+    inner, outer = ([min(width, channels) for width in sizes] for sizes in (ENCODER_WIDTHS, DECODER_WIDTHS))
+    # names have the numbers of torch's nn.Sequential, which counts norms and ReLUs
+    encoder = [
+        Layer(f"encoder.{3 * k}", f"encoder.{3 * k - 2}" if k else "", k > 0, *sizes)
+        for k, sizes in enumerate(pairwise([channels, *inner, latent]))
+    ]
+    decoder = [
+        Layer(f"decoder.{2 * k}", "", k > 0, *sizes)
+        for k, sizes in enumerate(pairwise([latent, *outer, channels]))
+    ]
+    return encoder, decoder
 
 
 def torch_generator(seed: int) -> np.random.RandomState:

@@ -20,39 +20,27 @@ from hilsplat.field.losses import (
 )
 from hilsplat.settings import FieldSettings
 
-MAX_MASKS_PER_LEVEL = 96
-"""Maximum number of masks per view and level in the losses, which compare all pairs."""
+MAX_MASKS_PER_LEVEL = 96  # maximum number of masks per view and level in the losses, which compare all pairs
 
 
 @dataclass(frozen=True)
 class ViewRelations:
-    """Inputs of the contrastive losses for one view.
+    """Inputs of the contrastive losses for one view."""
 
-    Attributes:
-        rows: selected masks of all levels.
-        depth: depth of the deepest common ancestor of each pair of them.
-        level: their levels.
-        parts: selected masks of PART and of SUBPART, and the rows of their parents, -1 for none.
-    """
-
-    rows: Int64[np.ndarray, " m"]
-    depth: Int64[np.ndarray, "m m"]
-    level: Int64[np.ndarray, " m"]
+    rows: Int64[np.ndarray, " m"]  # selected masks of all levels
+    depth: Int64[np.ndarray, "m m"]  # depth of the deepest common ancestor of each pair of them
+    level: Int64[np.ndarray, " m"]  # their levels
+    # selected masks of PART and of SUBPART, and the rows of their parents, -1 for none
     parts: tuple[tuple[Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]], ...]
 
 
 def view_relations(
     contributions: Contributions,
-    parents: dict[str, np.ndarray],
+    parents: dict[str, np.ndarray],  # by view, the row of each mask's parent among the view's masks
     settings: FieldSettings,
-    means: Float32[np.ndarray, "M D"],
+    means: Float32[np.ndarray, "M D"],  # of the lifted features in each mask, to prune similar masks
 ) -> list[ViewRelations]:
-    """Select the masks of each view for the contrastive losses, largest first.
-
-    Args:
-        parents: parent of each mask in the coverage tree, by view (row among the view's masks).
-        means: mean lifted feature of each mask, used to prune similar masks.
-    """
+    """Select the masks of each view for the contrastive losses, largest first."""
     relations = []
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
         pixels, half, parent = contributions.pixels[rows], contributions.half_pixels[rows], parents[view]
@@ -85,12 +73,8 @@ def distinct(
     """Prune contrastive samples: return rows that aren't similar to an unrelated row kept before them.
 
     The paper keeps the most distinct samples and gives no numbers. A pair of masks that are unrelated in the
-    tree but similar adds a gradient almost redundant with those of the kept pairs.
-
-    Args:
-        means: features, in order of preference.
-        depth: `common_ancestor_depth` of the rows.
-        most_alike: cosine above which a row is dropped.
+    tree but similar adds a gradient almost redundant with those of the kept pairs. Rows are in order of
+    preference, `depth` is their `common_ancestor_depth`, and `most_alike` a cosine.
     """
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     alike = (unit @ unit.T > most_alike) & (depth == 0)
@@ -130,21 +114,12 @@ def instance_term(
 
 def part_term(
     means: Float64[np.ndarray, "M D"],
-    halves: Float64[np.ndarray, "M D"],
-    other_halves: Float64[np.ndarray, "M D"],
+    halves: Float64[np.ndarray, "M D"],  # means over a random half of each mask's pixels
+    other_halves: Float64[np.ndarray, "M D"],  # means over the other pixels
     relations: list[ViewRelations],
     settings: FieldSettings,
 ) -> tuple[float, tuple[Float64[np.ndarray, "M D"], ...]]:
-    """Compute L_part, averaged over the views and levels that have masks to compare, and its gradients.
-
-    Args:
-        means: mean feature of each mask.
-        halves: mean feature over a random half of each mask's pixels.
-        other_halves: mean feature over the other pixels.
-
-    Returns:
-        the loss, and its gradients for the three.
-    """
+    """Compute L_part, averaged over views and levels that have masks to compare, and its three gradients."""
     losses = []
     by_means, by_halves, by_others = (np.zeros(means.shape) for _ in range(3))
     for view in relations:
@@ -169,16 +144,11 @@ def part_term(
 
 @dataclass(frozen=True)
 class Contrast:
-    """The contrastive losses as functions of the field.
+    """The contrastive losses as functions of the field."""
 
-    Attributes:
-        masks: A; `half_masks` is A over a random half of each mask's pixels.
-        pixels: n; `half_pixels` counts those of the halves.
-    """
-
-    masks: MaskOperator
+    masks: MaskOperator  # A; `half_masks` is A over a random half of each mask's pixels
     half_masks: MaskOperator
-    pixels: Float32[np.ndarray, " M"]
+    pixels: Float32[np.ndarray, " M"]  # n; `half_pixels` counts those of the halves
     half_pixels: Float32[np.ndarray, " M"]
     relations: list[ViewRelations]
     settings: FieldSettings

@@ -30,36 +30,27 @@ def run_field(
     out: Path,
     settings: FieldSettings,
     threads: int,
-    seed: int = 0,
-    rendered: tuple[Path, Path, Path] | None = None,
-    start: Path | None = None,
+    seed: int = 0,  # of a random start, and of the order of views of `trainer: literal`
+    rendered: tuple[Path, Path, Path] | None = None,  # scene, Gaussians and masks for `trainer: literal`
+    start: Path | None = None,  # field from which `start: langsplat` begins
 ) -> None:
     """Solve the language field of a scene: `field.safetensors` and `field.report.json` beside it.
 
     With `trainer: fast`, only a random start depends on the seed (halves of masks are seeded by the view's
     name). The result does not depend on `threads`.
 
-    Args:
-        seed: seed of a random start, and of the order of views of `trainer: literal`.
-        rendered: scene, Gaussians and masks that `trainer: literal` renders.
-        start: field from which `start: langsplat` begins.
-
     Raises:
         MisalignedArtifactError: an input belongs to other masks, Gaussians or codes.
         SettingsError: an input that the settings require is missing.
     """
-    for name, wanted, given, options in (
-        (
-            "trainer",
-            settings.trainer == "literal",
-            rendered,
-            "--scene, --gaussians and --masks with trainer: literal",
-        ),
-        ("start", settings.start == "langsplat", start, "--start <field.safetensors> with start: langsplat"),
+    for name, value, given, options in (
+        ("trainer", "literal", rendered, "--scene, --gaussians and --masks"),
+        ("start", "langsplat", start, "--start <field.safetensors>"),
     ):
-        if wanted != (given is not None):
+        if (getattr(settings, name) == value) != (given is not None):
             raise SettingsError(
-                f"field.{name} and the options don't fit together", expected=f"{options}, and only there"
+                f"field.{name} and the options don't fit together",
+                expected=f"{options} with {name}: {value}, and only there",
             )
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]

@@ -11,17 +11,12 @@ from hilsplat.base.arrays import made, read_tensors, write_tensors
 
 @dataclass(frozen=True)
 class LanguageField:
-    """One latent per Gaussian and level.
+    """One latent per Gaussian and level."""
 
-    Attributes:
-        features: latents of N Gaussians at three levels, coarse to fine; 0 for no latent.
-        gaussians_sha256: digest of the Gaussians' PLY.
-        autoencoder_sha256: digest of the code that decodes the latents.
-    """
-
+    # latents of N Gaussians at three levels, coarse to fine; 0 for no latent
     features: Float32[np.ndarray, "N 3 D"]
-    gaussians_sha256: str
-    autoencoder_sha256: str
+    gaussians_sha256: str  # digest of the Gaussians' PLY
+    autoencoder_sha256: str  # digest of the code that decodes the latents
 
     def save(self, path: Path) -> None:
         """Write `field.safetensors` atomically; equal fields give equal bytes."""

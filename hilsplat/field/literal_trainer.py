@@ -35,47 +35,31 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
-CURVE_POINTS = 30
-"""Points of the loss curve in the report."""
+CURVE_POINTS = 30  # points of the loss curve in the report
 
 
 @dataclass(frozen=True)
 class ViewTargets:
-    """Masks of one view in its covered pixels.
+    """Masks of one view in its covered pixels."""
 
-    Attributes:
-        rows: rows of its masks in the contributions.
-        level: level of each mask, 0 to 2.
-        painted: indicator (masks x pixels) of the pixels that show each mask.
-        half: indicator of those pixels that are in the random half.
-        relations: masks compared by L_ins and L_part.
-    """
-
-    rows: Int64[np.ndarray, " m"]
-    level: Int64[np.ndarray, " m"]
-    painted: sp.csr_matrix
-    half: sp.csr_matrix
-    relations: ViewRelations
+    rows: Int64[np.ndarray, " m"]  # rows of its masks in the contributions
+    level: Int64[np.ndarray, " m"]  # level of each mask, 0 to 2
+    painted: sp.csr_matrix  # indicator (masks x pixels) of the pixels that show each mask
+    half: sp.csr_matrix  # indicator of those pixels that are in the random half
+    relations: ViewRelations  # masks compared by L_ins and L_part
 
 
 def view_losses(
-    shown: Float64[np.ndarray, "P 3 D"],
+    shown: Float64[np.ndarray, "P 3 D"],  # rendered features divided by alpha
     view: ViewTargets,
-    latents: Float32[np.ndarray, "M D"],
+    latents: Float32[np.ndarray, "M D"],  # of every mask of the scene
     settings: FieldSettings,
-    shares: tuple[int, float, int, int],
+    shares: tuple[int, float, int, int],  # views, labelled pixels, and the counts of `compared`, of the scene
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
     """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
 
-    The losses are scaled so that their mean over all views equals the solver's objective.
-
-    Args:
-        shown: rendered features divided by alpha, channels of each level.
-        latents: latent of every mask of the scene.
-        shares: number of views and of labelled pixels, and the counts of `compared`, over the scene.
-
-    Returns:
-        unweighted losses by name; gradient with respect to the maps, 0 where no mask is painted.
+    The losses are returned unweighted, by name, and scaled so that their mean over all views equals the
+    solver's objective. The gradient is 0 where no mask is painted.
     """
     num_views, num_pixels, num_instance, num_part = shares
     pixels, levels, channels = shown.shape
@@ -133,15 +117,12 @@ def train_literally(
     problem: QuadraticProblem,
     contrast: Contrast,
     contributions: Contributions,
-    rendered: tuple[Path, Path, Path],
+    rendered: tuple[Path, Path, Path],  # scene, its frozen Gaussians, and masks
     settings: FieldSettings,
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Run Adam from the field's start, one random view per step, each once before any is repeated.
-
-    Args:
-        rendered: scene, its frozen Gaussians, and masks.
 
     Returns:
         the features, and a report: every term of the objective before and after, and the loss curve.

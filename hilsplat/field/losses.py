@@ -12,11 +12,9 @@ from jaxtyping import Bool, Float, Float64, Int, Int32, Int64
 
 from hilsplat.base.levels import NONE
 
-SOFTENING = 1e-3
-"""Added in quadrature to every distance, so that its logarithm has a finite slope at zero."""
+SOFTENING = 1e-3  # added in quadrature to every distance, so that its logarithm has a finite slope at zero
 
-SHORTEST = 1e-6
-"""Added in quadrature to every length in a denominator, so that the cosine of a zero vector is zero."""
+SHORTEST = 1e-6  # added in quadrature to lengths in denominators, so that the cosine of a zero vector is 0
 
 
 def log_distance_loss(
@@ -25,11 +23,8 @@ def log_distance_loss(
     """Return the mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
 
     The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from dot products: M x M
-    instead of M x M x D numbers. In float64 the cancellation error is far below the softening.
-
-    Args:
-        means: at least two rows.
-        log_wanted: natural logarithm of the target distance of each pair.
+    instead of M x M x D numbers. In float64 the cancellation error is far below the softening. At least two
+    means are required; `log_wanted` is the natural logarithm of the target distance of each pair.
     """
     rows = len(means)
     centred = means - means.mean(axis=0)
@@ -51,11 +46,8 @@ def instance_loss_literal(
     """Compute L_ins as printed (Eq. 3): the target distance of two masks is Omega^-|l_i - l_j|.
 
     This pushes all masks of the same level to distance 1, related or not, which is impossible for more than
-    D + 1 masks. Departs only in the softened distance.
-
-    Args:
-        means: mean rendered feature of each mask of one view, all levels; at least two.
-        omega: similarity degree, above 1.
+    D + 1 masks. Departs only in the softened distance. `means` has the mean rendered feature of each mask of
+    one view, all levels; Omega is above 1.
     """
     return log_distance_loss(means, -np.abs(level[:, None] - level[None]) * math.log(omega))
 
@@ -131,9 +123,9 @@ def similarity_without_parent(
 
 
 def part_loss_literal(
-    means: Float[np.ndarray, "M D"],
-    parent: Int[np.ndarray, " M"],
-    parent_means: Float[np.ndarray, "M D"],
+    means: Float[np.ndarray, "M D"],  # of the rendered features in each mask of the level
+    parent: Int[np.ndarray, " M"],  # id of each mask's parent, -1 for an orphan
+    parent_means: Float[np.ndarray, "M D"],  # any value for orphans
     tau: float,
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """Compute L_part of one view and level as printed (Eq. 5): siblings attract, children of others repel.
@@ -143,16 +135,7 @@ def part_loss_literal(
 
     Departs: we read 1 / (L N_p) as the mean, over anchors with at least one positive and one negative, of
     the mean over their positives. The caller omits level l = 1, which has no parents; this function omits
-    orphans. An anchor is not its own positive.
-
-    Args:
-        means: mean rendered feature of each mask of the level.
-        parent: id of each mask's parent, -1 for an orphan.
-        parent_means: mean feature of each mask's parent (any value for orphans).
-        tau: temperature.
-
-    Returns:
-        the loss, 0 without anchors, and its gradient for the means.
+    orphans. An anchor is not its own positive. Without anchors, the loss is 0.
     """
     similarity, pull_back = similarity_without_parent(means, means, parent_means)
     has_parent = parent != NONE
@@ -172,26 +155,17 @@ def part_loss_literal(
 
 
 def part_loss_disentangle(
-    half: Float[np.ndarray, "M D"],
-    other_half: Float[np.ndarray, "M D"],
-    has_parent: Bool[np.ndarray, " M"],
-    parent_means: Float[np.ndarray, "M D"],
+    half: Float[np.ndarray, "M D"],  # means over a random half of each mask's pixels; at least two masks
+    other_half: Float[np.ndarray, "M D"],  # means over the remaining pixels
+    has_parent: Bool[np.ndarray, " M"],  # masks with a parent, which are the anchors; at least one
+    parent_means: Float[np.ndarray, "M D"],  # any value for orphans
     tau: float,
 ) -> tuple[float, Float64[np.ndarray, "M D"], Float64[np.ndarray, "M D"]]:
     """Compute L_part of one view and level as the paper describes it: parts of one object are separated.
 
     Departs: the positive of a mask is the other random half of its own pixels; negatives are the other
     halves of all other masks of the level, including siblings; the denominator includes the positive
-    (InfoNCE). The anchor's parent mean is subtracted from all features.
-
-    Args:
-        half: mean feature over a random half of each mask's pixels; at least two masks.
-        other_half: mean over the remaining pixels.
-        has_parent: masks with a parent, which are the anchors; at least one.
-        parent_means: mean feature of each mask's parent (any value for orphans).
-
-    Returns:
-        mean over anchors, and its gradients for both halves.
+    (InfoNCE). The anchor's parent mean is subtracted from all features. The loss is the mean over anchors.
     """
     by_half = np.zeros(half.shape)
     anchors = np.flatnonzero(has_parent)

@@ -25,24 +25,15 @@ from hilsplat.contributions.quadratic import Quadratic, level_mass
 
 @dataclass(frozen=True)
 class QuadraticProblem:
-    """Language loss, clustering loss and ridge: all terms except the contrastive losses.
+    """Language loss, clustering loss and ridge: all terms except the contrastive losses."""
 
-    Attributes:
-        masks: A.
-        mass: G 1, the visible mass of each Gaussian at each level, px.
-        pixels: n.
-        latents: h.
-        lifted: start of the field, to which the ridge pulls.
-        weights: of the language loss, the clustering loss and the ridge.
-    """
-
-    masks: MaskOperator
+    masks: MaskOperator  # A
     quadratic: Quadratic
-    mass: Float32[np.ndarray, "N 3"]
-    pixels: Float32[np.ndarray, " M"]
-    latents: Float32[np.ndarray, "M D"]
-    lifted: Float32[np.ndarray, "N 3 D"]
-    weights: tuple[float, float, float]
+    mass: Float32[np.ndarray, "N 3"]  # G 1, the visible mass of each Gaussian at each level, px
+    pixels: Float32[np.ndarray, " M"]  # n
+    latents: Float32[np.ndarray, "M D"]  # h
+    lifted: Float32[np.ndarray, "N 3 D"]  # start of the field, to which the ridge pulls
+    weights: tuple[float, float, float]  # of the language loss, the clustering loss and the ridge
 
     @staticmethod
     def of(
@@ -51,14 +42,10 @@ class QuadraticProblem:
         pixels: Float32[np.ndarray, " M"],
         latents: Float32[np.ndarray, "M D"],
         weights: tuple[float, float, float],
-        start: str | Float32[np.ndarray, "N 3 D"] = "average",
+        start: str | Float32[np.ndarray, "N 3 D"] = "average",  # or "median", "random", features
         seed: int = 0,
     ) -> "QuadraticProblem":
-        """Compute the mass and the start of the field, to which the ridge pulls.
-
-        Args:
-            start: "average", "median", "random" (from `seed`), or features.
-        """
+        """Compute the mass and the start of the field, to which the ridge pulls."""
         mass = level_mass(quadratic)
         if isinstance(start, np.ndarray):
             lifted = start

@@ -68,18 +68,14 @@ def _rows(features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "R D"]:
 
 def keep_labelled(
     features: Float32[np.ndarray, "N 3 D"],
-    mass: Float32[np.ndarray, "N 3"],
-    total_mass: Float[np.ndarray, " N"],
+    mass: Float32[np.ndarray, "N 3"],  # visible weight in labelled pixels of each level
+    total_mass: Float[np.ndarray, " N"],  # visible weight in all pixels
     min_share: float,
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Remove the latents of Gaussians with little of their visible weight in a level's labelled pixels.
 
     Tables and walls have no part masks. But where a mask border extends onto them by a pixel, their Gaussians
     get the mask's full latent and match its queries everywhere: the regression uses only labelled pixels.
-
-    Args:
-        mass: visible weight in labelled pixels of each level.
-        total_mass: visible weight in all pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
     return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)
@@ -88,11 +84,8 @@ def keep_labelled(
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
     """Minimise by limited-memory BFGS with step halving; every sum is taken in a fixed order.
 
-    Args:
-        objective: function that returns the value and gradient at a point.
-        point: start, which is overwritten.
-        steps: iterations; each takes one evaluation, plus one per halving of its step.
-        first_step: inverse curvature assumed before the first step.
+    The start `point` is overwritten. A step takes one evaluation of value and gradient, plus one per halving;
+    `first_step` is the inverse curvature assumed before the first.
     """
     value, gradient = objective(point)
     memory: list[tuple[np.ndarray, np.ndarray, float]] = []

@@ -26,14 +26,9 @@ from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
-TOP_GAUSSIANS = 45
-"""Heaviest Gaussians of a pixel that take its vector, as in the published code."""
-
-PART = 4
-"""Elements of a CLIP vector that share a byte."""
-
-UNSEEN = 1e-9
-"""Averages shorter than this have no direction."""
+TOP_GAUSSIANS = 45  # heaviest Gaussians of a pixel that take its vector, as in the published code
+PART = 4  # elements of a CLIP vector that share a byte
+UNSEEN = 1e-9  # averages shorter than this have no direction
 
 
 def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:

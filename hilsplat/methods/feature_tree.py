@@ -25,14 +25,10 @@ from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import MIN_FIT, LevelNodes, best_fits, level_ious
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 
-CENTRE_OF = 4
-"""Minimum number of Gaussians per centre."""
+CENTRE_OF = 4  # minimum number of Gaussians per centre
+STEPS = 60  # L-BFGS steps of the features
 
-STEPS = 60
-"""L-BFGS steps of the features."""
-
-RIDGE = 1e-3
-"""Weight of the penalty towards the random start, which keeps unobserved directions from drifting."""
+RIDGE = 1e-3  # weight of the pull towards the random start; it keeps unobserved directions from drifting
 
 
 def farthest_alike(

@@ -64,15 +64,12 @@ def neighbour_loss(
 def identity_of_gaussians(
     views: list[LabelledView],
     contributions: Contributions,
-    identity: Int64[np.ndarray, " M"],
+    identity: Int64[np.ndarray, " M"],  # of every mask of the scene at the level, -1 for none
     level: Level,
     settings: MethodSettings,
     seed: int,
 ) -> Int64[np.ndarray, " N"]:
-    """Train codes and classifier of a level, and classify the Gaussians.
-
-    `identity` is that of every mask of the scene at the level, -1 for none.
-    """
+    """Train codes and classifier of a level, and classify the Gaussians."""
     num_classes = int(identity.max()) + 1
     draw = torch.Generator().manual_seed(seed)
     codes = (0.1 * torch.randn(contributions.num_gaussians, CHANNELS, generator=draw)).requires_grad_()

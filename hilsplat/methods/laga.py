@@ -43,14 +43,11 @@ from hilsplat.settings import MethodSettings
 
 SLICES = (16, 8, 8)
 PREFIX = (16, 24, 32)
-MIN_SHARE = 400 / (988 * 731)
-"""Minimum share of the image in a mask: 400 px of a LERF view."""
+MIN_SHARE = 400 / (988 * 731)  # minimum share of the image in a mask: 400 px of a LERF view
 SAME_IOU = 0.8
 HARD_COSINE = 0.5
-RADIUS = (0.3, 0.2, 0.1)
-"""Radius of density clusters at level whole, part, subpart."""
-LEAST_MASKS = 5
-"""Minimum number of masks within the radius of a dense mask, or the number of views if that is smaller."""
+RADIUS = (0.3, 0.2, 0.1)  # radius of density clusters at level whole, part, subpart
+LEAST_MASKS = 5  # minimum number of masks within the radius of a dense mask, at most the number of views
 MOST_DESCRIPTORS = 20
 PIXELS = 2048
 

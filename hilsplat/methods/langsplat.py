@@ -116,17 +116,14 @@ def signs_of_difference(typingctx, a, b, scale):
 
 
 def train_level(
-    views: list[LabelledView],
+    views: list[LabelledView],  # with labelled pixels at this level, at least one
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train by Adam from zero, one random view per step, each once before any is repeated.
-
-    `views` are train views with labelled pixels at this level, at least one.
-    """
+    """Train by Adam from zero, one random view per step, each once before any is repeated."""
     channels = latents.shape[1]
     wide = channels + -channels % WIDTH
     features, gradient = np.zeros((2, num_gaussians * wide), np.float32)

@@ -27,11 +27,8 @@ from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order, labelled_views
 from hilsplat.settings import MethodSettings
 
-ENTRIES = 64
-"""Codebook entries per level (LangSplatV2)."""
-
-KEPT = 4
-"""Non-zero coefficients per Gaussian and level (LangSplatV2)."""
+ENTRIES = 64  # codebook entries per level (LangSplatV2)
+KEPT = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
 
 
 def largest_shares(
@@ -64,16 +61,11 @@ def cosine_loss(
 def step(
     logits: Float32[np.ndarray, "N E"],
     codebook: Float32[np.ndarray, "E D"],
-    weights: sp.csr_matrix,
-    targets: Float32[np.ndarray, "p D"],
+    weights: sp.csr_matrix,  # compositing weights (pixels x Gaussians), rows summing to 1
+    targets: Float32[np.ndarray, "p D"],  # code of the mask painted at each pixel
     code: LinearCode,
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
-    """Return the loss of a view's labelled pixels, and its gradients for logits and codebook.
-
-    Args:
-        weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        targets: code of the mask painted at each pixel.
-    """
+    """Return the loss of a view's labelled pixels, and its gradients for logits and codebook."""
     chosen, shares = largest_shares(logits)
     rows = weights.indptr, weights.indices, weights.data
     mixed = np.zeros((weights.shape[0], len(codebook)), np.float32)
@@ -89,21 +81,16 @@ def step(
 
 
 def train_level(
-    views: list[LabelledView],
+    views: list[LabelledView],  # with labelled pixels at this level, at least one
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
-    codebook: Float32[np.ndarray, "E D"],
+    codebook: Float32[np.ndarray, "E D"],  # initial entries, at least `KEPT`
     code: LinearCode,
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train logits (from zero) and codebook; return the mixture of every Gaussian.
-
-    Args:
-        views: train views with labelled pixels at this level, at least one.
-        codebook: initial entries, at least `KEPT`.
-    """
+    """Train logits (from zero) and codebook; return the mixture of every Gaussian."""
     logits, entries = np.zeros((num_gaussians, len(codebook)), np.float32), codebook.copy()
     of_logits, of_entries = Adam(logits, settings.rate), Adam(entries, settings.rate)
     order = in_random_order(views, np.random.default_rng(seed))

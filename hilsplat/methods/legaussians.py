@@ -42,12 +42,9 @@ CHANNELS = 8
 DECODER_WIDTHS = (128, 256)
 POSITION_WIDTHS = (128,) * 4
 FIRST_UNCERTAINTY = 0.01
-UNCERTAINTY_RATE = 0.05
-"""Adam's rate for uncertainties, regardless of the rate of the codes."""
-NETWORK_RATE = 0.2
-"""Factor of the codes' rate for the networks; the authors use 1."""
-LEAST_SMOOTHING = 0.1
-"""Smoothing weight of a certain Gaussian; that of an uncertain one is 1."""
+UNCERTAINTY_RATE = 0.05  # Adam's rate for uncertainties, regardless of the rate of the codes
+NETWORK_RATE = 0.2  # factor of the codes' rate for the networks; the authors use 1
+LEAST_SMOOTHING = 0.1  # smoothing weight of a certain Gaussian; that of an uncertain one is 1
 SMOOTHING = 0.1
 SAMPLES = 1000
 PIXELS = 1024

@@ -5,7 +5,7 @@ that rows of a table differ only by method.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -39,19 +39,14 @@ View = TypeVar("View")
 
 @dataclass(frozen=True)
 class MethodInputs:
-    """Artifacts of a scene, read on first use.
+    """Artifacts of a scene, read on first use."""
 
-    Attributes:
-        scene_folder: scene artifact; a method may use only its train views.
-        threads: rasteriser threads; results must not depend on it.
-    """
-
-    scene_folder: Path
+    scene_folder: Path  # scene artifact; a method may use only its train views
     gaussians_ply: Path
     masks_folder: Path
     contributions_folder: Path
     autoencoder_folder: Path
-    threads: int = 1
+    threads: int = 1  # rasteriser threads; results must not depend on it
 
     @cached_property
     def contributions(self) -> Contributions:
@@ -143,27 +138,18 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
 
 @dataclass(frozen=True)
 class LabelledView:
-    """Covered pixels of one view that are labelled at any level, on the grid of `method.pixel_step`.
+    """Covered pixels of one view that are labelled at any level, on the grid of `method.pixel_step`."""
 
-    Attributes:
-        number: index of the view in the contributions.
-        rows: rows of the view's masks in the contributions.
-        weights: compositing weights (pixels x Gaussians), rows summing to 1.
-        labels: row, among the view's masks, of the mask painted at each pixel and level, -1 for none.
-        xy: column and row of each pixel, px.
-    """
-
-    number: int
-    rows: Int64[np.ndarray, " m"]
-    weights: sp.csr_matrix
+    number: int  # index of the view in the contributions
+    rows: Int64[np.ndarray, " m"]  # rows of the view's masks in the contributions
+    weights: sp.csr_matrix  # compositing weights (pixels x Gaussians), rows summing to 1
+    # row, among the view's masks, of the mask painted at each pixel and level, -1 for none
     labels: Int32[np.ndarray, "p 3"]
-    xy: Int64[np.ndarray, "p 2"]
+    xy: Int64[np.ndarray, "p 2"]  # column and row of each pixel, px
 
     def chosen(self, pixels: Int64[np.ndarray, " q"]) -> "LabelledView":
         """Return the given pixels, in that order."""
-        return LabelledView(
-            self.number, self.rows, self.weights[pixels], self.labels[pixels], self.xy[pixels]
-        )
+        return replace(self, weights=self.weights[pixels], labels=self.labels[pixels], xy=self.xy[pixels])
 
     def at(self, level: Level) -> Int64[np.ndarray, " q"]:
         """Return the pixels labelled at a level, in order."""
@@ -171,11 +157,7 @@ class LabelledView:
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Return the labelled pixels of all train views that have any, on every `pixel_step`-th row and column.
-
-    Raises:
-        ArtifactError: no view has a labelled pixel.
-    """
+    """Return the labelled pixels of train views that have any, on every `pixel_step`-th row and column."""
     found = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):

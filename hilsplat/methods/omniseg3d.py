@@ -33,8 +33,7 @@ from hilsplat.settings import MethodSettings
 
 CHANNELS = 16
 MIN_PATCH_PX = 3
-LEVEL_WEIGHT = 0.2
-"""Weight of each further step of sharing, relative to the previous one."""
+LEVEL_WEIGHT = 0.2  # weight of each further step of sharing, relative to the previous one
 SPREAD, LEAST_TEMPERATURE, MOST_TEMPERATURE = 10.0, 0.5, 1.0
 THRESHOLDS = (0.5, 0.8, 0.95)
 
@@ -63,11 +62,8 @@ def hierarchical_loss(
 
     A pixel's loss is -log of the softmax over prototypes. Its weight is 1 at the pixel's own patch and 1/5
     (1/25) at patches that share one mask less (two less). There the loss is at least that of the previous
-    step, so that nearer patches come first. Patches that share no mask are negatives only.
-
-    Args:
-        rendered: unit features of pixels.
-        shared: number of masks that two patches share.
+    step, so that nearer patches come first. Patches that share no mask are negatives only. Rendered features
+    have unit length; `shared` counts the masks that two patches share.
     """
     num = len(shared)
     prototypes, _ = segment_means(rendered, patch, num)
@@ -94,11 +90,7 @@ def hierarchical_loss(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, cluster them at three thresholds, and assign the clusters the codes of masks.
-
-    Raises:
-        SettingsError: the thresholds do not increase.
-    """
+    """Train features, cluster them at three increasing cosines, and assign clusters the codes of masks."""
     thresholds = thresholds_of(settings, THRESHOLDS)
     views = labelled_views(inputs, settings.pixel_step)
     features = alike(inputs.contributions.num_gaussians, CHANNELS, seed)

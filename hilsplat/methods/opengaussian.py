@@ -36,8 +36,7 @@ SMOOTHING = 0.1
 KMEANS_STEPS = 5
 POSITION = 0.5
 LEAST_WEIGHT, HARD_WEIGHT = 0.1, 0.9
-HARD_FROM = 0.5
-"""Share of the steps after which only the closest pairs keep their weight."""
+HARD_FROM = 0.5  # share of the steps after which only the closest pairs keep their weight
 
 
 def smoothing_loss(

@@ -41,11 +41,7 @@ def require_method(name: str) -> None:
 
 
 def method_of(name: str) -> "Fit":
-    """Load a baseline.
-
-    Raises:
-        SettingsError: there is no baseline of this name.
-    """
+    """Import a baseline, or raise a `SettingsError` if there is none of this name."""
     require_method(name)
     if name == OURS:
         raise SettingsError(

@@ -35,13 +35,11 @@ from hilsplat.settings import MethodSettings
 
 CHANNELS = 32
 NEIGHBOURS = 16
-SCALES = 8
-"""Random scales per step, besides one below and one above all masks of the view."""
+SCALES = 8  # random scales per step, besides one below and one above all masks of the view
 PIXELS = 256
 MOST_WEIGHT = 10.0
 EASY_POSITIVE, HARD_NEGATIVE = 0.75, 0.5
-COSINE = 0.95
-"""Minimum average cosine of a cluster; at 0.5, parts and subparts of development scenes are not separated."""
+COSINE = 0.95  # minimum average in a cluster; 0.5 does not separate parts from subparts on development scenes
 
 
 def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:

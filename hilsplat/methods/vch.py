@@ -37,11 +37,9 @@ from hilsplat.settings import CoverageTreeSettings, MethodSettings
 
 CHANNELS = 16
 TEMPERATURE = 0.1
-PAIRS = 64
-"""Triplets per mask and step."""
+PAIRS = 64  # triplets per mask and step
 PIXEL_NEIGHBOURS = 10
-BORDER = 10.0
-"""Added to edges across mask borders, per level, when the spanning tree is chosen."""
+BORDER = 10.0  # added to edges across mask borders, per level, when the spanning tree is chosen
 NEIGHBOURS = 16
 LARGEST = 200
 THRESHOLDS = (0.6, 0.5, 0.45)
@@ -165,11 +163,7 @@ def components(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train vectors, connect Gaussians at three distances, and assign components the codes of masks.
-
-    Raises:
-        SettingsError: the thresholds do not decrease.
-    """
+    """Train vectors, connect Gaussians at decreasing distances, and assign components the codes of masks."""
     thresholds = thresholds_of(settings, THRESHOLDS)
     contributions = inputs.contributions
     views = labelled_views(inputs, settings.pixel_step)

@@ -25,15 +25,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.chaos.commands import kill_commands
-from tests.chaos.faults import FAULTS, Run, Victim
+from tests.chaos.faults import FAULTS, Run, Victim, mounted
 from tests.conftest import PROJECT
 from tests.workflow.conftest import Project, copy_project
 
-DISK_MIB = 1000
-"""Size of the results disk, MiB; the ci configuration needs less than a tenth of it."""
+DISK_MIB = 1000  # size of the results disk, MiB; the ci configuration needs less than a tenth of it
 
-SLACK_S = 3600
-"""Maximum time of a start without a fault, in addition to that of the undisturbed run."""
+SLACK_S = 3600  # maximum time of a start without a fault, in addition to that of the undisturbed run
 
 
 @dataclass
@@ -44,8 +42,7 @@ class Tally:
     faults: dict[str, int] = field(default_factory=dict)
     finished: int = 0
     problems: list[str] = field(default_factory=list)
-    waiting: list[list[Victim]] = field(default_factory=list)
-    """Victims of the kills since the last start, by kill."""
+    waiting: list[list[Victim]] = field(default_factory=list)  # victims of the kills since the last start
 
     @property
     def kills(self) -> int:
@@ -97,16 +94,6 @@ def undisturbed(work: Path) -> tuple[Project, float]:
             sys.exit(f"the undisturbed run failed:\n{run.said()}")
         seconds.write_text(f"{time.monotonic() - start:.0f}\n")
     return project, float(seconds.read_text())
-
-
-def small_disk(folder: Path) -> bool:
-    """Mount a small disk at a folder; return False if this user may not."""
-    folder.mkdir(parents=True)
-    command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs", str(folder)]
-    try:
-        return subprocess.run(command, capture_output=True, check=False).returncode == 0
-    except OSError:
-        return False
 
 
 def torment(
@@ -176,7 +163,8 @@ def main() -> None:
     root = work / f"disturbed-{os.getpid()}"
     project = copy_project(PROJECT, root, results=False)
     results = root / "results"
-    disk = small_disk(results)
+    results.mkdir(parents=True)
+    disk = mounted(results, "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs")
     if not disk:
         print("no full or read-only disk: this user may not mount a tmpfs", flush=True)
     try:

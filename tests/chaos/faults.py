@@ -15,30 +15,21 @@ from pathlib import Path
 from tests.workflow.conftest import Project
 
 POLL_S = 0.25
-LEFT_KIB = 64
-"""Space left on a full disk."""
-WAKE_S = 60
-"""Maximum time in which a job that was frozen at its start detects that its Snakemake has ended."""
+LEFT_KIB = 64  # space left on a full disk
+WAKE_S = 60  # maximum time in which a job that was frozen at its start detects that its Snakemake has ended
 
 
 @dataclass
 class Victim:
-    """A job, and how much of its work is not stored yet.
-
-    Attributes:
-        cache: folder in which the stage stores finished views or a checkpoint.
-        begun_s, seen_s: monotonic times at which it was first and last observed.
-        kept_s: monotonic time of its last change of the cache.
-        first_s: duration up to its first stored view, which a new start repeats.
-    """
+    """A job, and how much of its work is not stored yet; times are monotonic."""
 
     pid: int
     stage: str
-    cache: Path
-    begun_s: float
-    kept_s: float
-    first_s: float | None = None
-    seen_s: float = 0.0
+    cache: Path  # folder in which the stage stores finished views or a checkpoint
+    begun_s: float  # first observation
+    kept_s: float  # last change of the cache
+    first_s: float | None = None  # duration up to its first stored view, which a new start repeats
+    seen_s: float = 0.0  # last observation
     entries: frozenset[tuple[str, int]] | None = None
 
     def look(self) -> bool:
@@ -168,7 +159,8 @@ class Run:
             if not has_ended(job.pid):
                 self.problems.append(f"{job.stage} (process {job.pid}) outlived its Snakemake")
                 os.kill(job.pid, signal.SIGKILL)
-        remounted(self.project.root / "results", "rw")
+        if self._filler.parent.is_mount():
+            mounted(self._filler.parent, "-o", "remount,rw")
         self._filler.unlink(missing_ok=True)
         return code
 
@@ -211,7 +203,7 @@ class Run:
     def lock_the_disk(self, chance: random.Random) -> list[Victim]:
         """Make results read-only until the run has ended."""
         for _ in range(40):  # a remount fails while a file is being written
-            if remounted(self.project.root / "results", "ro"):
+            if mounted(self._filler.parent, "-o", "remount,ro"):
                 break
             time.sleep(POLL_S)
         return []
@@ -239,12 +231,13 @@ class Run:
         return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
 
 
-def remounted(folder: Path, mode: str) -> bool:
-    """Remount a disk read-only (`ro`) or writable (`rw`); return False if it is no mount or is in use."""
-    if not folder.is_mount():
+def mounted(folder: Path, *options: str) -> bool:
+    """Mount a folder with these options; return False if this user may not, or if the disk is in use."""
+    command = ["mount", *options, str(folder)]
+    try:
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except OSError:
         return False
-    command = ["mount", "-o", f"remount,{mode}", str(folder)]
-    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def stage_of(pid: int) -> str | None:
@@ -259,22 +252,15 @@ def stage_of(pid: int) -> str | None:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault to inject into a run.
-
-    Attributes:
-        strike: injects it, and returns the jobs whose work is lost.
-        kills: whether it counts as a kill.
-        needs_disk: whether results must be on a separate disk.
-        may_fail: whether the run may end with an error.
-        ends_run: whether the run ends immediately.
-    """
+    """A fault to inject into a run."""
 
     name: str
+    # injects it, and returns the jobs whose work is lost
     strike: Callable[[Run, random.Random], list[Victim]]
-    kills: bool = True
-    needs_disk: bool = False
-    may_fail: bool = True
-    ends_run: bool = True
+    kills: bool = True  # whether it counts as a kill
+    needs_disk: bool = False  # whether results must be on a separate disk
+    may_fail: bool = True  # whether the run may end with an error
+    ends_run: bool = True  # whether the run ends immediately
 
 
 FAULTS = (

@@ -16,8 +16,7 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
-ROUNDS = 20
-"""Lloyd iterations; further ones reduce the error by less than 1 %."""
+ROUNDS = 20  # Lloyd iterations; further ones reduce the error by less than 1 %
 CENTRES = 256
 KMEANS_ROUNDS = 10
 MIN_SCORE = 0.2
@@ -26,6 +25,7 @@ MIN_VIEWS = 2
 ScanNet; its number of views for LERF is 5."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
+"""Function of pairs of a mask and a group."""
 
 
 def kmeans(
@@ -98,9 +98,9 @@ def features_of_groups(
 
 def associated_codes(
     inputs: MethodInputs,
-    group: Int64[np.ndarray, " N"],
-    rows: Int64[np.ndarray, " m"],
-    closeness: Closeness | None = None,
+    group: Int64[np.ndarray, " N"],  # -1 for none
+    rows: Int64[np.ndarray, " m"],  # candidate masks
+    closeness: Closeness | None = None,  # factor of the score; its masks are indices into `rows`
 ) -> Float32[np.ndarray, "N D"]:
     """Return the code of each Gaussian's group: that of its best-fitting mask of every view, averaged.
 
@@ -109,11 +109,6 @@ def associated_codes(
 
     A mask is chosen only if its score is above `MIN_SCORE`. Groups with masks in fewer than `MIN_VIEWS` views
     get 0; in a scene of one view, one is enough.
-
-    Args:
-        group: group of each Gaussian, -1 for none.
-        rows: candidate masks.
-        closeness: factor of the score for pairs of a mask (index into `rows`) and a group; 1 if None.
     """
     contributions = inputs.contributions
     num_groups = int(group.max(initial=NONE)) + 1
@@ -190,11 +185,7 @@ def density_clusters(
 
 
 def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the configured thresholds, or the method's own, whose order the configured ones must have.
-
-    Raises:
-        SettingsError: the thresholds are in the wrong order.
-    """
+    """Return the configured thresholds, or the method's own; raise a `SettingsError` if the order differs."""
     if settings.thresholds == "auto":
         return own
     grow = own[0] < own[-1]

@@ -18,11 +18,9 @@ from hilsplat.base.progress import track
 from hilsplat.methods.method import LabelledView, in_random_order
 from hilsplat.settings import MethodSettings
 
-PIXELS = 4096
-"""Maximum pixels rendered per step; published: VCH also 4096, OmniSeg3D 32,768, others whole views."""
+PIXELS = 4096  # maximum per step; published: VCH also 4096, OmniSeg3D 32,768, others whole views
 
-START_NOISE = 0.1
-"""Standard deviation of the initial features about their common value."""
+START_NOISE = 0.1  # standard deviation of the initial features about their common value
 
 
 class _Product(torch.autograd.Function):
@@ -73,19 +71,13 @@ Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
 
 def train(
     views: list[LabelledView],
-    parameters: list[Any],
+    parameters: list[Any],  # tensors, or groups of `torch.optim.Adam`, which may have their own rate
     loss: Loss,
     settings: MethodSettings,
-    seed: int,
-    pixels: int = PIXELS,
+    seed: int,  # of the order of views and the pixels
+    pixels: int = PIXELS,  # maximum per step
 ) -> None:
-    """Minimise in place by Adam: each step uses one view, each view once before any is repeated.
-
-    Args:
-        parameters: tensors, or parameter groups of `torch.optim.Adam`; groups may have their own rate.
-        seed: seed of the order of views and the pixels.
-        pixels: maximum pixels per step.
-    """
+    """Minimise in place by Adam: each step uses one view, each view once before any is repeated."""
     random = np.random.default_rng(seed)
     with one_torch_thread():
         optimiser = torch.optim.Adam(parameters, settings.rate, eps=1e-15)

@@ -40,14 +40,6 @@ def unit_vectors(rows: int, channels: int, seed: int = 0) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def test_both_ends_have_unit_length():
-    model = Autoencoder.drawn(16, 3, torch_generator(0))
-    latents = model.encode_array(unit_vectors(5, 16))
-    assert latents.shape == (5, 3)
-    assert np.linalg.norm(latents, axis=1) == pytest.approx(np.ones(5), abs=1e-5)
-    assert np.linalg.norm(model.decode_array(latents * 0.4), axis=1) == pytest.approx(np.ones(5), abs=1e-5)
-
-
 class TorchAutoencoder(nn.Module):
     """The same network in torch, whose autograd and BatchNorm ours are compared with."""
 
@@ -71,7 +63,7 @@ class TorchAutoencoder(nn.Module):
 
 
 @pytest.mark.parametrize("seed", [0, 2**32 + 7])
-def test_first_weights_and_orders_are_those_that_torch_draws(seed):
+def test_initial_weights_and_orders_equal_those_of_torch(seed):
     torch.manual_seed(seed)
     expected = dict(TorchAutoencoder({}, 300, 3).named_parameters())
     twister = torch_generator(seed)
@@ -108,7 +100,7 @@ def test_gradients_are_those_of_autograd(channels):
         assert found[name] == pytest.approx(values, rel=1e-3, abs=2e-6 * largest), name
 
 
-def test_a_trained_network_answers_as_torch_does_with_the_statistics_of_all_vectors():
+def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     vectors = unit_vectors(50, 16)
     model = Autoencoder.drawn(16, 3, torch_generator(2))
     model.arrays |= statistics(without_statistics(model), vectors, 3)
@@ -125,7 +117,7 @@ def test_a_trained_network_answers_as_torch_does_with_the_statistics_of_all_vect
 
 
 @pytest.mark.parametrize(("rows", "widths"), [(1, (3, 1)), (130, (2, 5, 16, 7)), (64, (16, 64))])
-def test_the_compiled_layers_are_products_with_relu_between_them(rows, widths):
+def test_compiled_layers_equal_matrix_products_with_relu(rows, widths):
     random = np.random.default_rng(0)
     layers = [
         (random.normal(size=(out, into)).astype(np.float32), random.normal(size=out).astype(np.float32))

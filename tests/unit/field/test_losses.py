@@ -66,7 +66,7 @@ def test_literal_instance_loss_is_least_at_omega_to_the_minus_level_difference(l
     assert loss(distance / 2) == pytest.approx(math.log(2) ** 2, rel=1e-6)
 
 
-def test_tree_instance_loss_puts_relatives_close_whatever_their_level():
+def test_the_tree_instance_loss_depends_on_relation_not_on_level():
     depth = np.array([[1, 0], [0, 1]])  # unrelated: distance 1
     means = np.array([[0.0], [1.0]])
     assert instance_loss_tree(means, depth, 10.0)[0] == pytest.approx(0, abs=1e-9)
@@ -105,7 +105,7 @@ def test_literal_part_loss_matches_hand_computation():
     assert loss == pytest.approx(-1.0)
 
 
-def test_literal_part_loss_leaves_orphans_out():
+def test_the_literal_part_loss_ignores_orphans():
     means = doubles(4, 3).numpy()
     parents = np.zeros((4, 3))
     with_orphan = part_loss_literal(means, np.array([7, 7, 8, -1]), parents, 0.1)

@@ -63,12 +63,7 @@ def instance_loss_tree(means: Tensor, depth: Tensor, omega: float) -> Tensor:
     return off_diagonal_mean((-soft_distances(means).log() - target).square())
 
 
-def part_loss_literal(
-    means: Tensor,
-    parent: Tensor,
-    parent_means: Tensor,
-    tau: float,
-) -> Tensor:
+def part_loss_literal(means: Tensor, parent: Tensor, parent_means: Tensor, tau: float) -> Tensor:
     similarity = similarity_without_parent(means, means, parent_means) / tau
     has_parent = parent != NONE
     both = has_parent[:, None] & has_parent[None]
@@ -85,11 +80,7 @@ def part_loss_literal(
 
 
 def part_loss_disentangle(
-    half: Tensor,
-    other_half: Tensor,
-    has_parent: Tensor,
-    parent_means: Tensor,
-    tau: float,
+    half: Tensor, other_half: Tensor, has_parent: Tensor, parent_means: Tensor, tau: float
 ) -> Tensor:
     anchors = torch.nonzero(has_parent).squeeze(1)
     similarity = similarity_without_parent(half[anchors], other_half, parent_means[anchors]) / tau
@@ -97,40 +88,25 @@ def part_loss_disentangle(
     return (similarity.logsumexp(1) - positive).mean()
 
 
-def instance_term(means: Tensor, relations: list[ViewRelations], settings: FieldSettings) -> Tensor:
-    losses = []
-    for view in relations:
-        if len(view.rows) < 2:
-            continue
-        chosen = means[view.rows]
-        if settings.instance_mode == "literal":
-            losses.append(instance_loss_literal(chosen, torch.from_numpy(view.level), settings.omega))
-        else:
-            losses.append(instance_loss_tree(chosen, torch.from_numpy(view.depth), settings.omega))
-    return torch.stack(losses).mean() if losses else means.sum() * 0
+def instance_term(means: Tensor, view: ViewRelations, settings: FieldSettings) -> Tensor:
+    """L_ins of one view."""
+    if settings.instance_mode == "literal":
+        return instance_loss_literal(means[view.rows], torch.from_numpy(view.level), settings.omega)
+    return instance_loss_tree(means[view.rows], torch.from_numpy(view.depth), settings.omega)
 
 
 def part_term(
-    means: Tensor,
-    halves: Tensor,
-    other_halves: Tensor,
-    relations: list[ViewRelations],
-    settings: FieldSettings,
+    means: Tensor, halves: Tensor, others: Tensor, view: ViewRelations, settings: FieldSettings
 ) -> Tensor:
+    """L_part of one view, as a mean over levels that have parents."""
     losses = []
-    for view in relations:
-        for rows, own in view.parts:
-            parent = torch.from_numpy(own)
-            has_parent = parent != NONE
-            if len(rows) < 2 or not has_parent.any():
-                continue
-            parent_means = means[parent.clamp(min=0)]
-            if settings.part_mode == "literal":
-                losses.append(part_loss_literal(means[rows], parent, parent_means, settings.tau))
-            else:
-                losses.append(
-                    part_loss_disentangle(
-                        halves[rows], other_halves[rows], has_parent.long(), parent_means, settings.tau
-                    )
-                )
-    return torch.stack(losses).mean() if losses else means.sum() * 0
+    for rows, own in view.parts:
+        parent = torch.from_numpy(own)
+        parents, has_parent = means[parent.clamp(min=0)], (parent != NONE).long()
+        if settings.part_mode == "literal":
+            losses.append(part_loss_literal(means[rows], parent, parents, settings.tau))
+        else:
+            losses.append(
+                part_loss_disentangle(halves[rows], others[rows], has_parent, parents, settings.tau)
+            )
+    return torch.stack(losses).mean()

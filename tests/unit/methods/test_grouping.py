@@ -13,32 +13,23 @@ import torch
 from torch.nn.functional import cross_entropy
 
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.base.levels import LEVELS
 from hilsplat.field.code import LinearCode
 from hilsplat.methods import laga, legaussians, omniseg3d, saga, vch
 from hilsplat.methods.common import groups
-from hilsplat.methods.common.groups import (
-    associated_codes,
-    clusters,
-    density_clusters,
-    kmeans,
-    thresholds_of,
-)
+from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans, thresholds_of
 from hilsplat.methods.common.training import of_seen, product, train, unit
-from hilsplat.methods.gaussian_grouping import mask_identities, neighbour_loss
+from hilsplat.methods.gaussian_grouping import neighbour_loss
 from hilsplat.methods.method import LabelledView, labelled_views
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
 from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
 from hilsplat.settings import MethodSettings
-from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
 
 RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize(
-    ("method", "wrong", "direction"),
-    [(omniseg3d, (0.9, 0.7, 0.5), "grow"), (vch, (0.1, 0.2, 0.2), "fall")],
+    ("method", "wrong", "direction"), [(omniseg3d, (0.9, 0.7, 0.5), "grow"), (vch, (0.1, 0.2, 0.2), "fall")]
 )
 def test_thresholds_out_of_order_are_refused(method, wrong, direction):
     settings = MethodSettings(name=method.__name__.rpartition(".")[2], thresholds=wrong)
@@ -64,7 +55,7 @@ def test_views_without_labelled_pixels_are_refused():
         inspect.unwrap(labelled_views)(inputs, 3)
 
 
-def test_labelled_pixels_know_their_place_and_are_covered():
+def test_labelled_pixels_are_covered_and_have_their_coordinates():
     # 2 x 3 pixels: 0 not labelled, 4 not covered
     labels = np.full((6, 3), 0, np.int32)
     labels[0] = -1
@@ -83,22 +74,8 @@ def test_gradient_of_the_sparse_product_is_that_of_the_dense_one():
     assert torch.allclose(product(matrix, features), torch.from_numpy(matrix.toarray()) @ features)
 
 
-def test_training_finds_the_mean_of_what_a_gaussian_shows_and_visits_all_views():
-    weights, xy = sp.csr_matrix(np.ones((2, 1), np.float32)), np.zeros((2, 2), int)
-    views = [LabelledView(n, np.arange(3), weights, np.full((2, 3), n, np.int32), xy) for n in range(3)]
-    feature, seen = torch.zeros(1, 1, requires_grad=True), []
-
-    def loss(view, random, done):
-        seen.append((view.number, done))
-        return (product(view.weights, feature) - 0.5).square().mean()
-
-    train(views, [{"params": [feature], "lr": 0.05}], loss, MethodSettings(name="vch", steps=300), 0)
-    assert feature.item() == pytest.approx(0.5, abs=1e-3)
-    assert {number for number, _ in seen[:3]} == {0, 1, 2} and seen[150][1] == 0.5
-
-
 @pytest.mark.parametrize(("most", "expected"), [(3, 3), (5, 5), (9, 5)])
-def test_a_step_sees_some_pixels_of_a_view_each_once(most, expected):
+def test_a_step_uses_distinct_pixels_of_a_view(most, expected):
     matrix = sp.csr_matrix(np.eye(5, dtype=np.float32))
     xy = np.stack([np.arange(5)] * 2, axis=1)
     view = LabelledView(0, np.arange(1), matrix, np.zeros((5, 3), np.int32), xy)
@@ -121,7 +98,7 @@ def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
     assert smoothing_loss(rendered, means, torch.tensor([0, 0, 1])).item() == pytest.approx((2 + 2) / 2)
 
 
-def test_contrast_weighs_the_closest_masks_most():
+def test_the_closest_masks_have_the_largest_contrast_weight():
     # on a line at 0, 1, 3: squares 1, 9, 4; from each mask the closest weighs 1, the farthest 0.55, later 0.1
     means = torch.tensor([[0.0], [1.0], [3.0]])
     for done, far in ((0.0, 0.55), (0.5, 0.1)):
@@ -137,7 +114,7 @@ def test_contrast_weighs_the_closest_masks_most():
     assert contrast_loss(means[:1], 0.0).item() == 0
 
 
-def test_codebooks_split_by_position_first_and_by_feature_then():
+def test_the_coarse_codebook_splits_by_position_and_the_fine_one_by_feature():
     means = np.zeros((40, 3), np.float32)
     means[20:, 0] = 10
     features = np.zeros((40, 6), np.float32)
@@ -158,7 +135,9 @@ def test_codebooks_split_by_position_first_and_by_feature_then():
         (0.2, 3, 3, None, 0.0),  # two of three views are not
     ],
 )
-def test_a_group_takes_the_best_mask_of_each_view(monkeypatch, least, views, num_views, far, expected):
+def test_a_group_has_the_average_code_of_its_best_mask_in_each_view(
+    monkeypatch, least, views, num_views, far, expected
+):
     monkeypatch.setattr(groups, "MIN_SCORE", least)
     monkeypatch.setattr(groups, "MIN_VIEWS", views)
     # view 0: mask 0 holds both Gaussians of group 0 (IoU 1), mask 1 one of them; view 1: mask 2, IoU 2/3
@@ -173,16 +152,7 @@ def test_a_group_takes_the_best_mask_of_each_view(monkeypatch, least, views, num
     assert found.tolist() == [[expected], [expected], [0.0]]
 
 
-def test_identities_link_the_masks_of_a_region_over_views(two_boxes_contributions):
-    inputs = two_boxes_inputs(*two_boxes_contributions)
-    for level in LEVELS:
-        rows = inputs.contributions.rows_of(level)
-        identity = mask_identities(inputs.contributions, level, 1)
-        region = inputs.latents[rows].argmax(axis=1)
-        assert len(np.unique(np.stack([identity, region]), axis=1).T) == len(np.unique(region))
-
-
-def test_neighbours_that_agree_cost_nothing_and_others_their_divergence():
+def test_neighbour_loss_is_the_divergence_per_class():
     logits = torch.tensor([[0.0, 0.0]])
     assert neighbour_loss(logits, logits[:, None], 2).item() == pytest.approx(0)
     others = torch.log(torch.tensor([[[0.25, 0.75]]]))
@@ -190,7 +160,7 @@ def test_neighbours_that_agree_cost_nothing_and_others_their_divergence():
     assert neighbour_loss(logits, others, 2).item() == pytest.approx(expected / 2)
 
 
-def test_patches_share_the_masks_that_hold_both():
+def test_patches_share_the_masks_that_contain_both():
     labels = np.repeat(np.int32([[0, 2, 4], [0, 2, 5], [0, 3, -1], [1, -1, -1]]), 3, axis=0)
     labels = np.concatenate([labels, np.int32([[0, -1, -1]])])  # a patch of one pixel is left out
     patch, shared = patches(labels)
@@ -226,7 +196,7 @@ def test_hierarchical_loss_matches_a_plain_loop_over_pixels():
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_clusters_of_higher_thresholds_lie_inside_those_of_lower_ones():
+def test_clusters_of_higher_thresholds_are_inside_those_of_lower_ones():
     # two pairs of directions: 20 degrees apart inside a pair, 90 between pairs
     angle = np.deg2rad([0, 20, 90, 110]).repeat(5)
     features = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
@@ -257,7 +227,7 @@ def test_ultrametric_is_the_least_longest_edge_of_any_path():
     assert found == pytest.approx(np.array(expected), abs=1e-6)
 
 
-def test_ultrametric_keeps_to_the_tree_that_borders_choose_and_has_the_slope_of_its_edge():
+def test_border_penalties_choose_the_tree_but_do_not_change_lengths_or_gradients():
     # pixels 0 - 1 - 2, and a short way 0 - 2 over a border
     vectors = torch.tensor([[0.0], [1.0], [0.4]], dtype=torch.float64, requires_grad=True)
     edges, pairs = np.array([[0, 1, 0], [1, 2, 2]]), np.array([[0], [2]])
@@ -274,7 +244,7 @@ def test_pixels_without_a_path_are_two_apart():
     assert found.tolist() == pytest.approx([2, 0, 0], abs=1e-5)
 
 
-def test_triplets_leave_a_mask_but_not_its_parent():
+def test_the_third_pixel_of_a_triplet_is_outside_the_mask_but_inside_its_parent():
     # one row of pixels: whole 0 holds parts 1 and 2; pixel 5 is outside
     labels = np.full((6, 3), -1, np.int32)
     labels[:5, 0], labels[:2, 1], labels[2:4, 1] = 0, 1, 2
@@ -291,7 +261,7 @@ def test_neighbouring_pixels_are_joined_once():
     assert [0, 1] in edges.T.tolist() and [0, 19] not in edges.T.tolist()
 
 
-def test_components_split_where_features_jump_and_those_beyond_the_largest_join_the_nearest(monkeypatch):
+def test_components_split_where_features_jump_and_small_ones_join_the_nearest_large_one(monkeypatch):
     means = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1).astype(np.float32)
     features = np.zeros((60, 2), np.float32)
     features[:30, 0], features[30:50, 1] = 1, 1
@@ -311,7 +281,7 @@ def test_only_seen_gaussians_are_rendered_and_the_result_is_the_same():
     assert torch.equal(product(small, features[seen]), product(matrix, features))
 
 
-def test_density_clusters_join_dense_points_and_leave_lonely_ones():
+def test_density_clusters_connect_dense_points_and_ignore_isolated_ones():
     line = np.float32([0, 0.1, 0.2, 0.3, 5, 5.1, 5.2, 9, 0.45])[:, None]  # the last is near one point only
     assert density_clusters(line, 0.16, 3).tolist() == [-1, 0, 0, 0, -1, 1, -1, -1, -1]
     assert density_clusters(line, 0.16, 1).tolist() == [0, 0, 0, 0, 1, 1, 1, 2, 0]
@@ -321,14 +291,14 @@ def test_density_clusters_join_dense_points_and_leave_lonely_ones():
 # ---- LEGaussians ----------------------------------------------------------------------------------------
 
 
-def test_uncertainty_discounts_the_cross_entropy_and_has_a_price():
+def test_uncertainty_reduces_the_cross_entropy_and_is_penalised():
     logits, index = torch.tensor([[2.0, 0], [0, 1.0]]), torch.tensor([0, 0])
     each = cross_entropy(logits, index, reduction="none").tolist()
     found = legaussians.index_loss(logits, index, torch.tensor([0.0, 0.75])).item()
     assert found == pytest.approx((each[0] + 0.25 * each[1]) / 2 - np.log(0.25) / 2)
 
 
-def test_uncertain_codes_follow_the_prediction_and_certain_ones_a_tenth():
+def test_certain_codes_are_smoothed_a_tenth_as_much_as_uncertain_ones():
     codes, predicted = torch.zeros(2, 8, requires_grad=True), torch.ones(2, 8, requires_grad=True)
     legaussians.smoothing_loss(codes, predicted, torch.tensor([0.0, 1.0])).backward()
     # (1 / 2 points) (1 / 8 numbers) 2 (0 - 1), times 0.1 and 1
@@ -339,7 +309,7 @@ def test_uncertain_codes_follow_the_prediction_and_certain_ones_a_tenth():
 # ---- LaGa -----------------------------------------------------------------------------------------------
 
 
-def test_masks_that_a_finer_level_repeats_are_left_out_unless_none_is_left():
+def test_masks_repeated_at_a_finer_level_are_ignored_unless_all_are():
     labels = np.full((20, 3), -1, np.int32)
     labels[:10, 0], labels[10:, 0] = 0, 1
     labels[:9, 1] = 2  # IoU 0.9 with mask 0
@@ -376,7 +346,7 @@ def test_nested_loss_matches_a_plain_loop_over_pixels_and_masks():
     assert found == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_gaussian_belongs_to_the_nearest_object_and_an_object_has_five_masks():
+def test_a_gaussian_joins_the_nearest_object_of_at_least_five_masks():
     prototypes = np.float32([[1, 0, 0]] * 5 + [[0, 1, 0]] * 6 + [[0, 0, 1]] * 4)
     features = np.float32([[0.6, 0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     group, of_mask = laga.objects(features, prototypes, 0.1, 5)
@@ -393,7 +363,7 @@ def test_silhouette_matches_hand_computation():
     assert found == pytest.approx(np.mean(each))
 
 
-def test_two_looks_of_an_object_are_two_descriptors_that_weigh_by_their_agreement_with_the_average():
+def test_descriptors_of_an_object_are_weighted_by_their_cosine_with_the_average():
     angle = np.deg2rad([-1, -0.6, -0.2, 0.2, 0.6, 1, 59, 60, 61])
     vectors = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
     weight = laga.descriptor_weights(vectors, 0)
@@ -406,7 +376,7 @@ def test_two_looks_of_an_object_are_two_descriptors_that_weigh_by_their_agreemen
     assert laga.descriptor_weights(vectors[:1], 0) == pytest.approx([1.0])
 
 
-def test_the_code_of_an_object_points_along_the_weighted_sum_of_its_vectors():
+def test_the_code_of_an_object_has_the_direction_of_the_weighted_sum_of_its_vectors():
     vectors = np.abs(RNG.normal(size=(6, 8))).astype(np.float32)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     code = LinearCode.fit(vectors, 6)
@@ -434,14 +404,14 @@ def test_pixels_share_masks_up_to_a_scale_and_the_smallest_one_above_it():
     assert small[3].tolist() == [False, False, False, True, False]
 
 
-def test_scales_lie_between_those_of_neighbouring_masks_and_beyond_both_ends():
+def test_scales_are_drawn_between_neighbouring_masks_and_beyond_both_ends():
     drawn = saga.drawn_scales(np.array([4.0, 1.0, 2.0]), np.random.default_rng(0))
     assert len(drawn) == 4 and 0 <= drawn[0] <= 1 and 4 <= drawn[-1] <= 8
     assert sorted(np.searchsorted([1, 2, 4], drawn[1:-1])) == [1, 2]
     assert len(saga.drawn_scales(np.arange(1.0, 30), np.random.default_rng(0))) == saga.SCALES + 2
 
 
-def test_pairs_of_pixels_in_small_masks_weigh_ten_times_those_in_large_ones():
+def test_pairs_of_pixels_in_small_masks_have_ten_times_the_weight():
     assert saga.pair_weights(np.array([1.0, 10.0])) == pytest.approx(
         np.float32([[10, 1 + 9 * 9 / 99], [1 + 9 * 9 / 99, 1]])
     )
@@ -482,7 +452,7 @@ def test_the_scale_of_a_mask_is_twice_the_spread_of_its_gaussians():
     )  # 10 apart: a deviation of 5
 
 
-def test_the_average_over_neighbours_keeps_what_is_the_same_everywhere():
+def test_neighbour_averages_have_sixteen_terms_that_sum_to_one():
     mean = saga.neighbour_mean(RNG.random((40, 3)).astype(np.float32))
     assert np.diff(mean.indptr).tolist() == [16] * 40 and mean.sum(axis=1) == pytest.approx(1)
     assert (mean.diagonal() > 0).all()
@@ -491,7 +461,7 @@ def test_the_average_over_neighbours_keeps_what_is_the_same_everywhere():
 # ---- k-means ----
 
 
-def test_centroids_are_the_means_of_groups_and_every_row_knows_its_own():
+def test_centroids_are_the_means_of_groups():
     groups = np.float32([[0, 0], [9, 0], [0, 0.2], [9, 0.2]])
     centroids, nearest = kmeans(groups, 2, seed=0)
     assert centroids[nearest] == pytest.approx(np.float32([[0, 0.1], [9, 0.1], [0, 0.1], [9, 0.1]]))
@@ -514,14 +484,14 @@ def test_more_centroids_than_different_rows_repeat_the_first_of_them():
     assert len(np.unique(centroids, axis=0)) == 2 and (centroids[2:] == centroids[0]).all()
 
 
-def test_no_rows_have_no_groups():
+def test_centroids_of_no_rows_are_zero():
     centroids, nearest = kmeans(np.zeros((0, 2), np.float32), 3, seed=0)
     assert centroids.tolist() == [[0, 0]] * 3 and len(nearest) == 0
 
 
 def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads():
     code = (
-        "import numpy as np; from hilsplat.methods.common.quantise import kmeans;"
+        "import numpy as np; from hilsplat.methods.common.groups import kmeans;"
         "rows = np.random.default_rng(0).normal(size=(5000, 16)).astype(np.float32);"
         "centroids, nearest = kmeans(rows, 100, 3, 5);"
         "import hashlib; print(hashlib.sha256(centroids.tobytes() + nearest.tobytes()).hexdigest())"

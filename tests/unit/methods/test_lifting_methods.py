@@ -11,10 +11,9 @@ import scipy.sparse as sp
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
-from hilsplat.field.adam import Adam
 from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat, langsplat_v2, lifted, occam
-from hilsplat.methods.langsplat import l1_gradient, train_level
+from hilsplat.methods.langsplat import train_level
 from hilsplat.methods.langsplat_v2 import as_vectors, cosine_loss, largest_shares
 from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order
 from hilsplat.scene.cameras import Camera
@@ -25,7 +24,7 @@ def unit(vectors):
     return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_a_gaussian_gets_the_average_of_its_masks_weighed_by_their_share_of_it():
+def test_lifted_averages_masks_by_their_weight_in_a_gaussian():
     # masks of 4 px and 2 px of the wholes, one of 5 px of the parts, on three Gaussians
     means = np.array([[0.75, 0, 0], [0.5, 0.5, 0], [0, 0, 1.0]], np.float32)
     contributions = types.SimpleNamespace(
@@ -52,28 +51,6 @@ def l1_by_scipy(features, weights, targets):
     return (weights.T @ (np.sign(apart) * scale)).astype(np.float32)
 
 
-def test_l1_gradient_is_the_slope_of_the_mean_absolute_difference_of_labelled_pixels():
-    rng = np.random.default_rng(0)
-    weights = sp.csr_matrix(rng.random((5, 4)).astype(np.float32))
-    labels, codes = np.array([1, -1, 0, 2, 1], np.int32), rng.normal(size=(3, 2))
-    features = rng.random((4, 2))
-
-    def loss(features):
-        apart = (weights @ features)[labels >= 0] - codes[labels[labels >= 0]]
-        return np.abs(apart).mean()
-
-    flat = [np.pad(rows, ((0, 0), (0, 2))).ravel().astype(np.float32) for rows in (codes, features)]
-    gradient = np.full(4 * 4, 9, np.float32)  # what a step before left there
-    l1_gradient(weights.indptr, weights.indices, weights.data, labels, flat[0], 2, 4, flat[1], gradient)
-    slope = np.zeros((4, 4))
-    for place in np.ndindex(4, 2):
-        step = np.zeros_like(features)
-        step[place] = 1e-6
-        slope[place] = (loss(features + step) - loss(features - step)) / 2e-6
-    assert gradient.reshape(4, 4) == pytest.approx(slope, abs=1e-5)
-    assert (np.abs(slope[:, :2]) > 0.01).any(axis=0).all()
-
-
 def adam_in_numpy(values, gradients, rate):
     """Adam in place, a step for each gradient, which may be computed from the values of that step."""
     first, second = np.zeros_like(values), np.zeros_like(values)
@@ -82,18 +59,6 @@ def adam_in_numpy(values, gradients, rate):
         second[:] = np.float32(0.999) * second + np.float32(1 - 0.999) * gradient * gradient
         scale = np.float32((1 - 0.999**step) ** -0.5)
         values -= np.float32(rate / (1 - 0.9**step)) * first / (np.sqrt(second) * scale + np.float32(1e-15))
-
-
-def test_adam_has_the_bytes_of_its_formula_in_numpy():
-    rng = np.random.default_rng(6)
-    gradients = rng.normal(size=(40, 7, 3)).astype(np.float32)
-    gradients[:, 0] = 0
-    expected, found = np.ones((2, 7, 3), np.float32)
-    adam_in_numpy(expected, gradients, 0.01)
-    adam = Adam(found, 0.01)
-    for gradient in gradients:
-        adam.step(gradient)
-    assert np.array_equal(found, expected) and (found[0] == 1).all() and (found[1:] != 1).all()
 
 
 def painted(weights, labels):
@@ -132,13 +97,13 @@ def test_training_has_the_bytes_of_products_with_the_matrix_and_of_adam_in_numpy
     assert np.array_equal(train_level(views, latents, Level.PART, 9, settings, seed=4), features)
 
 
-def test_a_code_that_is_no_number_is_not_trained_on_in_silence():
+def test_nan_codes_give_nan_features():
     view, latents = painted(np.ones((1, 1)), whole_masks(1)), np.float32([[np.nan]])
     settings = MethodSettings(name="langsplat", steps=2)
     assert np.isnan(train_level([view], latents, Level.WHOLE, 1, settings, seed=0)).all()
 
 
-def test_views_come_in_random_order_each_once_before_any_is_repeated():
+def test_views_are_drawn_in_random_order_each_once_before_any_is_repeated():
     first, again, other = (in_random_order(range(4), np.random.default_rng(seed)) for seed in (0, 0, 3))
     drawn = list(itertools.islice(first, 40))
     assert all(sorted(drawn[start : start + 4]) == [0, 1, 2, 3] for start in range(0, 40, 4))
@@ -169,7 +134,7 @@ def test_langsplat_trains_every_level_on_the_pixels_of_the_grid():
 # ---- LangSplatV2 ----
 
 
-def test_the_largest_shares_are_those_of_a_softmax_and_of_equal_logits_the_first():
+def test_shares_are_the_largest_of_a_softmax_and_the_first_wins_ties():
     logits = np.log(np.float32([[1, 6, 3, 2], [1, 1, 1, 1]]))
     chosen, shares = largest_shares(logits, 2)
     assert chosen.tolist() == [[1, 2], [0, 1]]
@@ -248,14 +213,14 @@ def one_row_of_pixels(weights, views=("a", "b"), second=AHEAD):
     )
 
 
-def test_the_heaviest_weights_of_a_pixel_stay_and_of_equal_ones_the_first():
+def test_the_heaviest_weights_of_a_pixel_are_kept_and_the_first_wins_ties():
     weights = sp.csr_matrix(np.float32([[0.1, 0.5, 0.4], [0.3, 0.3, 0.3], [0, 0.2, 0]]))
     kept = dr_splat.heaviest(weights, 2)
     assert kept.toarray() == pytest.approx(np.float32([[0, 0.5, 0.4], [0.3, 0.3, 0], [0, 0.2, 0]]))
     assert weights.nnz == 7  # the given matrix is not changed
 
 
-def test_only_gaussians_that_lead_a_pixel_take_its_vector():
+def test_only_gaussians_that_dominate_a_pixel_get_its_vector():
     # Gaussian 0 leads the left mask, Gaussian 1 the right one
     inputs = one_row_of_pixels([[0.9, 0.1]] * 4 + [[0.4, 0.6]] * 4)
     vectors = unit(np.array([[1.0, 0.2, 0.0, 0.1], [0.1, 1.0, 0.3, 0.0]] * 2))
@@ -278,7 +243,7 @@ def test_few_vectors_are_quantised_without_loss_and_many_to_less_than_their_spre
     assert np.square(dr_splat.quantised(many, dr_splat.codebooks(many, 0)) - many).mean() < 0.15
 
 
-def test_centres_fall_into_pixels_unless_they_are_behind_or_outside():
+def test_centres_have_a_pixel_unless_they_are_behind_or_outside():
     camera = Camera("a", np.eye(4), np.array([[4, 0, 4], [0, 4, 1], [0, 0, 1.0]]), (2, 8))
     means = np.array([[0, 0, 1.0], [-0.5, -0.2, 2.0], [0, 0, -1.0], [2, 0, 1.0], [0, -0.3, 1.0]])
     # (4, 1), (3, 0.6), behind, (12, 1) is outside, (4, -0.2) too
@@ -303,7 +268,7 @@ def test_occam_ignores_views_that_contain_no_centre():
     assert one.any() and np.array_equal(one, both)
 
 
-def test_methods_of_vectors_refuse_a_code_that_is_a_network(tmp_path, monkeypatch):
+def test_methods_that_average_vectors_refuse_a_network_code(tmp_path, monkeypatch):
     network = Autoencoder.__new__(Autoencoder)
     monkeypatch.setattr("hilsplat.methods.method.load_code", lambda folder: network)
     inputs = MethodInputs(*[tmp_path] * 5)

@@ -5,7 +5,7 @@ import inspect
 import re
 import sys
 import types
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -17,12 +17,26 @@ import yaml
 from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.configuration import parse_run
+from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.field.code import LinearCode
 from hilsplat.methods import laga, method, registry
+from hilsplat.methods.gaussian_grouping import mask_identities
+from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
+from hilsplat.scene.cameras import Camera
 from hilsplat.settings import MethodSettings
 from tests.conftest import PROJECT
-from tests.unit.methods.two_boxes_inputs import two_boxes_inputs
-from tests.unit.two_boxes_world import ONE_DROPPED, REGIONS, build_contributions, build_two_boxes, region_mask
+from tests.unit.two_boxes_world import (
+    HEIGHT,
+    ONE_DROPPED,
+    REGIONS,
+    WIDTH,
+    TwoBoxes,
+    build_contributions,
+    build_two_boxes,
+    region_mask,
+    two_boxes_weights,
+)
 
 pytestmark = pytest.mark.filterwarnings("error")  # such as the mean of an empty array
 EVERY, LARGE = tuple(range(len(REGIONS))), (0, 1, 2, 3, 5, 6)
@@ -44,6 +58,28 @@ FITS = {
 }
 
 
+@dataclass(frozen=True)
+class BoxesInputs(MethodInputs):
+    """Inputs from the world with two boxes; the code of a region is one-hot."""
+
+    world: TwoBoxes | None = None
+
+    @property
+    def latents(self):
+        return np.eye(len(REGIONS), dtype=np.float32)[np.concatenate(list(self.world.regions.values()))]
+
+    def linear_code(self, method):
+        return LinearCode(np.full(len(REGIONS), 0.1, np.float32), np.eye(len(REGIONS), dtype=np.float32))
+
+    def view_weights(self, view):
+        return normalised_weights(two_boxes_weights(self.world.views.index(view)))
+
+    def view_camera(self, view):
+        ahead = np.eye(4)
+        ahead[:3, 3] = self.world.views.index(view), 0, 1
+        return Camera(view, ahead, np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]), (HEIGHT, WIDTH))
+
+
 @pytest.fixture(scope="module")
 def inputs_of(tmp_path_factory):
     """A cached function that builds inputs with masks of the given regions in each view."""
@@ -52,7 +88,8 @@ def inputs_of(tmp_path_factory):
     def inputs_of(regions=ONE_DROPPED):
         with pytest.MonkeyPatch.context() as monkeypatch:
             world = build_two_boxes(tmp_path_factory.mktemp("boxes"), monkeypatch, regions)
-            return two_boxes_inputs(world, build_contributions(world))
+            folders = world.scene, world.ply, world.masks, build_contributions(world), world.folder
+            return BoxesInputs(*folders, world=world)
 
     return inputs_of
 
@@ -130,6 +167,15 @@ def test_descriptions_of_settings_name_the_methods_that_read_them(inputs_of, nam
     fields = MethodSettings.model_fields
     own = {key for key, field in fields.items() if key != "name" and name in readers(field.description)}
     assert (read & fields.keys()) - {"name"} == own
+
+
+def test_identities_link_the_masks_of_a_region_over_views(inputs_of):
+    inputs = inputs_of()
+    for level in LEVELS:
+        rows = inputs.contributions.rows_of(level)
+        identity = mask_identities(inputs.contributions, level, 1)
+        region = inputs.latents[rows].argmax(axis=1)
+        assert len(np.unique(np.stack([identity, region]), axis=1).T) == len(np.unique(region))
 
 
 def test_unknown_methods_name_those_that_exist():
