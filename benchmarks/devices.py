@@ -21,11 +21,10 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.api import draw, pixel_weights
-from hilsplat.splat.rasterise.device import Device
-from hilsplat.splat.rasterise.parity import disagreement
-from hilsplat.splat.views import TrainingView
+from hilsplat.splat.rasterise.device import Device, disagreement
 
 SIZES_TIMED = {**SIZES, "1M 986x728": (1_000_000, (728, 986))}
 WARM_UP_S, TIMED_S, MIN_ROUNDS = 0.5, 2.0, 3

@@ -18,6 +18,7 @@ from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.densify import ScreenGradients
 from hilsplat.splat.fit import FitState, fit_step
 from hilsplat.splat.gaussians import FIELDS, Gaussians
+from hilsplat.splat.initial import TrainingView
 from hilsplat.splat.optimise import Adam
 from hilsplat.splat.photometric import photometric_loss
 from hilsplat.splat.rasterise.cpu import (
@@ -26,7 +27,6 @@ from hilsplat.splat.rasterise.cpu import (
     project_gaussians,
     sparse_weights,
 )
-from hilsplat.splat.views import TrainingView
 
 LARGE = "100k 800x600"
 HALF_WAY = 500_000

@@ -63,7 +63,7 @@ def rendered_latents(
     """Return, per level, the pixels that mostly show Gaussians with a latent, and their rendered latents.
 
     Gaussians without a latent have zeros, which a code would decode like any latent. They are omitted, and
-    the normalised weights of the others are divided by their sum. The bytes are those of sparse products.
+    the normalised weights of the others are divided by their sum. The bytes equal those of sparse products.
     """
     rows = weights.indptr, weights.indices, weights.data
     shares = np.zeros((weights.shape[0], features.shape[1]), np.float32)

@@ -39,17 +39,10 @@ def run_key_masks(
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
-    """Choose training views greedily by the Gaussians that each one adds.
+    """Choose a share of the training views (rounded up) by the Gaussians that each one adds; in camera order.
 
-    The weight of a Gaussian is its mean visible mass, halved by each chosen view that shows it, so that
-    the views cover the scene before they repeat.
-
-    Args:
-        share: share of the training views to choose, rounded up.
-        threads: views rendered in parallel; the result does not depend on it.
-
-    Returns:
-        The chosen views in camera order.
+    A Gaussian counts with its mean visible mass, halved by each chosen view that shows it, so that the views
+    cover the scene before they repeat. The result does not depend on `threads`.
 
     Raises:
         SceneError: if there is no training view.
@@ -70,10 +63,9 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
 
 
 def most_covering(seen: Bool[np.ndarray, "V N"], worth: Float64[np.ndarray, " N"], number: int) -> list[int]:
-    """Choose rows greedily by the worth of the columns that they see; each sighting halves a column's worth.
+    """Choose rows greedily by the worth of the columns that they see, the first on a tie.
 
-    Returns:
-        The rows in the order of selection; on ties, the first.
+    Each chosen row halves the worth of its columns. The result is in the order of selection.
     """
     worth = worth.copy()
     chosen: list[int] = []

@@ -30,12 +30,8 @@ SPREAD_PARTS = 4
 class MaskOperator:
     """Products with A for all levels: from features of Gaussians to means of masks, and back.
 
-    A is used in place, for example mapped from its file, and not copied. The order of sums does not depend on
-    the number of threads.
-
-    Attributes:
-        indptr, indices, data: A in CSR form; rows are masks, with sorted columns.
-        level_index: level of each mask, from 0.
+    A (CSR; rows are masks, with sorted columns) is used in place, for example mapped from its file. The order
+    of sums does not depend on the number of threads. `level_index` is each mask's level, from 0.
     """
 
     indptr: np.ndarray
@@ -53,8 +49,7 @@ class MaskOperator:
     def means(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "M D"]:
         """Return A F: the mean rendered feature of each mask at its level."""
         out = np.zeros((len(self.level_index), features.shape[2]), features.dtype)
-        features = np.ascontiguousarray(features)
-        A = self.indptr, self.indices, self.data, self.level_index
+        features, A = np.ascontiguousarray(features), self._arrays()
         shares = np.searchsorted(self.indptr, np.linspace(0, self.indptr[-1], self.threads + 1)[1:-1])
         edges = [0, *shares.tolist(), len(out)]
         if _fills_lanes(out):
@@ -67,8 +62,7 @@ class MaskOperator:
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
         """Return A' x at each level: the adjoint of `means`."""
         out = np.zeros((self.num_gaussians, 3, values.shape[1]), values.dtype)
-        values = np.ascontiguousarray(values)
-        A = self.indptr, self.indices, self.data, self.level_index
+        values, A = np.ascontiguousarray(values), self._arrays()
         parts = 1 if self.threads == 1 else SPREAD_PARTS * self.threads
         edges = np.linspace(0, self.num_gaussians, parts + 1).astype(np.int64).tolist()
         if _fills_lanes(out):
@@ -77,6 +71,9 @@ class MaskOperator:
         else:
             self._share(lambda begin, end: _spread(begin, end, *A, values, out), edges)
         return out
+
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        return self.indptr, self.indices, self.data, self.level_index
 
     def _share(self, work: Callable[[int, int], None], edges: list[int]) -> None:
         """Distribute the ranges between edges over threads."""
@@ -95,10 +92,9 @@ def lifted_average(
     pixels: Float32[np.ndarray, " M"],
     latents: Float32[np.ndarray, "M D"],
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Average the latents of the pixels that show each Gaussian, weighted by its share of them.
+    """Average the latents of the pixels that show each Gaussian, weighted by its share of them; 0 if none do.
 
-    This takes one sparse product and is within about a tenth of the regression's optimum. Gaussians that no
-    labelled pixel shows get 0.
+    This takes one sparse product and is within about a tenth of the regression's optimum.
     """
     sums = masks.spread(pixels[:, None] * latents)
     return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
@@ -114,18 +110,14 @@ def lifted_median(
     """Compute the geometric median of the same latents and weights, to which LangSplat's L1 loss converges.
 
     Masks that merge or miss objects shift an average much more than a median. Each Weiszfeld iteration,
-    one pass over A, averages with the weights divided by the distance to the latest estimate.
-
-    Args:
-        start: lifted average; Gaussians that no mask shows keep it.
-        steps: iterations; 15 give about three correct digits.
+    one pass over A, averages with the weights divided by the distance to the latest estimate; 15 give about
+    three correct digits. Gaussians that no mask shows keep `start`, the lifted average.
     """
-    A = masks.indptr, masks.indices, masks.data, masks.level_index
     features = np.array(start, np.float32, order="C")
     for _ in range(steps):
         sums = np.zeros(features.shape, np.float64)
         weights = np.zeros(features.shape[:2], np.float64)
-        _median_step(*A, pixels, latents, features, sums, weights)
+        _median_step(*masks._arrays(), pixels, latents, features, sums, weights)
         seen = weights > 0
         features[seen] = sums[seen] / weights[seen][:, None]
     return features

@@ -1,9 +1,12 @@
-"""Sum the quadratic form of frozen geometry view by view, in bounded memory, and choose G or W."""
+"""Sum the quadratic form of frozen geometry part by part, in bounded memory, and choose G or W."""
 
 import logging
 import shutil
 import time
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,10 +22,17 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
-from hilsplat.contributions.gram_builder import GramBuilder
-from hilsplat.contributions.quadratic import Quadratic, StackedWeights
+from hilsplat.contributions.kernels import SUMS, add_to_block, enlarged, merge_rows, transpose
+from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
 logger = logging.getLogger(__name__)
+
+BLOCKS = 64
+"""G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. Blocks
+whose Gaussians a part does not show are skipped, which a Morton order makes frequent."""
+
+MERGE_AT = 8
+"""Late pairs of a block are merged with its rows once they exceed one in this many."""
 
 CHUNK_WEIGHTS = 2**25
 """Non-zeros of W collected before they are added to G; collecting and adding takes 0.6 GiB."""
@@ -39,9 +49,154 @@ CLEARLY_MORE = 2
 CHECKPOINT_SECONDS = 300.0
 """Seconds between checkpoints of a long pass; short passes write none."""
 
+ROWS = ("indptr", "indices", "values")
+
+
+class _Rows:
+    """Some rows of G, in reused memory: first writes to new pages take time and memory."""
+
+    def __init__(self, rows: int) -> None:
+        self.indptr = np.zeros(rows + 1, np.int64)
+        self._indices, self._values = np.empty(0, np.int32), np.empty((0, len(LEVELS)))
+
+    @property
+    def nonzeros(self) -> int:
+        """Number of pairs of Gaussians."""
+        return int(self.indptr[-1])
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return row starts, columns and values."""
+        return self.indptr, self._indices[: self.nonzeros], self._values[: self.nonzeros]
+
+    def replace(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
+        """Copy other rows over these; columns and values may have more entries than `indptr` uses."""
+        kept = int(indptr[-1])
+        self._make_room(kept, 0)
+        self.indptr = indptr
+        self._indices[:kept], self._values[:kept] = indices[:kept], values[:kept]
+
+    def merge(self, late: "_Rows") -> None:
+        """Add pairs that these rows don't contain."""
+        self._make_room(self.nonzeros + late.nonzeros, self.nonzeros)
+        merge_rows(self.indptr, self._indices, self._values, *late.arrays())
+
+    def _make_room(self, needed: int, kept: int) -> None:
+        if needed > len(self._indices):
+            self._indices, self._values = enlarged(self._indices, self._values, kept, 2 * needed)
+
+
+class _Block:
+    """Rows of G, with the few pairs that were added late kept separately.
+
+    A part shows a tenth of the Gaussians of a large scene. Sums of known pairs are updated in place, and only
+    the late pairs are rewritten, until there are enough of them to merge.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self.rows, self.late = _Rows(rows), _Rows(rows)
+
+    def replace_late(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
+        """Replace the late pairs, and merge them if they are many."""
+        self.late.replace(indptr, indices, values)
+        if MERGE_AT * self.late.nonzeros > self.rows.nonzeros:
+            self.merged()
+
+    def merged(self) -> _Rows:
+        """Merge the late pairs and return all pairs."""
+        if self.late.nonzeros:
+            self.rows.merge(self.late)
+            self.late = _Rows(len(self.rows.indptr) - 1)
+        return self.rows
+
+
+class GramBuilder:
+    """Sum of G over parts of W, such as one view after another; its memory grows only with G.
+
+    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on the division of
+    pixels into parts nor on the number of threads.
+    """
+
+    def __init__(self, num_gaussians: int, threads: int) -> None:
+        edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
+        self._ranges = list(pairwise(edges))
+        self._threads = max(1, threads)
+        self._pixels = self._places = np.zeros(0, np.int32)
+        self._blocks = [_Block(end - begin) for begin, end in self._ranges]
+        self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
+        for _ in range(self._threads):
+            sums, fresh = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
+            self._idle.put((sums, fresh, np.empty(1024, np.int32), np.empty((1024, len(LEVELS)))))
+
+    @property
+    def nonzeros(self) -> int:
+        """Number of pairs of Gaussians so far."""
+        return sum(block.rows.nonzeros + block.late.nonzeros for block in self._blocks)
+
+    def add(self, part: StackedWeights) -> None:
+        """Add W' diag(valid) W of further pixels; the columns of W must be sorted within rows."""
+        weights = part.weights
+        arrays = (weights.indptr, weights.indices, weights.data, part.valid)
+        columns = self._columns(weights)
+
+        def grow(number: int) -> None:
+            begin, end = self._ranges[number]
+            if columns[0][begin] == columns[0][end]:
+                return
+            block, indptr = self._blocks[number], np.zeros(end - begin + 1, np.int64)
+            sums, fresh, *late = self._idle.get()
+            known = block.rows.arrays(), block.late.arrays()
+            late = add_to_block(begin, end, arrays, columns, *known, sums, fresh, indptr, *late)
+            block.replace_late(indptr, *late)
+            self._idle.put((sums, fresh, *late))
+
+        with ThreadPoolExecutor(self._threads) as pool:
+            list(pool.map(grow, range(len(self._blocks))))
+
+    def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return each Gaussian's weights in W: start of its list, and lists of pixels and places.
+
+        The columns of the upper triangle begin at such a place in the pixel's row of W. The lists are reused
+        for the next part, because allocating memory takes longer than filling it.
+        """
+        dtype = np.int32 if weights.nnz < 2**31 else np.int64
+        if len(self._places) < weights.nnz or self._places.dtype != dtype:
+            self._pixels = np.empty(weights.nnz * 9 // 8, np.int32)
+            self._places = np.empty(len(self._pixels), dtype)
+        begins = np.zeros(weights.shape[1] + 1, np.int64)
+        transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
+        return begins, self._pixels, self._places
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return everything summed so far as arrays."""
+        return {
+            f"{name}_{number}": array
+            for number, block in enumerate(self._blocks)
+            for name, array in zip(ROWS, block.merged().arrays(), strict=True)
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Continue from `state`."""
+        for number, block in enumerate(self._blocks):
+            block.rows.replace(*(state[f"{name}_{number}"] for name in ROWS))
+
+    def finish(self) -> Gram:
+        """Return G of everything added, and empty the builder."""
+        indptr = np.zeros(self._ranges[-1][1] + 1, np.int64)
+        indices = np.empty(self.nonzeros, np.int32)
+        values = np.empty((len(indices), len(LEVELS)), np.float32)
+        done = 0
+        for number, (begin, end) in enumerate(self._ranges):
+            some_indptr, some_indices, some_values = self._blocks[number].merged().arrays()
+            self._blocks[number] = _Block(end - begin)
+            indptr[begin + 1 : end + 1] = some_indptr[1:] + done
+            indices[done : done + len(some_indices)] = some_indices
+            values[done : done + len(some_indices)] = some_values
+            done += len(some_indices)
+        return Gram(indptr, indices, values)
+
 
 class _Waiting:
-    """Stacked parts of W in reused memory, because fresh memory takes longer to fill."""
+    """Stacked parts of W in reused memory, because new memory takes longer to fill."""
 
     def __init__(self, num_gaussians: int) -> None:
         self._num_gaussians = num_gaussians
@@ -64,14 +219,14 @@ class _Waiting:
         self.nonzeros = after
 
     def held(self) -> StackedWeights:
-        """Return all waiting parts; valid until the next part is appended."""
+        """Return all parts; valid until the next part is appended."""
         indptr = np.concatenate(self._indptr)
         arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
         matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)
         return StackedWeights(matrix, np.concatenate(self._valid))
 
     def take(self) -> StackedWeights:
-        """Return all waiting parts, and remove them."""
+        """Return all parts, and remove them."""
         held = self.held()
         self._clear()
         return held
@@ -81,11 +236,8 @@ class QuadraticBuilder:
     """Builder of G or W, part by part; it keeps whichever has fewer non-zeros.
 
     A product reads each non-zero of either equally often. W is dropped and G is kept as soon as W has more
-    than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far.
-
-    Args:
-        keep: "auto", or "gram" or "weights" to force one.
-        threads: threads that build G.
+    than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far. `keep` is "auto", or
+    "gram" or "weights" to force one.
     """
 
     def __init__(self, num_gaussians: int, keep: str, threads: int) -> None:
@@ -124,7 +276,7 @@ class QuadraticBuilder:
         """Return everything added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
-            out |= {f"gram_{name}": array for name, array in self._gram.state().items()}
+            out |= self._gram.state()
         held = {"parts": stack_weights(self._parts)} if self._parts else {}
         if self._waiting.nonzeros:
             held["waiting"] = self._waiting.held()
@@ -138,8 +290,7 @@ class QuadraticBuilder:
         """Continue from `state`; the result has the same bytes as without interruption."""
         self.weights_nonzeros, self._keeps_weights = int(state["nonzeros"][0]), bool(state["nonzeros"][1])
         if self._gram is not None:
-            prefix = "gram_"
-            self._gram.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+            self._gram.restore(state)
         for name in ("parts", "waiting"):
             if f"{name}_valid" not in state:
                 continue
@@ -159,12 +310,7 @@ class QuadraticBuilder:
 
 
 class QuadraticCheckpoint:
-    """Checkpoint of the sums, kept on disk during a long pass.
-
-    Args:
-        keys: digests of the contributions of each view, in order.
-        keep: as in `QuadraticBuilder`.
-    """
+    """Checkpoint of the sums, stored during a long pass; `keys` are digests of each view's contributions."""
 
     def __init__(self, folder: Path, keys: list[str], keep: str) -> None:
         self._keys = keys

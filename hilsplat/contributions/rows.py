@@ -25,13 +25,11 @@ class Contributions:
     The M rows are the masks of all training views, view by view, in the order of each view.
 
     Attributes:
-        views: training views in the order of `view`.
         gaussians_sha256: digest of the Gaussians' PLY.
         cameras_sha256: digest of the scene's cameras.
         min_weight: smaller weights of a Gaussian at a pixel are dropped.
         view: index of each row's view in `views`.
         mask: row among the masks of the view.
-        level: `Level` of the mask.
         area_px: pixels of the raw mask.
         pixels: number n of pixels that show the mask and are covered by Gaussians.
         half_pixels: number of those that are in the random half.
@@ -98,7 +96,7 @@ class Contributions:
         """Memory-map an array from its file, read-only.
 
         Raises:
-            ArtifactError: if the file is missing or has changed since it was written.
+            ArtifactError: if the file is missing or has changed.
         """
         path = sealed(self.folder, f"{name}.npy")
         mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
@@ -111,15 +109,8 @@ class Contributions:
         Raises:
             ArtifactError: if it is missing, damaged or of another version.
         """
-        folder = Path(folder)
-        index = read_full_index(folder, "num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
-        return read_into(
-            Contributions,
-            sealed(folder, "rows.npz"),
-            folder=folder,
-            views=tuple(index["views"]),
-            num_gaussians=index["num_gaussians"],
-            gaussians_sha256=index["gaussians_sha256"],
-            cameras_sha256=index["cameras_sha256"],
-            min_weight=index["min_weight"],
-        )
+        folder, names = Path(folder), ("num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
+        index = read_full_index(folder, *names)
+        known = {name: index[name] for name in names}
+        views = tuple(index["views"])
+        return read_into(Contributions, sealed(folder, "rows.npz"), folder=folder, views=views, **known)

@@ -12,13 +12,15 @@ into one label map per level, with indicator B and areas n, the stage computes
 The losses of the language field and the semantic tree need nothing else from the images.
 """
 
+import hashlib
 import logging
-from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache as cache_calls
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Int32
 
 from hilsplat.base.artifacts import (
     ViewCache,
@@ -32,13 +34,13 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.identity import code_digest
+from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
-from hilsplat.contributions.compositing import normalised_weights
+from hilsplat.contributions.compositing import normalised_weights, visible_mass
+from hilsplat.contributions.kernels import move_to_front, summed_masks
 from hilsplat.contributions.quadratic import Gram, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
-from hilsplat.contributions.view_matrices import MATRICES, label_maps, labelled_rows, view_contributions
-from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
@@ -49,6 +51,9 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
+MATRICES = ("A", "A_half", "S")
+PARTS = {"data": np.float32, "indices": np.int32, "indptr": np.int64}
+
 WEIGHTS_PER_PIXEL = 40
 """Weights per pixel of a typical scene."""
 
@@ -56,15 +61,79 @@ MAX_WEIGHTS_TOGETHER = 2**25
 """Views with more weights are prepared one at a time; each takes 256 MiB, and up to four are waiting."""
 
 
-class ArrayStream:
-    """A .npy file written row by row, so that the stage never holds all of its output.
+def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
+    """Return the row of the painted mask at each pixel and level, -1 for none."""
+    return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
+
+
+def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
+    """Return B: one row per mask, with ones at those of the given pixels that show it (float64)."""
+    pixel, level = np.nonzero((labels >= 0) & pixels[:, None])
+    ones = np.ones(len(pixel))
+    return sp.csr_matrix((ones, (labels[pixel, level], pixel)), shape=(num_masks, len(labels)))
+
+
+def random_half(view: str, pixels: int) -> np.ndarray:
+    """Select each pixel with probability 1/2, seeded by the view's name."""
+    seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
+    return np.random.default_rng(seed).random(pixels) < 0.5
+
+
+def view_contributions(
+    view: str, weights: sp.csr_matrix, masks: HierarchicalMasks, threads: int = 1
+) -> dict[str, np.ndarray]:
+    """Return all matrices of one view except W as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
     Args:
-        row_shape: shape of one row; () for an array of numbers.
+        view: name of the view, which seeds the random halves.
+        weights: output of `normalised_weights`.
+        threads: the result does not depend on it.
     """
+    total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
+    shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
+    edges = [0, *np.searchsorted(total_px, shares).tolist(), len(masks)]
+    pixels = label_maps(masks), random_half(view, weights.shape[0])
+    W = weights.indptr, weights.indices, weights.data
+    level_index = masks.level.astype(np.int64) - 1
+
+    def some(first: int, last: int) -> tuple[np.ndarray, ...]:
+        runs = masks.runs, masks.offsets, level_index
+        return summed_masks(first, last, *runs, *pixels, *W, weights.shape[1])
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        parts = zip(*pool.map(some, edges[:-1], edges[1:]), strict=True)
+        counts, sizes, columns, sums = (np.concatenate(each) for each in parts)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    shown, in_half = counts.T
+    arrays = {"pixels": shown.copy(), "half_pixels": in_half.copy(), "mass": visible_mass(weights)}
+    areas = {"S": np.ones(len(masks)), "A": np.maximum(shown, 1), "A_half": np.maximum(in_half, 1)}
+    for index, (name, area) in enumerate(areas.items()):
+        present = sums[:, index] > 0
+        scaled = np.repeat(1.0 / area, sizes) * sums[:, index]
+        arrays[f"{name}_data"] = scaled[present].astype(np.float32)
+        arrays[f"{name}_indices"] = columns[present]
+        arrays[f"{name}_indptr"] = np.concatenate([[0], np.cumsum(present)])[starts]
+    return arrays
+
+
+def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
+    """Return the rows of W with Gaussians and a mask at some level, stored in the memory of `weights`."""
+    sizes = np.diff(weights.indptr)
+    valid = (labels >= 0) & (sizes > 0)[:, None]
+    rows = np.flatnonzero(valid.any(axis=1))
+    kept = move_to_front(rows, weights.indptr, weights.indices, weights.data)
+    indptr = np.concatenate([[0], np.cumsum(sizes[rows])])
+    arrays = (weights.data[:kept], weights.indices[:kept], indptr.astype(weights.indptr.dtype))
+    matrix = sp.csr_matrix(arrays, shape=(len(rows), weights.shape[1]), copy=False)
+    return StackedWeights(matrix, valid[rows])
+
+
+class ArrayStream:
+    """A .npy file written row by row, so that the stage never holds all of its output."""
 
     def __init__(self, path: Path, dtype: type, row_shape: tuple[int, ...] = ()) -> None:
         self._dtype, self._row_shape, self._rows = np.dtype(dtype), row_shape, 0
+        path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("wb")
         self._write_header()
 
@@ -88,36 +157,6 @@ class ArrayStream:
         self._stream.seek(0)
         self._write_header()
         self._stream.close()
-
-
-class _MatrixStream:
-    """A CSR matrix that grows by rows, in a folder with `data.npy`, `indices.npy` and `indptr.npy`."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True)
-        self._data = ArrayStream(folder / "data.npy", np.float32)
-        self._indices = ArrayStream(folder / "indices.npy", np.int32)
-        self._indptr = ArrayStream(folder / "indptr.npy", np.int64)
-        self._indptr.append(np.zeros(1))
-
-    @property
-    def nonzeros(self) -> int:
-        return len(self._data)
-
-    def append(self, data: np.ndarray, indices: np.ndarray, indptr: np.ndarray) -> None:
-        self._indptr.append(indptr[1:] + self.nonzeros)
-        self._data.append(data)
-        self._indices.append(indices)
-
-    def close(self) -> None:
-        for stream in (self._data, self._indices, self._indptr):
-            stream.close()
-
-
-def views_together(scene: Scene, threads: int) -> int:
-    """Return the number of views to prepare at once: half of the work has one thread, but W takes memory."""
-    pixels = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
-    return min(2, max(1, threads)) if pixels * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
 
 def run_contributions(
@@ -154,7 +193,22 @@ def run_contributions(
     }
     names = digests if read_index(masks_folder).get("partial") else scene.views("train")
     cameras = [scene.cameras[name] for name in names]
-    keys = [_key(camera, digests, about) for camera in cameras]
+    keys = [
+        sha256_of_json(
+            {
+                **about,
+                "masks": digests.get(camera.name),
+                "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
+                "view": camera.name,
+            }
+        )
+        for camera in cameras
+    ]
+    # half of the work has one thread, but W takes memory
+    most_px = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
+    fits = most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER
+    together = min(2, max(1, threads)) if fits else 1
+    threads_each = max(1, threads // together)
     store = ViewCache(Path(cache) / "contributions", compressed=False)
     checkpoint = QuadraticCheckpoint(store.folder / "partial", keys, settings.keep)
     rows: dict[str, list[np.ndarray]] = {
@@ -163,14 +217,16 @@ def run_contributions(
     with stage_log("contributions", scene.name) as counts, atomic_folder(out) as folder:
         builder = QuadraticBuilder(len(gaussians), settings.keep, threads)
         summed = checkpoint.resume(builder)
-        matrices = {name: _MatrixStream(folder / name) for name in MATRICES}
-        mass = ArrayStream(folder / "mass.npy", np.float32, (len(gaussians),))
-        together = views_together(scene, threads)
-        threads_each = max(1, threads // together)
+        streams = {
+            f"{name}_{what}": ArrayStream(folder / name / f"{what}.npy", dtype)
+            for name in MATRICES
+            for what, dtype in PARTS.items()
+        }
+        streams["mass"] = ArrayStream(folder / "mass.npy", np.float32, (len(gaussians),))
+        for name in MATRICES:
+            streams[f"{name}_indptr"].append(np.zeros(1))
 
-        def prepare(
-            number: int,
-        ) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
+        def prepare(number: int) -> tuple[HierarchicalMasks, dict[str, np.ndarray], StackedWeights | None]:
             """Return the masks and matrices of a view, and its rows of W if they are not yet in G."""
             camera = cameras[number]
             masks = load_masks(masks_folder, camera.name, digests)
@@ -197,11 +253,13 @@ def run_contributions(
             return masks, part, labelled_rows(weights(), label_maps(masks))
 
         prepared = in_order(prepare, range(len(cameras)), together)
-        for number, made in enumerate(track(prepared, "contributions of views", len(cameras))):
-            masks, part, labelled = made
-            for name, matrix in matrices.items():
-                matrix.append(*(part[f"{name}_{what}"] for what in ("data", "indices", "indptr")))
-            mass.append(part["mass"][None])
+        prepared = track(prepared, "contributions of views", len(cameras))
+        for number, (masks, part, labelled) in enumerate(prepared):
+            part["mass"] = part["mass"][None]
+            for name in MATRICES:
+                part[f"{name}_indptr"] = part[f"{name}_indptr"][1:] + len(streams[f"{name}_data"])
+            for name, stream in streams.items():
+                stream.append(part[name])
             rows["view"].append(np.full(len(masks), number, np.int32))
             rows["mask"].append(np.arange(len(masks), dtype=np.int32))
             rows["level"].append(masks.level)
@@ -211,9 +269,8 @@ def run_contributions(
             if labelled is not None:
                 builder.add(labelled)
                 checkpoint.offer(builder, number + 1)
-        mass.close()
-        for matrix in matrices.values():
-            matrix.close()
+        for stream in streams.values():
+            stream.close()
         num_masks = sum(len(part) for part in rows["view"])
         if not num_masks:
             raise ArtifactError(
@@ -224,7 +281,7 @@ def run_contributions(
         np.save(folder / "centres.npy", np.stack([camera.centre for camera in cameras]))
         write_npz(folder / "rows.npz", **{name: np.concatenate(values) for name, values in rows.items()})
         counts |= {"views": len(cameras), "masks": num_masks}
-        nonzeros = {name: matrix.nonzeros for name, matrix in matrices.items()}
+        nonzeros = {name: len(streams[f"{name}_data"]) for name in MATRICES}
         if settings.keep != "none":
             quadratic = builder.finish()
             quadratic.save(folder)
@@ -247,15 +304,3 @@ def run_contributions(
             nonzeros=nonzeros,
         )
     checkpoint.forget()
-
-
-def _key(camera: Camera, digests: Mapping[str, str], about: dict) -> str:
-    """Return a digest of all inputs of a view's matrices."""
-    return sha256_of_json(
-        {
-            **about,
-            "masks": digests.get(camera.name),
-            "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
-            "view": camera.name,
-        }
-    )

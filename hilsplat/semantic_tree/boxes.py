@@ -77,14 +77,12 @@ def node_boxes(
     centroid = np.zeros((len(level), 3), np.float32)
     box = np.zeros((len(level), 2, 3), np.float32)
     oriented = np.zeros((len(level), 5, 3), np.float32)
-    order, starts = {}, {}
-    for index in range(node_of_gaussian.shape[1]):
-        own = node_of_gaussian[:, index]
-        order[index] = np.argsort(own, kind="stable")
-        starts[index] = np.searchsorted(own[order[index]], np.arange(len(level) + 1))
+    order = np.argsort(node_of_gaussian, axis=0, kind="stable")
+    ids = np.arange(len(level) + 1)
+    starts = [np.searchsorted(node_of_gaussian[rows, k], ids) for k, rows in enumerate(order.T)]
     for node, each in enumerate(level):
         index = Level(int(each)).index
-        members = order[index][starts[index][node] : starts[index][node + 1]]
+        members = order[starts[index][node] : starts[index][node + 1], index]
         weight = mass[members] / mass[members].sum()
         points = means[members]
         centroid[node] = (weight[:, None] * points).sum(axis=0)

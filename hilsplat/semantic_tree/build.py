@@ -1,10 +1,9 @@
 """The semantic tree stage: links the masks of all views by the Gaussians they share.
 
-Masks have no identity across views. Masks of one level in different views are linked by how well they agree
-on the Gaussians that both views see. Clusters of masks become nodes, each Gaussian joins its best node, and
-small stray pieces leave it. A coarser node that holds most of a finer one becomes its parent. None of this
-needs CLIP: the tree only scores the crops that show each node. The clip stage embeds the best crops, and
-their average is the node's vector.
+Masks of one level in different views are linked by how well they agree on the Gaussians that both views see.
+Clusters of masks become nodes, each Gaussian joins its best node, and small stray pieces leave it. A coarser
+node that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores the
+crops that show each node. The clip stage embeds the best, and their average is the node's vector.
 """
 
 import logging
@@ -12,8 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse as sp
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Int32, Int64
 
 from hilsplat.base.artifacts import (
     atomic_folder,
@@ -28,11 +26,11 @@ from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.boxes import node_boxes
-from hilsplat.semantic_tree.crops import crop_ranks
 from hilsplat.semantic_tree.export import readable_nodes
-from hilsplat.semantic_tree.level_nodes import LevelNodes, level_nodes
 from hilsplat.semantic_tree.nodes import (
     MIN_VISIBLE_PX,
+    LevelNodes,
+    level_nodes,
     mask_fits,
     nearest_gaussians,
     nest_nodes,
@@ -44,6 +42,15 @@ from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
 
+APART_DEG = 30.0
+"""Directions at least this far apart do not lower each other's score."""
+
+LEAST_NEW = 0.1
+"""Share of its score that a crop keeps if a higher-ranked crop has the same direction."""
+
+RANKED = 32
+"""Number of crops ranked per node."""
+
 LEAST_IOU = 1e-3
 """Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
 
@@ -53,30 +60,55 @@ NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
 logger = logging.getLogger(__name__)
 
 
+def crop_ranks(
+    node: Int32[np.ndarray, " M"],
+    score: Float32[np.ndarray, " M"],
+    directions: Float[np.ndarray, "M 3"],
+) -> Int32[np.ndarray, " M"]:
+    """Rank the masks of each node by score, reduced for directions close to those already ranked.
+
+    At equal scores, crops from different sides describe a thing better (docs/experiments.md).
+
+    Args:
+        node: node that each mask shows, -1 for none.
+        score: how well its crop shows the node.
+        directions: unit vectors from nodes to cameras.
+
+    Returns:
+        rank of each mask among those of its node, 0 for the best; -1 without a node or beyond `RANKED`.
+    """
+    rank = np.full(len(node), NONE, np.int32)
+    order = np.argsort(node, kind="stable")
+    starts = np.flatnonzero(np.diff(node[order], prepend=NONE))
+    for rows in np.split(order, starts)[1:]:
+        left = score[rows].astype(np.float64)
+        new = np.ones(len(rows))
+        for place in range(min(RANKED, len(rows))):
+            best = int((left * new).argmax())
+            rank[rows[best]] = place
+            cosine = np.clip(directions[rows] @ directions[rows[best]], -1, 1)
+            apart = np.rad2deg(np.arccos(cosine)) / APART_DEG
+            new = np.minimum(new, np.clip(apart, LEAST_NEW, 1))
+            left[best] = -1
+    return rank
+
+
 def build_tree(
     contributions: Contributions,
-    S: sp.csr_matrix,
-    mass: Float32[np.ndarray, "V N"],
-    means: Float[np.ndarray, "N 3"],
-    centres: Float[np.ndarray, "V 3"],
     settings: SemanticTreeSettings,
-    threads: int = 1,
-    join_wholes: bool = False,
-    nodes_of: NodesOf | None = None,
+    threads: int,
+    join_wholes: bool,
+    nodes_of: NodesOf | None,
 ) -> SemanticTree:
     """Link masks into nodes, compute their Gaussians, parents and boxes, and score the crops that show them.
 
     Args:
-        contributions: rows of the masks.
-        S: weight of each Gaussian in each raw mask, px.
-        mass: visible mass of each Gaussian in each view, px.
-        means: centres of the Gaussians, scene units.
-        centres: centres of the cameras, scene units.
-        settings: thresholds.
-        threads: number of threads for the evidence; results do not depend on it.
+        threads: the result does not depend on it.
         join_wholes: join wholes from nodes that touch in 3D, for segmenters that detect only colour regions.
         nodes_of: finds the nodes of a level; None links masks.
     """
+    S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
+    view = contributions.view
     visible = mass > MIN_VISIBLE_PX
     num_visible = visible.sum(axis=0)
     total_mass = mass.sum(axis=0, dtype=np.float64)
@@ -90,13 +122,11 @@ def build_tree(
     nearest = None if nodes_of else nearest_gaussians(means, threads)
     for each in LEVELS:
         rows = contributions.rows_of(each)
-        found = (
-            nodes_of(each, rows)
-            if nodes_of
-            else level_nodes(
-                S[rows], contributions.view[rows], mass, visible, importance, total_mass, settings, threads
-            )
-        )
+        if nodes_of:
+            found = nodes_of(each, rows)
+        else:
+            masses = mass, visible, importance, total_mass
+            found = level_nodes(S[rows], view[rows], *masses, settings, threads)
         if join_wholes and each is Level.WHOLE:
             whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
             found = found.joined(whole)
@@ -120,23 +150,20 @@ def build_tree(
     kept = np.flatnonzero(renumber[:num] != NONE)
     node_of_gaussian, cluster_of_mask = renumber[node_of_gaussian], renumber[cluster_of_mask]
     levels, parent, num = levels[kept], renumber[parent[kept]], len(kept)
-    quality = [quality[node] for node in kept]
     view_area = np.zeros((num, len(contributions.views)), np.float64)
     own = np.flatnonzero(cluster_of_mask >= 0)
-    np.add.at(view_area, (cluster_of_mask[own], contributions.view[own]), contributions.area_px[own])
+    np.add.at(view_area, (cluster_of_mask[own], view[own]), contributions.area_px[own])
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
-    fits, iou = mask_fits(node_of_gaussian, S, mass, contributions.view, contributions.level, cluster_of_mask)
+    fits, iou = mask_fits(node_of_gaussian, S, mass, view, contributions.level, cluster_of_mask)
     # Nesting may remove from a node the Gaussians that its masks show; the node still needs a crop.
-    score = np.sqrt(contributions.area_px) * np.where(
-        cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU)
-    )
+    fit = np.where(cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU))
+    score = (np.sqrt(contributions.area_px) * fit).astype(np.float32)
     if join_wholes:  # the mask of a piece has a low IoU with the joined whole, but shows it
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = cluster_of_mask[pieces]
     linked = cluster_of_mask.astype(np.int32)
-    towards = centres[contributions.view] - centroid[linked] if num else np.zeros((len(linked), 3))
+    towards = contributions.centres()[view] - centroid[linked] if num else np.zeros((len(linked), 3))
     towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    score = score.astype(np.float32)
     return SemanticTree(
         level=levels,
         parent=parent,
@@ -144,7 +171,7 @@ def build_tree(
         centroid=centroid,
         box=box,
         oriented_box=oriented,
-        quality=np.array(quality, np.float32),
+        quality=np.array(quality, np.float32)[kept],
         views=(view_area > 0).sum(axis=1).astype(np.int32),
         node_of_gaussian=node_of_gaussian,
         membership=membership,
@@ -180,17 +207,8 @@ def run_semantic_tree(
     scene = read_index(contributions_folder)["scene"]
     require_same_masks(contributions_folder, masks_folder)
     with stage_log("semantic tree", scene) as counts:
-        tree = build_tree(
-            contributions,
-            contributions.matrix("S"),
-            contributions.mass(),
-            contributions.means(),
-            contributions.centres(),
-            settings,
-            threads,
-            join_wholes=read_full_index(masks_folder, "segmenter")["segmenter"] == "graph",
-            nodes_of=nodes_of,
-        )
+        join_wholes = read_full_index(masks_folder, "segmenter")["segmenter"] == "graph"
+        tree = build_tree(contributions, settings, threads, join_wholes, nodes_of)
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
         orphans = {
             level.label: int((tree.parent[tree.nodes_of(level)] == NONE).sum()) for level in LEVELS[1:]

@@ -23,11 +23,10 @@ class Evidence:
 
     Attributes:
         intersection: of pairs a < b from different views that share Gaussians.
-        union: of the same pairs, in the same order of stored values.
+        union: of the same pairs, stored in the same order.
         seen: size of each mask as each of the V views sees it: its full size in its own view, 0 in views
             that see too little of it. A pair that is not stored has intersection 0 and union
             `seen[a, view[b]] + seen[b, view[a]]`.
-        view: view of each mask.
     """
 
     intersection: sp.csr_matrix
@@ -59,76 +58,28 @@ def mask_evidence(
     Args:
         shares: s, one row per mask of a level; zero if the Gaussian is not visible in the mask's view.
         importance: w, such as the mean visible mass.
-        visible: which Gaussians each view sees.
-        view: view of each mask.
         min_covisible: pairs that see a smaller share of each other are dropped.
-        threads: number of threads; the result does not depend on it.
+        threads: the result does not depend on it.
     """
 
-    def like(values: np.ndarray) -> sp.csr_matrix:
-        return sp.csr_matrix((values, shares.indices, shares.indptr), shape=shares.shape, copy=False)
-
-    share = shares.data.astype(np.float64)
+    num, share = len(view), shares.data.astype(np.float64)
     weight = importance.astype(np.float64)[shares.indices]
-    size = weight * np.square(share)
-    products = (like(share), like(weight * share), like(size), visible, view, min_covisible)
-    upper, seen = _evidence_by_loops(*products, threads)
-    shape = (len(view), len(view))
-    intersection, union = (sp.csr_matrix((values, *upper[:2]), shape=shape) for values in upper[2:])
-    return Evidence(intersection, union, seen, view)
-
-
-def _evidence_by_loops(
-    shares: sp.csr_matrix,
-    weighted: sp.csr_matrix,
-    sizes: sp.csr_matrix,
-    visible: Bool[np.ndarray, "V N"],
-    view: Int32[np.ndarray, " M"],
-    min_covisible: float,
-    threads: int,
-) -> tuple[tuple[np.ndarray, ...], Float64[np.ndarray, "M V"]]:
-    """Return the pairs a < b that share Gaussians, and `Evidence.seen`.
-
-    Args:
-        shares: s.
-        weighted: w s, stored in the same pattern.
-        sizes: each Gaussian's contribution to a mask's size, stored in the same pattern.
-        visible, view, min_covisible, threads: as in `mask_evidence`.
-
-    Returns:
-        (b, row starts, intersection, union) of the pairs, and the sizes.
-    """
-    num = shares.shape[0]
-    seen_everywhere = np.zeros((num, len(visible)))
+    sizes, weighted = weight * np.square(share), weight * share
+    columns = sp.csr_matrix((share, shares.indices, shares.indptr), shape=shares.shape, copy=False).tocsc()
+    rows, by_column = (shares.indptr, shares.indices), (columns.indptr, columns.indices, columns.data)
     flags = np.ascontiguousarray(visible.T).view(np.uint8)
-    columns = shares.tocsc()
-    rows = (shares.indptr, shares.indices)
+    everywhere = np.zeros((num, len(visible)))  # size of each mask as each view sees it
+    ranges = list(pairwise([*range(0, num, ROWS_AT_A_TIME), num])) or [(0, 0)]
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        ranges = list(pairwise([*range(0, num, ROWS_AT_A_TIME), num]))
-        list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes.data, flags, seen_everywhere), ranges))
-        seen = _counted(seen_everywhere, view, min_covisible)
-        column_arrays = (columns.indptr, columns.indices, columns.data)
-        parts = list(
-            pool.map(
-                lambda span: _shared_pairs(
-                    *span, *rows, weighted.data, *column_arrays, view, seen, seen_everywhere
-                ),
-                ranges,
-            )
-        )
-    if not parts:
-        return (np.zeros(0, np.int32), np.zeros(num + 1, np.int64), np.zeros(0), np.zeros(0)), seen
-    indptr = np.concatenate(([0], np.cumsum(np.concatenate([np.diff(part[0]) for part in parts]))))
-    indices, intersection, union = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
-    return (indices, indptr, intersection, union), seen
-
-
-def _counted(
-    seen_everywhere: Float64[np.ndarray, "M V"], view: Int32[np.ndarray, " M"], min_covisible: float
-) -> Float64[np.ndarray, "M V"]:
-    """Return the sizes that count as evidence: 0 where a view sees too little of a mask."""
-    size = seen_everywhere[np.arange(len(view)), view]
-    return np.where(seen_everywhere < min_covisible * size[:, None], 0.0, seen_everywhere)
+        list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes, flags, everywhere), ranges))
+        own = everywhere[np.arange(num), view]
+        seen = np.where(everywhere < min_covisible * own[:, None], 0.0, everywhere)
+        pairs = (*rows, weighted, *by_column, view, seen, everywhere)
+        parts = list(pool.map(lambda span: _shared_pairs(*span, *pairs), ranges))
+    counts, indices, *sums = (np.concatenate(each) for each in zip(*parts, strict=True))
+    indptr = np.concatenate(([0], np.cumsum(counts)))
+    intersection, union = (sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in sums)
+    return Evidence(intersection, union, seen, view)
 
 
 @compiled
@@ -143,14 +94,14 @@ def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
 
 @compiled
 def _shared_pairs(
-    begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, seen_everywhere
+    begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, everywhere
 ):
-    """Return the pairs a < b that share Gaussians: row starts, b, intersection and union."""
+    """Return the pairs a < b that share Gaussians: number per row, b, intersection and union."""
     num = len(indptr) - 1
     touched_by = np.full(num, -1, np.int64)
     sums = np.zeros(num)
     found = np.empty(num, np.int32)
-    out_indptr = np.zeros(end - begin + 1, np.int64)
+    counts = np.zeros(end - begin, np.int64)
     out = np.empty(1024, np.int32)
     out_intersection, out_union = np.empty(1024), np.empty(1024)
     done = 0
@@ -182,7 +133,7 @@ def _shared_pairs(
                 continue
             out[done] = b
             out_intersection[done] = sums[b]
-            out_union[done] = seen_everywhere[a, view[b]] + seen_everywhere[b, view[a]] - sums[b]
+            out_union[done] = everywhere[a, view[b]] + everywhere[b, view[a]] - sums[b]
+            counts[a - begin] += 1
             done += 1
-        out_indptr[a - begin + 1] = done
-    return out_indptr, out[:done].copy(), out_intersection[:done].copy(), out_union[:done].copy()
+    return counts, out[:done].copy(), out_intersection[:done].copy(), out_union[:done].copy()

@@ -41,17 +41,9 @@ def write_tree_ply(gaussians_ply: Path, tree: SemanticTree, out: Path) -> None:
     Raises:
         MisalignedArtifactError: the tree was made for another PLY.
     """
-    from plyfile import PlyData
-
     require_same("semantic tree", str(gaussians_ply.parent), gaussians_ply, tree.gaussians_sha256)
-    vertex = PlyData.read(str(gaussians_ply))["vertex"].data
-    more = [(f"node_{level.label}", "<i4") for level in LEVELS]
-    table = np.empty(len(vertex), [*vertex.dtype.descr, *more])
-    for name in vertex.dtype.names:
-        table[name] = vertex[name]
-    for level in LEVELS:
-        table[f"node_{level.label}"] = tree.node_of_gaussian[:, level.index]
-    _write(table, out)
+    nodes = {f"node_{level.label}": tree.node_of_gaussian[:, level.index] for level in LEVELS}
+    _write(gaussians_ply, slice(None), nodes, out)
 
 
 def write_selection_ply(
@@ -67,24 +59,26 @@ def write_selection_ply(
         labels: label of each Gaussian, from 1; written as the property `label`.
         names: name of each label; the header gets a comment for each, such as `label 1: mug`.
     """
-    from plyfile import PlyData
-
-    table = PlyData.read(str(gaussians_ply))["vertex"].data[rows]
-    if labels is None:
-        _write(table, out)
-        return
-    labelled = np.empty(len(table), [*table.dtype.descr, ("label", "<i4")])
-    for name in table.dtype.names:
-        labelled[name] = table[name]
-    labelled["label"] = labels
     # PLY headers are ASCII, and a comment is one line.
     plain = [" ".join(name.split()).encode("ascii", "backslashreplace").decode() for name in names]
-    _write(labelled, out, [f"label {number + 1}: {name}" for number, name in enumerate(plain)])
+    comments = [f"label {number + 1}: {name}" for number, name in enumerate(plain)]
+    _write(gaussians_ply, rows, {} if labels is None else {"label": labels}, out, comments)
 
 
-def _write(table: np.ndarray, out: Path, comments: Sequence[str] = ()) -> None:
+def _write(
+    ply: Path,
+    rows: Int64[np.ndarray, " g"] | slice,
+    columns: dict[str, np.ndarray],
+    out: Path,
+    comments: Sequence[str] = (),
+) -> None:
+    """Copy rows of a PLY, with additional int32 columns."""
     from plyfile import PlyData, PlyElement
 
+    vertex = PlyData.read(str(ply))["vertex"].data[rows]
+    table = np.empty(len(vertex), [*vertex.dtype.descr, *((name, "<i4") for name in columns)])
+    for name in (*vertex.dtype.names, *columns):
+        table[name] = columns[name] if name in columns else vertex[name]
     with atomic_path(out) as temporary:
         element = PlyElement.describe(table, "vertex")
         PlyData([element], byte_order="<", comments=list(comments)).write(str(temporary))

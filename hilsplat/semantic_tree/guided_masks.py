@@ -33,21 +33,15 @@ def run_guided_masks(
 ) -> None:
     """Segment the training views after the key views, with guided prompts (`segment.stage.run_masks`).
 
-    Departs: SAM and LangSplat prompt a grid in every view (measured in docs/experiments.md).
+    The masks of the key views are kept unchanged; `semantic_tree_folder` is their tree.
 
-    Args:
-        gaussians_ply: the scene's Gaussians.
-        key_masks_folder: masks of the key views, which are kept unchanged.
-        semantic_tree_folder: the tree of those masks.
+    Departs: SAM and LangSplat prompt a grid in every view (measured in docs/experiments.md).
 
     Raises:
         MisalignedArtifactError: the tree was made for other Gaussians.
     """
-    scene, tree, gaussians = (
-        Scene.load(scene_folder),
-        SemanticTree.load(semantic_tree_folder),
-        load_ply(gaussians_ply),
-    )
+    scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
+    tree = SemanticTree.load(semantic_tree_folder)
     require_same("semantic tree", scene.name, gaussians_ply, tree.gaussians_sha256)
     grid = point_grid(settings.points_per_side)
 
@@ -68,15 +62,14 @@ def run_guided_masks(
 def guided_points(
     labels: dict[Level, Int32[np.ndarray, "H W"]], grid: Float[np.ndarray, "G 2"], min_area_px: int
 ) -> Float[np.ndarray, "P 2"]:
-    """Return a prompt in the middle of each node, and the grid points that no subpart explains.
+    """Return a prompt in the middle of each node, and the grid points that no subpart covers; (x, y), px.
+
+    The middle is the pixel farthest from the region's border.
 
     Args:
         labels: node that each pixel shows at each level, -1 for none.
         grid: points of the unit square (x, y).
         min_area_px: smaller regions get no prompt.
-
-    Returns:
-        points (x, y), px; the middle is the pixel farthest from the region's border.
     """
     found = []
     for node_of_pixel in labels.values():

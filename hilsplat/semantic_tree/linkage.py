@@ -42,10 +42,7 @@ def pooled_linkage(
 
 @compiled
 def _neighbours(indptr, indices, intersection, union, seen, view):
-    """Return the initial pool of neighbours for `_link`, and where each mask's run starts and stops in it.
-
-    The pool has 25 % more entries than there are pairs, counted in both directions.
-    """
+    """Return the initial pool of neighbours for `_link`, with 25 % spare room, and each mask's run in it."""
     num = len(view)
     start = np.zeros(num + 1, np.int64)
     for a in range(num):
@@ -72,8 +69,8 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
     """Copy a run of neighbours to `first` and beyond, and sum neighbours joined since it was written.
 
-    Entries already there, from an earlier run of the same cluster, are summed too. Entries that refer to
-    the cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
+    Entries already there, from an earlier run of the cluster, are summed too. Entries that refer to the
+    cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
     """
     own_inter, own_extra = 0.0, 0.0
     last = first
@@ -128,9 +125,9 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown
 
 @compiled
 def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Move the runs of living clusters to the front of the pool, and update `start` and `stop`.
+    """Move the runs of living clusters to the front of the pool, or to a larger pool, and update their ends.
 
-    If `needed` more entries would not fit, the runs move to a larger pool.
+    The new pool has room for `needed` more entries.
     """
     living = 0
     for i in range(len(alive)):

@@ -1,14 +1,27 @@
-"""The Gaussians of each node, its parent, and the masks that show it."""
+"""Nodes: masks linked across views, the Gaussians and parent of each node, and the masks that show it."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.semantic_tree.evidence import mask_evidence
+from hilsplat.semantic_tree.linkage import pooled_linkage
+from hilsplat.settings import SemanticTreeSettings
 
 MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
+MIN_COVISIBLE = 0.2
+"""Pairs of masks whose views see less than this share of each other are no evidence."""
+
+MIN_MEMBER_SHARE = 0.05
+"""A Gaussian joins its best node if that node holds more than this share of its weight."""
+
+MIN_FIT = 0.25
+"""A mask shows its best-fitting node if their IoU in the mask's view is above this."""
 
 PRIOR_VIEWS = 3
 """Views without the node that are added to those that show it, so that one view alone decides little."""
@@ -18,6 +31,89 @@ NEIGHBOURS = 11
 
 STRAY_SHARE = 0.02
 """A piece of a node with less than this share of the mass of its largest piece leaves the node."""
+
+
+@dataclass(frozen=True)
+class LevelNodes:
+    """Nodes of one level, numbered from 0.
+
+    Attributes:
+        of_mask: node that each mask of the level belongs to, -1 for none.
+        of_gaussian: node of each Gaussian, -1 for none.
+        membership: share of the Gaussian's visible weight inside its node's masks.
+        quality: pooled IoU of each node.
+    """
+
+    of_mask: Int64[np.ndarray, " m"]
+    of_gaussian: Int32[np.ndarray, " N"]
+    membership: Float32[np.ndarray, " N"]
+    quality: Float64[np.ndarray, " t"]
+
+    def joined(self, into: Int64[np.ndarray, " t"]) -> "LevelNodes":
+        """Merge nodes with the same number in `into`; the quality is the mean over their masks."""
+        into_or_none = np.append(into, NONE)
+        masks = np.bincount(self.of_mask[self.of_mask != NONE], minlength=len(into))
+        total = np.bincount(into, masks * self.quality)
+        return LevelNodes(
+            into_or_none[self.of_mask],
+            into_or_none[self.of_gaussian].astype(np.int32),
+            self.membership,
+            total / np.maximum(np.bincount(into, masks), 1),
+        )
+
+
+def level_nodes(
+    weights: sp.csr_matrix,
+    view: Int32[np.ndarray, " m"],
+    mass: Float32[np.ndarray, "V N"],
+    visible: Bool[np.ndarray, "V N"],
+    importance: Float64[np.ndarray, " N"],
+    total_mass: Float64[np.ndarray, " N"],
+    settings: SemanticTreeSettings,
+    threads: int,
+) -> LevelNodes:
+    """Link the masks of one level into nodes and assign Gaussians to them.
+
+    A cluster whose Gaussians go to other clusters, such as a duplicate, could select nothing. A cluster
+    therefore becomes a node only if at least `min_views` masks fit it best.
+
+    Args:
+        weights: S of the masks.
+        mass: visible mass of each Gaussian in each view, px.
+        visible: which Gaussians each view sees.
+        importance: mean visible mass, px.
+        total_mass: visible mass of each Gaussian, summed over views, px.
+    """
+    place = view[_row_of(weights)], weights.indices
+    shares = weights.astype(np.float64)
+    shares.data /= np.where(visible[place], mass[place], np.inf)
+    shares.eliminate_zeros()
+    del place
+    evidence = mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
+    del shares
+    cluster, quality = pooled_linkage(evidence, settings.link_threshold)
+    del evidence
+    pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
+    kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
+
+    def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        of_cluster = np.full(len(quality) + 1, NONE, np.int64)
+        of_cluster[kept] = np.arange(len(kept))
+        return of_cluster, *gaussian_nodes(
+            of_cluster[cluster], len(kept), weights, view, mass, total_mass, MIN_MEMBER_SHARE
+        )
+
+    fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
+    kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
+    of_cluster, node, share = winners(kept)
+    renumber = renumbered_without_empty(node, len(kept))
+    of_mask = renumber[of_cluster[cluster]].astype(np.int64)
+    return LevelNodes(of_mask, renumber[node], share, quality[kept[renumber[:-1] != NONE]])
+
+
+def _row_of(matrix: sp.csr_matrix) -> Int64[np.ndarray, " E"]:
+    """Return the row of each stored value."""
+    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
 
 
 def gaussian_nodes(
@@ -41,7 +137,7 @@ def gaussian_nodes(
         cluster: node of each mask of one level, -1 for none.
         weights: S of the masks.
         mass: visible mass of each Gaussian in each view, px.
-        total_mass: visible mass of each Gaussian, summed over views, px.
+        total_mass: sum of `mass` over views, px.
         min_share: a Gaussian joins only nodes that hold more than this share of its weight in all views.
 
     Returns:
@@ -67,7 +163,7 @@ def gaussian_nodes(
         in_its_views[row] += mass[in_view].take(column[row])
     one_view = total_mass / np.maximum(np.count_nonzero(mass > MIN_VISIBLE_PX, axis=0), 1)
     share_there = share * total_mass[column] / (in_its_views + PRIOR_VIEWS * one_view[column])
-    row_of = np.repeat(np.arange(num_nodes), np.diff(per_node.indptr))
+    row_of = _row_of(per_node)
     ranked = np.lexsort((row_of, -share * share_there, column))
     best = ranked[np.flatnonzero(np.diff(column[ranked], prepend=NONE))]
     node_of_gaussian = np.full(shape[1], NONE, np.int32)
@@ -93,11 +189,6 @@ def without_strays(
     """Return the nodes without their stray pieces: Gaussians behind or beside a thing that its masks cover.
 
     Gaussians of one node are connected if one is among the nearest of the other (`nearest_gaussians`).
-
-    Args:
-        node_of_gaussian: node of each Gaussian at one level, -1 for none.
-        nearest: nearest Gaussians of each.
-        total_mass: visible mass of each Gaussian, summed over views, px.
     """
     num = len(node_of_gaussian)
     row, other = np.repeat(np.arange(num), nearest.shape[1]), nearest.ravel()
@@ -153,11 +244,8 @@ def mask_fits(
     """Return the node that each mask shows: the one with the best soft IoU with it, in its view.
 
     Args:
-        node_of_gaussian: node of each Gaussian at each level.
         S: weight of each Gaussian in each mask, px.
         mass: visible mass of each Gaussian in each view, px.
-        view: view of each mask.
-        level: level of each mask.
         linked: node that each mask was linked into, -1 for none.
 
     Returns:
@@ -182,11 +270,7 @@ def level_ious(
 ) -> sp.csr_matrix:
     """Return the soft IoU of each mask of a level with each node that it shares Gaussians with, in its view.
 
-    Args:
-        node_of_gaussian: node of each Gaussian at the level.
-        weights: S of the level's masks.
-        mass: visible mass of each Gaussian in each view, px.
-        view: view of each mask.
+    `weights` is S of the level's masks; `mass` is the visible mass of each Gaussian in each view, px.
     """
     has = np.flatnonzero(node_of_gaussian >= 0)
     node = node_of_gaussian[has]
@@ -195,7 +279,7 @@ def level_ious(
     inter = (weights.astype(np.float64) @ member).tocsr()
     area = np.asarray(weights.sum(axis=1, dtype=np.float64)).ravel()
     size = np.stack([np.bincount(node, seen[has], num_nodes) for seen in mass])  # [view, node]
-    row = np.repeat(np.arange(len(view)), np.diff(inter.indptr))
+    row = _row_of(inter)
     inter.data /= area[row] + size[view[row], inter.indices] - inter.data
     return inter
 
@@ -203,7 +287,7 @@ def level_ious(
 def best_fits(iou: sp.csr_matrix) -> tuple[Int32[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
     """Return the column of each row's largest value (lowest on a tie) and the value; -1 and 0 if empty."""
     best, value = np.full(iou.shape[0], NONE, np.int32), np.zeros(iou.shape[0])
-    row = np.repeat(np.arange(iou.shape[0]), np.diff(iou.indptr))
+    row = _row_of(iou)
     order = np.lexsort((iou.indices, -iou.data, row))
     first = order[np.flatnonzero(np.diff(row[order], prepend=NONE))]
     best[row[first]], value[row[first]] = iou.indices[first], iou.data[first]
@@ -219,9 +303,6 @@ def nest_nodes(
 
     A Gaussian of a child joins the parent and the parent's parent if no other node holds it at their levels;
     otherwise it leaves the child. Coarse levels are processed first.
-
-    Returns:
-        node of each Gaussian at each level.
     """
     nested = node_of_gaussian.copy()
     index_of = level.astype(np.int64) - 1
@@ -244,14 +325,12 @@ def nest_nodes(
 
 
 def renumbered_without_empty(
-    node_of_gaussian: Int32[np.ndarray, "N 3"], num_nodes: int
+    node_of_gaussian: Int32[np.ndarray, "..."], num_nodes: int
 ) -> Int32[np.ndarray, " T1"]:
     """Return each node's new id, in the old order; NONE for a node without Gaussians, which selects nothing.
 
-    Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost.
-
-    Returns:
-        one more entry than there are nodes: the last is NONE, so that indexing with NONE gives NONE.
+    Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost. The
+    result has one more entry than there are nodes: the last is NONE, so that indexing with NONE gives NONE.
     """
     used = np.unique(node_of_gaussian[node_of_gaussian >= 0])
     renumber = np.full(num_nodes + 1, NONE, np.int32)

@@ -21,7 +21,6 @@ class SemanticTree:
     """T nodes at three levels, coarse to fine.
 
     Attributes:
-        level: `Level` of each node.
         parent: row of the coarser node that holds it, -1 for none.
         clip: unit CLIP vector of each node; empty (C = 0) in the tree that the stage writes.
         centroid: mean of its Gaussians' centres weighted by visible mass, scene units.
@@ -37,9 +36,8 @@ class SemanticTree:
         linked_node: node that each mask was linked into, -1 for none.
         crop_score: how well the crop of each mask shows the node that it was linked into: the square root of
             its area, times its IoU with the node in its view, px; 0 without a node.
-        crop_rank: order in which the crops of a node are embedded (`crops.crop_ranks`), -1 for none.
+        crop_rank: order in which the crops of a node are embedded (`build.crop_ranks`), -1 for none.
         view_area_px: area of its masks in each view.
-        view_names: the columns of `view_area_px`.
         gaussians_sha256: digest of the PLY that the tree belongs to.
         cameras_sha256: digest of the scene's cameras.
         min_weight: weights below this are dropped in the contributions and when views are rendered.
@@ -106,8 +104,7 @@ class SemanticTree:
     def with_vectors(self, vectors: Float32[np.ndarray, "M C"]) -> "SemanticTree":
         """Return the tree with node vectors: the normalised sum of the masks' vectors times `crop_score`.
 
-        Args:
-            vectors: CLIP vector of each mask, zero if its crop was not embedded.
+        The vector of a mask whose crop was not embedded is zero.
         """
         sums = np.zeros((len(self), vectors.shape[1]))
         linked = np.flatnonzero(self.linked_node != NONE)
@@ -117,27 +114,16 @@ class SemanticTree:
 
     @staticmethod
     def load(folder: Path, clip_folder: Path | None = None) -> "SemanticTree":
-        """Read a finished semantic tree.
-
-        Args:
-            folder: output of the stage.
-            clip_folder: CLIP vectors of the masks; if None, the nodes get no vectors.
+        """Read a finished semantic tree; nodes get vectors from `clip_folder`, the masks' CLIP vectors.
 
         Raises:
             ArtifactError: the tree is missing, damaged or of another version.
             MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
         """
-        folder = Path(folder)
-        index = read_full_index(folder, "gaussians_sha256", "cameras_sha256", "min_weight")
-        tree = read_into(
-            SemanticTree,
-            sealed(folder, "tree.npz"),
-            LIMITS,
-            view_names=tuple(index["views"]),
-            gaussians_sha256=index["gaussians_sha256"],
-            cameras_sha256=index["cameras_sha256"],
-            min_weight=index["min_weight"],
-        )
+        folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")
+        index = read_full_index(folder, *names)
+        known = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
+        tree = read_into(SemanticTree, sealed(folder, "tree.npz"), LIMITS, **known)
         tree._require_whole(folder / "tree.npz")
         if clip_folder is None:
             return tree

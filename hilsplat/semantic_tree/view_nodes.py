@@ -2,7 +2,7 @@
 
 A pixel blends about ten Gaussians, but rarely more than two nodes of a level. Summing its weights by node
 once per view makes each later answer in that view several times cheaper than a product with all weights,
-with a fraction of the memory.
+and needs a fraction of the memory.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,6 @@ class ViewNodes:
     """Nodes of one level in each pixel of a view (CSR over P pixels).
 
     Attributes:
-        indptr: start of the entries of each pixel.
         nodes: rows of the semantic tree.
         shares: share of the pixel that each node makes up; the rest has no node.
         covered: whether the Gaussians cover each pixel.
@@ -49,10 +48,7 @@ class ViewNodes:
         return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)
 
     def blend(
-        self,
-        values: Float32[np.ndarray, " n"],
-        without: float,
-        out: Float32[np.ndarray, " P"] | None = None,
+        self, values: Float32[np.ndarray, " n"], without: float, out: Float32[np.ndarray, " P"] | None = None
     ) -> Float32[np.ndarray, " P"]:
         """Blend one value per node; Gaussians without a node have the value `without`.
 

@@ -1,8 +1,8 @@
 """Wholes for a segmenter that detects only colour regions: regions that touch in 3D are joined.
 
 In a photograph, a coloured part of a thing borders both the wall behind it and the part beside it. In 3D it
-touches only the latter. Joining touching regions, small before large, builds things from their parts before
-any of them is joined to the table, the walls or the floor, which are large.
+touches only the latter. Small regions join first, so things are complete before any of their parts is joined
+to the table, the walls or the floor, which are large.
 """
 
 import heapq
@@ -40,7 +40,6 @@ def joined_regions(
 
     Args:
         region_of_gaussian: region of each Gaussian, -1 for none.
-        num_regions: T; ids are smaller.
         means: centres of the Gaussians, scene units.
         mass: visible mass of each Gaussian in each view, px.
         most: limit of the cost, as a share of the side of a view.

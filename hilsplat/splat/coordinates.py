@@ -1,34 +1,114 @@
-"""Import and export of Gaussians in the coordinates of a scene's source, and the JSON file between both."""
+"""Coordinates of Gaussians: similarity transforms, and import and export in the coordinates of a source."""
 
 import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
+from scipy.special import sph_harm_y
 
 from hilsplat.base.artifacts import read_json, sha256_of_file, write_json
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError
+from hilsplat.base.rotations import are_rotations, multiply, quaternion_of
 from hilsplat.scene.importers.nerfstudio import source_from_dataparser
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply, save_ply
-from hilsplat.splat.similarity import decompose, move_gaussians
 
 logger = logging.getLogger(__name__)
 
 AXES = "right-handed; cameras in OpenCV axes (x right, y down, z forward)"
-
 FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians of the scene sheet"
+TOLERANCE = 1e-5
+"""Largest deviation of a matrix from a scaled rotation, relative to the scale."""
+
+
+def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
+    """Return the scale, rotation and translation of x -> scale rotation x + translation.
+
+    Raises:
+        HilsplatError: if the matrix mirrors, shears or projects, or contains non-finite numbers.
+    """
+    matrix = np.asarray(similarity, dtype=np.float64)
+    linear = matrix[:3, :3]
+    determinant = np.linalg.det(linear) if np.isfinite(matrix).all() else 0.0
+    scale = float(np.cbrt(determinant))
+    rotation = linear / scale if scale > 0 else np.zeros((3, 3))
+    if not are_rotations(rotation, TOLERANCE) or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise HilsplatError(
+            "a transform of coordinates is not a similarity",
+            expected="a 4 x 4 matrix of scale times rotation, with a translation and the last row 0 0 0 1",
+            found=str(matrix.tolist()),
+        )
+    return scale, rotation, matrix[:3, 3]
+
+
+def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -> Gaussians:
+    """Transform Gaussians from coordinates a to b, given b_from_a.
+
+    A camera transformed with them sees the same image: spherical harmonics are rotated too, because they are
+    functions of the direction in the world.
+
+    Raises:
+        HilsplatError: if `similarity` is not a similarity.
+    """
+    scale, rotation, translation = decompose(similarity)
+    g = gaussians
+    means, log_scales, quats, sh = (a.astype(np.float64) for a in (g.means, g.log_scales, g.quats, g.sh))
+    moved = (
+        scale * np.einsum("ij,nj->ni", rotation, means) + translation,
+        log_scales + np.log(scale),
+        multiply(quaternion_of(rotation), quats),
+        g.opacity_logits.copy(),
+        np.einsum("kj,njc->nkc", sh_rotation(rotation, g.sh_degree), sh),
+    )
+    return Gaussians(*(np.ascontiguousarray(values, dtype=np.float32) for values in moved))
+
+
+def sh_basis(directions: Float64[np.ndarray, "P 3"], degree: int) -> Float64[np.ndarray, "P K"]:
+    """Return real spherical harmonics at unit directions, in the order and with the signs of 3DGS.
+
+    Within a band, orders run from -l to l; negative orders are the sines. 3DGS keeps the Condon-Shortley sign
+    (-1)^m, which real harmonics often omit.
+    """
+    x, y, z = directions.T
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    columns = []
+    for band in range(degree + 1):
+        for order in range(-band, band + 1):
+            value = sph_harm_y(band, abs(order), polar, azimuth)
+            part = value.imag if order < 0 else value.real
+            columns.append(np.sqrt(2) * part if order else part)
+    return np.stack(columns, axis=1)
+
+
+def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np.ndarray, "K K"]:
+    """Return the matrix that rotates spherical-harmonics coefficients.
+
+    The rotated colour along R d is the original colour along d. A rotated harmonic stays in its band, so the
+    matrix has one block per band. Each block is a least-squares solution over more directions than harmonics,
+    exact up to rounding.
+    """
+    number = 64  # directions spread over the sphere along a spiral
+    height = 1 - (2 * np.arange(number) + 1) / number
+    angle = np.arange(number) * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(1 - height**2)
+    turned = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    before = sh_basis(turned @ rotation, degree)  # rows are R^T d
+    after = sh_basis(turned, degree)
+    out = np.zeros(((degree + 1) ** 2,) * 2)
+    for band in range(degree + 1):
+        block = slice(band**2, (band + 1) ** 2)
+        out[block, block] = np.linalg.lstsq(after[:, block], before[:, block], rcond=None)[0]
+    return out
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
     """Write the transform between a PLY's coordinates, which are the scene's, and those of its source.
 
-    The source of the poses is an imported COLMAP model or transforms.json, or our own structure from motion,
-    whose coordinates are not recorded elsewhere.
-
-    The JSON is beside the PLY and applies to no other file, so it contains the PLY's digest.
+    The JSON file beside the PLY applies to no other PLY, so it contains the digest. Coordinates of our own
+    structure from motion are not recorded elsewhere.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
@@ -58,7 +138,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
     """Return the transform of a PLY of this package to its source's coordinates, or None without a JSON file.
 
     Raises:
-        ArtifactError: if the JSON belongs to another PLY, or its transform cannot be used.
+        ArtifactError: if the JSON file belongs to another PLY, or its transform cannot be used.
     """
     path = ply.with_suffix(".json")
     if not path.is_file():
@@ -85,8 +165,7 @@ def import_gaussians(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.
 
-    A PLY of this package is in its scene's coordinates instead; it is first moved to the source's by the
-    transform in the JSON file beside it. A nerfstudio PLY is moved by the transform of its data parser.
+    A PLY of this package is moved to the source's coordinates by the transform in the JSON file beside it.
 
     Args:
         dataparser: nerfstudio's `dataparser_transforms.json`, if the PLY is in its training coordinates.
@@ -129,11 +208,8 @@ def import_gaussians(
 def write_source_ply(ply: Path, out: Path) -> int:
     """Write the Gaussians of a scene in the coordinates of its source, and return their number.
 
-    Args:
-        ply: `gaussians.ply` of a scene, with its JSON file beside it.
-
     Raises:
-        ArtifactError: if the PLY or its JSON file is missing or damaged.
+        ArtifactError: if `ply` or the JSON file beside it is missing or damaged.
     """
     source_from_scene = read_source_from_scene(ply)
     if source_from_scene is None:

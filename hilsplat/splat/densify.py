@@ -1,21 +1,28 @@
-"""Adaptive density control of 3DGS: clone, split, prune, reset opacities.
+"""The two strategies that add, move and remove Gaussians during a fit.
 
-The criterion is the gradient of the loss with respect to a Gaussian's projected mean, in the units of 3DGS:
-its x component times half the image width and its y component times half the height (as in normalised
-device coordinates), with its length averaged over the steps in which the Gaussian was drawn.
+Adaptive density control (3DGS; `strategy: default`) clones, splits and prunes Gaussians and resets opacities.
+Its criterion is the gradient of the loss with respect to a Gaussian's projected mean, in the units of 3DGS:
+x times half the image width and y times half the height (as in normalised device coordinates), with the
+length averaged over the steps in which the Gaussian was drawn.
+
+3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024; `strategy: mcmc`) moves transparent (dead) Gaussians
+onto opaque ones, increases the number by a fixed share up to the cap, and lets noise move transparent
+Gaussians. Two regularisers make unneeded Gaussians transparent and small. "Paper" below is that paper.
 """
 
 from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float, Float32, Float64, Int, Int32
+from scipy.special import comb, expit, logit
 
 from hilsplat.base.compiled import compiled
-from hilsplat.base.rotations import rotate, unit_quaternions
+from hilsplat.base.rotations import matrix_entries, rotate, unit_quaternions
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.optimise import Adam
+from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 SMALL = 0.01
 """Gaussians whose largest axis exceeds this, in units of the extent, are split; others are cloned (3DGS)."""
@@ -25,6 +32,15 @@ HUGE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
 opacity reset; here walls of rooms are flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
+
+MAX_TOGETHER = 51
+"""Maximum number of Gaussians that share one place (the paper's code); more would change little."""
+MAX_OPACITY = 1 - 1e-6
+"""Largest opacity; opacity 1 has no logit."""
+NOISE_SHARPNESS = 100.0
+"""Rate at which noise decreases with opacity (paper: k = 100): at opacity 0.1 its factor is e^-9.5."""
+LEAST_GATE = 1e-6
+"""Noise with a smaller factor is skipped."""
 
 
 @compiled
@@ -47,7 +63,7 @@ class ScreenGradients:
 
     @staticmethod
     def start(n: int) -> "ScreenGradients":
-        """Return the averages before the first step."""
+        """Return the sums before the first step."""
         return ScreenGradients(np.zeros(n), np.zeros(n, np.int32))
 
     def add(self, means_px: Float32[np.ndarray, "N 2"], drawn: np.ndarray, size_hw: tuple[int, int]) -> None:
@@ -75,15 +91,13 @@ def densify(
     p = adam.parameters
     large = np.exp(p["log_scales"][selected].max(axis=1, initial=-np.inf)) > SMALL * extent
     clone, split = selected[~large], selected[large]
-    copies = {name: p[name][clone].copy() for name in FIELDS}
     halves = {name: np.repeat(p[name][split], 2, axis=0) for name in FIELDS}
     offsets = generator.normal(size=halves["means"].shape) * np.exp(halves["log_scales"].astype(np.float64))
     halves["means"] += rotate(unit_quaternions(halves["quats"]), offsets).astype(np.float32)
     halves["log_scales"] -= np.float32(np.log(SPLIT_FACTOR))
-    keep = np.ones(len(adam), dtype=bool)
-    keep[split] = False
-    adam.keep(keep)
-    adam.append({name: np.concatenate([copies[name], halves[name]]) for name in FIELDS})
+    more = {name: np.concatenate([p[name][clone], halves[name]]) for name in FIELDS}
+    adam.keep(np.delete(np.arange(len(adam)), split))
+    adam.append(more)
 
 
 def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
@@ -99,7 +113,160 @@ def prune(adam: Adam, settings: GaussiansSettings, extent: float) -> None:
 
 def reset_opacities(adam: Adam) -> None:
     """Cap all opacities at RESET_OPACITY, so that only needed Gaussians become opaque again (3DGS)."""
-    logit = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
-    np.minimum(adam.parameters["opacity_logits"], logit, out=adam.parameters["opacity_logits"])
-    adam.first["opacity_logits"][:] = 0
-    adam.second["opacity_logits"][:] = 0
+    most = np.float32(np.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+    np.minimum(adam.parameters["opacity_logits"], most, out=adam.parameters["opacity_logits"])
+    adam.reset_moments(slice(None), ("opacity_logits",))
+
+
+def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
+    """Return the opacity at which `number` coincident Gaussians cover as much as one of `opacity`.
+
+    1 - (1 - new)^number = old (paper, Eq. 9).
+    """
+    return -np.expm1(np.log1p(-np.minimum(opacity, MAX_OPACITY)) / number)
+
+
+def scale_factor(
+    opacity: Float[np.ndarray, " N"], shared: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]
+) -> Float[np.ndarray, " N"]:
+    """Return the factor on the scales of Gaussians that share a place; it preserves their profile's integral.
+
+    n Gaussians of opacity o and deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. Its
+    integral is sqrt(2 pi) s times the sum over k = 1..n of C(n, k) (-1)^(k-1) o^k / sqrt(k); one
+    Gaussian of opacity `opacity` and deviation 1 has sqrt(2 pi) opacity. (Paper, Eq. 9, whose double
+    sum is this one, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
+
+    Args:
+        opacity: opacity of the original Gaussian.
+        shared: `shared_opacity(opacity, number)`.
+        number: Gaussians that share the place, 1 to MAX_TOGETHER.
+    """
+    k = np.arange(1, MAX_TOGETHER + 1)
+    signs = np.where(k % 2 == 1, 1.0, -1.0) / np.sqrt(k)
+    binomials = comb(np.arange(MAX_TOGETHER + 1)[:, None], k) * signs  # row n: terms of the sum
+    total = (binomials[number] * shared[:, None] ** k).sum(axis=1)
+    return opacity / total
+
+
+@compiled(error_model="numpy")
+@no_type_check
+def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
+    """Add noise to rows begin..end: weight x gate x covariance x normal, in units of the extent.
+
+    The gate is 1/2 at the opacity threshold of the dead, and 0 for opaque Gaussians (paper, Eq. 8).
+    """
+    turn, local = np.empty((3, 3)), np.empty(3)
+    for row in range(begin, end):
+        opacity = 1.0 / (1.0 + np.exp(-np.float64(logits[row])))
+        gate = 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
+        if gate < LEAST_GATE:
+            continue
+        w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
+        y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])
+        norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+        entries = matrix_entries(w * norm, x * norm, y * norm, z * norm)
+        for axis in range(3):
+            for k in range(3):
+                turn[axis, k] = entries[3 * axis + k]
+        for axis in range(3):
+            along = 0.0
+            for k in range(3):
+                along += turn[k, axis] * normal[row, k]
+            local[axis] = along * np.exp(2.0 * np.float64(log_scales[row, axis])) / (extent * extent)
+        square = local[0] ** 2 + local[1] ** 2 + local[2] ** 2  # rotation preserves the length
+        # without this limit, a Gaussian far wider than the scene would jump out of it
+        factor = extent * weight * gate / max(weight * gate * np.sqrt(square), 1.0)
+        for axis in range(3):
+            step = turn[axis, 0] * local[0] + turn[axis, 1] * local[1] + turn[axis, 2] * local[2]
+            means[row, axis] += factor * step
+
+
+def add_noise(
+    adam: Adam,
+    settings: GaussiansSettings,
+    rate_of_means: float,
+    extent: float,
+    generator: np.random.Generator,
+    threads: int = 1,
+) -> None:
+    """Move the means of transparent Gaussians randomly along their own axes (SGLD; paper, Eq. 8).
+
+    The step is noise weight x rate of the means x gate x covariance x normal numbers, limited to the extent.
+    The paper assumes scenes of extent 1; here the covariance is in units of the extent, so that the result
+    does not depend on the scene's unit.
+
+    Args:
+        rate_of_means: step size of the means, in units of the extent.
+        extent: radius of the cameras, scene units.
+        threads: the result has the same bytes for any number.
+    """
+    p = adam.parameters
+    normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
+    arrays = (p["means"], p["log_scales"], p["quats"], p["opacity_logits"], normal)
+    weight = settings.mcmc_noise * rate_of_means
+    over_ranges(_noise_rows, len(adam), threads, *arrays, settings.min_opacity, weight, extent)
+
+
+def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettings, extent: float) -> None:
+    """Add the gradients of opacity_weight x mean opacity + scale_weight x mean scale (paper, Eq. 10).
+
+    Scales are in units of the extent.
+    """
+    n = len(adam)
+    opacity = expit(adam.parameters["opacity_logits"])
+    by_logit, by_log_scale = gradients.opacity_logits, gradients.log_scales
+    by_logit += np.float32(settings.mcmc_opacity_weight / n) * opacity * (1 - opacity)
+    scales = np.exp(adam.parameters["log_scales"])
+    by_log_scale += np.float32(settings.mcmc_scale_weight / (3 * n * extent)) * scales
+
+
+def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
+    """Move dead Gaussians onto live ones, then add copies of live ones up to the cap.
+
+    Places are drawn with a probability proportional to their opacity. The Gaussians that then share a place
+    together cover what the original one covered.
+    """
+    opacity = opacities(adam)
+    dead = opacity <= settings.min_opacity
+    if dead.any() and not dead.all():
+        targets = np.flatnonzero(dead)
+        copies = _share(adam, np.where(dead, 0.0, opacity), len(targets), settings, generator)
+        for name in FIELDS:
+            adam.parameters[name][targets] = copies[name]
+        adam.reset_moments(targets)
+    n = len(adam)
+    target = min(settings.max_gaussians, int(n * (1 + settings.mcmc_growth)))
+    if target > n:
+        adam.append(_share(adam, opacities(adam), target - n, settings, generator))
+
+
+def opacities(adam: Adam) -> Float[np.ndarray, " N"]:
+    """Return the peak alphas."""
+    return expit(adam.parameters["opacity_logits"].astype(np.float64))
+
+
+def _share(
+    adam: Adam,
+    weights: Float[np.ndarray, " N"],
+    number: int,
+    settings: GaussiansSettings,
+    generator: np.random.Generator,
+) -> dict[str, Float32[np.ndarray, "M ..."]]:
+    """Draw rows with replacement and a probability proportional to `weights`, and return copies of them.
+
+    The drawn rows themselves are reduced to their share of the place, like the copies.
+    """
+    p, edges = adam.parameters, np.cumsum(weights)
+    source = np.searchsorted(edges, generator.uniform(0, edges[-1], number), side="right")
+    rows, drawn = np.unique(source, return_counts=True)
+    together = np.minimum(drawn + 1, MAX_TOGETHER)
+    old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
+    new = shared_opacity(old, together)
+    p["log_scales"][rows] += np.log(scale_factor(old, new, together)).astype(np.float32)[:, None]
+    # Rows at or below the threshold would be relocated again in the next round. The nearest float32 to the
+    # threshold's logit may be below it (that of 0.005 has opacity 0.0049999995), by at most 6e-8 of its size.
+    exact = float(logit(settings.min_opacity))
+    alive = np.float32(exact + 1e-6 * max(abs(exact), 1.0))
+    p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)
+    adam.reset_moments(rows)
+    return {name: p[name][source] for name in FIELDS}

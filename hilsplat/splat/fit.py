@@ -1,32 +1,49 @@
-"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023) on the CPU, the geometry of all later stages."""
+"""Base 3D Gaussian Splatting fit (Kerbl et al. 2023), the geometry of all later stages, and its report."""
 
 import json
 import logging
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
-from hilsplat.base.artifacts import read_npz, sha256_of_json, sha256_of_path, write_npz
+from hilsplat.base.artifacts import (
+    atomic_folder,
+    read_npz,
+    sha256_of_json,
+    sha256_of_path,
+    write_index,
+    write_json,
+    write_npz,
+)
 from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.identity import code_digest
-from hilsplat.base.images import to_float
+from hilsplat.base.images import to_float, write_png
 from hilsplat.base.progress import stage_log, track
+from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat.coordinates import import_gaussians, write_coordinates
-from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
-from hilsplat.splat.fit_report import write_report
+from hilsplat.splat.densify import (
+    ScreenGradients,
+    add_noise,
+    add_regularisers,
+    densify,
+    prune,
+    relocate_and_grow,
+    reset_opacities,
+)
+from hilsplat.splat.flyaround import contact_sheet, write_flyaround
 from hilsplat.splat.gaussians import FIELDS, Gaussians, morton_order
-from hilsplat.splat.initial import first_gaussians
-from hilsplat.splat.mcmc import add_noise, add_regularisers, relocate_and_grow
+from hilsplat.splat.initial import TrainingView, camera_extent, first_gaussians, load_views
 from hilsplat.splat.optimise import Adam, means_rate
-from hilsplat.splat.photometric import photometric_loss
+from hilsplat.splat.photometric import photometric_loss, psnr, ssim
 from hilsplat.splat.ply import save_ply
-from hilsplat.splat.rasterise.api import draw
+from hilsplat.splat.rasterise.api import draw, render
 from hilsplat.splat.rasterise.device import choose_device
-from hilsplat.splat.views import TrainingView, camera_extent, load_views
 
 logger = logging.getLogger(__name__)
 
@@ -34,6 +51,14 @@ CURVE_EVERY = 20
 """Steps between two points of the training curve."""
 MIN_SIDE_PX = 64
 """Images are not shrunk below this shorter side."""
+MAX_SHOWN = 8
+"""Maximum number of views on the sheet of test views."""
+SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
+"""Entries of the report that the index repeats."""
+ERROR_GAIN = 4
+"""Factor by which displayed errors are magnified."""
+TABLES = ("parameters", "first", "second")
+"""Tables of `Adam` in a checkpoint."""
 
 
 @dataclass
@@ -57,11 +82,7 @@ class FitState:
 
     def save(self, path: Path, key: str) -> None:
         """Write a checkpoint."""
-        arrays = {
-            f"{table}_{name}": getattr(self.adam, table)[name]
-            for table in ("parameters", "first", "second")
-            for name in FIELDS
-        }
+        arrays = {f"{table}_{name}": getattr(self.adam, table)[name] for table in TABLES for name in FIELDS}
         write_npz(
             path,
             key=np.array(key),
@@ -87,10 +108,7 @@ class FitState:
         if arrays["key"].item() != key:
             logger.info("checkpoint %s belongs to other inputs; the fit starts over", path)
             return None
-        parameters, first, second = (
-            {name: arrays[f"{table}_{name}"] for name in FIELDS}
-            for table in ("parameters", "first", "second")
-        )
+        parameters, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
         generator = np.random.default_rng()
         generator.bit_generator.state = json.loads(arrays["generator"].item())
         step, adam_steps = (int(count) for count in arrays["counts"])
@@ -114,10 +132,10 @@ def fit_step(
     progress = state.step / settings.iterations
     # 3DGS adds a degree every 1000 of 30 000 steps; short fits reach degree 3 after 30 % of the steps
     degree = min(settings.sh_degree, int(progress * 10))
-    behind = {"black": np.zeros(3), "white": np.ones(3)}.get(settings.background)
-    if behind is None:
-        behind = state.generator.uniform(size=3)
-    behind = behind.astype(np.float32)
+    if settings.background == "random":
+        behind = state.generator.uniform(size=3).astype(np.float32)
+    else:
+        behind = np.full(3, settings.background == "white", np.float32)
 
     device = choose_device(settings.device)
     seen = draw(state.adam.as_gaussians(), view.camera, degree, threads=threads, device=device)
@@ -150,13 +168,10 @@ def steps_of(settings: GaussiansSettings, num_views: int) -> int:
 
 
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
-    """Return the scale of the training images, from coarse to fine, in units of their full size.
+    """Return the scale of the training images after a share of the iterations, from coarse to fine.
 
     Coarse images are cheaper, and their wide gradients move Gaussians into place from further away.
-
-    Args:
-        progress: share of the iterations done, in [0, 1].
-        side_px: shorter side of the images at full size.
+    `side_px` is the shorter side of the images at full size.
     """
     scale = 0.25 if progress < settings.quarter_until else 0.5 if progress < settings.half_until else 1.0
     while scale < 1 and scale * side_px < MIN_SIDE_PX:
@@ -195,9 +210,10 @@ def fit_gaussians(
 ) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     """Fit Gaussians to the training views of a scene.
 
+    The result has the same bytes for any number of threads, and for a fit that was interrupted and resumed.
+
     Args:
-        seed: determines the view order, splits, relocations, noise and random points; the result has the
-            same bytes for any number of threads, and for a fit that was interrupted and resumed.
+        seed: determines the view order, splits, relocations, noise and random points.
         checkpoint: file to which the state is written every `checkpoint_every` steps, and from which
             an interrupted fit resumes; removed at the end.
         key: digest of all inputs of the fit; checkpoints with another key are ignored.
@@ -243,6 +259,85 @@ def fit_gaussians(
     return state.adam.as_gaussians(), np.array(state.curve, dtype=np.float64).reshape(-1, 4)
 
 
+def write_report(
+    folder: Path,
+    gaussians: Gaussians,
+    scene: Scene,
+    curve: Float64[np.ndarray, "S 4"] | None,
+    origin: dict[str, Any],
+    settings: GaussiansSettings,
+    threads: int,
+) -> dict[str, Any]:
+    """Write the report folder and return the content of report.json.
+
+    The training views are scored if the scene has no held-out views. `curve` is that of `fit_gaussians`; None
+    for imported Gaussians.
+    """
+    background = (float(settings.background == "white"),) * 3
+
+    def picture(camera: Camera, threads: int = threads) -> UInt8[np.ndarray, "H W 3"]:
+        color = render(gaussians, camera, background=background, threads=threads).color
+        return np.round(color.clip(0, 1) * 255).astype(np.uint8)
+
+    views, split = load_views(scene, "test", settings.image_scale), "test"
+    if not views:
+        views, split = load_views(scene, "train", settings.image_scale), "train"
+    scores: dict[str, dict[str, float]] = {}
+    flat: list[float] = []
+    cells: list[UInt8[np.ndarray, "_ _ 3"]] = []
+    for view in views:
+        shown = picture(view.camera)  # scored as a saved 8-bit image
+        drawn, truth = to_float(shown), to_float(view.image)
+        scores[view.name] = {"psnr_db": psnr(drawn, truth), "ssim": ssim(drawn, truth)}
+        flat.append(psnr(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth))
+        if len(cells) < 3 * MAX_SHOWN:
+            error = np.abs(view.image.astype(np.int32) - shown) * ERROR_GAIN
+            cells += [view.image, shown, np.minimum(error, 255).astype(np.uint8)]
+    report: dict[str, Any] = {
+        "split": split,
+        **{name: float(np.mean([score[name] for score in scores.values()])) for name in ("psnr_db", "ssim")},
+        "gaussians": len(gaussians),
+        "origin": origin,
+        "image_scale": settings.image_scale,
+        "warnings": [],
+        "views": scores,
+    }
+    if report["psnr_db"] <= np.mean(flat):
+        report["warnings"].append(
+            f"the {split} views score {report['psnr_db']:.1f} dB, no more than one flat colour does: look at "
+            "test_views.png; the Gaussians may be in other coordinates than the cameras, or the poses "
+            "may be wrong"
+        )
+    with atomic_folder(folder) as temporary:
+        write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
+        path = [view.camera for view in load_views(scene, "train", settings.image_scale) or views]
+        write_flyaround(temporary, path, partial(picture, threads=1), threads)
+        if curve is not None:
+            _draw_curves(temporary / "curves.png", curve)
+        write_json(temporary / "report.json", report)
+        write_index(temporary, scores, **{name: report[name] for name in SUMMARY})
+    for warning in report["warnings"]:
+        logger.warning("%s: %s", scene.name, warning)
+    return report
+
+
+def _draw_curves(path: Path, curve: Float64[np.ndarray, "S 4"]) -> None:
+    """Plot loss, training PSNR and number of Gaussians over the steps."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3), layout="constrained")
+    FigureCanvasAgg(figure)
+    steps = curve[:, 0]
+    titles = ("loss", "PSNR of the step's view, dB", "Gaussians")
+    for axes, values, title in zip(figure.subplots(1, 3), curve[:, 1:].T, titles, strict=True):
+        axes.plot(steps, values, linewidth=0.8)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("step")
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
 def run_gaussians(
     scene_folder: Path,
     out_ply: Path,
@@ -255,10 +350,7 @@ def run_gaussians(
     dataparser: Path | None = None,
     transforms: Path | None = None,
 ) -> None:
-    """Fit Gaussians or import existing ones; write them, their coordinates and the report.
-
-    Writes `out_ply` (standard 3DGS), a JSON file of the same name beside it (the transform to the source's
-    coordinates) and the report folder (test PSNR and SSIM, curves, pictures, fly-around).
+    """Fit Gaussians or import existing ones; write the PLY, the JSON file beside it and the report folder.
 
     Args:
         existing: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.

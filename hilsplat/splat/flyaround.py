@@ -33,12 +33,10 @@ OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a closed tour of the given ones, evenly spaced and smoothed.
+    """Return cameras along a closed tour of the given ones, which is short in position and direction.
 
-    The tour is short in position and viewing direction, and its speed is constant; after the last camera it
-    returns to the first. Position, viewing
-    direction and up are smoothed along it. Lens and image size are those of the first camera. A single camera
-    is repeated.
+    Its speed is constant. Position, viewing direction and up are smoothed along it. Lens and image size are
+    those of the first camera. A single camera is repeated.
     """
     stops = cameras[:: -(-len(cameras) // MAX_STOPS)]
     centres = np.stack([camera.centre for camera in stops])
@@ -59,10 +57,10 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
 
 
 def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a smooth curve through the given ones, in their order.
+    """Return cameras along a smooth curve through two or more given ones, in their order.
 
     Position and lens follow a monotone cubic, so that the path does not overshoot; the direction rotates at
-    a constant rate between neighbours. Image size is that of the first camera. There are at least two.
+    a constant rate between neighbours. The image size is that of the first camera.
     """
     centres = np.stack([camera.centre for camera in cameras])
     turns = Rotation.from_matrix([camera.cam_from_world[:3, :3] for camera in cameras])
@@ -85,7 +83,7 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
     """Build a camera from its centre, viewing direction and down direction, which need not be orthogonal."""
     forward = row[3:6] / max(np.linalg.norm(row[3:6]), 1e-12)
     down = row[6:] - forward * (row[6:] @ forward)
-    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel; any upright will do
+    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel; use the first camera's
         down = like.cam_from_world[1, :3] - forward * (like.cam_from_world[1, :3] @ forward)
     down = down / max(np.linalg.norm(down), 1e-12)
     pose = np.eye(4)
@@ -123,8 +121,7 @@ def write_flyaround(
 ) -> None:
     """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 
-    Args:
-        threads: frames rendered in parallel while others are encoded; the bytes do not depend on it.
+    Frames are rendered on threads while others are encoded; the bytes do not depend on their number.
     """
     shown: list[UInt8[np.ndarray, "H W 3"]] = []
     path = closed_path(cameras, FRAMES)
@@ -141,13 +138,10 @@ def write_flyaround(
 
 
 def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
-    """Encode frames of one size; equal frames give equal bytes with the same version of PyAV.
+    """Encode one or more frames of one size as MP4; equal frames give equal bytes with the same PyAV.
 
-    An odd last row or column is cropped: yuv420p needs even sides.
-
-    Args:
-        path: .mp4 file, in a temporary folder or file of an atomic writer.
-        frames: at least one; consumed one by one, so that a long film needs little memory.
+    An odd last row or column is cropped: yuv420p needs even sides. Frames are consumed one by one, so that a
+    long film needs little memory. `path` is in a temporary folder, or a file of an atomic writer.
     """
     frames = iter(frames)
     first = next(frames)
@@ -164,11 +158,9 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
         film.mux(stream.encode())
 
 
-def contact_sheet(
-    pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int, max_side_px: int = MAX_SIDE_PX
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Arrange pictures on a white sheet, row by row, shrunk by whole factors to at most `max_side_px`."""
-    cells = [_shrunk(picture, -(-max(picture.shape[:2]) // max_side_px)) for picture in pictures]
+def contact_sheet(pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Arrange pictures on a white sheet, row by row, shrunk by whole factors to at most MAX_SIDE_PX."""
+    cells = [_shrunk(picture, -(-max(picture.shape[:2]) // MAX_SIDE_PX)) for picture in pictures]
     height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
     rows = -(-len(cells) // columns)
     sheet = np.full((rows * height, min(columns, len(cells)) * width, 3), 255, np.uint8)
@@ -180,8 +172,6 @@ def contact_sheet(
 
 def _shrunk(picture: UInt8[np.ndarray, "_ _ 3"], factor: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """Average blocks of factor x factor pixels; incomplete blocks at the border are cropped."""
-    if factor <= 1:
-        return picture
     height, width = (side // factor for side in picture.shape[:2])
     blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
     return np.round(blocks.mean(axis=(1, 3))).astype(np.uint8)

@@ -53,14 +53,11 @@ BITS = 21
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the order of points along a Z-shaped curve (Morton 1966) through their box.
+    """Return the rows of points in the order of a Z-shaped curve (Morton 1966) through their box.
 
     Loops over Gaussians and their neighbours, such as G of the language field, then mostly hit the
     processor's cache. The box excludes the outermost hundredth on each side: otherwise a few Gaussians
-    far away would put all others into one cell.
-
-    Returns:
-        rows in that order; rows of one cell keep their relative order.
+    far away would put all others into one cell. Rows of one cell keep their relative order.
     """
     if not len(means):
         return np.zeros(0, np.int64)

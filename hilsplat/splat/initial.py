@@ -1,8 +1,11 @@
-"""Initial Gaussians of a fit."""
+"""Start of a fit: the training views at the size at which they are fitted, and the initial Gaussians."""
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import SceneError
@@ -10,7 +13,6 @@ from hilsplat.base.images import to_float
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.views import camera_extent
 
 logger = logging.getLogger(__name__)
 
@@ -22,6 +24,35 @@ ADDED_POINTS = 2_000
 """Number of random points added to too few sparse points."""
 RANDOM_POINTS = 10_000
 """Number of random points if `gaussians.initial` is "random"."""
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """One view at the size at which it is fitted."""
+
+    name: str
+    camera: Camera
+    image: UInt8[np.ndarray, "H W 3"]
+
+
+def load_views(scene: Scene, split: str, image_scale: float) -> list[TrainingView]:
+    """Load the images and cameras of a split, scaled by `image_scale` (box filter)."""
+    views = []
+    for name in scene.views(split):
+        image, camera = scene.image(name), scene.cameras[name]
+        if image_scale < 1:
+            size_hw = tuple(max(1, round(side * image_scale)) for side in image.shape[:2])
+            shrunk = Image.fromarray(image).resize(size_hw[::-1], Image.Resampling.BOX)
+            image, camera = np.asarray(shrunk), camera.scaled(size_hw)
+        views.append(TrainingView(name, camera, image))
+    return views
+
+
+def camera_extent(cameras: list[Camera]) -> float:
+    """Return 1.1 times the largest distance of a camera from their common centre (3DGS); scene units."""
+    centres = np.stack([camera.centre for camera in cameras])
+    radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    return float(1.1 * radius) if radius > 0 else 1.0
 
 
 def first_gaussians(

@@ -28,8 +28,8 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
 def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
     """Take an Adam step for chunks begin..end of 16 numbers, in place.
 
-    `rates` is cyclic: chunk k uses the rates from 16 k on, divided by 1 - beta1^t beforehand;
-    `root_of_rest2` is sqrt(1 - beta2^t).
+    `rates` (divided by 1 - beta1^t) is cyclic: chunk k uses those at 16 k and beyond. `root_of_rest2` is
+    sqrt(1 - beta2^t).
     """
     beta1, rest1 = lanes(np.float32(BETA1)), lanes(np.float32(1.0 - BETA1))
     beta2, rest2 = lanes(np.float32(BETA2)), lanes(np.float32(1.0 - BETA2))
@@ -73,10 +73,8 @@ class Adam:
     @staticmethod
     def start(parameters: dict[str, np.ndarray]) -> "Adam":
         """Return the parameters with zero moments."""
-        first, second = (
-            {name: np.zeros_like(values) for name, values in parameters.items()} for _ in range(2)
-        )
-        return Adam(parameters, first, second)
+        zeros = [{name: np.zeros_like(values) for name, values in parameters.items()} for _ in range(2)]
+        return Adam(parameters, zeros[0], zeros[1])
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -108,9 +106,15 @@ class Adam:
             for name in FIELDS:
                 table[name] = np.ascontiguousarray(table[name][rows])
 
+    def reset_moments(self, rows: np.ndarray | slice, names: tuple[str, ...] = FIELDS) -> None:
+        """Set the moments of some rows and fields to zero."""
+        for table in (self.first, self.second):
+            for name in names:
+                table[name][rows] = 0
+
     def append(self, more: dict[str, np.ndarray]) -> None:
         """Add Gaussians with moments at zero."""
-        for name in FIELDS:
-            zeros = np.zeros_like(more[name])
-            for table, rows in ((self.parameters, more[name]), (self.first, zeros), (self.second, zeros)):
-                table[name] = np.concatenate([table[name], rows])
+        for name, rows in more.items():
+            zeros = np.zeros_like(rows)
+            for table, added in ((self.parameters, rows), (self.first, zeros), (self.second, zeros)):
+                table[name] = np.concatenate([table[name], added])

@@ -11,7 +11,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 
 HEADER_BYTES = 2**14
-"""Bytes in which the number of vertices of a PLY is searched for."""
+"""Bytes that are searched for the number of vertices."""
 
 
 def _names(num_bases: int) -> list[str]:
@@ -64,10 +64,7 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
     """Read a 3DGS PLY of this or another package; the number of f_rest columns determines the degree.
 
     The file may be binary or ASCII, with properties in any order and of any number type. Normals and
-    properties not in 3DGS (colours, labels) are ignored.
-
-    Args:
-        fix: fix in errors about a file that cannot be used; "": how to rerun its stage.
+    properties not in 3DGS (colours, labels) are ignored. `fix` is for errors; "": how to rerun the stage.
 
     Raises:
         ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers.

@@ -10,7 +10,7 @@ from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise import cpu
-from hilsplat.splat.rasterise.cpu import Drawn, project_gaussians, sparse_weights
+from hilsplat.splat.rasterise.cpu import Drawn, project_gaussians, sparse_weights, weight_matrix
 from hilsplat.splat.rasterise.device import Device
 
 
@@ -29,16 +29,6 @@ class Rendering:
     features: Float32[np.ndarray, "H W D"] | None = None
 
 
-def _checked_degree(gaussians: Gaussians, sh_degree: int | None) -> int:
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    if not 0 <= degree <= min(gaussians.sh_degree, 3):
-        raise HilsplatError(
-            f"spherical harmonics of degree {degree} are not available",
-            expected=f"0 to {gaussians.sh_degree}, the degree of these Gaussians, and at most 3",
-        )
-    return degree
-
-
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -49,28 +39,7 @@ def render(
     threads: int = 1,
     device: Device = "cpu",
 ) -> Rendering:
-    """Render a view; `draw` does the same and also computes gradients.
-
-    The conventions are those of gsplat, on both devices:
-
-    - the centre of the top-left pixel is (0.5, 0.5);
-    - a Gaussian is projected by the perspective Jacobian at its centre, with the ray clamped to 30 %
-      beyond the image, and 0.3 px^2 are added to its variance (`eps2d`), whatever its size;
-    - Gaussians nearer than depth 0.01 are not drawn; no Gaussian is too small (`radius_clip` 0);
-    - scales are clipped at exp(20) scene units, where a Gaussian covers any view evenly (CPU only; gsplat
-      overflows);
-    - alpha below 1/255 is not drawn, and alpha is clipped at 0.999;
-    - blending runs front to back by the depth of the centres and stops before the Gaussian that
-      would leave less than 1e-4 of the light;
-    - colour is max(0, 0.5 + spherical harmonics) in the direction from the camera to the centre;
-    - features are premultiplied by alpha, and the background affects only colour.
-
-    A single round Gaussian of scale s and opacity o on the optical axis at depth z, seen by a camera of
-    focal length f px, thus has at a distance of r px from the principal point
-
-        alpha = o exp(-r^2 / (2 ((f s / z)^2 + 0.3))), if that is at least 1/255.
-
-    Without Gaussians, the image is the background.
+    """Render a view by the conventions of gsplat (docs/rasteriser.md); `draw` also computes gradients.
 
     Args:
         features: additional channels to blend in the same pass; any number.
@@ -82,7 +51,12 @@ def render(
         HilsplatError: if parameters are not finite, quaternions are zero, or features have another number
             of rows.
     """
-    degree = _checked_degree(gaussians, sh_degree)
+    degree = gaussians.sh_degree if sh_degree is None else sh_degree
+    if not 0 <= degree <= min(gaussians.sh_degree, 3):
+        raise HilsplatError(
+            f"spherical harmonics of degree {degree} are not available",
+            expected=f"0 to {gaussians.sh_degree}, the degree of these Gaussians, and at most 3",
+        )
     seen = draw(gaussians, camera, degree, features=features, threads=threads, device=device)
     color = seen.image[..., :3] + (1 - seen.alpha)[..., None] * np.array(background, np.float32)
     return Rendering(color, seen.alpha, seen.image[..., 3:] if features is not None else None)
@@ -100,14 +74,7 @@ def draw(
     """Draw image and alpha of a view without background, and compute gradients on demand.
 
     Gaussians behind the camera get zero gradient. Gradients are first-order only and do not reach the
-    camera.
-
-    Args:
-        degree: degree of spherical harmonics to use.
-        features, threads, device: as in `render`.
-
-    Raises:
-        HilsplatError: as in `render`.
+    camera. Arguments and errors are those of `render`.
     """
     if features is not None and len(features) != len(gaussians):
         raise HilsplatError(
@@ -132,17 +99,11 @@ def pixel_weights(
 
     Returns:
         float32 matrix (H W, N) with row-major pixels as rows, and sorted columns. With min_weight 0, the
-        rows sum to the alpha of the view.
+        rows sum to the view's alpha.
     """
     if device == "cuda":
         from hilsplat.splat.rasterise import cuda
 
         return cuda.pixel_weights(gaussians, camera, min_weight)
     view = project_gaussians(gaussians, camera, 0, threads)
-    row_start, columns, weights = sparse_weights(view, min_weight, threads)
-    if row_start[-1] < np.iinfo(np.int32).max:
-        row_start = row_start.astype(np.int32)
-    shape = (camera.size_hw[0] * camera.size_hw[1], len(gaussians))
-    matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
-    matrix.has_sorted_indices = True
-    return matrix
+    return weight_matrix(*sparse_weights(view, min_weight, threads), len(gaussians))

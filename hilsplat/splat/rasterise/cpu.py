@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
+from scipy.sparse import csr_matrix
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lanes import WIDTH, aligned
@@ -42,7 +43,7 @@ def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *argume
 def over_ranges(
     work: Callable[..., Any], count: int, threads: int, *arguments: Any, first: int = 0
 ) -> list[Any]:
-    """Call `over_edges` with ranges that cover `count` numbers from `first`."""
+    """Call `work(begin, end, *arguments)` for ranges that cover `count` numbers from `first`, on threads."""
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
     edges = first + np.linspace(0, count, pieces + 1).astype(int)
     return over_edges(work, edges.tolist(), threads, *arguments)
@@ -53,12 +54,11 @@ class Projected:
     """Gaussians of a view, ready to blend.
 
     Attributes:
-        camera: packed camera row.
+        camera: output of `pack_camera`.
         degree: degree of spherical harmonics used.
         geometry: see `project.GEOMETRY`.
         box: pixel box of each Gaussian; last < first if it is not drawn.
         colours: RGB in this view.
-        tiles: depth order and sizes of the tile lists; `tile_lists` fills them band by band.
         only_band: the filled lists, if one band contains them all and they were filled before.
     """
 
@@ -103,7 +103,7 @@ class Drawn:
 
 
 def refuse_broken(broken: int, total: int) -> None:
-    """Raise an error if parameters are not finite or quaternions have zero length."""
+    """Raise HilsplatError if the number of Gaussians that cannot be drawn is not 0."""
     if broken:
         raise HilsplatError(
             f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
@@ -116,7 +116,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
     """Project all Gaussians into a view, and count them per tile.
 
     Raises:
-        HilsplatError: if parameters are not finite, or quaternions have zero length.
+        HilsplatError: if parameters are not finite or quaternions are zero.
     """
     n = len(gaussians)
     groups = (n + WIDTH - 1) // WIDTH
@@ -137,8 +137,7 @@ class Band:
     """Filled lists of tiles begin..end, as arguments of the kernels.
 
     Attributes:
-        lists: base, tiles_x, tile_start, tile_end, gaussian, reach: the list of tile t is
-            gaussian[tile_start[t] - base : tile_end[t] - base]; reach has the bits of the tile's blocks.
+        lists: base, tiles_x, tile_start, tile_end, gaussian, reach; see `blend`.
     """
 
     begin: int
@@ -146,8 +145,8 @@ class Band:
     lists: tuple[Any, ...]
 
     def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
-        """Call `work(begin, end, *lists, *arguments)` over ranges that cover the band's tiles, on threads."""
-        over_ranges(work, self.end - self.begin, threads, *self.lists, *arguments, first=self.begin)
+        """Call `work(begin, end, lists, *arguments)` over ranges that cover the band's tiles, on threads."""
+        over_ranges(work, self.end - self.begin, threads, self.lists, *arguments, first=self.begin)
 
 
 def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
@@ -197,10 +196,7 @@ def blend_gradients(
     grad_alpha: Float32[np.ndarray, "H W"],
     threads: int,
 ) -> Gradients:
-    """Compute the gradients of the parameters from those of the output of `blend_forward`.
-
-    `channels` are the view's colours, then features.
-    """
+    """Compute gradients from those of `blend_forward`; `channels` are colours, then features."""
     p, n = gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
     width = (columns + WIDTH - 1) // WIDTH * WIDTH
@@ -223,7 +219,7 @@ def blend_gradients(
     tables = map(np.ascontiguousarray, (p.means, p.log_scales, p.quats, p.sh))
     known = (*tables, view.degree, view.camera, view.geometry, sums)
     outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
-    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, *outputs)
+    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, outputs)
     return out
 
 
@@ -250,9 +246,9 @@ def draw(
 def sparse_weights(
     view: Projected, min_weight: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return blending weights >= min_weight as CSR arrays (row starts, columns, weights), one row per pixel.
+    """Return blending weights >= min_weight as CSR arrays: row starts (int64), columns, weights.
 
-    Rows are row-major pixels; columns ascend within a row. Row starts are int64.
+    Rows are row-major pixels; columns ascend within a row.
     """
     counts = np.zeros(view.size_hw[0] * view.size_hw[1], np.int64)
 
@@ -266,3 +262,15 @@ def sparse_weights(
     if len(columns):
         over_bands(write_weights, int(counts.max()), row_start, columns, weights)
     return row_start, columns, weights
+
+
+def weight_matrix(
+    row_start: np.ndarray, columns: np.ndarray, weights: np.ndarray, num_gaussians: int
+) -> csr_matrix:
+    """Build a matrix from CSR arrays with sorted columns; row starts become int32 if they fit."""
+    if row_start[-1] < np.iinfo(np.int32).max:
+        row_start = row_start.astype(np.int32)
+    shape = (len(row_start) - 1, num_gaussians)
+    matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
+    matrix.has_sorted_indices = True
+    return matrix

@@ -6,7 +6,7 @@ CUDA sums are atomic, so gradients are reproducible only up to rounding.
 gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.blend import MAX_ALPHA
-from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken
+from hilsplat.splat.rasterise.cpu import Drawn, Gradients, refuse_broken, weight_matrix
 from hilsplat.splat.rasterise.project import LOW_PASS_PX2, NEAR
 
 DEVICE = "cuda"
@@ -29,45 +29,38 @@ EVERYTHING = 2**31 - 1
 """A number beyond the last batch of any tile."""
 
 
-class OnDevice(NamedTuple):
-    """Gaussians as float32 tensors on the device, with the fields of `Gaussians`."""
+def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Copy the fields of Gaussians to the device.
 
-    means: Float[Tensor, "N 3"]
-    log_scales: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    opacity_logits: Float[Tensor, " N"]
-    sh: Float[Tensor, "N K 3"]
-
-    @staticmethod
-    def of(gaussians: Gaussians) -> "OnDevice":
-        """Copy Gaussians to the device.
-
-        Raises:
-            HilsplatError: if parameters are not finite, or quaternions are zero.
-        """
-        g = OnDevice(*(torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS))
-        broken = (g.quats == 0).all(dim=1)
-        for values in g:
-            broken |= ~values.isfinite().reshape(len(values), -1).all(dim=1)
-        refuse_broken(int(broken.sum()), len(gaussians))
-        return g
+    Raises:
+        HilsplatError: if parameters are not finite or quaternions are zero.
+    """
+    g = {name: torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS}
+    broken = (g["quats"] == 0).all(dim=1)
+    for values in g.values():
+        broken |= ~values.isfinite().reshape(len(values), -1).all(dim=1)
+    refuse_broken(int(broken.sum()), len(gaussians))
+    return g
 
 
 def blend(
-    g: OnDevice, camera: Camera, channels: Float[Tensor, "N C"]
+    g: dict[str, Tensor], camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
     """Blend channels of Gaussians on the device into premultiplied image, alpha and intermediate results."""
     import gsplat
 
     height, width = camera.size_hw
+    pose, K = (
+        torch.tensor(each, dtype=torch.float32, device=DEVICE) for each in (camera.cam_from_world, camera.K)
+    )
     image, alpha, notes = gsplat.rasterization(
-        g.means,
-        g.quats,
-        g.log_scales.exp(),
-        g.opacity_logits.sigmoid(),
+        g["means"],
+        g["quats"],
+        g["log_scales"].exp(),
+        g["opacity_logits"].sigmoid(),
         channels,
-        torch.tensor(camera.cam_from_world, dtype=torch.float32, device=DEVICE)[None],
-        torch.tensor(camera.K, dtype=torch.float32, device=DEVICE)[None],
+        pose[None],
+        K[None],
         width,
         height,
         near_plane=NEAR,
@@ -82,16 +75,8 @@ def blend(
     return image[0], alpha[0, ..., 0], notes
 
 
-def colours(g: OnDevice, camera: Camera, degree: int) -> Float[Tensor, "N 3"]:
-    """Return the colours in a view, max(0, 0.5 + spherical harmonics), on the device."""
-    import gsplat
-
-    centre = torch.tensor(camera.centre, dtype=torch.float32, device=DEVICE)
-    return (gsplat.spherical_harmonics(degree, g.means - centre, g.sh) + 0.5).clamp_min(0.0)
-
-
 def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> csr_matrix:
-    """Return the blending weight of each Gaussian at each pixel, like `api.pixel_weights`.
+    """Return the blending weight of each Gaussian at each pixel; see `api.pixel_weights`.
 
     gsplat lists the Gaussians blended at each pixel; their weights are computed from the projected
     Gaussians. The list takes about 60 bytes per entry on the device (some 40 entries per pixel).
@@ -99,12 +84,11 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
     import gsplat
 
     height, width = camera.size_hw
-    shape = (height * width, len(gaussians))
     if len(gaussians) == 0:
-        return csr_matrix(shape, dtype=np.float32)
+        return csr_matrix((height * width, 0), dtype=np.float32)
     with torch.no_grad():
-        g = OnDevice.of(gaussians)
-        _, _, notes = blend(g, camera, torch.zeros(len(g.means), 1, device=DEVICE))
+        g = on_device(gaussians)
+        _, _, notes = blend(g, camera, torch.zeros(len(gaussians), 1, device=DEVICE))
         who, pixel, _ = gsplat.rasterize_to_indices_in_range(
             0,
             EVERYTHING,
@@ -125,7 +109,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
         dy = notes["means2d"][0, who, 1] - (pixel // width + 0.5)
         conic = notes["conics"][0, who]
         power = 0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) + conic[:, 1] * dx * dy
-        alpha = (g.opacity_logits.sigmoid()[who] * torch.exp(-power)).clamp_max(MAX_ALPHA).double()
+        alpha = (g["opacity_logits"].sigmoid()[who] * torch.exp(-power)).clamp_max(MAX_ALPHA).double()
         count = torch.bincount(pixel, minlength=height * width)
         weight = alpha * _light_before(alpha, count)
         kept = (weight >= min_weight) & (weight > 0)
@@ -135,11 +119,7 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, min_weight: float) -> cs
         row_start = np.zeros(height * width + 1, np.int64)
         row_start[1:] = torch.bincount(pixel, minlength=height * width).cumsum(0).cpu().numpy()
         columns, weights = who[order].int().cpu().numpy(), weight[order].float().cpu().numpy()
-    if row_start[-1] < np.iinfo(np.int32).max:
-        row_start = row_start.astype(np.int32)
-    matrix = csr_matrix((weights, columns, row_start), shape=shape, copy=False)
-    matrix.has_sorted_indices = True
-    return matrix
+    return weight_matrix(row_start, columns, weights, len(gaussians))
 
 
 def _light_before(alpha: Float[Tensor, " E"], count: Tensor) -> Float[Tensor, " E"]:
@@ -154,21 +134,24 @@ def draw(
     gaussians: Gaussians, camera: Camera, degree: int, features: Float32[np.ndarray, "N D"] | None
 ) -> Drawn:
     """Draw image and alpha, and compute gradients on demand; see `api.draw`."""
-    width = 0 if features is None else features.shape[1]
-    if len(gaussians) == 0:
-        return _nothing(gaussians, camera, width)
-    leaves = [values.requires_grad_() for values in OnDevice.of(gaussians)]
-    g = OnDevice(*leaves)
-    blended = torch.from_numpy(
-        np.zeros((len(gaussians), 0), np.float32) if features is None else features
-    ).to(DEVICE)
-    blended.requires_grad_()
-    image, alpha, notes = blend(g, camera, torch.cat([colours(g, camera, degree), blended], dim=1))
+    import gsplat
+
+    features = np.zeros((len(gaussians), 0), np.float32) if features is None else features
+    if len(gaussians) == 0:  # gsplat does not support this
+        empty = np.zeros((*camera.size_hw, 3 + features.shape[1]), np.float32)
+        zeros = {name: np.zeros_like(getattr(gaussians, name)) for name in FIELDS}
+        nothing = Gradients(**zeros, features=features, means_px=np.zeros((0, 2), np.float32))
+        return Drawn(empty, empty[..., 0].copy(), np.zeros(0, np.bool_), lambda *_: nothing)
+    g = {name: values.requires_grad_() for name, values in on_device(gaussians).items()}
+    blended = torch.from_numpy(features).to(DEVICE).requires_grad_()
+    centre = torch.tensor(camera.centre, dtype=torch.float32, device=DEVICE)
+    colours = (gsplat.spherical_harmonics(degree, g["means"] - centre, g["sh"]) + 0.5).clamp_min(0.0)
+    image, alpha, notes = blend(g, camera, torch.cat([colours, blended], dim=1))
 
     def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
         grads = torch.autograd.grad(
             [image, alpha],
-            [*leaves, blended, notes["means2d"]],
+            [*g.values(), blended, notes["means2d"]],
             [torch.from_numpy(np.ascontiguousarray(grad)).to(DEVICE) for grad in (grad_image, grad_alpha)],
         )
         *by_field, by_features, by_mean_px = (grad.cpu().numpy() for grad in grads)
@@ -177,16 +160,3 @@ def draw(
 
     drawn = (notes["radii"][0] > 0).all(dim=-1).cpu().numpy()
     return Drawn(image.detach().cpu().numpy(), alpha.detach().cpu().numpy(), drawn, gradients)
-
-
-def _nothing(gaussians: Gaussians, camera: Camera, width: int) -> Drawn:
-    """Return a view without Gaussians, which gsplat does not support."""
-
-    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
-        by_name = {name: np.zeros_like(getattr(gaussians, name)) for name in FIELDS}
-        return Gradients(
-            **by_name, features=np.zeros((0, width), np.float32), means_px=np.zeros((0, 2), np.float32)
-        )
-
-    image = np.zeros((*camera.size_hw, 3 + width), np.float32)
-    return Drawn(image, np.zeros(camera.size_hw, np.float32), np.zeros(0, np.bool_), gradients)

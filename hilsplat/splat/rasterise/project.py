@@ -1,9 +1,8 @@
 """Projection of Gaussians into a view, and its gradient, each in one pass over the Gaussians.
 
-Conventions are gsplat's: a pinhole camera whose top-left pixel has its centre at (0.5, 0.5); the
-3D covariance is mapped by the perspective Jacobian at the centre (EWA), with the ray clamped to 30 %
-beyond the image border; 0.3 px^2 are added to the diagonal; colour is max(0, 0.5 + spherical harmonics) in
-the direction from the camera to the mean.
+Conventions are gsplat's (docs/rasteriser.md): the 3D covariance is mapped by the perspective Jacobian at the
+centre (EWA), with the ray clamped to 30 % beyond the image border; 0.3 px^2 are added to the diagonal; colour
+is max(0, 0.5 + spherical harmonics) in the direction from the camera to the mean.
 
 Projected Gaussians are stored for the blending loops, whose exponent is base 2:
 log2 alpha = peak - (a dx^2 + b dx dy + c dy^2), where (dx, dy) = mean - pixel centre.
@@ -70,13 +69,8 @@ ROW = 96
 _C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
 _C20, _C22, _C24 = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
-_C30, _C31, _C32, _C33, _C35 = (
-    0.5900435899266435,
-    2.890611442640554,
-    0.4570457994644658,
-    0.3731763325901154,
-    1.445305721320277,
-)
+_C30, _C31, _C32 = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
+_C33, _C35 = 0.3731763325901154, 1.445305721320277
 
 
 def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
@@ -90,14 +84,10 @@ def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
     height, width = camera.size_hw
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     margin_x, margin_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
-    limits = (
-        -cx / fx - margin_x,
-        (width - cx) / fx + margin_x,
-        -cy / fy - margin_y,
-        (height - cy) / fy + margin_y,
-    )
+    limits_x = -cx / fx - margin_x, (width - cx) / fx + margin_x
+    limits_y = -cy / fy - margin_y, (height - cy) / fy + margin_y
     row = (*camera.cam_from_world[:3, :3].ravel(), *camera.cam_from_world[:3, 3], fx, fy, cx, cy)
-    return np.array((*row, *camera.centre, *limits, height, width), dtype=np.float64)
+    return np.array((*row, *camera.centre, *limits_x, *limits_y, height, width), dtype=np.float64)
 
 
 @compiled(inline="always")
@@ -227,22 +217,13 @@ def _place(columns, camera):
     x = camera[0] * mx + camera[1] * my + camera[2] * mz + camera[9]
     y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
     z = camera[6] * mx + camera[7] * my + camera[8] * mz + camera[11]
-    w, i, j, k = (
-        _wide_column(columns, 6),
-        _wide_column(columns, 7),
-        _wide_column(columns, 8),
-        _wide_column(columns, 9),
-    )
+    w, i = _wide_column(columns, 6), _wide_column(columns, 7)
+    j, k = _wide_column(columns, 8), _wide_column(columns, 9)
     norm = 1.0 / root(w * w + i * i + j * j + k * k)
     dx, dy, dz = mx - camera[16], my - camera[17], mz - camera[18]
     distance = 1.0 / root(dx * dx + dy * dy + dz * dz)
-    return (
-        (x, y, z),
-        (w * norm, i * norm, j * norm, k * norm),
-        norm,
-        (dx * distance, dy * distance, dz * distance),
-        distance,
-    )
+    direction = dx * distance, dy * distance, dz * distance
+    return (x, y, z), (w * norm, i * norm, j * norm, k * norm), norm, direction, distance
 
 
 @compiled(inline="always")
@@ -403,29 +384,13 @@ def _axis_backward(camera, scale, i, j, k, shared):
 
 @compiled
 @no_type_check
-def project_backward(
-    begin,
-    end,
-    means,
-    log_scales,
-    quats,
-    sh,
-    degree,
-    camera,
-    geometry,
-    sums,
-    grad_means,
-    grad_log_scales,
-    grad_quats,
-    grad_opacity_logits,
-    grad_sh,
-    grad_means_px,
-):
+def project_backward(begin, end, means, log_scales, quats, sh, degree, camera, geometry, sums, outputs):
     """Compute gradients of groups begin..end of 16 Gaussians from rows of `sums`: moments and dL/dcolours.
 
-    The outputs are overwritten, with zeros for Gaussians that are not drawn. `grad_means_px` is
-    dL/d(projected mean), per pixel.
+    `outputs` are overwritten, with zeros for Gaussians that are not drawn: gradients of means, log scales,
+    quaternions, opacity logits, harmonics and projected means (px).
     """
+    grad_means, grad_log_scales, grad_quats, grad_opacity_logits, grad_sh, grad_means_px = outputs
     fx, fy = camera[12], camera[13]
     rows, columns = aligned(LANES * ROW), aligned(LANES * ROW)
     basis, pulls = aligned(16 * LANES), aligned(16 * LANES)
@@ -455,11 +420,8 @@ def project_backward(
         opacity = exp2_negative(load(columns, 69 * LANES))
         gpx, gpy = 0.0 - (conic_a * sx + conic_b * sy), 0.0 - (conic_b * sx + conic_c * sy)
         # dL/d conic as a symmetric matrix (p, q; q, r); dL/d cov = -conic (p, q; q, r) conic
-        p, q, r = (
-            -0.5 * _wide_column(columns, 83),
-            -0.5 * _wide_column(columns, 84),
-            -0.5 * _wide_column(columns, 85),
-        )
+        p, q = -0.5 * _wide_column(columns, 83), -0.5 * _wide_column(columns, 84)
+        r = -0.5 * _wide_column(columns, 85)
         m00, m01 = conic_a * p + conic_b * q, conic_a * q + conic_b * r
         m10, m11 = conic_b * p + conic_c * q, conic_b * q + conic_c * r
         cov_xx = 0.0 - (m00 * conic_a + m01 * conic_b)
@@ -473,11 +435,8 @@ def project_backward(
         ray_y = _clamped(free_y, camera[21], camera[22])
         jx, jy = fx * inverse_z, fy * inverse_z
         shared = (jx, jy, ray_x, ray_y, cov_xx, cov_xy, cov_yy)
-        size_1, size_2, size_3 = (
-            load(columns, 3 * LANES),
-            load(columns, 4 * LANES),
-            load(columns, 5 * LANES),
-        )
+        size_1, size_2 = load(columns, 3 * LANES), load(columns, 4 * LANES)
+        size_3 = load(columns, 5 * LANES)
         along_1, (d00, d10, d20), to_j1 = _axis_backward(camera, _exp(size_1), r00, r10, r20, shared)
         along_2, (d01, d11, d21), to_j2 = _axis_backward(camera, _exp(size_2), r01, r11, r21, shared)
         along_3, (d02, d12, d22), to_j3 = _axis_backward(camera, _exp(size_3), r02, r12, r22, shared)

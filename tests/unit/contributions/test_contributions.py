@@ -1,4 +1,4 @@
-"""A and G against their definitions, and what the stage writes."""
+"""A and G compared with their definitions, and the files of the stage."""
 
 import shutil
 from pathlib import Path
@@ -10,9 +10,8 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import read_index, sha256_of_path, write_index
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.contributions import gram_builder, quadratic_builder, stage
+from hilsplat.contributions import quadratic_builder, stage
 from hilsplat.contributions.compositing import normalised_weights, padded
-from hilsplat.contributions.gram_builder import GramBuilder
 from hilsplat.contributions.quadratic import (
     Gram,
     StackedWeights,
@@ -20,13 +19,14 @@ from hilsplat.contributions.quadratic import (
     _wide_gram_product,
     level_mass,
 )
-from hilsplat.contributions.quadratic_builder import QuadraticBuilder, stack_weights
+from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import ArrayStream, run_contributions
-from hilsplat.contributions.view_matrices import (
+from hilsplat.contributions.stage import (
+    ArrayStream,
     label_maps,
     labelled_rows,
     random_half,
+    run_contributions,
     view_contributions,
 )
 from hilsplat.embed.vectors import mask_embeddings
@@ -50,7 +50,7 @@ FEATURES = np.random.default_rng(5).normal(size=(40, 3, 4)).astype(np.float32)
 
 
 def random_view(seed: int, num_gaussians: int = 40) -> tuple[sp.csr_matrix, HierarchicalMasks]:
-    """Some pixels are nearly transparent; masks overlap within and across levels."""
+    """Weights and masks; some pixels are nearly transparent, and masks overlap within and across levels."""
     rng = np.random.default_rng(seed)
     weights = sp.random(PIXELS, num_gaussians, 0.15, random_state=rng, dtype=np.float32, format="csr")
     weights = weights.multiply(1 / np.maximum(weights.sum(axis=1), 1e-9)).tocsr()
@@ -110,15 +110,9 @@ def test_matrices_of_a_view_do_not_depend_on_threads(threads):
     }
 
 
-def built_gram(parts: list[StackedWeights], threads: int = 1) -> Gram:
-    builder = GramBuilder(40, threads)
-    for part in parts:
-        builder.add(part)
-    return builder.finish()
-
-
-def built(keep: str, parts: list[StackedWeights]) -> Gram | StackedWeights:
-    builder = QuadraticBuilder(40, keep, threads=1)
+def built(parts: list[StackedWeights], threads: int = 1, keep: str | None = None) -> Gram | StackedWeights:
+    """Build G, or with `keep` G or W."""
+    builder = QuadraticBuilder(40, keep, threads) if keep else GramBuilder(40, threads)
     for part in parts:
         builder.add(part)
     return builder.finish()
@@ -139,7 +133,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
         for index in range(3):
             valid = labels[:, index] >= 0
             dense[index] += full[valid].T @ full[valid]
-    gram = built_gram(stacked)
+    gram = built(stacked)
     expected = np.einsum("lij,jld->ild", dense, FEATURES)
     for each in (gram, stack_weights(stacked)):
         assert each.product(FEATURES) == pytest.approx(expected, abs=1e-5)
@@ -153,7 +147,7 @@ def test_gram_and_weights_give_the_quadratic_form_of_every_level():
 
 @pytest.mark.parametrize("channels", [1, 16, 17, 32])
 def test_a_product_of_sixteen_channels_at_a_time_has_the_bytes_of_the_plain_loop(channels):
-    gram = built_gram([labelled_part(7)])
+    gram = built([labelled_part(7)])
     features = np.random.default_rng(channels).normal(size=(40, 3, channels)).astype(np.float32)
     arrays = gram.indptr, gram.indices, gram.values
     for begin, end in ((0, 40), (13, 31)):
@@ -169,21 +163,17 @@ def test_a_product_of_sixteen_channels_at_a_time_has_the_bytes_of_the_plain_loop
 
 @pytest.mark.parametrize("merge_at", [0, 1, 8])
 def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge_at, monkeypatch):
-    monkeypatch.setattr(gram_builder, "MERGE_AT", merge_at)
+    monkeypatch.setattr(quadratic_builder, "MERGE_AT", merge_at)
     parts = [labelled_part(seed) for seed in range(4)]
-    one = built_gram([stack_weights(parts)])
-    assert_same_gram(built_gram(parts), one)
-    assert_same_gram(built_gram(parts, threads=2), one)
-    # too many weights to hold: G, whatever its size
+    one = built([stack_weights(parts)])
+    assert_same_gram(built(parts), one)
+    assert_same_gram(built(parts, threads=2), one)
+    # large parts (here two) are added in their turn
+    monkeypatch.setattr(quadratic_builder, "LARGE_PART", sorted(part.nonzeros for part in parts)[2])
+    assert_same_gram(built(parts, keep="gram"), one)
+    # too many weights to hold: G of any size
     monkeypatch.setattr(quadratic_builder, "MAX_WEIGHTS", parts[0].nonzeros)
-    assert_same_gram(built("auto", parts), one)
-
-
-def test_large_parts_join_g_in_their_turn(monkeypatch):
-    parts = [labelled_part(seed) for seed in range(4)]
-    sizes = sorted(part.nonzeros for part in parts)
-    monkeypatch.setattr(quadratic_builder, "LARGE_PART", sizes[2])  # two of them
-    assert_same_gram(built("gram", parts), built_gram(parts))
+    assert_same_gram(built(parts, keep="auto"), one)
 
 
 @pytest.mark.parametrize("keep", ["auto", "weights", "gram"])
@@ -195,7 +185,7 @@ def test_a_builder_resumes_from_its_state(keep, monkeypatch):
     first.add(parts[1])
     second.restore(first.state())
     second.add(parts[2])
-    whole, resumed = built(keep, parts), second.finish()
+    whole, resumed = built(parts, keep=keep), second.finish()
     assert type(whole) is type(resumed)
     assert whole.product(FEATURES).tobytes() == resumed.product(FEATURES).tobytes()
 
@@ -280,10 +270,10 @@ def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, checkpointed, monke
     assert run("out", "cache") == whole
     # the first two views are neither drawn nor summed again
     assert drawn[3:] == list(two_boxes.views[2:])
-    assert not list((two_boxes.folder / "cache").rglob("*.npy"))  # the checkpoint is gone
+    assert not list((two_boxes.folder / "cache").rglob("*.npy"))  # the checkpoint is removed
 
 
-def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, checkpointed, monkeypatch):
+def test_a_checkpoint_without_one_file_is_discarded(two_boxes, checkpointed, monkeypatch):
     run, whole = checkpointed
     with monkeypatch.context() as killed:
         killed.setattr(stage, "write_npz", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -294,13 +284,10 @@ def test_a_checkpoint_that_lost_a_file_costs_time_and_no_result(two_boxes, check
     assert run("out", "cache") == whole
 
 
-def test_streams_are_files_of_numpy(tmp_path):
+def test_array_streams_are_npy_files(tmp_path):
     rows = np.arange(12, dtype=np.float32).reshape(4, 3)
-    for path, parts, row_shape in (
-        (tmp_path / "rows.npy", (rows[:1], rows[1:]), (3,)),
-        (tmp_path / "none.npy", (), ()),
-    ):
-        stream = ArrayStream(path, np.float32, row_shape)
+    for name, parts, row_shape in (("rows", (rows[:1], rows[1:]), (3,)), ("none", (), ())):
+        stream = ArrayStream(tmp_path / f"{name}.npy", np.float32, row_shape)
         for part in parts:
             stream.append(part)
         stream.close()
@@ -324,11 +311,3 @@ def test_masks_that_their_index_does_not_record_are_refused(two_boxes_contributi
     reverse_masks(world, "001.png", record=False)
     with pytest.raises(MisalignedArtifactError, match=r"001\.png\.npz contains other masks"):
         build_contributions(world)
-
-
-def test_views_without_clip_vectors_are_named(two_boxes_contributions):
-    world, out = two_boxes_contributions
-    views = read_index(world.clip)["views"]
-    write_index(world.clip, {view: entry for view, entry in views.items() if view != "002.png"})
-    with pytest.raises(MisalignedArtifactError, match=r"view 002\.png(.|\n)*found +no masks"):
-        mask_embeddings(world.clip, out)

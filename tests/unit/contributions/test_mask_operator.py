@@ -1,4 +1,4 @@
-"""A as an operator against dense algebra, on the CPU and by torch; the two lifts by hand."""
+"""A as an operator compared with dense algebra, the two lifts by hand, and key views."""
 
 from dataclasses import replace
 
@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from hilsplat.contributions import key_views as module
+from hilsplat.contributions.key_views import key_views, most_covering
 from hilsplat.contributions.mask_operator import (
     BLOCK,
     MaskOperator,
@@ -14,6 +16,8 @@ from hilsplat.contributions.mask_operator import (
     lifted_average,
     lifted_median,
 )
+from hilsplat.scene.scene import Scene
+from tests.unit.two_boxes_world import NUM_GAUSSIANS, two_boxes_weights
 
 
 def random_operator(masks: int = 14, gaussians: int = 30) -> tuple[MaskOperator, np.ndarray, np.ndarray]:
@@ -56,7 +60,7 @@ def test_threads_and_sixteen_channels_at_a_time_give_the_bytes_of_the_plain_loop
 
 
 def one_gaussian(latents: list[list[float]], weights: list[float]):
-    """Masks of level whole that all show one Gaussian."""
+    """Return masks of level whole that all show one Gaussian, its mass, their pixels and latents."""
     count = len(latents)
     A = sp.csr_matrix(np.array(weights, np.float32)[:, None])
     masks = MaskOperator.of(A, np.ones(count, np.uint8))
@@ -65,7 +69,7 @@ def one_gaussian(latents: list[list[float]], weights: list[float]):
     return masks, mass, pixels, np.array(latents, np.float32)
 
 
-def test_the_median_passes_over_a_mask_that_is_wrong():
+def test_the_median_ignores_a_wrong_mask():
     masks, mass, pixels, latents = one_gaussian([[0, 1], [0, 1], [1, 0]], [1, 1, 1])
     average = lifted_average(masks, mass, pixels, latents)
     assert average[0, 0] == pytest.approx([1 / 3, 2 / 3])
@@ -74,8 +78,31 @@ def test_the_median_passes_over_a_mask_that_is_wrong():
     assert np.array_equal(median[0, 1:], average[0, 1:])  # levels that no mask shows keep the start
 
 
-def test_the_median_of_a_triangle_sees_its_sides_under_equal_angles():
-    # an isosceles triangle: from (0, y) the two lower corners stand 120 degrees apart, y = 1 / sqrt(3)
+def test_the_median_of_a_triangle_is_its_fermat_point():
+    # an isosceles triangle: seen from (0, y), the two lower corners are 120 degrees apart, so y = 1 / sqrt(3)
     masks, mass, pixels, latents = one_gaussian([[-1, 0], [1, 0], [0, 3]], [1, 1, 1])
     median = lifted_median(masks, pixels, latents, lifted_average(masks, mass, pixels, latents), steps=200)
     assert median[0, 0] == pytest.approx([0, 1 / np.sqrt(3)], abs=1e-4)
+
+
+def test_views_that_add_most_are_chosen_first():
+    seen = np.array([[1, 1, 1, 0], [1, 1, 0, 0], [0, 0, 0, 1]], bool)
+    # row 0 sees most; then rows 1 (half of 2) and 2 both add 1, and the first is chosen
+    assert most_covering(seen, np.array([1.0, 1, 1, 1]), 3) == [0, 1, 2]
+    assert most_covering(seen, np.array([1.0, 1, 1, 2]), 2) == [0, 2]
+
+
+def test_a_share_of_the_training_views_is_chosen_in_camera_order(two_boxes, monkeypatch):
+    shown = {"000.png": 4, "001.png": 1, "002.png": 9, "003.png": 2}
+
+    def weights(gaussians, camera, *, min_weight):
+        matrix = two_boxes_weights(0).tolil()
+        matrix[:, shown[camera.name] * NUM_GAUSSIANS // 10 :] = 0  # the first Gaussians only
+        return matrix.tocsr()
+
+    monkeypatch.setattr(module, "load_ply", lambda path: None)
+    monkeypatch.setattr(module, "pixel_weights", weights)
+    scene = Scene.load(two_boxes.scene)
+    assert key_views(scene, two_boxes.ply, 0.5) == ["000.png", "002.png"]
+    assert key_views(scene, two_boxes.ply, 0.3) == ["000.png", "002.png"]  # rounded up
+    assert key_views(scene, two_boxes.ply, 0.25) == ["002.png"]

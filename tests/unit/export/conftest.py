@@ -1,19 +1,26 @@
-"""SAM and CLIP of the transformers library with small configurations and random weights, and their real
-ONNX exports by optimum: what a user downloads or exports, without any download."""
+"""Small SAM and CLIP models of transformers with random weights, and their ONNX exports by optimum."""
 
 import json
 import os
+import shutil
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
 
 WORDS = ("re", "red</w>", "mu", "mug</w>")
+SMALL = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
 MERGES = ("r e", "re d</w>", "m u", "mu g</w>")
+
+
+@pytest.fixture(scope="session")
+def transformers():
+    return pytest.importorskip("transformers", reason="needs the extra export")
 
 
 def export(folder: Path, out: Path) -> Path:
@@ -28,10 +35,8 @@ def export(folder: Path, out: Path) -> Path:
 def enliven(model) -> None:
     """Replace the tiny initial weights, whose outputs would hardly depend on the inputs.
 
-    A SAM's frequencies of positions are a buffer that transformers draws anew for every model.
+    SAM's positional frequencies are a buffer that transformers draws anew for every model.
     """
-    import torch
-
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -43,9 +48,8 @@ def enliven(model) -> None:
 
 
 @pytest.fixture(scope="session")
-def sam_parts(tmp_path_factory):
+def sam_parts(transformers, tmp_path_factory):
     """A SAM for images of 64 px: transformers' model, its processor, and its exported folder."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export")
     folder = tmp_path_factory.mktemp("sam")
     vision = transformers.SamVisionConfig(
         hidden_size=16,
@@ -82,9 +86,8 @@ def sam_parts(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def clip_parts(tmp_path_factory):
+def clip_parts(transformers, tmp_path_factory):
     """A CLIP for crops of 32 px and texts of 16 tokens, as `sam_parts`; its export is one `model.onnx`."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export")
     from transformers.models.clip.tokenization_clip import bytes_to_unicode
 
     folder = tmp_path_factory.mktemp("clip")
@@ -95,16 +98,15 @@ def clip_parts(tmp_path_factory):
     tokenizer = transformers.CLIPTokenizerFast(
         str(folder / "vocab.json"), str(folder / "merges.txt"), model_max_length=16
     )
-    small = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
     text = transformers.CLIPTextConfig(
         vocab_size=len(words),
         max_position_embeddings=16,
         bos_token_id=len(words) - 2,
         eos_token_id=len(words) - 1,
         pad_token_id=len(words) - 1,
-        **small,
+        **SMALL,
     )
-    vision = transformers.CLIPVisionConfig(image_size=32, patch_size=8, **small)
+    vision = transformers.CLIPVisionConfig(image_size=32, patch_size=8, **SMALL)
     config = transformers.CLIPConfig(text.to_dict(), vision.to_dict(), projection_dim=12)
     model = transformers.CLIPModel(config).eval()
     enliven(model)
@@ -129,8 +131,6 @@ def photograph() -> np.ndarray:
 
 def trace(module, inputs: dict, outputs: list[str], dynamic: dict, path: Path) -> None:
     """`torch.onnx.export` by tracing, as the scripts do that made the published exports."""
-    import torch
-
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
@@ -147,8 +147,7 @@ def trace(module, inputs: dict, outputs: list[str], dynamic: dict, path: Path) -
 
 
 def as_module(model, function):
-    """A module that holds a model and calls a function."""
-    import torch
+    """Wrap a function of a model as a module."""
 
     class Called(torch.nn.Module):
         def __init__(self) -> None:
@@ -162,11 +161,8 @@ def as_module(model, function):
 
 
 @pytest.fixture(scope="session")
-def sam2_parts(tmp_path_factory):
+def sam2_parts(transformers, tmp_path_factory):
     """A SAM 2 for images of 64 px: transformers' model, and its folder with the names of transformers.js."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export")
-    import torch
-
     folder = tmp_path_factory.mktemp("sam2")
     backbone = transformers.Sam2HieraDetConfig(
         hidden_size=8,
@@ -229,18 +225,15 @@ def sam2_parts(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def siglip_parts(tmp_path_factory):
+def siglip_parts(transformers, tmp_path_factory):
     """A SigLIP for crops of 32 px: transformers' model, its folder with the names of transformers.js, and its
     single network by optimum."""
-    transformers = pytest.importorskip("transformers", reason="needs the extra export")
-    import torch
     from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
     folder = tmp_path_factory.mktemp("siglip")
-    small = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
     config = transformers.SiglipConfig(
-        {"vocab_size": 8, "max_position_embeddings": 64, **small},
-        {"image_size": 32, "patch_size": 8, **small},
+        {"vocab_size": 8, "max_position_embeddings": 64, **SMALL},
+        {"image_size": 32, "patch_size": 8, **SMALL},
     )
     model = transformers.SiglipModel(config).eval()
     enliven(model)
@@ -278,10 +271,6 @@ def siglip_parts(tmp_path_factory):
 @pytest.fixture(scope="session")
 def open_clip_folder(clip_parts, tmp_path_factory):
     """The CLIP of `clip_parts` in open_clip's two folders, with one picture and one text per call."""
-    import shutil
-
-    import torch
-
     model, processor, exported = clip_parts
     folder = tmp_path_factory.mktemp("open_clip")
     visual = as_module(model, lambda image: torch.nn.functional.normalize(model.get_image_features(image)))
@@ -294,11 +283,7 @@ def open_clip_folder(clip_parts, tmp_path_factory):
     config = {"embed_dim": 12, "vision_cfg": {"image_size": 32, "patch_size": 8}, "text_cfg": {}}
     (folder / "config.json").write_text(json.dumps(config))
     images = processor.image_processor
-    preprocessing = {
-        "size": [32, 32],
-        "mean": images.image_mean,
-        "std": images.image_std,
-        "interpolation": "bicubic",
-    }
+    preprocessing = {"size": [32, 32], "mean": images.image_mean, "std": images.image_std}
+    preprocessing["interpolation"] = "bicubic"
     (folder / "visual/preprocess_cfg.json").write_text(json.dumps(preprocessing))
     return folder

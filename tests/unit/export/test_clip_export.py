@@ -1,69 +1,66 @@
-"""A CLIP exported by optimum, cut into its two halves, gives through our code what transformers gives."""
+"""Exports of CLIP, SigLIP and open_clip give through our code what transformers gives."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
+from hilsplat.embed.model_check import check_model
 from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.masks import HierarchicalMasks
 
 TOLERANCE = 1e-4
-TEXTS = ["red mug", "a mug on the table", "x" * 40, "object"]
-
-
-@pytest.fixture(scope="module")
-def folder(clip_parts, tmp_path_factory) -> Path:
-    copy = tmp_path_factory.mktemp("cut") / "clip"
-    shutil.copytree(clip_parts[2], copy)
-    with pytest.raises(ModelError, match=r"lacks onnx/vision_model.onnx(.|\n)*hilsplat models split"):
-        ClipModel.load(copy)
-    assert [path.name for path in split_clip(copy)] == ["vision_model.onnx", "text_model.onnx"]
-    return copy
-
-
-@pytest.fixture(scope="module")
-def ours(folder) -> ClipModel:
-    return ClipModel.load(folder)
+TEXTS = ["red mug", "a Mug on red", "x" * 40, "object"]
+"""The third is longer than the CLIP of these tests reads."""
+CROPS = np.random.default_rng(0).integers(0, 255, (5, 32, 32, 3), dtype=np.uint8)
 
 
 def unit(vectors) -> np.ndarray:
     return (vectors / vectors.norm(dim=-1, keepdim=True)).numpy()
 
 
-def test_crops_are_prepared_and_embedded_as_by_transformers(ours, clip_parts):
-    import torch
-
-    model, processor, _ = clip_parts
-    crops = np.random.default_rng(0).integers(0, 255, (5, 32, 32, 3), dtype=np.uint8)
-    inputs = processor.image_processor(list(crops), return_tensors="pt")
-    np.testing.assert_allclose(ours.prepare(crops), inputs["pixel_values"].numpy(), atol=TOLERANCE)
+def assert_same_vectors(ours: ClipModel, model, images, inputs_of: Callable[[str], dict]) -> None:
+    """Compare vectors of crops and texts; texts one by one, as our code embeds them."""
+    pixels = images(list(CROPS), return_tensors="pt")["pixel_values"]
     with torch.no_grad():
-        expected = unit(model.get_image_features(inputs["pixel_values"]))
+        expected = unit(model.get_image_features(pixels))
+        texts = [(text, unit(model.get_text_features(**inputs_of(text)))) for text in TEXTS]
     assert np.abs(expected[0] - expected[1]).max() > 0.01
-    np.testing.assert_allclose(ours.embed_crops(crops), expected, atol=TOLERANCE)
-
-
-def test_texts_are_tokenised_and_embedded_as_by_transformers(ours, clip_parts):
-    import torch
-
-    model, processor, _ = clip_parts
-    for text in TEXTS:  # one by one, as our code does; the third is longer than the model reads
-        inputs = processor.tokenizer([text], truncation=True, return_tensors="pt")
-        assert ours.tokenizer.encode(text).ids == inputs["input_ids"][0].tolist()
-        with torch.no_grad():
-            expected = unit(model.get_text_features(**inputs))
+    np.testing.assert_allclose(ours.prepare(CROPS), pixels.numpy(), atol=TOLERANCE)
+    np.testing.assert_allclose(ours.embed_crops(CROPS), expected, atol=TOLERANCE)
+    for text, expected in texts:
         np.testing.assert_allclose(ours.embed_texts([text]), expected, atol=TOLERANCE)
 
 
-def test_a_mask_over_a_square_image_is_the_image_itself(ours, clip_parts):
-    import torch
+@pytest.fixture(scope="module")
+def ours(clip_parts, tmp_path_factory) -> ClipModel:
+    copy = tmp_path_factory.mktemp("cut") / "clip"
+    shutil.copytree(clip_parts[2], copy)
+    with pytest.raises(ModelError, match=r"lacks onnx/vision_model.onnx(.|\n)*hilsplat models split"):
+        ClipModel.load(copy)
+    assert [path.name for path in split_clip(copy)] == ["vision_model.onnx", "text_model.onnx"]
+    return ClipModel.load(copy)
 
+
+def test_clip_gives_what_transformers_gives(ours, clip_parts):
     model, processor, _ = clip_parts
-    image = np.random.default_rng(1).integers(0, 255, (32, 32, 3), dtype=np.uint8)
+
+    def inputs_of(text: str) -> dict:
+        inputs = processor.tokenizer([text], truncation=True, return_tensors="pt")
+        assert ours.tokenizer.encode(text).ids == inputs["input_ids"][0].tolist()
+        return inputs
+
+    assert_same_vectors(ours, model, processor.image_processor, inputs_of)
+
+
+def test_a_mask_that_covers_a_square_image_is_the_image_itself(ours, clip_parts):
+    model, processor, _ = clip_parts
+    image = CROPS[0]
     one = np.ones(1, np.float32)
     masks = HierarchicalMasks.from_dense(np.ones((1, 32, 32), bool), np.ones(1, np.uint8), one, one)
     with torch.no_grad():
@@ -73,6 +70,34 @@ def test_a_mask_over_a_square_image_is_the_image_itself(ours, clip_parts):
     np.testing.assert_allclose(ours.embed_masks(image, masks), expected, atol=TOLERANCE + 2**-11)
 
 
-def test_a_folder_without_an_export_cannot_be_cut(tmp_path):
+def test_a_folder_without_an_export_cannot_be_split(tmp_path: Path):
     with pytest.raises(ModelError, match=r"has no model.onnx to split"):
         split_clip(tmp_path)
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_siglip_gives_what_transformers_gives(siglip_parts, tmp_path, split):
+    model, images, folder = siglip_parts
+    shutil.copytree(folder / ("optimum" if split else "js"), tmp_path / "siglip")
+    if split:
+        split_clip(tmp_path / "siglip")
+
+    def inputs_of(text: str) -> dict:
+        ids = [{"red": 1, "mug": 2, "on": 3}.get(word, 0) for word in text.lower().split()]
+        return {"input_ids": torch.tensor([ids + [4] * (64 - len(ids))])}  # </s> ends and pads the text
+
+    assert_same_vectors(ClipModel.load(tmp_path / "siglip"), model, images, inputs_of)
+    assert "kind       siglip" in check_model(tmp_path / "siglip")
+
+
+def test_open_clip_in_two_folders_gives_what_transformers_gives(open_clip_folder, clip_parts):
+    model, processor, _ = clip_parts
+    ours = ClipModel.load(open_clip_folder)
+
+    def inputs_of(text: str) -> dict:
+        return processor.tokenizer([text], truncation=True, return_tensors="pt")
+
+    assert_same_vectors(ours, model, processor.image_processor, inputs_of)
+    assert ours.width == 12
+    names = {path.relative_to(open_clip_folder).as_posix() for path in ours.model.files}
+    assert {"visual/model.onnx", "textual/model.onnx", "textual/tokenizer.json"} < names

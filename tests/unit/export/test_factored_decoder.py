@@ -46,7 +46,7 @@ def test_candidates_are_those_of_the_network(model, photograph):
     assert np.mean(same) > 0.9  # a logit within 1e-5 of a rounding step may fall to the other side
 
 
-def test_previewed_candidates_are_some_of_all(model, photograph):
+def test_previewed_candidates_are_a_subset(model, photograph):
     settings = {"points_per_side": 6, "predicted_iou_min": 0, "stability_min": 0.1}
     some = decode_candidates(photograph, model, MasksSettings(**settings))  # previews first
     everything = decode_candidates(photograph, model, MasksSettings(**settings, box_nms_iou=1))
@@ -70,7 +70,7 @@ def test_a_decoder_that_differs_runs_in_onnxruntime(sam_parts, monkeypatch, capl
 
 
 @pytest.mark.parametrize("change", ["names", "half"])
-def test_an_unusual_graph_says_why_it_cannot_be_factored(sam_parts, tmp_path, change):
+def test_an_unusual_graph_is_an_error_with_the_reason(sam_parts, tmp_path, change):
     graph = onnx.load(str(next(sam_parts[-1].rglob("*mask_decoder.onnx"))))
     if change == "names":
         for number, node in enumerate(graph.graph.node):

@@ -1,16 +1,17 @@
-"""A SAM exported by optimum gives through our code what transformers gives through its own."""
+"""Exports of SAM and SAM 2 give through our code what transformers gives."""
 
 import numpy as np
 import onnx
 import pytest
+import torch
 
 from hilsplat.embed.model_check import check_model
 from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.generate import crop_boxes, decode_candidates, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.sam import SamModel, point_grid
+from hilsplat.segment.sam import Frame, SamModel, enlarged, point_grid
 from hilsplat.settings import MasksSettings
-from tests.unit.segment.plain import quantise, restore
+from tests.unit.segment.plain import quantise
 
 TOLERANCE = 1e-4
 EVERYTHING = MasksSettings(
@@ -35,8 +36,6 @@ def ours(sam_parts) -> SamModel:
 @pytest.fixture(scope="module")
 def theirs(sam_parts, photograph):
     """Inputs and outputs of transformers' processor and model for a grid of points."""
-    import torch
-
     model, processor, _ = sam_parts
     points = point_grid(3) * (photograph.shape[1], photograph.shape[0])
     inputs = processor(photograph, input_points=[[[point] for point in points.tolist()]], return_tensors="pt")
@@ -58,8 +57,6 @@ def test_images_are_prepared_as_by_the_processor(ours, theirs, photograph):
 
 
 def test_embeddings_agree(ours, sam_parts, theirs, photograph):
-    import torch
-
     model = sam_parts[0]
     with torch.no_grad():
         embeddings = model.get_image_embeddings(theirs[1]["pixel_values"])
@@ -74,7 +71,7 @@ def test_embeddings_agree(ours, sam_parts, theirs, photograph):
     )
 
 
-def test_global_attention_goes_row_by_row_with_the_same_result(ours, photograph):
+def test_rowwise_global_attention_gives_the_same_result(ours, photograph):
     assert not ours.as_exported
     path = ours.model.networks["vision_encoder"]
     graph = onnx.load_from_string(with_rowwise_attention(path, [1], 2, 8)).graph
@@ -109,7 +106,7 @@ def test_masks_and_boxes_agree_at_full_size(ours, sam_parts, theirs, photograph)
         inputs["reshaped_input_sizes"],
     )
     frame = ours.prepare(photograph)[1]
-    found = np.stack([restore(one, frame) for one in rounded.reshape(-1, *rounded.shape[2:])])
+    found = enlarged(rounded.reshape(-1, *rounded.shape[2:]).astype(np.float32), frame)
     expected = full.numpy().reshape(found.shape)
     assert 0.02 < expected.mean() < 0.98
     assert (found != expected).mean() < 1e-4  # rounding may decide on the border itself
@@ -132,7 +129,7 @@ def test_the_stage_finds_the_masks_of_every_prompt(ours, theirs, photograph):
     rounded = quantise(theirs[2].pred_masks[0].numpy())
     scores = theirs[2].iou_scores[0].numpy()
     for head, level in ((0, 3), (1, 2), (2, 1)):
-        expected = np.stack([restore(one, frame) for one in rounded[:, head]])
+        expected = enlarged(rounded[:, head].astype(np.float32), frame)
         rows = np.flatnonzero(masks.level == level)
         found = masks.dense(rows)
         assert len(found)
@@ -156,3 +153,41 @@ def test_check_describes_the_export(sam_parts):
     text = check_model(sam_parts[2])
     assert "kind       sam" in text
     assert "image      64 x 64 px" in text
+
+
+def test_sam_2_stretches_images_to_its_square(sam2_parts, photograph):
+    pixels, frame = SamModel.load(sam2_parts[1]).prepare(photograph)
+    assert frame == Frame((60, 100), (64, 64), (64, 64), stretched=True)
+    assert pixels.shape == (1, 3, 64, 64)
+    # the bottom right corner is image, not padding
+    last = (photograph[-1, -1] / 255 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
+    assert np.abs(pixels[0, :, -1, -1] - last).max() < 0.5
+
+
+def test_sam_2_gives_what_transformers_gives(sam2_parts, photograph):
+    reference, folder = sam2_parts
+    model = SamModel.load(folder)
+    points = point_grid(3) * (100, 60)
+    scores, logits = model.decode(model.encode(photograph), points)
+    with torch.no_grad():
+        found = reference(
+            pixel_values=torch.from_numpy(model.prepare(photograph)[0]),
+            input_points=torch.from_numpy(points * (64 / 100, 64 / 60)).float()[None, :, None],
+            input_labels=torch.ones((1, 9, 1), dtype=torch.int64),
+        )
+    assert found.pred_masks.std() > 0.1
+    np.testing.assert_allclose(scores, found.iou_scores[0].numpy(), atol=TOLERANCE, rtol=TOLERANCE)
+    np.testing.assert_allclose(logits, found.pred_masks[0].numpy(), atol=TOLERANCE, rtol=TOLERANCE)
+
+
+def test_masks_of_sam_2_are_enlarged_as_by_its_processor(sam2_parts, photograph):
+    model = SamModel.load(sam2_parts[1])
+    candidates = decode_candidates(photograph, model, EVERYTHING)
+    masks = masks_from_candidates(candidates, (60, 100), model, EVERYTHING)
+    _, logits = model.decode(model.encode(photograph), point_grid(3) * (100, 60))
+    rounded = torch.from_numpy(np.rint(logits * 8).clip(-127, 127)).flatten(0, 1)[None]
+    large = torch.nn.functional.interpolate(rounded, (60, 100), mode="bilinear", align_corners=False)[0] > 0
+    found = masks.dense()
+    assert len(found) > 5
+    # the order of sums may decide on the border itself
+    assert (found[:, None] != large.numpy()[None]).mean(axis=(2, 3)).min(axis=1).max() < 1e-3

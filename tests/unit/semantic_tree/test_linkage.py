@@ -31,37 +31,29 @@ def pair(evidence: Evidence, a: int, b: int) -> tuple[float, float]:
     return 0.0, float(evidence.seen[a, evidence.view[b]] + evidence.seen[b, evidence.view[a]])
 
 
-def test_evidence_counts_only_gaussians_both_views_see():
-    # three Gaussians; view 0 sees 0 and 1, view 1 sees 1 and 2
-    visible = np.array([[True, True, False], [False, True, True]])
-    shares = sp.csr_matrix(np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.5]]))
-    evidence = mask_evidence(shares, np.ones(3), visible, np.array([0, 1], np.int32), 0.2)
-    # on Gaussian 1 both agree fully: intersection 1, union 1 + 1 - 1
-    assert pair(evidence, 0, 1) == pytest.approx((1, 1))
-    assert pair(evidence, 1, 0) == pytest.approx((1, 1))
+FOUR_OF_ELEVEN = np.array([[1] * 5 + [0] * 6, [0] * 4 + [1] * 7], bool)
+"""Two views that share Gaussian 4 alone."""
 
 
-def test_a_blurred_region_agrees_fully_with_itself():
-    visible, shares = np.ones((2, 1), bool), sp.csr_matrix(np.array([[0.3], [0.3]]))
-    view = np.array([0, 1], np.int32)
-    intersection, union = pair(mask_evidence(shares, np.ones(1), visible, view, 0.2), 0, 1)
-    assert intersection / union == pytest.approx(1)
-
-
-def test_masks_of_one_view_are_evidence_against_a_link():
-    visible = np.ones((1, 2), bool)
-    shares = sp.csr_matrix(np.array([[1.0, 0.0], [1.0, 1.0]]))
-    evidence = mask_evidence(shares, np.ones(2), visible, np.zeros(2, np.int32), 0.2)
-    assert pair(evidence, 0, 1) == pytest.approx((0, 3))  # sizes 1 and 2
-
-
-def test_masks_that_hardly_see_each_other_are_no_evidence():
-    visible = np.ones((2, 11), bool)
-    visible[0, 5:], visible[1, :4] = False, False  # common: Gaussian 4 alone
-    shares = sp.csr_matrix(np.where(visible, 1.0, 0.0))
-    view = np.array([0, 1], np.int32)
-    assert pair(mask_evidence(shares, np.ones(11), visible, view, 0.1), 0, 1) == pytest.approx((1, 1))
-    assert pair(mask_evidence(shares, np.ones(11), visible, view, 0.25), 0, 1) == (0, 0)
+@pytest.mark.parametrize(
+    ("shares", "visible", "view", "min_covisible", "expected"),
+    [
+        # both agree on Gaussian 1, the only one that both views see: intersection 1, union 1 + 1 - 1
+        ([[1, 1, 0], [0, 1, 0.5]], [[1, 1, 0], [0, 1, 1]], [0, 1], 0.2, (1, 1)),
+        # a blurred region agrees fully with itself: 0.3^2 in both
+        ([[0.3], [0.3]], [[1], [1]], [0, 1], 0.2, (0.09, 0.09)),
+        # masks of one view, of sizes 1 and 2, are evidence against a link
+        ([[1, 0], [1, 1]], [[1, 1]], [0, 0], 0.2, (0, 3)),
+        # masks whose views share little are no evidence
+        (FOUR_OF_ELEVEN, FOUR_OF_ELEVEN, [0, 1], 0.1, (1, 1)),
+        (FOUR_OF_ELEVEN, FOUR_OF_ELEVEN, [0, 1], 0.25, (0, 0)),
+    ],
+)
+def test_evidence_of_two_masks(shares, visible, view, min_covisible, expected):
+    shares, visible = np.array(shares, float), np.array(visible, bool)
+    importance, view = np.ones(shares.shape[1]), np.array(view, np.int32)
+    evidence = mask_evidence(sp.csr_matrix(shares), importance, visible, view, min_covisible)
+    assert pair(evidence, 0, 1) == pair(evidence, 1, 0) == pytest.approx(expected)
 
 
 def test_linkage_pools_intersections_over_unions():

@@ -1,4 +1,4 @@
-"""Boxes, nesting, pixels of nodes and exports of the semantic tree, by hand."""
+"""Boxes, nesting, crops, prompts, pixels and exports of nodes, by hand."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,12 @@ from plyfile import PlyData
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import Level
+from hilsplat.segment.sam import point_grid
 from hilsplat.semantic_tree.boxes import OrientedBox, oriented_box
+from hilsplat.semantic_tree.build import RANKED, crop_ranks
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
+from hilsplat.semantic_tree.guided_masks import guided_points
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
 from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.splat.ply import load_ply, save_ply
@@ -16,7 +20,7 @@ from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.round_gaussians import round_gaussians
 
 
-def test_the_box_of_a_turned_brick_lies_along_the_brick():
+def test_the_box_of_a_rotated_brick_is_parallel_to_it():
     rng = np.random.default_rng(0)
     angle = np.deg2rad(30)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
@@ -83,7 +87,7 @@ def tree_of(ply):
     return plain_tree([1, 1, 2, 3], [-1, -1, 0, 0], nodes, gaussians_sha256=sha256_of_file(ply))
 
 
-def test_the_exported_ply_is_still_one_of_gaussians(ply, tmp_path):
+def test_the_exported_tree_is_a_valid_3dgs_ply(ply, tmp_path):
     out = tmp_path / "tree.ply"
     write_tree_ply(ply, tree_of(ply), out)
     vertex = PlyData.read(out)["vertex"]
@@ -91,16 +95,13 @@ def test_the_exported_ply_is_still_one_of_gaussians(ply, tmp_path):
     assert vertex["node_part"].tolist() == [-1, 2, -1, -1]
     assert vertex["node_subpart"].tolist() == [3, -1, -1, -1]
     np.testing.assert_array_equal(load_ply(out).means, load_ply(ply).means)
-
-
-def test_a_tree_of_other_gaussians_is_not_exported(ply, tmp_path):
     other = tree_of(ply)
     save_ply(ply, round_gaussians(np.arange(12.0).reshape(4, 3) + 1))  # as many Gaussians
     with pytest.raises(MisalignedArtifactError, match=r"made for another .*\.ply"):
         write_tree_ply(ply, other, tmp_path / "tree.ply")
 
 
-def test_a_selection_holds_the_chosen_gaussians(ply, tmp_path):
+def test_a_selection_contains_the_chosen_gaussians(ply, tmp_path):
     write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
     assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
 
@@ -114,3 +115,49 @@ def test_a_node_that_nesting_emptied_is_dropped_and_the_others_keep_their_order(
     assert renumber.tolist() == [0, 1, -1, 2, -1]
     assert renumber[after].tolist() == [[0, -1, -1], [1, -1, -1], [1, 2, -1]]
     assert renumber[parent[[0, 1, 3]]].tolist() == [-1, -1, 1]
+
+
+def towards(*degrees: float) -> np.ndarray:
+    turns = np.deg2rad(degrees)
+    return np.stack([np.cos(turns), np.sin(turns), np.zeros(len(turns))], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("node", "score", "degrees", "ranks"),
+    [
+        # 3 degrees beside the best one, the second keeps a tenth of its score
+        ([0, 0, 0, -1, 1], [4, 3, 1, 9, 1], [0, 3, 90, 0, 0], [0, 2, 1, -1, 0]),
+        ([0, 0, 0, 0], [2, 4, 1, 3], [0, 0, 0, 0], [2, 0, 3, 1]),
+        ([], [], [], []),
+    ],
+    ids=["other side first", "one side: by score", "no mask"],
+)
+def test_crops_are_ranked_by_score_and_side(node, score, degrees, ranks):
+    found = crop_ranks(np.array(node, np.int32), np.array(score, np.float32), towards(*degrees))
+    assert found.tolist() == ranks
+
+
+def test_a_node_has_a_limited_number_of_ranks():
+    ranks = crop_ranks(np.zeros(50, np.int32), np.ones(50, np.float32), towards(*range(50)))
+    assert sorted(ranks[ranks >= 0]) == list(range(RANKED))
+
+
+def test_nodes_are_prompted_in_their_middle_and_the_grid_elsewhere():
+    whole, part, subpart = (np.full((8, 12), -1, np.int32) for _ in range(3))
+    whole[:, :] = 0
+    part[6:8, 10:12] = 1  # 4 px: too small for a prompt
+    subpart[1:6, 1:6] = 4  # its middle is pixel (3, 3)
+    labels = {Level.WHOLE: whole, Level.PART: part, Level.SUBPART: subpart}
+    points = guided_points(labels, point_grid(4), 5)
+    assert (3.5, 3.5) in map(tuple, points)
+    # nodes 0 and 4; the subpart covers the grid points at x 1.5, 4.5 and y 1, 3, 5
+    assert len(points) == 2 + 16 - 6
+    assert (4.5, 3.0) not in map(tuple, points)
+    nothing = dict.fromkeys(Level, np.full((4, 4), -1, np.int32))
+    np.testing.assert_allclose(guided_points(nothing, point_grid(2), 1), point_grid(2) * 4)
+
+
+def test_a_pixel_shows_the_node_that_makes_up_more_than_half_of_it():
+    weights = sp.csr_matrix(np.array([[0.7, 0.3, 0], [0.5, 0.5, 0], [0, 0, 0], [0, 0.4, 0.6]], np.float32))
+    shown = ViewNodes.of(weights, np.array([2, 5, -1], np.int32))
+    assert shown.labels((2, 2)).tolist() == [[2, -1], [-1, -1]]

@@ -1,4 +1,4 @@
-"""Regions that touch in 3D, joined to wholes."""
+"""Regions that touch in 3D are joined to wholes."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from hilsplat.base.levels import Level
 from hilsplat.contributions.stage import run_contributions
 from hilsplat.semantic_tree import wholes
 from hilsplat.semantic_tree.build import run_semantic_tree
-from hilsplat.semantic_tree.level_nodes import LevelNodes
+from hilsplat.semantic_tree.nodes import LevelNodes
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.semantic_tree.wholes import joined, joined_regions, touching
 from hilsplat.settings import ContributionsSettings, SemanticTreeSettings
@@ -46,13 +46,9 @@ def test_regions_are_joined_while_the_pair_costs_less_than_the_limit():
     # both with 2: side 0.854, and the pair touches nothing else
     assert joined(touch, shares, 0.85).tolist() == [0, 0, 1]
     assert joined(touch, shares, 0.86).tolist() == [0, 0, 0]
-
-
-def test_a_weak_touch_costs_more():
+    # a weak touch costs more: 0 touches 1 nine times as often as 2
     shares = np.array([[0.04], [0.05], [0.05]])
-    # 0 touches 1 nine times as often as 2
-    touch = symmetric(3, _01=9, _02=1)
-    assert joined(touch, shares, 0.33).tolist() == [0, 0, 1]
+    assert joined(symmetric(3, _01=9, _02=1), shares, 0.33).tolist() == [0, 0, 1]
 
 
 def test_sides_are_means_of_the_views_that_show_a_region():
@@ -110,9 +106,6 @@ def test_floating_gaussians_and_those_without_region_join_nothing():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wholes, "NEIGHBOURS", 2)  # the floating one at 1.1 alone would touch region 0
         assert joined_regions(region, 2, means, mass, 5.0).tolist() == [0, 1]
-
-
-def test_no_region_gives_no_whole():
     none = np.full(3, -1, np.int32)
     assert len(joined_regions(none, 0, on_a_line(0, 1, 2), np.ones((1, 3), np.float32), 1.0)) == 0
 

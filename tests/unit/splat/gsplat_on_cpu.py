@@ -61,7 +61,7 @@ def rasterize_to_indices_in_range(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As gsplat's: Gaussian and pixel of each blended pair, front to back within a pixel."""
+    """As in gsplat: Gaussian and pixel of each blended pair, front to back within a pixel."""
     assert first == 0 and bool((transmittances == 1).all())
     order = flatten_ids
     alpha = _alpha(means2d[0, order], conics[0, order], opacities[0, order], width, height)

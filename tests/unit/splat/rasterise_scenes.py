@@ -11,7 +11,7 @@ from tests.unit.round_gaussians import round_gaussians
 
 
 def camera(height: int = 40, width: int = 56, focal: float = 50.0) -> Camera:
-    """A turned and shifted camera, so that every entry of the pose matters."""
+    """A rotated and shifted camera, so that every entry of the pose matters."""
     a, b = 0.3, -0.2
     turn = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
     tilt = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])

@@ -1,4 +1,4 @@
-"""Slow, obvious rendering in float64 torch: what the fast backends are tested against.
+"""Slow, obvious rendering in float64 torch, with which the fast backends are compared.
 
 Every Gaussian is evaluated at every pixel, and gradients are torch's own. It shares no code with the
 backends, and repeats their constants and formulas on purpose.

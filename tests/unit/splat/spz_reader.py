@@ -1,4 +1,4 @@
-"""SPZ read back, by the format's own description."""
+"""A reader of SPZ, written from the description of the format."""
 
 import gzip
 

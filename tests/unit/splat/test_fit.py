@@ -1,20 +1,37 @@
-"""The fit on a scene of three Gaussians: it improves, it resumes, and threads do not matter."""
+"""The fit of a scene of three Gaussians, and its two strategies."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import expit, logit
 
 from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import SceneError
+from hilsplat.base.rotations import rotation_matrices
+from hilsplat.scene.cameras import Camera
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit
-from hilsplat.splat.densify import ScreenGradients, densify, prune, reset_opacities
-from hilsplat.splat.gaussians import morton_order
+from hilsplat.splat.densify import (
+    ScreenGradients,
+    add_noise,
+    add_regularisers,
+    densify,
+    opacities,
+    prune,
+    relocate_and_grow,
+    reset_opacities,
+    scale_factor,
+    shared_opacity,
+)
+from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.initial import RANDOM_POINTS, first_gaussians
 from hilsplat.splat.optimise import Adam, means_rate
 from hilsplat.splat.ply import load_ply
+from hilsplat.splat.rasterise.api import render
 from hilsplat.splat.rasterise.cpu import Gradients
+from tests.unit.round_gaussians import round_gaussians
 from tests.unit.splat.three_gaussians_world import mean_psnr
 
 SETTINGS = GaussiansSettings(
@@ -34,7 +51,7 @@ def test_fit_improves_held_out_views(scene, strategy):
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_path, monkeypatch, strategy):
+def test_threads_and_interruptions_do_not_change_the_bytes(scene, tmp_path, monkeypatch, strategy):
     settings = SETTINGS.model_copy(update={"strategy": strategy, "background": "random"})
 
     def stage(name: str, threads: int) -> dict[str, bytes]:
@@ -79,7 +96,7 @@ def test_stage_writes_the_same_bytes_on_any_threads_and_after_a_stop(scene, tmp_
     assert coordinates["origin"] == {"kind": "fitted", "strategy": strategy, "iterations": 60, "seed": 3}
 
 
-def test_another_fits_checkpoint_is_not_used(scene, tmp_path):
+def test_the_checkpoint_of_another_fit_is_ignored(scene, tmp_path):
     adam = Adam.start(first_gaussians(scene, [scene.cameras["000.png"]], SETTINGS, np.random.default_rng(0)))
     state = fit.FitState(adam, ScreenGradients.start(len(adam)), np.random.default_rng(0))
     state.save(tmp_path / "c.npz", "this")
@@ -116,7 +133,7 @@ def test_a_fit_does_not_resume_on_another_device(scene, tmp_path, monkeypatch):
     assert steps[0] == 0
 
 
-def test_random_start_holds_as_many_points_as_asked_in_sight_of_cameras(scene):
+def test_random_points_are_in_view_of_cameras(scene):
     cameras = [scene.cameras[name] for name in scene.views("train")]
     settings = GaussiansSettings(initial="random")
     first = first_gaussians(scene, cameras, settings, np.random.default_rng(0))
@@ -130,18 +147,18 @@ def test_random_start_holds_as_many_points_as_asked_in_sight_of_cameras(scene):
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_frozen_gaussians_stay_the_points(scene, strategy):
+def test_frozen_gaussians_stay_at_their_points(scene, strategy):
     points = np.random.default_rng(0).normal(0, 0.3, (150, 3)).astype(np.float32)
     bare = replace(scene, points_xyz=points, points_rgb=np.full((150, 3), 128, np.uint8))
     few = {"initial": "frozen", "max_gaussians": 100, "strategy": strategy, "opacity_reset_every": 20}
     settings = SETTINGS.model_copy(update=few)
     gaussians, curve = fit.fit_gaussians(bare, settings, seed=0)
     assert np.array_equal(gaussians.means, points)
-    assert curve[-1, 2] > curve[0, 2]  # colours, sizes and opacities are fitted all the same
+    assert curve[-1, 2] > curve[0, 2]  # colours, sizes and opacities are still fitted
     assert len(set(gaussians.opacities.round(3))) > 50
 
 
-def test_frozen_points_must_be_there(scene):
+def test_frozen_points_must_exist_and_be_finite(scene):
     broken = scene.points_xyz.copy()
     broken[0] = np.nan
     settings = SETTINGS.model_copy(update={"initial": "frozen"})
@@ -164,9 +181,7 @@ def test_images_grow_from_a_quarter_to_their_size():
 
 def test_rate_of_the_means_falls_exponentially():
     settings = GaussiansSettings(means_rate=1e-2, means_rate_last=1e-4)
-    assert means_rate(settings, 0.0) == pytest.approx(1e-2)
-    assert means_rate(settings, 0.5) == pytest.approx(1e-3)
-    assert means_rate(settings, 1.0) == pytest.approx(1e-4)
+    assert [means_rate(settings, at) for at in (0.0, 0.5, 1.0)] == pytest.approx([1e-2, 1e-3, 1e-4])
 
 
 def test_scene_without_training_views_is_refused(scene):
@@ -177,16 +192,18 @@ def test_scene_without_training_views_is_refused(scene):
 
 def two_gaussians() -> dict[str, np.ndarray]:
     """A small one (largest axis 0.001) and a large one (0.1)."""
-    return {
-        "means": np.float32([[0, 0, 0], [1, 0, 0]]),
-        "log_scales": np.log(np.float32([[0.001] * 3, [0.1, 0.05, 0.05]])),
-        "quats": np.float32([[1, 0, 0, 0]] * 2),
-        "opacity_logits": np.float32([0, 1]),
-        "sh": np.zeros((2, 1, 3), np.float32),
-    }
+    two = vars(round_gaussians(np.array([[0, 0, 0], [1, 0, 0]])))
+    return two | {"log_scales": np.log(np.float32([[0.001] * 3, [0.1, 0.05, 0.05]]))}
 
 
-def test_small_is_cloned_and_large_is_split():
+def gradients_of(adam: Adam, value: float) -> Gradients:
+    """Gradients that have one value everywhere."""
+    by_name = {name: np.full_like(values, value) for name, values in adam.parameters.items()}
+    features, means_px = (np.zeros((len(adam), width), np.float32) for width in (0, 2))
+    return Gradients(**by_name, features=features, means_px=means_px)
+
+
+def test_small_gaussians_are_cloned_and_large_ones_split():
     adam = Adam.start(two_gaussians())
     settings = GaussiansSettings(densify_gradient=0.5)
     densify(adam, ScreenGradients(np.ones(2), np.ones(2, np.int32)), settings, 1.0, np.random.default_rng(0))
@@ -197,7 +214,7 @@ def test_small_is_cloned_and_large_is_split():
     assert not np.array_equal(adam.parameters["means"][2], adam.parameters["means"][3])
 
 
-def test_the_cap_takes_the_largest_gradient_first():
+def test_the_largest_gradient_comes_first_at_the_cap():
     adam = Adam.start(two_gaussians())
     settings = GaussiansSettings(densify_gradient=0.5).model_copy(update={"max_gaussians": 3})
     gradients = ScreenGradients(np.array([1.0, 2.0]), np.ones(2, np.int32))
@@ -207,7 +224,7 @@ def test_the_cap_takes_the_largest_gradient_first():
     np.testing.assert_allclose(widths, [0.001, 0.0625, 0.0625], rtol=1e-5)
 
 
-def test_transparent_and_huge_are_pruned_and_opacity_is_reset():
+def test_transparent_and_huge_gaussians_are_pruned_and_opacity_is_reset():
     adam = Adam.start(two_gaussians())
     adam.parameters["opacity_logits"][0] = -6  # opacity 0.0025 < 0.005
     prune(adam, GaussiansSettings(), extent=1.0)
@@ -222,17 +239,167 @@ def test_screen_gradient_is_in_units_of_half_the_image():
     gradients = ScreenGradients.start(1)
     for _ in range(2):
         gradients.add(np.float32([[3e-3, 2e-3]]), np.array([True]), (40, 20))
-    # x times 10, y times 20: (0.03, 0.04) has length 0.05, the same in both steps
+    # x times 10, y times 20: (0.03, 0.04) has length 0.05 in both steps
     assert gradients.mean()[0] == pytest.approx(0.05, rel=1e-6)
 
 
 def test_first_adam_step_moves_by_the_rate_against_the_sign():
     adam = Adam.start(two_gaussians())
     before = {name: values.copy() for name, values in adam.parameters.items()}
-    ones = {name: np.ones_like(values) for name, values in before.items()}
-    features, means_px = np.zeros((2, 0), np.float32), np.zeros((2, 2), np.float32)
-    gradients = Gradients(**ones, features=features, means_px=means_px)
-    adam.step(gradients, GaussiansSettings(scales_rate=0.01, sh_rate=2.5e-3), rate_of_means=3.2e-4, threads=1)
+    settings = GaussiansSettings(scales_rate=0.01, sh_rate=2.5e-3)
+    adam.step(gradients_of(adam, 1.0), settings, rate_of_means=3.2e-4, threads=1)
     np.testing.assert_allclose(before["means"] - adam.parameters["means"], 3.2e-4, rtol=1e-3)
     np.testing.assert_allclose(before["log_scales"] - adam.parameters["log_scales"], 0.01, rtol=1e-3)
     np.testing.assert_allclose(before["sh"] - adam.parameters["sh"], 2.5e-3, rtol=1e-3)
+
+
+MCMC = GaussiansSettings(strategy="mcmc")
+NO_GROWTH = MCMC.model_copy(update={"mcmc_growth": 0.0})
+
+
+def row_of_gaussians(opacity: list[float], scale: float = 0.2) -> dict[str, np.ndarray]:
+    n = len(opacity)
+    row = vars(round_gaussians(np.arange(n)[:, None] * np.eye(1, 3), log_scale=math.log(scale)))
+    sh = np.arange(3 * n, dtype=np.float32).reshape(n, 1, 3)
+    return row | {"opacity_logits": logit(np.array(opacity)).astype(np.float32), "sh": sh}
+
+
+def started(parameters: dict[str, np.ndarray]) -> Adam:
+    """Return Adam with copies of the parameters."""
+    return Adam.start({name: values.copy() for name, values in parameters.items()})
+
+
+def test_gaussians_that_share_a_place_cover_what_one_covered():
+    # 1 - (1 - 0.5)^2 = 0.75
+    assert shared_opacity(np.array([0.75]), np.array([2]))[0] == pytest.approx(0.5)
+    old, number = np.array([0.01, 0.3, 0.9, 0.999, 0.7]), np.array([2, 3, 7, 51, 1])
+    np.testing.assert_allclose(1 - (1 - shared_opacity(old, number)) ** number, old, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("opacity", "number"), [(0.3, 1), (0.3, 2), (0.8, 5), (0.99, 20), (0.999, 51)])
+def test_scale_factor_is_the_papers_double_sum_and_keeps_the_integral(opacity, number):
+    new = 1 - (1 - opacity) ** (1 / number)
+    total = 0.0
+    for i in range(1, number + 1):
+        for k in range(i):
+            total += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+    found = scale_factor(np.array([opacity]), np.array([new]), np.array([number]))[0]
+    assert found == pytest.approx(opacity / total, rel=1e-9)
+    # the profile keeps its integral
+    x = np.linspace(-12, 12, 24001)
+    one = opacity * np.exp(-(x**2) / 2)
+    many = 1 - (1 - new * np.exp(-((x / found) ** 2) / 2)) ** number
+    assert np.trapezoid(many, x) == pytest.approx(np.trapezoid(one, x), rel=1e-6)
+
+
+def test_relocation_hardly_changes_the_picture():
+    parameters = row_of_gaussians([0.6, 0.001])
+    parameters["means"] = np.float32([[0, 0, 0], [0.1, 0.3, 0]])
+    parameters["sh"] = np.float32([[[1, 0, -1]], [[0, 1, 0]]])
+    adam = started(parameters)
+    relocate_and_grow(adam, NO_GROWTH, np.random.default_rng(0))
+    np.testing.assert_array_equal(adam.parameters["means"], 0)
+    np.testing.assert_allclose(opacities(adam), 1 - math.sqrt(0.4), rtol=1e-5)
+    pose = np.eye(4)
+    pose[2, 3] = 3
+    camera = Camera("v", pose, np.array([[60, 0, 24], [0, 60, 24], [0, 0, 1.0]]), (48, 48))
+
+    def picture(values: dict[str, np.ndarray]) -> np.ndarray:
+        return render(Gaussians(**values), camera).color
+
+    before, after = picture(parameters), picture(adam.parameters)
+    # equal at the centre; the profile's shape changes a little (paper, Fig. 3), its sum does not
+    np.testing.assert_allclose(after[24, 24], before[24, 24], atol=0.01)
+    assert np.abs(after - before).max() < 0.03
+    assert after.sum() == pytest.approx(before.sum(), rel=0.05)
+
+
+def test_dead_gaussians_move_onto_live_ones_and_moments_are_reset():
+    adam = Adam.start(row_of_gaussians([0.9, 0.004, 0.5, 0.001]))
+    for table in (adam.first, adam.second):
+        for values in table.values():
+            values[:] = 1
+    relocate_and_grow(adam, NO_GROWTH, np.random.default_rng(1))
+    assert len(adam) == 4
+    assert set(adam.parameters["means"][:, 0]) <= {0.0, 2.0}
+    moved = adam.parameters["means"][[1, 3], 0]
+    for source in (0, 2):
+        members = np.flatnonzero(adam.parameters["means"][:, 0] == source)
+        covered = 1 - np.prod(1 - opacities(adam)[members])
+        assert covered == pytest.approx([0.9, None, 0.5][source], rel=1e-4)
+        touched = source in moved
+        assert (adam.first["means"][members] == (0 if touched else 1)).all()
+
+
+@pytest.mark.parametrize(("min_opacity", "opacity"), [(0.005, 0.1), (0.003, 0.1), (0.1, 0.6), (0.5, 0.9)])
+def test_gaussians_that_share_a_place_stay_alive(min_opacity, opacity):
+    # an equal share for 51 would be 0.002, 0.002, 0.018 or 0.044: below each threshold
+    adam = Adam.start(row_of_gaussians([opacity] + [min_opacity / 2] * 200))
+    settings = NO_GROWTH.model_copy(update={"min_opacity": min_opacity})
+    relocate_and_grow(adam, settings, np.random.default_rng(0))
+    assert (opacities(adam) > min_opacity).all()
+    np.testing.assert_allclose(opacities(adam), min_opacity, rtol=1e-5)
+    before = {name: values.copy() for name, values in adam.parameters.items()}
+    relocate_and_grow(adam, settings, np.random.default_rng(1))
+    for name, values in before.items():
+        np.testing.assert_array_equal(adam.parameters[name], values)
+
+
+def test_growth_is_a_share_and_stops_at_the_cap():
+    adam = Adam.start(row_of_gaussians([0.5] * 40))
+    settings = MCMC.model_copy(update={"mcmc_growth": 0.05, "max_gaussians": 43})
+    relocate_and_grow(adam, settings, np.random.default_rng(0))
+    assert len(adam) == 42  # 5 % of 40
+    for _ in range(2):
+        relocate_and_grow(adam, settings, np.random.default_rng(0))
+        assert len(adam) == 43
+    # each place keeps its opacity, however many Gaussians share it
+    for place in range(40):
+        members = adam.parameters["means"][:, 0] == place
+        assert 1 - np.prod(1 - opacities(adam)[members]) == pytest.approx(0.5, rel=1e-4)
+
+
+def test_places_are_drawn_by_their_opacity():
+    adam = Adam.start(row_of_gaussians([0.8, 0.2] + [0.0001] * 4000))
+    relocate_and_grow(adam, NO_GROWTH, np.random.default_rng(0))
+    share = (adam.parameters["means"][2:, 0] == 0).mean()
+    assert share == pytest.approx(0.8, abs=0.02)  # standard error 0.006
+
+
+def test_noise_is_normal_numbers_times_the_covariance_and_spares_opaque_gaussians():
+    opacity = np.array([0.004, 0.005, 0.015] * 10 + [0.99] * 2)
+    parameters = row_of_gaussians(opacity.tolist())
+    generator = np.random.default_rng(2)
+    parameters["log_scales"] = np.log(generator.uniform(0.001, 0.02, (32, 3))).astype(np.float32)
+    parameters["quats"] = (3 * generator.normal(size=(32, 4))).astype(np.float32)
+    adam = started(parameters)
+    add_noise(adam, MCMC, 1e-4, 2.0, np.random.default_rng(0))
+    normal = np.random.default_rng(0).standard_normal((32, 3), dtype=np.float32)
+    root = rotation_matrices(parameters["quats"]) * np.exp(parameters["log_scales"].astype(float))[:, None]
+    gate = expit(-100 * (opacity - 0.005))[:, None]
+    # lengths in units of the extent 2, and back
+    expected = 5e5 * 1e-4 * gate * np.einsum("nij,nkj,nk->ni", root, root, normal) / 2
+    # means lie up to 30 from 0, where float32 steps by 2e-6
+    np.testing.assert_allclose(adam.parameters["means"] - parameters["means"], expected, atol=2e-6)
+    np.testing.assert_array_equal(adam.parameters["means"][30:], parameters["means"][30:])
+
+
+def test_noise_does_not_depend_on_the_unit_of_the_scene():
+    shifts = []
+    for size in (1.0, 10.0):
+        parameters = row_of_gaussians([0.004] * 5, scale=0.02 * size)
+        parameters["means"] *= size
+        adam = started(parameters)
+        add_noise(adam, MCMC, 1e-4, 3.0 * size, np.random.default_rng(0))
+        shifts.append((adam.parameters["means"] - parameters["means"])[0] / size)
+    np.testing.assert_allclose(shifts[1], shifts[0], rtol=1e-4)
+
+
+def test_regularisers_add_the_gradient_of_mean_opacity_and_mean_scale():
+    adam = Adam.start(row_of_gaussians([0.5, 0.2], scale=0.3))
+    gradients = gradients_of(adam, 0.0)
+    settings = MCMC.model_copy(update={"mcmc_opacity_weight": 0.1, "mcmc_scale_weight": 0.6})
+    add_regularisers(adam, gradients, settings, extent=2.0)
+    # 0.1 / 2 x o (1 - o); 0.6 / (3 x 2) x 0.3 / 2
+    np.testing.assert_allclose(gradients.opacity_logits, [0.05 * 0.25, 0.05 * 0.16], rtol=1e-5)
+    np.testing.assert_allclose(gradients.log_scales, 0.015, rtol=1e-5)

@@ -25,7 +25,7 @@ def shuffled_ring(number: int) -> list[Camera]:
     return [cameras[cameras.names[row]] for row in order]
 
 
-def test_path_of_a_ring_goes_once_round_whatever_the_order():
+def test_the_closed_path_circles_a_ring_once_in_any_order():
     path = closed_path(shuffled_ring(24), 60)
     centres = np.stack([camera.centre for camera in path])
     radius = np.linalg.norm(centres[:, :2], axis=1)
@@ -59,7 +59,7 @@ def test_an_open_path_goes_through_its_cameras_in_their_order():
         np.testing.assert_allclose(np.linalg.det(camera.cam_from_world[:3, :3]), 1)
 
 
-def test_hand_shake_is_smoothed():
+def test_camera_shake_is_smoothed():
     steady = ring(40, 48)
     generator = np.random.default_rng(0)
     shaky = []
@@ -75,13 +75,10 @@ def test_hand_shake_is_smoothed():
     assert jerk(walked) < 0.4 * jerk(np.stack([camera.centre for camera in shaky]))
 
 
-def test_one_camera_stays_where_it_is():
+def test_one_camera_is_repeated_and_opposite_cameras_do_not_break_the_path():
     camera = ring(1, 48)["000.png"]
     for stop in closed_path([camera], 5) + open_path([camera, camera], 3):
         np.testing.assert_allclose(stop.cam_from_world, camera.cam_from_world, atol=1e-9)
-
-
-def test_opposite_cameras_do_not_break_the_path():
     cameras = ring(2, 48)
     for camera in closed_path([cameras[name] for name in cameras.names], 16):
         assert np.isfinite(camera.cam_from_world).all()
@@ -112,13 +109,10 @@ def test_the_film_shows_every_frame_and_the_sheet_every_tenth(tmp_path):
     assert Image.open(tmp_path / "flyaround.png").size == (4 * 52, 3 * 52)
 
 
-def test_frames_of_odd_sides_lose_a_row_or_column(tmp_path):
+def test_odd_sides_are_cropped_and_equal_frames_give_equal_bytes(tmp_path):
     write_film(tmp_path / "a.mp4", np.random.default_rng(0).integers(0, 255, (3, 47, 61, 3), np.uint8), 24)
     with av.open(tmp_path / "a.mp4") as film:
         assert [frame.to_ndarray(format="rgb24").shape for frame in film.decode(video=0)] == [(46, 60, 3)] * 3
-
-
-def test_the_same_frames_give_the_same_bytes(tmp_path):
     tile = np.random.default_rng(0).integers(0, 255, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
     frames = [np.roll(tile, 3 * shift, axis=1).astype(np.uint8) for shift in range(40)]
     written = set()
@@ -128,10 +122,11 @@ def test_the_same_frames_give_the_same_bytes(tmp_path):
     assert len(written) == 1
 
 
-def test_sheet_shrinks_by_averages():
+def test_sheet_shrinks_by_averages(monkeypatch):
+    monkeypatch.setattr(flyaround, "MAX_SIDE_PX", 4)
     picture = np.zeros((6, 8, 3), np.uint8)
     picture[:, ::2] = 100
-    sheet = contact_sheet([picture, picture], columns=1, max_side_px=4)
+    sheet = contact_sheet([picture, picture], columns=1)
     assert sheet.shape == (2 * 7, 8, 3)
     assert (sheet[:3, :4] == 50).all()
     assert (sheet[3:7] == 255).all()

@@ -1,19 +1,21 @@
-"""What the CPU backend promises beyond the numbers: threads, bands of tiles, the notice, the device."""
+"""Threads, bands of tiles, notice and choice of the device; the CUDA backend without a device."""
 
 import logging
 import subprocess
 import sys
 from dataclasses import replace
 
+import gsplat
 import numpy as np
 import pytest
 
 from hilsplat.base.errors import DeviceError
-from hilsplat.splat.rasterise import binning
+from hilsplat.splat.rasterise import binning, cuda, device
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.binning import bin_gaussians, fill_lists
-from hilsplat.splat.rasterise.device import choose_device, cuda_problem
+from hilsplat.splat.rasterise.device import choose_device
 from hilsplat.splat.rasterise.project import GEOMETRY
+from tests.unit.splat import gsplat_on_cpu
 from tests.unit.splat.rasterise_scenes import camera, random_gaussians
 
 
@@ -42,7 +44,7 @@ def test_bands_of_tiles_give_the_same_bytes(monkeypatch, max_entries):
         np.testing.assert_array_equal(one, in_bands)
 
 
-def test_bands_cover_all_tiles_and_hold_no_more_than_the_limit(monkeypatch):
+def test_bands_cover_all_tiles_within_the_limit(monkeypatch):
     tiles = binning.Tiles(2, np.empty(0, np.int32), np.array([0, 3, 3, 10, 12, 13]))
     assert tiles.bands() == [(0, 5)]
     monkeypatch.setattr(binning, "MAX_ENTRIES", 5)
@@ -72,7 +74,7 @@ def test_tiles_list_the_boxes_that_touch_them_front_to_back():
         assert gaussian[tiles.tile_start[tile] : tile_end[tile]].tolist() == expected
 
 
-def test_a_tile_that_only_the_box_of_a_needle_touches_does_not_list_it():
+def test_a_tile_lists_only_gaussians_that_reach_its_pixels():
     # along the diagonal of 2 x 2 tiles, (x - y)^2 / 2 px^2: the other two tiles are 1.5 px away at least
     box, order = np.array([[0, 31, 0, 31]], np.int32), np.zeros(1, np.int32)
     geometry = np.zeros((1, GEOMETRY), np.float32)
@@ -84,7 +86,7 @@ def test_a_tile_that_only_the_box_of_a_needle_touches_does_not_list_it():
     assert reach[0] & 0b1000_0100_0010_0001 == 0b1000_0100_0010_0001  # its blocks on the diagonal
 
 
-def test_gaussians_in_any_memory_order_give_the_same_picture():
+def test_gaussians_in_any_memory_order_give_the_same_weights():
     gaussians, view = random_gaussians(40, 2), camera(30, 20)
     turned = replace(gaussians, sh=np.asfortranarray(gaussians.sh), means=np.asfortranarray(gaussians.means))
     same, other = (pixel_weights(each, view, min_weight=0.0) for each in (gaussians, turned))
@@ -119,31 +121,53 @@ def test_compiling_is_announced_once_and_only_when_it_happens(tmp_path):
 
 @pytest.fixture
 def no_cuda(monkeypatch):
-    """A machine with gsplat but without CUDA, whatever this one has."""
-    monkeypatch.setattr("hilsplat.splat.rasterise.device.find_spec", lambda name: name)
-    monkeypatch.setattr("hilsplat.splat.rasterise.device._has_driver", lambda: True)
+    """Simulate a machine with gsplat but without CUDA."""
+    monkeypatch.setattr(device, "find_spec", lambda name: name)
+    monkeypatch.setattr(device, "_has_driver", lambda: True)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    for cached in (cuda_problem, choose_device):
+    for cached in (device.cuda_problem, choose_device):
         cached.cache_clear()
     yield
-    for cached in (cuda_problem, choose_device):
+    for cached in (device.cuda_problem, choose_device):
         cached.cache_clear()
 
 
 @pytest.mark.usefixtures("no_cuda")
-def test_auto_takes_the_cpu_without_cuda_and_says_so_once(caplog):
+def test_without_cuda_auto_selects_the_cpu_and_cuda_is_an_error(caplog):
     with caplog.at_level(logging.INFO):
         assert choose_device("auto") == choose_device("auto") == "cpu"
     assert caplog.text.count("rasterising on cpu (device: auto") == 1
     assert "finds no CUDA device" in caplog.text
+    with pytest.raises(DeviceError, match=r"device: cuda was requested(?s:.*)finds no CUDA device(?s:.*)gpu"):
+        choose_device("cuda")
 
 
-def test_the_cpu_is_chosen_without_a_check_for_cuda(monkeypatch):
-    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: pytest.fail("it ran"))
+def test_the_cpu_is_selected_without_a_check_for_cuda(monkeypatch):
+    monkeypatch.setattr(device, "cuda_problem", lambda: pytest.fail("it ran"))
     assert choose_device.__wrapped__("cpu") == "cpu"
 
 
-@pytest.mark.usefixtures("no_cuda")
-def test_cuda_is_never_replaced_by_the_cpu():
-    with pytest.raises(DeviceError, match=r"device: cuda was requested(?s:.*)finds no CUDA device(?s:.*)gpu"):
-        choose_device("cuda")
+# ---- CUDA backend with gsplat's reference implementation in torch ----------------------------------
+
+
+@pytest.fixture
+def without_device(monkeypatch):
+    """gsplat's reference functions in place of its kernels."""
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    for name in ("rasterization", "spherical_harmonics", "rasterize_to_indices_in_range"):
+        monkeypatch.setattr(gsplat, name, getattr(gsplat_on_cpu, name))
+
+
+@pytest.mark.usefixtures("without_device")
+def test_gsplats_reference_draws_what_our_kernels_draw():
+    assert device.disagreement("cpu", "cuda") is None
+
+
+@pytest.mark.usefixtures("without_device")
+@pytest.mark.parametrize(
+    ("name", "value", "what"),
+    [("LOW_PASS_PX2", 0.6, "image"), ("NEAR", 1.0, "image"), ("MAX_ALPHA", 0.5, "weights")],
+)
+def test_the_self_test_detects_other_conventions(monkeypatch, name, value, what):
+    monkeypatch.setattr(cuda, name, value)
+    assert what in device.disagreement("cpu", "cuda")

@@ -33,7 +33,7 @@ def ring(number: int, size: int) -> Cameras:
 
 
 def three_gaussians() -> Gaussians:
-    """What there is to see."""
+    """The true Gaussians."""
     return Gaussians(
         np.array([[0.4, 0, 0], [-0.4, 0.2, 0.1], [0, -0.4, 0.3]], np.float32),
         np.log(np.array([[0.3, 0.2, 0.2], [0.15, 0.3, 0.2], [0.2, 0.2, 0.35]], np.float32)),

@@ -1,4 +1,4 @@
-"""Ready-made Gaussians replace a fit: as other programs write them, in the source's coordinates."""
+"""Similarity transforms of Gaussians, and their import as other programs write them."""
 
 import json
 import shutil
@@ -11,15 +11,104 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from hilsplat.base.artifacts import read_json, write_json
-from hilsplat.base.errors import ArtifactError, SceneError
+from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError
+from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.coordinates import import_gaussians, write_source_ply
+from hilsplat.splat.coordinates import (
+    decompose,
+    import_gaussians,
+    move_gaussians,
+    sh_basis,
+    sh_rotation,
+    write_source_ply,
+)
 from hilsplat.splat.fit import run_gaussians
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.ply import load_ply, save_ply
-from hilsplat.splat.similarity import move_gaussians
+from hilsplat.splat.rasterise.api import render
+from tests.unit.splat.rasterise_scenes import camera, random_gaussians
+from tests.unit.splat.reference import SH
 from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians, three_gaussians_scene
+
+
+def turned(seed: int) -> np.ndarray:
+    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+
+
+def directions(number: int) -> np.ndarray:
+    values = np.random.default_rng(5).normal(size=(number, 3))
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def test_basis_is_that_of_3dgs():
+    d = directions(30)
+    expected = np.stack([harmonic(*d.T) for harmonic in SH], axis=1)
+    np.testing.assert_allclose(sh_basis(d, 3), expected, atol=1e-14)
+
+
+def test_linear_band_rotates_like_a_vector():
+    # about z by 90 degrees: what was along x is along y. 3DGS: row 1 is -y, row 2 is z, row 3 is -x
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    along_x = np.array([0, 0, 0, -1.0])
+    np.testing.assert_allclose(sh_rotation(quarter, 1) @ along_x, [0, -1, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rotated_harmonics_have_the_old_colour_along_the_rotated_direction(degree):
+    rotation, d = turned(degree), directions(50)
+    coefficients = np.random.default_rng(1).normal(size=(degree + 1) ** 2)
+    before = sh_basis(d, degree) @ coefficients
+    after = sh_basis(d @ rotation.T, degree) @ (sh_rotation(rotation, degree) @ coefficients)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_rendered_view_is_unchanged_under_a_similarity(degree):
+    gaussians, view = random_gaussians(60, degree, degree), camera()
+    similarity = np.eye(4)
+    similarity[:3, :3] = 0.37 * turned(7)
+    similarity[:3, 3] = (5.0, -3.0, 2.0)
+    before = render(gaussians, view)
+    moved = replace(view, cam_from_world=move_cameras(view.cam_from_world[None], similarity)[0])
+    after = render(move_gaussians(gaussians, similarity), moved)
+    assert before.alpha.mean() > 0.2
+    # float32 parameters; a pixel at the cut of 1/255 may fall on either side
+    np.testing.assert_allclose(after.color, before.color, atol=5e-3)
+    assert np.abs(after.color - before.color).mean() < 1e-5
+
+
+def test_a_similarity_and_its_inverse_cancel():
+    gaussians = random_gaussians(40)
+    similarity = np.eye(4)
+    similarity[:3, :3] = 4 * turned(3)
+    similarity[:3, 3] = (1, 2, 3)
+    back = move_gaussians(move_gaussians(gaussians, similarity), np.linalg.inv(similarity))
+    for name in ("means", "log_scales", "opacity_logits", "sh"):
+        np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), atol=1e-5)
+    # a quaternion and its negative are the same rotation
+    first, second = (
+        quats / np.linalg.norm(quats, axis=1)[:, None] for quats in (back.quats, gaussians.quats)
+    )
+    np.testing.assert_allclose(np.abs((first * second).sum(axis=1)), 1, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.0, 2.0, 1.0, 1.0]), np.full((4, 4), np.nan)],
+    ids=["mirrors", "stretches", "not finite"],
+)
+def test_a_matrix_that_is_not_a_similarity_is_refused(matrix):
+    with pytest.raises(HilsplatError, match="not a similarity"):
+        decompose(matrix)
+
+
+def test_a_similarity_is_decomposed():
+    scale, rotation, translation = decompose(np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert scale == pytest.approx(2, rel=1e-12)
+    np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+    assert translation.tolist() == [0, 0, 0]
+
 
 COMPARED = ("means", "log_scales", "opacity_logits", "sh")
 """All fields but the quaternions: a quaternion and its negative are the same rotation."""
@@ -27,7 +116,7 @@ COMPARED = ("means", "log_scales", "opacity_logits", "sh")
 
 @pytest.fixture(scope="module")
 def turned_scene(tmp_path_factory) -> Scene:
-    """The three Gaussians, whose source was turned, six times as large and elsewhere."""
+    """The three Gaussians, with a source that is rotated, six times as large and shifted."""
     transform = np.eye(4)
     transform[:3, :3] = Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix() / 6
     transform[:3, 3] = (0.5, -1.0, 2.0)
@@ -61,16 +150,13 @@ def stage_output(scene: Scene, existing: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def out(turned_scene, source_ply, tmp_path) -> Path:
-    """The folder with PLY, JSON and report of the imported Gaussians."""
+def out(turned_scene, source_ply, tmp_path, monkeypatch) -> Path:
+    """The folder with PLY, JSON and report of the imported Gaussians; a fit would fail."""
+    monkeypatch.setattr("hilsplat.splat.fit.fit_gaussians", None)
     return stage_output(turned_scene, source_ply, tmp_path)
 
 
-def test_the_stage_reports_on_imported_gaussians_without_a_fit(
-    turned_scene, source_ply, tmp_path, monkeypatch
-):
-    monkeypatch.setattr("hilsplat.splat.fit.fit_gaussians", None)
-    out = stage_output(turned_scene, source_ply, tmp_path)
+def test_the_stage_reports_on_imported_gaussians_without_a_fit(out):
     report = read_json(out / "report" / "report.json")
     assert report["origin"]["kind"] == "imported"
     assert report["origin"]["file"] == "theirs.ply"
@@ -80,18 +166,15 @@ def test_the_stage_reports_on_imported_gaussians_without_a_fit(
     assert not (out / "report" / "curves.png").exists()
     assert (out / "report" / "flyaround.png").is_file()
     assert read_json(out / "g.json")["origin"]["kind"] == "imported"
-    # the written PLY and its JSON lead back to where the existing one was
-    again = move_gaussians(load_ply(out / "g.ply"), np.array(read_json(out / "g.json")["source_from_scene"]))
-    np.testing.assert_allclose(again.means, load_ply(source_ply).means, atol=1e-4)
 
 
-def test_gaussians_elsewhere_are_reported(turned_scene, tmp_path):
+def test_gaussians_in_other_coordinates_are_reported(turned_scene, tmp_path):
     save_ply(tmp_path / "elsewhere.ply", three_gaussians())
     out = stage_output(turned_scene, tmp_path / "elsewhere.ply", tmp_path)
     assert "other coordinates" in read_json(out / "report" / "report.json")["warnings"][0]
 
 
-def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, source_ply, out):
+def test_a_ply_of_this_package_is_moved_by_the_json_beside_it(turned_scene, source_ply, out):
     again, origin = import_gaussians(out / "g.ply", turned_scene)
     np.testing.assert_allclose(again.means, three_gaussians().means, atol=1e-5)
     assert "JSON" in origin["taken_as"]
@@ -104,11 +187,7 @@ def test_a_ply_of_this_package_returns_through_the_json_beside_it(turned_scene, 
 
 
 def nerfstudio_run(folder: Path, how: str) -> tuple[np.ndarray, dict[str, Path]]:
-    """Training coordinates as nerfstudio's data parser chooses and records them.
-
-    Returns:
-        training_from_source, and the files that describe it.
-    """
+    """Return training_from_source as nerfstudio's data parser chooses it, and the files that describe it."""
     orient = np.eye(4)  # of the poses in transforms.json: turned upright and centred
     orient[:3, :3] = Rotation.from_rotvec([0.7, 0.2, -1.1]).as_matrix()
     orient[:3, 3] = (3.0, -1.0, 0.5)
@@ -116,7 +195,7 @@ def nerfstudio_run(folder: Path, how: str) -> tuple[np.ndarray, dict[str, Path]]
     applied = np.eye(4)
     applied[:3] = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]  # by ns-process-data, from COLMAP
     applied_scale = 2.5 if how == "applied" else 1.0
-    content = {} if how != "applied" else {"applied_transform": applied[:3].tolist(), "applied_scale": 2.5}
+    content = {"applied_transform": applied[:3].tolist(), "applied_scale": 2.5} if how == "applied" else {}
     if how == "old":
         (folder / "colmap/sparse/0").mkdir(parents=True)
     if how == "colmap":
@@ -124,16 +203,14 @@ def nerfstudio_run(folder: Path, how: str) -> tuple[np.ndarray, dict[str, Path]]
     write_json(folder / "transforms.json", {**content, "frames": []})
     recorded = {"transform": (orient @ applied)[:3].tolist(), "scale": scale * applied_scale}
     write_json(folder / "dataparser_transforms.json", recorded)
-    training_from_source = np.diag([scale, scale, scale, 1.0]) @ orient
     files = {"dataparser": folder / "dataparser_transforms.json"}
-    return training_from_source, files if how == "colmap" else {
-        **files,
-        "transforms": folder / "transforms.json",
-    }
+    if how != "colmap":
+        files["transforms"] = folder / "transforms.json"
+    return np.diag([scale, scale, scale, 1.0]) @ orient, files
 
 
 @pytest.mark.parametrize("how", ["applied", "old", "colmap"])
-def test_nerfstudios_ply_is_as_sharp_as_its_source(turned_scene, source_ply, tmp_path, how):
+def test_a_nerfstudio_ply_is_moved_to_scene_coordinates(turned_scene, source_ply, tmp_path, how):
     training_from_source, files = nerfstudio_run(tmp_path / "run", how)
     save_ply(tmp_path / "splat.ply", move_gaussians(load_ply(source_ply), training_from_source))
     existing, origin = import_gaussians(tmp_path / "splat.ply", turned_scene, **files)
@@ -147,7 +224,7 @@ def test_nerfstudios_ply_is_as_sharp_as_its_source(turned_scene, source_ply, tmp
     "content",
     ["[", "[]", {"transform": [[1, 0]], "scale": 1}, {"transform": np.eye(3, 4).tolist(), "scale": 0}],
 )
-def test_a_damaged_record_of_nerfstudio_is_named(turned_scene, source_ply, tmp_path, content):
+def test_a_damaged_dataparser_file_is_named(turned_scene, source_ply, tmp_path, content):
     path = tmp_path / "dataparser_transforms.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(SceneError, match=r"dataparser_transforms\.json"):
@@ -180,7 +257,7 @@ DIALECTS = {
     "no normals (gsplat)": lambda c: {k: v for k, v in c.items() if k not in ("nx", "ny", "nz")},
     "backwards": lambda c: dict(reversed(c.items())),
     "doubles": lambda c: {k: v.astype(np.float64) for k, v in c.items()},
-    "bytes of colour (nerfstudio)": lambda c: {
+    "colours as bytes (nerfstudio)": lambda c: {
         **c,
         **{name: np.full(len(c["x"]), 7, np.uint8) for name in ("red", "green", "blue", "label")},
     },
@@ -190,7 +267,7 @@ DIALECTS = {
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
 @pytest.mark.parametrize("dialect", DIALECTS)
 @pytest.mark.parametrize("bases", [1, 4, 9, 16])
-def test_dialects_of_other_programs_are_read(tmp_path, dialect, bases, text):
+def test_plys_of_other_programs_are_read(tmp_path, dialect, bases, text):
     gaussians = three_gaussians()
     sh = np.random.default_rng(bases).standard_normal((3, bases, 3), np.float32)
     gaussians = replace(gaussians, sh=sh)
@@ -222,7 +299,7 @@ def changed(columns: dict, value: float, *names: str) -> dict:
         (lambda c: {k: v[:0] for k, v in c.items()}, "does not hold any Gaussians"),
     ],
 )
-def test_what_cannot_be_used_is_named(turned_scene, source_ply, tmp_path, change, message):
+def test_an_unusable_ply_is_named(turned_scene, source_ply, tmp_path, change, message):
     path = rewritten(source_ply, tmp_path / "broken.ply", change)
     with pytest.raises(ArtifactError, match=message) as caught:
         import_gaussians(path, turned_scene)

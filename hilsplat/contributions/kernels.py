@@ -1,0 +1,226 @@
+"""Compiled loops that sum weights of Gaussians over masks, and products of weights over pixels."""
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from hilsplat.base.compiled import compiled
+
+SUMS = 4
+"""Numbers that are summed together: three sums, and the number of products added, 0 for a new pair."""
+
+
+@compiled
+def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, indices, data, num_gaussians):
+    """Sum weights over masks first..last, and count the summed pixels.
+
+    Args:
+        runs, offsets: as in `HierarchicalMasks`.
+        labels: painted mask of each pixel and level, -1 for none.
+        half: whether a pixel is in the random half.
+        indptr, indices, data: W; pixels without weights are ignored.
+
+    Returns:
+        pixel counts (masks x 2): painted ones and those in the half; row sizes, columns, and sums over the
+        raw mask, its painted pixels and their half (entries x 3, float64, summed in the order of the pixels).
+    """
+    sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
+    counts = np.zeros((last - first, 2), np.int64)
+    sizes = np.zeros(last - first, np.int64)
+    columns, values = np.empty(1024, np.int32), np.empty((1024, 3))
+    done = 0
+    for m in range(first, last):
+        count, pixel, level = 0, np.int64(0), level_index[m]
+        for run in range(offsets[m], offsets[m + 1]):
+            begin, pixel = pixel, pixel + np.int64(runs[run])
+            if (run - offsets[m]) % 2 == 0:
+                continue  # outside
+            for p in range(begin, pixel):
+                if indptr[p] == indptr[p + 1]:
+                    continue
+                painted = 1.0 if labels[p, level] == m else 0.0
+                in_half = painted if half[p] else 0.0
+                counts[m - first, 0] += painted > 0
+                counts[m - first, 1] += in_half > 0
+                for k in range(indptr[p], indptr[p + 1]):
+                    j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
+                    at, weight = np.int64(j) * SUMS, np.float64(data[k])
+                    if add_products(sums, at, 1.0, painted, in_half, weight) == 0:
+                        found[count] = np.int32(j)
+                        count += 1
+        found[:count] = np.sort(found[:count])
+        if done + count > len(columns):
+            columns, values = enlarged(columns, values, done, 2 * (done + count))
+        for k in range(count):
+            at = np.int64(found[k]) * SUMS
+            columns[done + k] = found[k]
+            values[done + k] = sums[at : at + 3]
+            sums[at : at + SUMS] = 0
+        done += count
+        sizes[m - first] = count
+    return counts, sizes, columns[:done], values[:done]
+
+
+@compiled
+def move_to_front(rows, indptr, indices, data):
+    """Move the weights of some rows of W to the front of its arrays, and return their number."""
+    done = 0
+    for row in rows:
+        for k in range(indptr[row], indptr[row + 1]):
+            indices[done], data[done] = indices[k], data[k]
+            done += 1
+    return done
+
+
+@compiled
+def transpose(indptr, indices, begins, pixels, places):
+    """Return each column's start, and the row and place of its values; `begins` must be zero."""
+    for k in range(indptr[-1]):
+        begins[indices[k] + 1] += 1
+    begins[:] = np.cumsum(begins)
+    filled = begins[:-1].copy()
+    for p in range(len(indptr) - 1):
+        for k in range(indptr[p], indptr[p + 1]):
+            at = filled[indices[k]]
+            pixels[at] = p
+            places[at] = k
+            filled[indices[k]] += 1
+
+
+@intrinsic
+def add_products(typingctx, sums, at, whole, part, subpart, value):
+    """Add three numbers times `value`, and 1, to the sums at `at`, as one vector; nothing is fused.
+
+    Returns the number of previous additions.
+    """
+
+    def codegen(context, builder, sig, args):
+        number, lane = ir.DoubleType(), ir.IntType(32)
+        four = ir.VectorType(number, SUMS)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
+        weights = values = ir.Constant(four, [ir.Constant(number, 1.0)] * SUMS)
+        for index, each in enumerate(args[2:5]):
+            weights = builder.insert_element(weights, each, ir.Constant(lane, index))
+            values = builder.insert_element(values, args[5], ir.Constant(lane, index))
+        before = builder.load(place, align=8)
+        builder.store(builder.fadd(before, builder.fmul(weights, values)), place, align=8)
+        return builder.extract_element(before, ir.Constant(lane, SUMS - 1))
+
+    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
+
+
+@compiled
+def enlarged(indices, values, kept, room):
+    """Return larger copies of both arrays with their first `kept` entries."""
+    more_indices = np.empty(room, np.int32)
+    more_values = np.empty((room, values.shape[1]), np.float64)
+    more_indices[:kept], more_values[:kept] = indices[:kept], values[:kept]
+    return more_indices, more_values
+
+
+@compiled
+def _load(first, last, indices, values, sums):
+    """Load pairs of a row into the sums, and mark them as known."""
+    levels = values.shape[1]
+    for k in range(first, last):
+        at = np.int64(indices[k]) * SUMS
+        for level in range(levels):
+            sums[at + level] = values[k, level]
+        sums[at + levels] = 1
+
+
+@compiled
+def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr, out_indices, out_values):
+    """Add the pixels of a part to rows begin..end of G.
+
+    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output.
+
+    Args:
+        part: row starts, columns and values of W, and whether a pixel counts at each level.
+        columns: output of `transpose` for the part: starts, pixels and places.
+        rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
+        sums: zero before and after the call; SUMS for each Gaussian.
+        fresh: buffer for all columns.
+        out_indptr, out_indices, out_values: late pairs; columns are sorted within rows.
+
+    Returns:
+        `out_indices` and `out_values`, or larger copies if they were too small.
+    """
+    indptr, indices, data, valid = part
+    begins, pixels, places = columns
+    row_indptr, row_indices, row_values = rows
+    late_indptr, late_indices, late_values = late
+    levels = row_values.shape[1]
+    done = 0
+    for i in range(begin, end):
+        first, last = row_indptr[i - begin], row_indptr[i - begin + 1]
+        old, old_end = late_indptr[i - begin], late_indptr[i - begin + 1]
+        count, shown = 0, begins[i] < begins[i + 1]
+        if shown:
+            _load(first, last, row_indices, row_values, sums)
+            _load(old, old_end, late_indices, late_values, sums)
+        for t in range(begins[i], begins[i + 1]):
+            p = pixels[t]
+            weight = np.float64(data[places[t]])
+            whole = weight if valid[p, 0] else 0.0
+            part_weight = weight if valid[p, 1] else 0.0
+            subpart = weight if valid[p, 2] else 0.0
+            for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
+                j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
+                at, value = np.int64(j) * SUMS, np.float64(data[k])
+                if add_products(sums, at, whole, part_weight, subpart, value) == 0:
+                    fresh[count] = np.int32(j)
+                    count += 1
+        if count:
+            fresh[:count] = np.sort(fresh[:count])
+        size = old_end - old + count
+        if done + size > len(out_indices):
+            out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
+        if shown:
+            for k in range(first, last):
+                at = np.int64(row_indices[k]) * SUMS
+                for level in range(levels):
+                    row_values[k, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
+            new = 0
+            for place in range(done, done + size):
+                if new < count and (old == old_end or fresh[new] < late_indices[old]):
+                    column = fresh[new]
+                    new += 1
+                else:
+                    column = late_indices[old]
+                    old += 1
+                at = np.int64(column) * SUMS
+                out_indices[place] = column
+                for level in range(levels):
+                    out_values[place, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
+        else:
+            out_indices[done : done + size] = late_indices[old:old_end]
+            out_values[done : done + size] = late_values[old:old_end]
+        done += size
+        out_indptr[i - begin + 1] = done
+    return out_indices, out_values
+
+
+@compiled
+def merge_rows(indptr, indices, values, late_indptr, late_indices, late_values):
+    """Merge late pairs into the rows, in place from the end; `indices` and `values` have room for all."""
+    at = indptr[-1] + late_indptr[-1]
+    for i in range(len(indptr) - 2, -1, -1):
+        k, t = indptr[i + 1] - 1, late_indptr[i + 1] - 1
+        if at == k + 1:
+            break  # no late pair is left
+        indptr[i + 1] = at
+        while k >= indptr[i] or t >= late_indptr[i]:
+            at -= 1
+            if t < late_indptr[i] or (k >= indptr[i] and indices[k] > late_indices[t]):
+                indices[at] = indices[k]
+                values[at] = values[k]
+                k -= 1
+            else:
+                indices[at] = late_indices[t]
+                values[at] = late_values[t]
+                t -= 1
