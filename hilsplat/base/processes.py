@@ -51,11 +51,6 @@ def _watch(parent: int) -> None:
     os._exit(1)
 
 
-def jobs_end_with_this_process() -> None:
-    """Make the commands that this process starts from this point end with it."""
-    os.environ[PARENT] = str(os.getpid())
-
-
 def end_with_workflow() -> None:
     """End this process with the Snakemake that started it; do nothing if a user started the command."""
     parent = os.environ.pop(PARENT, "")  # popped, because the children of this process have another parent
@@ -143,11 +138,10 @@ def remove_leftovers(folder: Path) -> list[Path]:
 def is_alive(pid: int) -> bool:
     """Return whether a process with this id exists."""
     try:
-        os.kill(pid, 0)
+        with suppress(PermissionError):
+            os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:
-        return True
     return True
 
 

@@ -26,7 +26,7 @@ import yaml
 from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.base.files import INSTALLED, project_path
-from hilsplat.base.processes import jobs_end_with_this_process, remove_leftovers
+from hilsplat.base.processes import PARENT, remove_leftovers
 from hilsplat.configuration import CONFIG, first_unusable, merged_config, parse_run
 from hilsplat.scene.sheet import DEFAULT_SHEET, SceneRow, read_sheet
 from hilsplat.workflow.estimate import forecasts
@@ -58,7 +58,7 @@ def prepare_process() -> TextIOWrapper | None:
     process holds it, Snakemake's locks are left over from a dead run.
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-    jobs_end_with_this_process()
+    os.environ[PARENT] = str(os.getpid())
     if os.environ.get(UNREGISTERED):
         return None
     with suppress(OSError):

@@ -55,10 +55,12 @@ class Project:
             **more,
         }
 
-    def snakemake(self, *words: str, cores: int = 2, check: bool = True) -> subprocess.CompletedProcess[str]:
-        """Run Snakemake with the CI configuration."""
-        command = [sys.executable, "-m", "snakemake", "--configfile", "config/ci.yaml", "--cores", str(cores)]
-        return self.run(*command, *words, check=check)
+    def snakemake(
+        self, *words: str, config: str = "ci", cores: int = 2, check: bool = True
+    ) -> subprocess.CompletedProcess[str]:
+        """Run Snakemake with a configuration of the project."""
+        command = [sys.executable, "-m", "snakemake", "--configfile", f"config/{config}.yaml"]
+        return self.run(*command, "--cores", str(cores), *words, check=check)
 
     def hilsplat_run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run `hilsplat run` with the CI configuration."""

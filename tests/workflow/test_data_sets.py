@@ -1,14 +1,13 @@
 """Published data sets in the workflow: absent ones are reported, labels are inputs of evaluation alone."""
 
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from hilsplat.evaluate.tables.build import TABLES
-from tests.workflow.conftest import Project, copy_project
+from tests.workflow.conftest import copy_project
 
 LABEL_OF = {
     "lerf/figurines": "data/lerf_ovs/label/figurines/frame_00041.json",
@@ -38,24 +37,17 @@ def planned(project, tmp_path_factory) -> str:
         data / "replica/replica/room_0/habitat/mesh_semantic.ply",
     )
     scan = data / "scannet/scans/scene0000_00"
+    mesh = "scene0000_00_vh_clean_2"
     names = (
-        "_vh_clean_2.ply",
-        "_vh_clean_2.labels.ply",
-        "_vh_clean_2.0.010000.segs.json",
-        ".aggregation.json",
+        f"{mesh}.ply",
+        f"{mesh}.labels.ply",
+        f"{mesh}.0.010000.segs.json",
+        "scene0000_00.aggregation.json",
     )
     touch(scan / "color/0.jpg", scan / "pose/0.txt", scan / "intrinsic/intrinsic_color.txt")
-    touch(*(scan / f"scene0000_00{name}" for name in names))
-    return run(copy, "data_root=data")
-
-
-def run(project: Project, *config: str) -> str:
-    command = [sys.executable, "-m", "snakemake", "-n", "--configfile", "config/paper.yaml"]
-    models = [
-        'masks={"model": "models/sam-tiny"}',
-        'clip={"model": "models/clip-tiny"}',
-    ]  # those that are here
-    result = project.run(*command, "--config", *models, *config, check=False)
+    touch(*(scan / name for name in names))
+    models = ('masks={"model": "models/sam-tiny"}', 'clip={"model": "models/clip-tiny"}')
+    result = copy.snakemake("-n", "--config", *models, "data_root=data", config="paper", check=False)
     return result.stdout + result.stderr
 
 
@@ -84,9 +76,10 @@ def test_absent_scenes_are_listed_with_the_reason(planned):
     assert re.search(r"replica/room_0 is skipped: .*one level too deep", planned)
 
 
-def test_tables_list_what_was_not_measured(planned):
-    tables = [text for rule, text in blocks(planned) if rule == "table"]
-    assert len(tables) == len(TABLES)
+def test_every_stage_and_table_is_planned(planned):
+    rules = [rule for rule, _ in blocks(planned)]
+    stages = {"poses", "gaussians", "masks", "coverage_tree", "clip", "contributions", "field", "figures"}
+    assert stages <= set(rules) and rules.count("table") == len(TABLES)
 
 
 def test_a_dry_run_ends_with_the_estimate_table(planned):
@@ -99,7 +92,6 @@ def test_a_dry_run_ends_with_the_estimate_table(planned):
 
 def test_tables_without_data_list_the_absent_scenes(project, tmp_path):
     copy = copy_project(project, tmp_path / "project", results=False)
-    command = [sys.executable, "-m", "snakemake", "-n", "-p", "results/tables/replica.csv"]
-    printed = copy.run(*command, "--configfile", "config/ci.yaml").stdout
+    printed = copy.snakemake("-n", "-p", "results/tables/replica.csv").stdout
     assert " table replica --published" in printed
     assert "--absent 'replica (office_0, office_1, office_2 and 5 more): data_root is not set.'" in printed

@@ -9,21 +9,14 @@ import pytest
 
 from tests.workflow.conftest import Project, copy_project
 
-FIELD = "results/synthetic/tiny/default/field.safetensors"
-SCORES = "results/synthetic/tiny/default/scores.csv"
+FOLDERS = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "names", "autoencoder")
 OUTPUTS = {
     "poses": "results/synthetic/tiny/scene",
     "gaussians": "results/synthetic/tiny/gaussians.ply",
-    "masks": "results/synthetic/tiny/default/masks",
-    "coverage_tree": "results/synthetic/tiny/default/coverage_tree",
-    "clip": "results/synthetic/tiny/default/clip",
-    "contributions": "results/synthetic/tiny/default/contributions",
-    "semantic_tree": "results/synthetic/tiny/default/semantic_tree",
-    "names": "results/synthetic/tiny/default/names",
-    "autoencoder": "results/synthetic/tiny/default/autoencoder",
-    "field": FIELD,
+    **{name: f"results/synthetic/tiny/default/{name}" for name in FOLDERS},
+    "field": "results/synthetic/tiny/default/field.safetensors",
     "method": "results/synthetic/tiny/lifted/field.safetensors",
-    "evaluate": SCORES,
+    "evaluate": "results/synthetic/tiny/default/scores.csv",
     "figures": "results/figures/synthetic/tiny/panel.png",
     "mask_truth": "results/figures/synthetic/tiny/masks.png",
     "comparison": "results/figures/synthetic/tiny/comparison.png",

@@ -35,16 +35,7 @@ def base(plain) -> Counter:
 
 
 def test_without_sweeps_every_stage_runs_once(base):
-    stages = (
-        "masks",
-        "coverage_tree",
-        "clip",
-        "contributions",
-        "semantic_tree",
-        "autoencoder",
-        "field",
-        "evaluate",
-    )
+    stages = (*BY_LEVELS, "field", "evaluate")
     assert {stage: base[stage] for stage in stages} == dict.fromkeys(stages, 1)
     assert base["table"] == 12  # sweeps and ablation without variants have none
 

@@ -33,6 +33,7 @@ def test_a_missing_device_is_refused(section):
         ("masks", "models/clip-tiny", "contains another kind of model"),
         ("clip", "models/sam-tiny", "contains another kind of model"),
         ("clip", "hilsplat", "no readable config.json"),
+        ("clip", "models/clip-vit-b-16-laion2b", "hilsplat models get clip-vit-b-16-laion2b"),
     ],
 )
 def test_a_model_folder_that_cannot_be_used_is_refused(section, model, words):
