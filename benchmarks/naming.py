@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import hilsplat
+from hilsplat.base.artifacts import read_json
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.tables import markdown_table
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -60,6 +61,7 @@ def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
     """Add the counts of a scene; `missed` counts absent texts that were answered without a doubt."""
     scene = hilsplat.open(folder)
     assert scene.naming is not None, f"{folder} has no names: hilsplat run {folder}/default/names"
+    rows = read_json(folder / "default/names/names.json")
     truth = HierarchyAnnotations.load(folder / "world/truth")
     ply = folder / "gaussians.ply"
     views = scene.scene.views("train")
@@ -68,7 +70,7 @@ def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
         counts = levels[level]
         for node, partner in measured.pairs:
             texts = {truth.nodes[partner].text, *truth.nodes[partner].synonyms}
-            nearest = [text for text, _ in scene.naming.candidates[node]]
+            nearest = [text for text, _ in rows[node]["candidates"]]
             name = scene.naming.of_node[node]
             counts.top1.add(nearest[0] in texts)
             counts.top5.add(bool(texts & {*nearest}))

@@ -5,6 +5,7 @@ All geometry is computed here, with the polygon filling that evaluation uses; th
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -23,27 +24,19 @@ from hilsplat.annotate.labels import (
     Rings,
     cut_to_parents,
     fill_rings,
+    known_labels,
     label_path,
     traced,
     write_labels,
 )
-from hilsplat.annotate.opened_scene import OpenedScene
-from hilsplat.base.errors import SettingsError
+from hilsplat.annotate.proposals import Clicks, Proposals
+from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import version_of
 from hilsplat.web.guard import Guard
 from hilsplat.web.messages import Message
-from hilsplat.web.scene_thread import SceneThread
-from hilsplat.web.server import (
-    BYTES,
-    Pages,
-    answer,
-    guarded,
-    plain,
-    read,
-    serve,
-    version_sent,
-    view_name,
-)
+from hilsplat.web.scene_thread import SceneThread, ShownScene
+from hilsplat.web.server import BYTES, Pages, answer, guarded, plain, read, serve, version_sent, view_name
 
 MAX_BODY_BYTES = 16 << 20
 """Maximum size of a request, enough for a COCO file of a whole scene."""
@@ -109,6 +102,62 @@ class Given(Message):
     """Files of annotations."""
 
     files: Annotated[list[File], Field(min_length=1, max_length=5000)]
+
+
+class OpenedScene(ShownScene):
+    """The parts of a scene that existed when it was opened.
+
+    Args:
+        folder: the scene's folder, such as results/photos/desk.
+        labels: folder of its label files; created when the first one is written.
+        variant: variant whose masks and tree are proposed.
+
+    Raises:
+        ArtifactError: the scene has no photographs with poses yet.
+    """
+
+    def __init__(self, folder: Path, labels: Path, variant: str, threads: int) -> None:
+        super().__init__()
+        self.folder, self.labels, self.variant, self.threads = folder, labels, variant, threads
+        self.photographs = folder / "scene"
+        if not (self.photographs / "index.json").is_file():
+            raise ArtifactError(
+                f"{folder} has no photographs to annotate yet: {self.photographs} is missing",
+                expected="results/<dataset>/<scene> of a run, or a copy of it",
+                fix=f"hilsplat run {self.photographs}",
+            )
+        proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
+        self.changes.note((self.photographs, folder / "gaussians.ply", *proposing))
+        self.scene = Scene.load(self.photographs)
+        self.proposals = Proposals(self.scene, folder, variant, threads)
+        self.clicks = Clicks(self.scene, folder / variant / "masks")
+
+    def opened_again(self) -> "OpenedScene":
+        return OpenedScene(self.folder, self.labels, self.variant, self.threads)
+
+    def same_photographs(self) -> AbstractContextManager[None]:
+        """Guard photographs and drawing: as `unchanged`, but parts other than photographs may change."""
+        return self.changes.unchanged(self.scene.name, self.photographs)
+
+    def described(self) -> dict[str, Any]:
+        """Describe the photographs and available proposals."""
+        cameras = self.scene.cameras
+        return {
+            "name": self.scene.name,
+            "of": self.state,
+            "folder": str(self.labels),
+            "proposes": self.proposals.of,
+            "segments": self.clicks.name,
+            "carries": self.proposals.gaussians is not None,
+            "views": [
+                {"name": name, "split": self.scene.split[name], "size_hw": list(cameras[name].size_hw)}
+                for name in cameras.names
+            ],
+        }
+
+    def known(self) -> dict[str, list[Label]]:
+        """Return the annotations of all views that have any."""
+        return known_labels(self.labels, self.scene.cameras, self.scene.cameras.names)
 
 
 # -- the server -----------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hilsplat.annotate.labels import Label, as_file, label_path, read_labels, traced
+from hilsplat.annotate.labels import Label, as_file, known_labels, traced
 from hilsplat.base.artifacts import atomic_folder, write_text
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -52,8 +52,7 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
     if truth.is_dir():
         known = labels_of_truth(HierarchyAnnotations.load(truth), views)
     else:
-        read = {view: read_labels(label_path(annotated, view), scene.cameras[view].size_hw) for view in views}
-        known = {view: labels for view, labels in read.items() if labels}
+        known = known_labels(annotated, scene.cameras, views)
     if not known:
         raise SceneError(
             f"{scene.name} has no labels", expected=f"files in {annotated}", fix=f"hilsplat annotate {folder}"

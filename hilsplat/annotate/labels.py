@@ -20,6 +20,7 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import by_id, parents_of
 from hilsplat.datasets.images.isat import IsatFile, read_isat
 from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
+from hilsplat.scene.cameras import Cameras
 from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import MAX_SIDE_PX, Message, Text
 
@@ -71,10 +72,6 @@ class Label(Message):
         """Return the region."""
         return fill_rings(self.polygons, size_hw)
 
-    def with_mask(self, mask: Bool[np.ndarray, "H W"]) -> "Label":
-        """Return the same thing with other pixels."""
-        return self.model_copy(update={"polygons": traced(mask)})
-
 
 def fill_rings(
     rings: Sequence[Sequence[tuple[int, int]]], size_hw: tuple[int, int]
@@ -124,7 +121,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
                 fix="draw it inside, or choose another parent",
             )
         if not np.array_equal(inside, mask):
-            masks[label.id], cut[label.id] = inside, label.with_mask(inside)
+            masks[label.id], cut[label.id] = inside, label.model_copy(update={"polygons": traced(inside)})
     return [cut[label.id] for label in labels]
 
 
@@ -153,6 +150,12 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
             fix="annotate the scene that it was drawn on, or move the file away",
         )
     return labels_of(found)
+
+
+def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
+    """Return the annotations of the views that have any; errors as in `read_labels`."""
+    found = {view: read_labels(label_path(folder, view), cameras[view].size_hw) for view in views}
+    return {view: labels for view, labels in found.items() if labels}
 
 
 def labels_of(found: IsatFile) -> list[Label]:

@@ -24,6 +24,7 @@ from hilsplat.query.names import read_names
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import HEADS, SamModel, enlarged
+from hilsplat.segment.suppression import box_iou
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
@@ -280,7 +281,11 @@ class Clicks:
         masks = enlarged(logits, encoded.frame)
         columns, rows = points.astype(np.int64).T if clicks else (np.zeros(0, np.int64),) * 2
         right = (masks[:, rows, columns] == inside).sum(axis=1)
-        fits = iou * [_box_iou(mask, corners) for mask in masks] if box else iou
+        fits = iou
+        if box:
+            x, y, width, height = np.array([cv2.boundingRect(mask.astype(np.uint8)) for mask in masks]).T
+            boxes = np.stack([x, y, x + width, y + height], axis=1)
+            fits = iou * box_iou(boxes, corners[None] + (0, 0, 1, 1))[:, 0]
         kept: dict[int, Level] = {}  # the coarsest level among masks that count as the same
         for row in np.lexsort((-fits, -right)).tolist():
             level = HEADS[row % len(HEADS)]
@@ -301,17 +306,6 @@ def _grid(box: np.ndarray) -> np.ndarray:
     steps = (np.arange(BOX_GRID) + 0.5) / BOX_GRID
     x, y = np.meshgrid(box[0] + steps * (box[2] + 1 - box[0]), box[1] + steps * (box[3] + 1 - box[1]))
     return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-def _box_iou(mask: Bool[np.ndarray, "H W"], box: np.ndarray) -> float:
-    if not mask.any():
-        return 0.0
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    own = np.array([columns[0], rows[0], columns[-1], rows[-1]])
-    low, high = np.maximum(own[:2], box[:2]), np.minimum(own[2:], box[2:]) + 1
-    common = np.prod(np.maximum(high - low, 0))
-    areas = [np.prod(each[2:] - each[:2] + 1) for each in (own, box)]
-    return float(common / (sum(areas) - common))
 
 
 def _iou(one: Bool[np.ndarray, "H W"], other: Bool[np.ndarray, "H W"]) -> float:

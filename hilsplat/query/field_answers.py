@@ -23,7 +23,7 @@ TextEncoder = Callable[[list[str]], np.ndarray]
 
 
 @dataclass(frozen=True)
-class FieldAnswers(SceneViews):
+class FieldScene(SceneViews):
     """A scene whose language field can be queried.
 
     Attributes:

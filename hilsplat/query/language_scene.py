@@ -20,7 +20,7 @@ from hilsplat.field.code import autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.caches import Opened
-from hilsplat.query.field_answers import FieldAnswers
+from hilsplat.query.field_answers import FieldScene
 from hilsplat.query.hits import Doubt, Hit, doubts_of
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
@@ -47,7 +47,7 @@ ANSWERERS = ("tree", "field")
 
 
 @dataclass(frozen=True)
-class LanguageScene(FieldAnswers):
+class LanguageScene(FieldScene):
     """A finished scene that accepts text queries.
 
     Attributes:
@@ -176,7 +176,7 @@ class LanguageScene(FieldAnswers):
         from hilsplat.viewer.embedded import EmbeddedViewer
 
         if self.finished is None:
-            raise ArtifactError("the scene was put together from parts", fix="open it with hilsplat.open")
+            raise ArtifactError("the scene was assembled from parts", fix="open it with hilsplat.open")
         return EmbeddedViewer(self.finished, text=text, height=height, proxy=proxy, threads=self.threads)
 
     # -- answers ----------------------------------------------------------------------------------

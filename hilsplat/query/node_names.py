@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -112,13 +113,11 @@ class NodeNaming:
 
     Attributes:
         of_node: name of each node; "" if nothing fits.
-        candidates: the texts nearest to each node, best first, with their cosine margins.
         surfaces: whether each node's name is a surface.
         rivals: unit vectors of words for absent things, to estimate chance; may be empty.
     """
 
     of_node: tuple[str, ...]
-    candidates: tuple[tuple[tuple[str, float], ...], ...]
     surfaces: tuple[bool, ...]
     rivals: Float32[np.ndarray, "W C"]
 
@@ -139,7 +138,6 @@ class NodeNaming:
         try:
             found = NodeNaming(
                 tuple(str(row["name"]) for row in rows),
-                tuple(tuple((text, float(value)) for text, value in row["candidates"]) for row in rows),
                 tuple(bool(row["surface"]) for row in rows),
                 read_npy(sealed(folder, "rivals.npy")).astype(np.float32),
             )
@@ -148,7 +146,7 @@ class NodeNaming:
         except (TypeError, KeyError, ValueError) as error:
             raise ArtifactError(
                 f"{folder / 'names.json'} or rivals.npy is damaged: {error!r}",
-                expected=f"{index['nodes']} names with candidates, and vectors (W, C)",
+                expected=f"{index['nodes']} names, and vectors (W, C)",
                 fix=remake(folder),
             ) from error
         return found
@@ -193,14 +191,9 @@ def run_names(
             nearest = set(margin.argmax(axis=1).tolist())
             known = [text for row, text in enumerate(texts) if row not in nearest]
         rivals = known if len(known) >= FEWEST_ABSENT else []
-        naming = named(tree, vocabulary, margin, of(rivals))
-        described = []
-        for row in zip(naming.of_node, naming.surfaces, naming.candidates, strict=True):
-            name, surface, best = row
-            candidates = [[text, round(value, 4)] for text, value in best]
-            described.append({"name": name, "surface": surface, "candidates": candidates})
-        write_json(folder / "names.json", described)
-        write_npy(folder / "rivals.npy", naming.rivals.astype(np.float16))
+        rows = named(tree, vocabulary, margin)
+        write_json(folder / "names.json", rows)
+        write_npy(folder / "rivals.npy", of(rivals).astype(np.float16))
         write_index(
             folder,
             {},
@@ -212,7 +205,7 @@ def run_names(
             texts=len(texts),
             rivals=len(rivals),
         )
-        named_nodes = sum(bool(name) for name in naming.of_node)
+        named_nodes = sum(bool(row["name"]) for row in rows)
         counts |= {"nodes": len(tree), "named": named_nodes, "texts": len(texts)}
 
 
@@ -229,39 +222,42 @@ def text_vectors(model: ClipModel, texts: Sequence[str], cache: Path) -> Float32
 
 
 def named(
-    tree: SemanticTree,
-    vocabulary: Vocabulary,
-    margin: Float32[np.ndarray, "n T"],
-    rivals: Float32[np.ndarray, "W C"],
-) -> NodeNaming:
+    tree: SemanticTree, vocabulary: Vocabulary, margin: Float32[np.ndarray, "n T"]
+) -> list[dict[str, Any]]:
     """Name each node by the text nearest to its vector, if that text stands out from the others.
 
     A whole is a thing or a surface. A part or subpart is a part, or a thing: a plate is part of a laid table.
 
-    `margin` has the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order;
-    `rivals` are as in `NodeNaming`.
+    Args:
+        margin: the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order.
+
+    Returns:
+        for each node: its `name`, whether it is a `surface`, and its `candidates`: the nearest texts with
+        their margins, best first.
     """
     groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
     words = [word for group in groups for word in group]
     kinds = np.repeat([THINGS, PARTS, SURFACES], [len(group) for group in groups])
-    names: list[str] = []
-    candidates: list[tuple[tuple[str, float], ...]] = []
-    surfaces: list[bool] = []
+    rows: list[dict[str, Any]] = []
     for node, level in enumerate(tree.level.tolist()):
         may = np.flatnonzero(kinds != (PARTS if level == Level.WHOLE else SURFACES))
         own = margin[node, may]
         order = np.argsort(-own, kind="stable")[:CANDIDATES]
         best = own.max(initial=0.0)
         fits = best > 0 and best - own[order[-1]] >= STANDS_OUT * own.std()
-        names.append(words[may[order[0]]] if fits else "")
-        surfaces.append(bool(fits and kinds[may[order[0]]] == SURFACES))
-        candidates.append(tuple((words[may[row]], float(own[row])) for row in order))
+        rows.append(
+            {
+                "name": words[may[order[0]]] if fits else "",
+                "surface": bool(fits and kinds[may[order[0]]] == SURFACES),
+                "candidates": [[words[may[row]], round(float(own[row]), 4)] for row in order],
+            }
+        )
     for level in LEVELS[1:]:  # a part does not get the name of its parent
         for node in tree.nodes_of(level).tolist():
             parent = int(tree.parent[node])
-            if parent != NONE and names[node] == names[parent]:
-                names[node] = ""
-    return NodeNaming(tuple(names), tuple(candidates), tuple(surfaces), rivals)
+            if parent != NONE and rows[node]["name"] == rows[parent]["name"]:
+                rows[node]["name"] = ""
+    return rows
 
 
 def _clip_digest(clip_folder: Path) -> str:

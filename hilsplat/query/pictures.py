@@ -21,6 +21,7 @@ RELEVANCY_COLOURS = "inferno"
 SH_CONSTANT = 0.28209479177387814
 """Value of the constant spherical harmonic; colour is 0.5 + this times row 0 of `sh`."""
 
+DPI = 110
 TITLE_LETTERS = 110
 """Maximum number of characters in a line of a panel's title."""
 
@@ -129,7 +130,7 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(up, right), up])
 
 
-def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
+def save_figure(figure: Figure, out: Path, dpi: int = DPI) -> None:
     """Write a PNG atomically; its metadata names this package instead of Matplotlib's version."""
     packed = {"compress_level": 4}  # half the time of the default 6, for 4 % more bytes
     own: dict[str, Any] = {"format": "png", "metadata": SOFTWARE, "pil_kwargs": packed}
@@ -137,9 +138,9 @@ def save_figure(figure: Figure, out: Path, dpi: int = 110) -> None:
         figure.savefig(temporary, dpi=dpi, facecolor="white", **own)
 
 
-def save_png_and_pdf(figure: Figure, out: Path, dpi: int = 110) -> None:
+def save_png_and_pdf(figure: Figure, out: Path) -> None:
     """Write a PNG and, beside it, a PDF; the same figure gives the same bytes."""
-    save_figure(figure, out, dpi)
+    save_figure(figure, out)
     with atomic_path(Path(out).with_suffix(".pdf")) as temporary:
         about = {"Creator": None, "Producer": None, "CreationDate": None}
-        figure.savefig(temporary, format="pdf", dpi=dpi, facecolor="white", metadata=about)
+        figure.savefig(temporary, format="pdf", dpi=DPI, facecolor="white", metadata=about)

@@ -13,12 +13,12 @@ JSON = "application/json"
 BYTES = "application/octet-stream"
 
 SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
-    ("get", "/api/scene", "Views with their cameras, number of Gaussians, variants that answer", None, JSON),
+    ("get", "/api/scene", "Views with their cameras, number of Gaussians, queryable variants", None, JSON),
     ("get", "/api/variant/{variant}", "The nodes of a variant's semantic tree, in row order", None, JSON),
     ("get", "/api/photo/{number}", "An undistorted photograph", None, IMAGE),
     ("get", "/api/crop/{variant}/{node}", "A node in the photograph that shows it largest", None, IMAGE),
     ("post", "/api/query", "Answers to a text or a path", wire.Query, JSON),
-    ("post", "/api/like", "What looks like a node or a picture", wire.Like, JSON),
+    ("post", "/api/like", "Nodes similar to a node or a picture", wire.Like, JSON),
     ("post", "/api/pick", "The nodes that a pixel of a camera shows, with their shares", wire.Pick, JSON),
     ("post", "/api/frame", "A picture of the scene", wire.Frame, IMAGE),
     ("post", "/api/field", "The field's relevancy of every Gaussian in 1/255", wire.FieldRelevancy, BYTES),
@@ -63,9 +63,9 @@ def description() -> dict[str, Any]:
             **body,
             "responses": {
                 "200": {"description": summary, "content": {given: content}},
-                "400": {"description": "what was sent is malformed: {error}"},
-                "403": {"description": "the cookie, the host or the origin is missing or another"},
-                "422": {"description": "it cannot be answered: {error}"},
+                "400": {"description": "the request is malformed: {error}"},
+                "403": {"description": "the cookie, the host or the origin is missing or wrong"},
+                "422": {"description": "the request cannot be answered: {error}"},
             },
         }
     return {

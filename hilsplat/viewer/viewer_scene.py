@@ -107,7 +107,7 @@ class ViewerScene(ShownScene):
         if before is None or (before.language is None and field.exists()):
             if variant not in self.variants:  # reject anything but listed names, such as paths
                 raise SettingsError(
-                    f"variant {variant!r} cannot answer here",
+                    f"variant {variant!r} cannot be queried here",
                     expected=", ".join(self.variants) or "none yet: the scene isn't finished",
                 )
             with self.unchanged():

@@ -2,18 +2,17 @@
 
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool
 
 
 def coco_region(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
     """Return the keys of an annotation that describe its region; run lengths instead of polygons."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1)
     return {
         "iscrowd": 0,
         "area": int(mask.sum()),
-        "bbox": [int(side) for side in box],
+        "bbox": list(cv2.boundingRect(mask.astype(np.uint8))),
         "segmentation": {"size": list(mask.shape), "counts": coco_counts(mask)},
     }
 

@@ -35,7 +35,6 @@ class Guard:
     """ASGI middleware that accepts requests from the owner's page only.
 
     Args:
-        app: the application to guard.
         token: secret in the printed address.
         max_body: maximum size of a request body, bytes.
         embedded: the page is a frame in another page, such as a notebook, possibly behind a proxy. Browsers
@@ -64,7 +63,7 @@ class Guard:
         is_opening = scope["path"] == "/" and has_token and not self.embedded
         if self.embedded:
             is_known = has_token or scope["path"].startswith("/static/")
-            refused = self._sent_as_json(scope["method"], headers) if is_known else "the token is another"
+            refused = self._sent_as_json(scope["method"], headers) if is_known else "the token is wrong"
         else:
             refused = self._refusal(scope["method"], headers, is_opening)
         if refused:
@@ -74,7 +73,7 @@ class Guard:
             await PlainTextResponse("the address is too long", 414, self.headers)(scope, receive, send)
             return
         if int(headers.get("content-length") or 0) > self.max_body or "transfer-encoding" in headers:
-            await PlainTextResponse("too much was sent", 413, self.headers)(scope, receive, send)
+            await PlainTextResponse("the request is too large", 413, self.headers)(scope, receive, send)
             return
 
         async def send_with_headers(message: Message) -> None:
@@ -97,18 +96,18 @@ class Guard:
         if name not in LOCAL_NAMES:
             return f"{host!r} is not this machine: open the printed address"
         if headers.get("sec-fetch-site") == "cross-site" and not is_opening:
-            return "another site sent this"
+            return "the request comes from another site"
         if not is_opening and not self._has_cookie(headers.get("cookie", "")):
-            return "open the printed address, with its token"
+            return "open the printed address, which contains the token"
         if method in ("GET", "HEAD"):
             return ""
         if headers.get("origin") != f"http://{host}":
-            return "only the page itself may send something"
+            return "only the page itself may send requests with a body"
         return self._sent_as_json(method, headers)
 
     def _sent_as_json(self, method: str, headers: dict[str, str]) -> str:
         is_json = headers.get("content-type", "").partition(";")[0].strip() == "application/json"
-        return "" if method in ("GET", "HEAD") or is_json else "only JSON may be sent"
+        return "" if method in ("GET", "HEAD") or is_json else "only JSON is accepted"
 
     def _has_cookie(self, text: str) -> bool:
         try:

@@ -190,3 +190,20 @@ def ask_and_wait(page, text: str) -> None:
 def choose_row(page, node: int) -> None:
     """Click a node in the outline."""
     page.locator(f"[role=treeitem][data-node='{node}'] > .row .label").click()
+
+
+def save(page, name: str, path: Path) -> Path:
+    """Save a file with a button of the menu."""
+    page.locator("#save summary").click()
+    with page.expect_download() as started:
+        page.get_by_role("button", name=name).click()
+    started.value.save_as(path)
+    return path
+
+
+def on_page(page, *points: tuple[float, float, float]) -> np.ndarray:
+    """Positions of points of the scene on the page, px."""
+    wire, view = wire_camera(page), page.locator("#view").bounding_box()
+    K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
+    places = (np.array(points) @ pose[:3, :3].T + pose[:3, 3]) @ K.T
+    return places[:, :2] / places[:, 2:] + (view["x"], view["y"])

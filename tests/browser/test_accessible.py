@@ -46,7 +46,7 @@ def test_the_annotator_has_no_serious_violation(opened, desk, tmp_path, scheme):
         page.close()
 
 
-def test_the_scheme_of_the_reader_is_followed(opened, desk_address):
+def test_the_colour_scheme_of_the_user_is_used(opened, desk_address):
     def brightness(scheme: str) -> int:
         page = opened(desk_address, color_scheme=scheme)
         colour = page.evaluate("getComputedStyle(document.getElementById('panel')).backgroundColor")
@@ -55,21 +55,21 @@ def test_the_scheme_of_the_reader_is_followed(opened, desk_address):
     assert brightness("dark") < 150 < 600 < brightness("light")
 
 
-def test_the_chosen_level_shows_in_forced_colours(opened, desk_address):
+def test_the_chosen_level_is_visible_in_forced_colours(opened, desk_address):
     page = opened(desk_address, forced_colors="active")
     outlines = """[...document.querySelectorAll('#levels label')].map((label) => [
         label.querySelector('input').checked, getComputedStyle(label.querySelector('span')).outlineStyle])"""
     assert all((style == "solid") == checked for checked, style in page.evaluate(outlines))
 
 
-def test_at_twice_the_size_the_picture_is_still_large(opened, desk_address):
+def test_the_picture_is_large_enough_at_twice_the_text_size(opened, desk_address):
     page = opened(desk_address, viewport={"width": 640, "height": 360})
     box = page.locator("#view").bounding_box()
     assert box["height"] > 250 and box["width"] > 300
     assert page.evaluate("document.documentElement.scrollWidth") <= 640
 
 
-def test_controls_are_large_enough_to_hit(opened, desk_address):
+def test_controls_are_at_least_24_px_high(opened, desk_address):
     page = opened(desk_address)
     low = """[...document.querySelectorAll('#tools select, #tools summary, #tools button, #views button')]
         .filter((each) => each.getBoundingClientRect().height > 0 && each.getBoundingClientRect().height < 24)

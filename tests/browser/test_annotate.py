@@ -97,7 +97,7 @@ def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, root):
     assert [region.path for region in scene.views["000.png"]] == [("mug",), ("mug", "handle")]
 
 
-def test_a_brush_adds_and_an_eraser_takes_away(page, root):
+def test_the_brush_adds_and_the_eraser_removes_pixels(page, root):
     draw_mug(page)
     before = kept(root)[0].mask(SIZE)
     page.get_by_role("slider", name="Radius of the brush, pixels").fill("2")
@@ -133,7 +133,7 @@ def test_changes_are_undone_and_redone_and_each_is_saved(page, root):
     assert (root / "annotated/photos/desk/000.json").read_bytes() == both
 
 
-def test_a_node_is_proposed_stays_a_proposal_and_is_accepted(page, root):
+def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, root):
     page.locator("#view").press("x")
     page.mouse.click(*place(page, 6, 6))
     offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
@@ -154,7 +154,7 @@ def test_a_node_is_proposed_stays_a_proposal_and_is_accepted(page, root):
     assert kept(root)[0].origin == "edited"
 
 
-def test_the_next_thing_does_not_inherit_a_name(page, root):
+def test_a_new_thing_has_no_name(page, root):
     draw_mug(page)
     page.locator("#view").press("Escape")
     assert page.locator("#text").input_value() == "" and page.locator("#title").inner_text() == "New thing"
@@ -169,7 +169,7 @@ def test_the_next_thing_does_not_inherit_a_name(page, root):
     assert page.get_by_role("status").inner_text() == ""
 
 
-def test_things_are_carried_into_the_next_photograph(page, root):
+def test_things_are_transferred_to_the_next_photograph(page, root):
     mug = region_mask("mug") | region_mask("handle")
     label = Label(id=4, level=1, text="mug", polygons=traced(mug))
     page.evaluate(f"hilsplat.store.change([[0, [{label.model_dump_json()}]]])")
@@ -245,7 +245,7 @@ def test_a_refused_change_and_later_ones_are_undone(page, opened, root):
     assert kept(root) == [] and items(page).count() == 0
 
 
-def test_what_can_be_undone_outlives_a_reload(page, root):
+def test_the_undo_history_survives_a_reload(page, root):
     draw_mug(page)
     page.reload()
     page.locator("body[data-ready=yes]").wait_for()
@@ -258,7 +258,7 @@ def test_what_can_be_undone_outlives_a_reload(page, root):
     assert [label.text for label in kept(root)] == ["mug"]
 
 
-def test_a_subpart_proposed_under_a_whole_says_that_it_is_part_of_nothing(page, root):
+def test_a_subpart_proposed_below_a_whole_has_no_parent(page, root):
     draw_mug(page)
     page.locator("#view").press("x")
     page.mouse.click(*place(page, 6, 6))
@@ -274,7 +274,7 @@ def area(root: Path) -> int:
     return int(np.count_nonzero(mug.mask(SIZE)))
 
 
-def test_corners_of_the_chosen_outline_are_moved_added_and_taken_out(page, root):
+def test_corners_of_the_chosen_outline_are_moved_added_and_removed(page, root):
     draw_mug(page)
     before = area(root)
     page.locator("#view").press("v")
@@ -295,7 +295,7 @@ def test_corners_of_the_chosen_outline_are_moved_added_and_taken_out(page, root)
     assert kept(root)[0].mask(SIZE)[19, 21]
 
 
-def test_sam_outlines_what_is_clicked(opened, browser, desk, tmp_path):
+def test_sam_outlines_clicked_things(opened, browser, desk, tmp_path):
     folder = tmp_path / "results/photos/desk"
     shutil.copytree(desk, folder)
     change_index(folder / "default/masks", segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
@@ -324,18 +324,18 @@ def test_sam_outlines_what_is_clicked(opened, browser, desk, tmp_path):
         page.close()
 
 
-def test_without_a_sam_there_is_no_tool_for_it(page):
+def test_without_sam_there_is_no_tool_for_it(page):
     assert not page.locator("#segment-label").is_visible()
 
 
-def test_a_telephone_has_everything_within_its_width(page):
+def test_on_a_phone_the_page_fits_the_width(page):
     page.set_viewport_size({"width": 390, "height": 780})
     view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
     assert view["width"] == 390 and view["height"] > 150 and panel["y"] >= view["y"] + view["height"]
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
-def test_a_scene_that_was_rewritten_is_reported(opened, desk, root, tmp_path_factory):
+def test_a_rewritten_scene_is_reported(opened, desk, root, tmp_path_factory):
     project = tmp_path_factory.mktemp("changing")
     shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
     folder = project / desk.relative_to(desk.parents[2])

@@ -6,17 +6,27 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import hilsplat
-from hilsplat.base.artifacts import atomic_folder, read_json
+from hilsplat.base.artifacts import atomic_folder
 from hilsplat.base.images import write_png
-from tests.browser.conftest import answers, ask, ask_and_wait, choose_row, drawn, pixels, serving, wire_camera
+from tests.browser.conftest import (
+    answers,
+    ask,
+    ask_and_wait,
+    choose_row,
+    drawn,
+    on_page,
+    pixels,
+    save,
+    serving,
+    wire_camera,
+)
 from tests.unit.artifact_changes import change_index
 
 both = pytest.mark.parametrize("painter", ["gl", "server"])
 
 
 @both
-def test_a_text_is_asked_by_keyboard_and_lights_up(opened, desk_address, scene, painter):
+def test_a_query_typed_after_the_slash_key_paints_its_answer(opened, desk_address, scene, painter):
     page = opened(desk_address, painter)
     assert page.evaluate("document.activeElement.id") == "text"  # the text box is first
     page.locator("#view").focus()
@@ -36,7 +46,7 @@ def test_a_text_is_asked_by_keyboard_and_lights_up(opened, desk_address, scene, 
         assert grey.mean() > 0.1 and (orange | grey | (picture.max(axis=2) <= 8)).mean() > 0.9
 
 
-def test_a_query_typed_before_the_tree_is_loaded_runs_when_it_is(opened, desk_address):
+def test_a_query_typed_before_the_tree_is_loaded_runs_later(opened, desk_address):
     page = opened(desk_address)
     held = []
     page.route("**/api/nodes/**", lambda route: held.append(route))
@@ -61,12 +71,9 @@ def test_doubts_are_reported(opened, desk_address, painter):
 @both
 def test_a_click_chooses_the_whole_and_the_next_click_its_part(opened, desk_address, scene, painter):
     page = opened(desk_address, painter)
-    wire, view = wire_camera(page), page.locator("#view").bounding_box()
-    K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
-    place = K @ (pose[:3, :3] @ [6, 6, 0] + pose[:3, 3])  # a yellow pixel of the rim
-    x, y = (place[:2] / place[2]).tolist()
+    (place,) = on_page(page, (6, 6, 0))  # a yellow pixel of the rim
     for text in ("mug", "mug > handle", "mug > handle > rim", "mug"):
-        page.mouse.click(view["x"] + x, view["y"] + y)
+        page.mouse.click(*place.tolist())
         node = scene.query(text)[0].node
         page.locator(f"#overlay path.chosen[data-node='{node}']").first.wait_for(state="attached")
         assert page.locator(f"[role=treeitem][data-node='{node}']").get_attribute("aria-selected") == "true"
@@ -91,7 +98,7 @@ def test_quick_picks_agree_with_exact_ones(opened, desk_address, scene):
     assert len(agree) > 20 and np.mean(agree) > 0.8
 
 
-def test_the_outline_is_walked_by_keys(opened, desk_address, scene):
+def test_keys_move_in_the_outline(opened, desk_address, scene):
     page = opened(desk_address)
     tree = page.get_by_role("tree")
     items = tree.get_by_role("treeitem")
@@ -118,7 +125,7 @@ def test_the_outline_is_walked_by_keys(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
-def test_an_image_or_a_frame_drawn_over_the_view_is_requested(opened, desk_address, scene, tmp_path):
+def test_queries_by_an_image_and_by_a_frame_drawn_over_the_view(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
     write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
@@ -126,21 +133,18 @@ def test_an_image_or_a_frame_drawn_over_the_view_is_requested(opened, desk_addre
     page.locator(f"#answers li[data-node='{book}']").first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
     page.locator("#view").press("Escape")
-    wire, view = wire_camera(page), page.locator("#view").bounding_box()
-    K, pose = np.array(wire["K"]), np.array(wire["cam_from_world"])
-    corners = (K @ (pose[:3, :3] @ np.array([[18, 18, 0], [34, 22, 0]]).T + pose[:3, 3:])).T  # of the book
-    (x0, y0), (x1, y1) = corners[:, :2] / corners[:, 2:] + (view["x"], view["y"])
+    low, high = on_page(page, (18, 18, 0), (34, 22, 0)).tolist()  # corners of the book
     page.keyboard.down("Alt")
-    page.mouse.move(x0, y0)
+    page.mouse.move(*low)
     page.mouse.down()
-    page.mouse.move(x1, y1, steps=4)
+    page.mouse.move(*high, steps=4)
     page.mouse.up()
     page.keyboard.up("Alt")
     answers(page).first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
 
 
-def test_two_answerers_stand_side_by_side(opened, desk_address):
+def test_two_answerers_are_shown_side_by_side(opened, desk_address):
     page = opened(desk_address)
     ask_and_wait(page, "mug")
     drawn(page, lambda: page.get_by_label("Beside").select_option("default|field"))
@@ -178,17 +182,15 @@ RECORD_TEXTS = """() => {
 }"""
 
 
-def test_a_film_tells_how_far_it_is_and_a_gif_has_the_chosen_size(opened, desk_address, tmp_path):
+def test_films_show_progress_and_gifs_have_the_chosen_size(opened, desk_address, tmp_path):
     page = opened(desk_address)
     page.locator("#save summary").click()
     page.get_by_label("Longer side of the GIF").select_option("240")
+    page.locator("#save summary").click()
     page.evaluate(RECORD_TEXTS)  # a small film may be done before this process looks
-    with page.expect_download() as started:
-        page.get_by_role("button", name="Film, GIF").click()
-    started.value.save_as(tmp_path / "flight.gif")
+    gif = Image.open(save(page, "Film, GIF", tmp_path / "flight.gif"))
     texts = page.evaluate("window.texts")
     assert any("of 60 pictures" in text for text in texts)
-    gif = Image.open(tmp_path / "flight.gif")
     assert max(gif.size) == 240 and gif.n_frames > 10
     page.get_by_role("progressbar", name="Film").wait_for(state="hidden")
     page.locator("#save summary").click()
@@ -203,15 +205,11 @@ def test_a_film_tells_how_far_it_is_and_a_gif_has_the_chosen_size(opened, desk_a
 def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, desk_address, tmp_path, scene):
     page = opened(desk_address)
     ask_and_wait(page, "book")
-    page.get_by_role("button", name="Keep").click()
+    page.get_by_role("button", name="Keep", exact=True).click()
     page.get_by_text("Kept “book”").wait_for()
     ask_and_wait(page, "mug > handle")
     page.locator("#view").press("ArrowLeft")
-    page.locator("#save summary").click()
-    with page.expect_download() as started:
-        page.get_by_role("button", name="Page with answers, HTML").click()
-    file = tmp_path / "page.html"
-    started.value.save_as(file)
+    file = save(page, "Page with answers, HTML", tmp_path / "page.html")
     context = browser.new_context(viewport={"width": 740, "height": 420}, offline=True)
     alone, wrong = context.new_page(), []
     alone.on("pageerror", lambda error: wrong.append(str(error)))
@@ -233,7 +231,7 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     context.close()
 
 
-def test_a_telephone_has_everything_below_the_view(opened, desk_address):
+def test_on_a_phone_the_panel_is_below_the_view(opened, desk_address):
     page = opened(desk_address)
     page.set_viewport_size({"width": 390, "height": 780})
     view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
@@ -241,7 +239,7 @@ def test_a_telephone_has_everything_below_the_view(opened, desk_address):
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
-def test_escape_and_letters_do_not_act_while_somebody_types(opened, desk_address):
+def test_keys_do_not_act_during_typing(opened, desk_address):
     page = opened(desk_address)
     box = page.locator("#text")
     box.fill("")
@@ -252,9 +250,7 @@ def test_escape_and_letters_do_not_act_while_somebody_types(opened, desk_address
     assert page.get_by_role("dialog", name="Keys").is_visible()
 
 
-def test_a_scene_that_was_rewritten_is_reported_and_loaded_again_without_the_old_choice(
-    opened, desk, tmp_path_factory
-):
+def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opened, desk, tmp_path_factory):
     project = tmp_path_factory.mktemp("changing")
     shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
     folder = project / desk.relative_to(desk.parents[2])
@@ -283,27 +279,7 @@ def test_a_scene_that_was_rewritten_is_reported_and_loaded_again_without_the_old
         page.close()  # before its server ends: it asks for changes
 
 
-def test_a_name_is_given_and_answers_here_and_in_python(opened, desk_address, desk, scene):
-    page = opened(desk_address)
-    book = scene.query("book")[0].node
-    choose_row(page, book)
-    name = page.get_by_role("textbox", name="Name")
-    name.fill("Atlas <b")
-    name.press("Enter")
-    page.get_by_text("Named “Atlas <b”").wait_for()
-    ask(page, "atlas <B")
-    page.locator("#answers").get_by_text("Atlas <b").wait_for()
-    assert list(read_json(desk / "names.json")["trees"].values()) == [{str(book): "Atlas <b"}]
-    assert [hit.node for hit in hilsplat.open(desk).query("atlas <b")] == [book]
-    page.locator("#view").press("Escape")
-    choose_row(page, book)
-    name.fill("")
-    name.press("Enter")
-    page.get_by_text("The name is taken away.").wait_for()
-    (desk / "names.json").unlink()
-
-
-def test_what_is_like_the_choice_is_listed(opened, desk_address, scene):
+def test_nodes_similar_to_the_choice_are_listed(opened, desk_address, scene):
     page = opened(desk_address)
     handle = scene.query("mug > handle")[0].node
     choose_row(page, handle)

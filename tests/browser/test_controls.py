@@ -11,7 +11,7 @@ def distance(page) -> float:
     return page.evaluate("Math.hypot(...hilsplat.camera.c.map((v, k) => v - hilsplat.camera.target[k]))")
 
 
-def test_a_refused_query_takes_the_answers_of_the_one_before_away(opened, desk_address):
+def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
     opened.expected.append("422")
     page = opened(desk_address)
     ask_and_wait(page, "mug > handle")
@@ -33,7 +33,7 @@ def test_the_server_paints_the_first_picture_once_and_sends_no_nodes(opened, des
     assert not [url for url in asked if "/api/nodes/" in url or "/api/splats" in url]
 
 
-def test_two_small_pictures_are_under_way_at_most(opened, desk_address):
+def test_at_most_two_small_pictures_are_requested_at_once(opened, desk_address):
     page = opened(desk_address, "server")
     page.wait_for_timeout(2000)  # until its own are all there
     held = []
@@ -50,7 +50,7 @@ def test_two_small_pictures_are_under_way_at_most(opened, desk_address):
     page.unroute_all(behavior="ignoreErrors")
 
 
-def test_zooming_out_ends_and_home_goes_back(opened, desk_address):
+def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_address):
     page = opened(desk_address)
     begun = wire_camera(page)
     page.locator("#view").focus()
@@ -86,7 +86,7 @@ def test_a_held_key_moves_evenly(opened, desk_address):
     assert page.evaluate("hilsplat.camera.c") == before
 
 
-def test_nothing_stays_framed_as_hovered_after_a_flight(opened, desk_address):
+def test_no_node_stays_marked_as_hovered_after_a_flight(opened, desk_address):
     page = opened(desk_address)
     row = page.locator("[role=treeitem] > .row").first
     row.locator(".label").click()
@@ -97,7 +97,7 @@ def test_nothing_stays_framed_as_hovered_after_a_flight(opened, desk_address):
     page.locator("#overlay path.hover").first.wait_for(state="detached")
 
 
-def test_back_goes_to_the_query_before(opened, desk_address):
+def test_back_returns_to_the_previous_query(opened, desk_address):
     page = opened(desk_address)
     page.wait_for_timeout(800)
     for text in ("mug > handle", "book"):
@@ -119,7 +119,7 @@ def test_back_goes_to_the_query_before(opened, desk_address):
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
 @pytest.mark.parametrize("colour", ["relevancy", "field"])
-def test_a_threshold_cuts_the_colours_and_counts_what_reaches_it(opened, desk_address, painter, colour):
+def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, desk_address, painter, colour):
     page = opened(desk_address, painter)
     ask_and_wait(page, "mug")
     page.locator("#colour").select_option(colour)

@@ -1,4 +1,4 @@
-"""A notebook with the viewer in a frame: another site to the browser, which gives the frame no cookie."""
+"""A notebook with the viewer in a frame: to the browser another site, so the frame gets no cookie."""
 
 import threading
 from functools import partial
@@ -19,7 +19,7 @@ def notebook(tmp_path):
     server.server_close()
 
 
-def test_the_frame_of_a_notebook_answers(browser, desk, tmp_path, notebook):
+def test_the_frame_in_a_notebook_answers_a_query(browser, desk, tmp_path, notebook):
     shown = hilsplat.open(desk).show("mug > handle", height=420)
     try:
         (tmp_path / "notebook.html").write_text(

@@ -24,7 +24,7 @@ def press(page, *keys: str) -> None:
         page.keyboard.press(key)
 
 
-def test_the_viewer_asks_walks_names_and_saves(opened, desk, tmp_path):
+def test_querying_choosing_naming_and_saving_in_the_viewer(opened, desk, tmp_path):
     folder = tmp_path / "project" / desk.relative_to(desk.parents[2])
     shutil.copytree(desk.parents[2], tmp_path / "project")  # the names of this test are its own
     with serving(folder) as address:
@@ -55,7 +55,7 @@ def walk(page, desk, tmp_path) -> None:
     assert read_json(tmp_path / "boxes.json")
 
 
-def test_the_annotator_names_draws_corrects_and_saves(opened, desk, tmp_path):
+def test_naming_drawing_and_saving_in_the_annotator(opened, desk, tmp_path):
     with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
         page = opened(address)
         tab_to(page, "#text")

@@ -1,4 +1,4 @@
-"""The page's two painters draw what the pipeline renders."""
+"""Both painters of the page, compared with the pipeline."""
 
 import numpy as np
 import pytest
@@ -23,13 +23,13 @@ def rendered(gaussians: Gaussians, page) -> np.ndarray:
     return to_uint8(render(gaussians, camera).color)
 
 
-def test_webgl_is_the_one_that_these_tests_are_for(opened, cloud_address):
+def test_webgl_runs_in_llvmpipe(opened, cloud_address):
     page = opened(cloud_address)
     assert "llvmpipe" in page.locator("#view").get_attribute("data-gl")
     assert page.locator("#view").get_attribute("data-painter") == "gl"
 
 
-def test_webgl_draws_what_the_pipeline_renders_of_the_same_bytes(opened, cloud, cloud_address):
+def test_webgl_equals_the_pipeline_on_the_same_bytes(opened, cloud, cloud_address):
     page = opened(cloud_address)
     gaussians = load_ply(cloud / "gaussians.ply")
     sent = decoded(spz_bytes(gaussians, np.arange(len(gaussians)), fractional_bits(gaussians)))
@@ -43,7 +43,7 @@ def test_webgl_draws_what_the_pipeline_renders_of_the_same_bytes(opened, cloud, 
         assert psnr(found, expected) > 40, keys
 
 
-def test_the_server_draws_what_the_pipeline_renders(opened, cloud, cloud_address):
+def test_the_server_painter_equals_the_pipeline(opened, cloud, cloud_address):
     page = opened(cloud_address, "server")
     assert page.locator("#view").get_attribute("data-painter") == "server"
     read = """(() => { const c = document.querySelector('#view canvas');
@@ -53,7 +53,7 @@ def test_the_server_draws_what_the_pipeline_renders(opened, cloud, cloud_address
     assert psnr(found, rendered(load_ply(cloud / "gaussians.ply"), page)) > 30
 
 
-def test_software_webgl_leaves_the_painting_to_the_server(opened, cloud_address):
+def test_the_server_paints_if_webgl_is_in_software(opened, cloud_address):
     page = opened(cloud_address, "")
     assert page.locator("#view").get_attribute("data-painter") == "server"
 
@@ -66,14 +66,14 @@ def test_nothing_is_drawn_while_nothing_changes(opened, cloud_address):
     assert page.locator("#view").get_attribute("data-drawn") == before
 
 
-def test_a_scene_without_answers_says_that_it_is_not_finished(opened, cloud_address):
+def test_an_unfinished_scene_is_reported(opened, cloud_address):
     page = opened(cloud_address)
     assert "The run goes on" in page.get_by_role("status").inner_text()
     assert not page.get_by_role("tree").is_visible()
 
 
 @pytest.mark.parametrize("painter", ["gl", "server"])
-def test_a_photograph_lies_exactly_over_its_view(opened, desk_address, painter):
+def test_a_photograph_is_aligned_with_its_view(opened, desk_address, painter):
     page = opened(desk_address, painter)
     page.get_by_role("option", name="003.png").click()
     page.get_by_role("button", name="photo", exact=True).click()

@@ -31,7 +31,7 @@ def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tool
     page.wait_for_function("!document.querySelector('#overlay text')")  # the last picture may be on its way
 
 
-def test_what_is_flown_to_is_seen_whole(opened, desk_address, scene):
+def test_a_flight_ends_with_the_whole_node_in_view(opened, desk_address, scene):
     page = opened(desk_address, "server")
     for text in ("mug", "mug > handle"):
         page.locator(f"[role=treeitem][data-node='{scene.query(text)[0].node}'] > .row .label").click()
@@ -45,7 +45,7 @@ def test_what_is_flown_to_is_seen_whole(opened, desk_address, scene):
         assert (np.abs(places - middle) < half).all() and np.ptp(places, axis=0).max() > 0.3 * half.min()
 
 
-def test_of_what_is_alike_the_first_five_are_painted(opened, desk_address, scene, tmp_path):
+def test_the_first_five_similar_nodes_are_painted(opened, desk_address, scene, tmp_path):
     page = opened(desk_address, "server")
     write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
     page.get_by_label("Picture to look for").set_input_files(tmp_path / "blue.png")
@@ -59,7 +59,7 @@ def test_of_what_is_alike_the_first_five_are_painted(opened, desk_address, scene
     assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
 
 
-def test_names_and_likeness_get_no_caution_about_words(opened, desk_address):
+def test_answers_by_name_or_similarity_show_no_caution(opened, desk_address):
     page = opened(desk_address, "server")
     shown = "own.showAnswers({ caution: 'no word means anything' }, ANSWER, {})"
     said = "document.getElementById('caution').hidden || document.getElementById('caution').textContent"
@@ -73,7 +73,7 @@ def test_names_and_likeness_get_no_caution_about_words(opened, desk_address):
         assert page.evaluate(code.replace("ANSWER", answer)) == expected
 
 
-def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened, desk_address, scene):
+def test_the_present_photograph_is_marked_even_if_it_shows_the_answer(opened, desk_address, scene):
     page = opened(desk_address, "server", color_scheme="dark")
     ask_and_wait(page, "mug > handle")
     best = scene.views.index(scene.query("mug > handle")[0].best_views[0])
@@ -84,7 +84,7 @@ def test_the_present_photograph_is_marked_also_where_it_shows_the_answer(opened,
     assert button.evaluate(f"(each) => {marks}") == ["rgb(255, 138, 31)", "rgb(255, 255, 255)"]
 
 
-def test_masks_are_saved_step_by_step_and_the_size_is_reported(opened, desk_address):
+def test_saving_masks_reports_the_size_of_the_file(opened, desk_address):
     page = opened(desk_address, "server")
     ask_and_wait(page, "mug > handle")
     page.locator("#save summary").click()

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from hilsplat.annotate.app import Annotator
+from hilsplat.annotate.app import Annotator, OpenedScene
 from hilsplat.annotate.labels import Label, traced
-from hilsplat.annotate.opened_scene import OpenedScene
 from hilsplat.base.errors import ArtifactError
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.segment.masks import HierarchicalMasks

@@ -68,18 +68,16 @@ def test_a_name_must_stand_out_and_differ_from_the_name_of_the_parent():
     vague = np.full(24, 0.2, np.float32)
     tree = replace(tree, clip=np.stack([texts[2], texts[22], vague, texts[11], texts[2], texts[12]]))
     generic = np.full((1, 24), 0.01, np.float32)
-    naming = named(tree, vocabulary, margins(tree.clip, texts, generic).T, texts[:3])
-    assert naming.of_node == ("thing 2", "floor", "", "part 0", "", "part 1")
-    assert naming.surfaces == (False, True, False, False, False, False)
-    assert naming.candidates[0][0] == ("thing 2", pytest.approx(0.99)) and len(naming.candidates[0]) == 5
+    rows = named(tree, vocabulary, margins(tree.clip, texts, generic).T)
+    assert [row["name"] for row in rows] == ["thing 2", "floor", "", "part 0", "", "part 1"]
+    assert [row["surface"] for row in rows] == [False, True, False, False, False, False]
+    assert rows[0]["candidates"][0] == ["thing 2", pytest.approx(0.99)] and len(rows[0]["candidates"]) == 5
 
 
 def test_names_of_parts_include_their_whole_and_user_given_names_come_first(desk):
     scene = hilsplat.open(desk)
-    naming = NodeNaming(
-        ("mug", "book", "handle", "", "rim"), ((),) * 5, (False,) * 5, np.eye(3, dtype=np.float32)
-    )
-    scene = replace(scene, naming=naming)
+    names = ("mug", "book", "handle", "", "rim")
+    scene = replace(scene, naming=NodeNaming(names, (False,) * 5, np.eye(3, dtype=np.float32)))
     order = [scene.query(text)[0].node for text in ("mug", "book", "mug > handle", "mug > handle > rim")]
     assert order[:2] == [0, 1] and scene.name_of(order[2]) == "handle of mug"
     assert scene.name_of(order[3]) == "rim of mug"
