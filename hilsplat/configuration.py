@@ -259,7 +259,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     """Validate a configuration with variants and overrides; raise SettingsError, which names each bad key."""
     if "\\u0000" in json.dumps(config, default=str):
         raise SettingsError(
-            "a text of the configuration has a null byte", fix="take it out: no command takes it"
+            "a text of the configuration has a null byte", fix="remove it: commands cannot take it"
         )
     try:
         run = RunSettings.model_validate(config)
@@ -278,9 +278,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
             )
     for key, texts in run.queries.items():
         if any(not text.strip() for text in texts):
-            raise SettingsError(
-                f"queries.{key}: a text is empty", fix="take it out, or write what to look for"
-            )
+            raise SettingsError(f"queries.{key}: a text is empty", fix="remove it, or write what to look for")
     for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
         run.stages(variant)
     for scope in run.overrides:
@@ -295,9 +293,9 @@ def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> No
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
             raise SettingsError(
-                f"{where}.{key}: there is nothing of this name",
+                f"{where}.{key}: unknown name",
                 expected=f"did you mean {near[0]!r}?" if near else f"one of {', '.join(known)}",
-                fix=f"correct the key, or take it out of {where}",
+                fix=f"correct the key, or remove it from {where}",
             )
 
 
@@ -309,7 +307,7 @@ class _UniqueKeys(yaml.SafeLoader):
         for key, _ in node.value:
             if key.tag != "tag:yaml.org,2002:merge" and isinstance(key, yaml.ScalarNode):
                 if key.value in seen:
-                    problem = f"key {key.value!r} is there twice"
+                    problem = f"key {key.value!r} is duplicated"
                     raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
@@ -328,12 +326,12 @@ def read_config(path: Path) -> dict[str, Any]:
             fix="indent with spaces, close what is open, and quote texts with a colon or braces",
         ) from error
     except FileNotFoundError as error:
-        raise SettingsError(f"{path} is missing", fix="correct its path, which begins here") from error
+        raise SettingsError(f"{path} is missing", fix="correct the path") from error
     except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: a date, not UTF-8
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
     if not isinstance(found, dict):
         kind = "nothing" if found is None else type(found).__name__
-        raise SettingsError(f"{path} does not hold settings", expected="lines of key: value", found=kind)
+        raise SettingsError(f"{path} does not contain settings", expected="lines of key: value", found=kind)
     try:
         json.dumps(found, default=str)
     except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key

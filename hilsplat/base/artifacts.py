@@ -282,7 +282,7 @@ def read_npy(path: Path) -> np.ndarray:
     with _readable(path):
         array = np.load(path, allow_pickle=False)
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
-            raise ValueError(f"it holds {getattr(array, 'dtype', 'an archive')}, not numbers")
+            raise ValueError(f"it contains {getattr(array, 'dtype', 'an archive')}, not numbers")
     return array
 
 

@@ -57,20 +57,20 @@ NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/
 """Parts of the messages of libraries that cannot start a thread or be loaded within `ulimit -v`."""
 
 PLACES = {
-    errno.EACCES: "may not be read or written",
-    errno.EPERM: "may not be read or written",
-    errno.EROFS: "is on a disk that can only be read",
+    errno.EACCES: "cannot be read or written: permission denied",
+    errno.EPERM: "cannot be read or written: permission denied",
+    errno.EROFS: "is on a read-only disk",
     errno.ENOENT: "is missing, or cannot be created",
-    errno.ENOTDIR: "cannot be: a part of the path is a file",
-    errno.EISDIR: "is a folder, where a file is needed",
-    errno.EEXIST: "is in the way",
-    errno.ELOOP: "is a symbolic link that leads back to itself",
+    errno.ENOTDIR: "cannot be created: part of the path is a file",
+    errno.EISDIR: "is a folder; a file is expected",
+    errno.EEXIST: "already exists",
+    errno.ELOOP: "is a symbolic link that points to itself",
     errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
-    errno.ENAMETOOLONG: "is longer than this disk takes",
+    errno.ENAMETOOLONG: "is too long for this disk",
     errno.EFBIG: "would be larger than the limit of this shell (ulimit -f) or disk",
     errno.EIO: "cannot be read or written: the disk reports an error",
     errno.ENOSPC: "does not fit on the disk, which is full",
-    errno.EDQUOT: "does not fit into your share of the disk",
+    errno.EDQUOT: "exceeds your disk quota",
 }
 """System error number -> problem with the path."""
 

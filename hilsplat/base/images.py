@@ -37,7 +37,7 @@ def open_image(path: Path) -> Image.Image:
         raise ImageError(
             f"image {path} is too large: {str(error).partition(',')[0]}",
             expected=f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f} megapixels",
-            fix="shrink it, or leave it out",
+            fix="shrink or remove it",
         ) from error
 
 
@@ -61,7 +61,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     try:
         with open_image(path) as image:
             if (num_frames := _frames(image)) > 1:
-                raise ValueError(f"it holds {num_frames} pictures of one size, as an animation does")
+                raise ValueError(f"it contains {num_frames} frames of one size, like an animation")
             image.load()
             upright = ImageOps.exif_transpose(image)
             if upright.mode.startswith("I"):  # Pillow would clip values above 255
@@ -107,9 +107,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
                 colours, io.BytesIO(profile), _srgb_profile(), outputMode="RGB"
             )
         except ImageCms.PyCMSError as error:
-            logger.warning(
-                "%s: its colours count as sRGB, for its colour profile is damaged: %s", path, error
-            )
+            logger.warning("%s: read as sRGB, because its colour profile is damaged: %s", path, error)
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted

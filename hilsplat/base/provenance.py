@@ -222,12 +222,12 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
         place = out.resolve()
         for each in read:
             if place == each or place in each.parents:
-                what = "is an input" if place == each else f"holds the input {each}"
+                what = "is an input" if place == each else f"contains the input {each}"
                 raise ArtifactError(f"output {out} {what} of {stage}", fix="name another output")
         for name, folder in (("working", Path.cwd()), ("home", Path.home())):
             if place == folder.resolve() or place in folder.resolve().parents:
                 raise ArtifactError(
-                    f"output {out} is the {name} folder, or holds it", fix="name a new file or folder"
+                    f"output {out} is the {name} folder, or contains it", fix="name a new file or folder"
                 )
         if not _is_something(out) or place in own or was_interrupted(out):
             continue

@@ -114,7 +114,7 @@ def masks(
     if section.key_views < 1:
         if gaussians is None:
             raise HilsplatError(
-                "masks: the Gaussians choose the key views",
+                "masks: key views are selected by the Gaussians",
                 expected="--gaussians results/<dataset>/<scene>/gaussians.ply",
                 fix="name the PLY, or set masks.key_views: 1",
             )

@@ -99,8 +99,8 @@ def cuda() -> Iterator[Finding]:
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
         return
-    sound = "gsplat draws what the CPU draws: image, gradients, pixel weights"
-    yield verdict("cuda", cuda_disagreement(), sound, "set device: cpu, and report what this command prints")
+    sound = "gsplat and the CPU render the same: image, gradients, pixel weights"
+    yield verdict("cuda", cuda_disagreement(), sound, "set device: cpu, and report this output")
 
 
 def kernels() -> Iterator[Finding]:
@@ -109,7 +109,7 @@ def kernels() -> Iterator[Finding]:
 
     begin = time.monotonic()
     apart = disagreement("cpu", "cpu")
-    sound = f"a small scene is drawn, {time.monotonic() - begin:.1f} s with compiling"
+    sound = f"a small scene was rendered, {time.monotonic() - begin:.1f} s with compiling"
     yield verdict("kernels", apart, sound, "reinstall numba and llvmlite")
 
 

@@ -375,7 +375,7 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
             raise SettingsError(
                 f"{where} of the configuration has the scene {key!r}, which {run.scenes} does not have",
                 expected=f"did you mean {near[0]!r}?",
-                fix="correct the name, or take it out",
+                fix="correct or remove the name",
             )
 
 

@@ -209,7 +209,7 @@ class RunProgress:
             self._refined.add(scene)
             commands = [refining(job.log.parents[2]), *commands]
         elif scene in self._refined:
-            return [f"{scene} answers from all photographs"]
+            return [f"{scene} uses all photographs"]
         elif self._hint_given:
             return []
         self._hint_given = True

@@ -128,7 +128,7 @@ def verify(results: Path) -> tuple[str, bool]:
     paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
     if not paths:
         raise ArtifactError(
-            f"{results} holds no artifact", expected="a results folder, with *.provenance.json in it"
+            f"{results} contains no artifact", expected="a results folder, with *.provenance.json in it"
         )
     counts, lines, again, records = Counter[str](), [], [], Records(results, every_byte=True)
     for path in track(paths, "artifacts read"):
@@ -143,7 +143,7 @@ def verify(results: Path) -> tuple[str, bool]:
     states = ", ".join(f"{counts[state]} {state}" for state in (WHOLE, STALE, DAMAGED) if counts[state])
     lines.append(f"{len(paths)} artifacts in {results}: {states}")
     if again:
-        lines.append(f"to make them again: snakemake --cores 2 --forcerun {shlex.join(again)}")
+        lines.append(f"to rebuild them: snakemake --cores 2 --forcerun {shlex.join(again)}")
     return "\n".join(lines), not again
 
 
@@ -186,11 +186,11 @@ class Records:
             if gone := sorted(sizes.keys() - found.keys()):
                 return f"{gone[0]} is missing in {path.name}"
             if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
-                return f"{path.name if wrong[0] == '.' else wrong[0]} is not as it was written"
+                return f"{path.name if wrong[0] == '.' else wrong[0]} was changed after it was written"
             if not self.every_byte and not was_interrupted(artifact):
                 self._digests[path] = written.sha256
             elif self._digest(path) != written.sha256:
-                return f"{path.name} is not as it was written"
+                return f"{path.name} was changed after it was written"
         return None
 
     def _differences(self, record: Provenance, expected: Expected | None) -> Iterator[str]:
@@ -203,9 +203,9 @@ class Records:
             for name in sorted(then.keys() | now.keys()):
                 made, configured = then.get(name), now.get(name)
                 if made != configured:
-                    yield f"it was made with {name} {made!r}, and the configuration says {configured!r}"
+                    yield f"it was made with {name} {made!r}, but the configuration has {configured!r}"
             if record.seed != expected.seed:
-                yield f"it was made with seed {record.seed}, and the configuration says {expected.seed}"
+                yield f"it was made with seed {record.seed}, but the configuration has {expected.seed}"
             stage, plugins = expected.stage, expected.plugins
         try:
             code = stage_code(stage, plugins)

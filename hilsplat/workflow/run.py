@@ -106,7 +106,7 @@ def start_project(folder: Path) -> list[Path]:
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:
         if path.exists():
-            raise HilsplatError(f"{path} is there already", fix="edit it, or name another folder")
+            raise HilsplatError(f"{path} already exists", fix="edit it, or name another folder")
     for path, installed in zip(written, (CONFIG, DEFAULT_SHEET), strict=True):
         write_text(path, (INSTALLED / installed).read_text(encoding="utf-8"))
     return written
@@ -201,7 +201,7 @@ def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Seque
         needed = {line.split("\t")[0] for line in summary.stdout.splitlines()}
         wrong = {output: reason for output, reason in wrong.items() if output in needed}
     for output, reason in wrong.items():
-        logger.warning("%s is made again: %s", output, reason)
+        logger.warning("%s is rebuilt: %s", output, reason)
     logging.getLogger().handlers.clear()  # otherwise Snakemake's records would be printed twice
     sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *ending]
     try:
@@ -261,7 +261,7 @@ def _recover(command: Sequence[str], results: Path) -> None:
             ) from error
     remove_leftovers(results)
     if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
-        logger.warning("a run of another machine may be going on here; if none is: snakemake --unlock")
+        logger.warning("another machine may be running this workflow; if not: snakemake --unlock")
         return
     try:
         alone = _locked("processes.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -273,10 +273,10 @@ ROWS = {
     "an output below a file": row(
         nothing,
         ("coverage-tree", "--masks", str(MASKS), "--out", "config/scenes.tsv/new"),
-        "scenes.tsv is in the way",
+        "scenes.tsv already exists",
     ),
     "a log below a file": row(
-        nothing, ("--log", "config/scenes.tsv/log", *COVERAGE), "scenes.tsv is in the way"
+        nothing, ("--log", "config/scenes.tsv/log", *COVERAGE), "scenes.tsv already exists"
     ),
     "an output on a disk without room": row(
         nothing,
@@ -284,7 +284,7 @@ ROWS = {
         "too little space on the disk of /proc",
     ),
     "a name that no disk takes": row(
-        nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "longer than this disk takes"
+        nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "too long for this disk"
     ),
     # ---- numbers and JSON on the command line
     "a seed beyond 64 bits": row(nothing, (*POSES, "--seed", str(10**30)), "--seed"),
@@ -350,7 +350,7 @@ ROWS = {
         "did you mean 'weight_part'",
     ),
     "YAML that is a list": row(
-        write("config/config.yaml", "- a\n"), OWN_CONFIG, "does not hold settings", "list"
+        write("config/config.yaml", "- a\n"), OWN_CONFIG, "does not contain settings", "list"
     ),
 }
 

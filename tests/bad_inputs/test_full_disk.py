@@ -99,4 +99,4 @@ def test_a_read_only_disk_is_reported_with_the_users_file(disk: Path, told: Call
     textured(Path("photos"))
     subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
     text = told(("new", "chair", "photos", "--sheet", "disk/scenes.tsv"))
-    assert "disk/scenes.tsv is on a disk that can only be read" in text
+    assert "disk/scenes.tsv is on a read-only disk" in text

@@ -71,8 +71,8 @@ def test_a_variant_cannot_have_the_name_of_a_file_in_the_scene_folder(name: str)
 @pytest.mark.parametrize(
     ("text", "place"),
     [
-        ("seed: 1\nfield:\n  latent: 4\n  latent: 8\n", r"line 4, column 3(.|\n)*'latent' is there twice"),
-        ("seed: 1\nseed: 2\n", r"line 2, column 1(.|\n)*'seed' is there twice"),
+        ("seed: 1\nfield:\n  latent: 4\n  latent: 8\n", r"line 4, column 3(.|\n)*'latent' is duplicated"),
+        ("seed: 1\nseed: 2\n", r"line 2, column 1(.|\n)*'seed' is duplicated"),
     ],
 )
 def test_a_duplicate_key_is_refused(tmp_path: Path, text: str, place: str) -> None:

@@ -79,7 +79,7 @@ def test_an_input_is_never_an_output(photographs, tmp_path):
     with pytest.raises(ArtifactError, match="is an input"):
         require_replaceable([link], "poses", [photographs])
     record(tmp_path, "poses")
-    with pytest.raises(ArtifactError, match="holds the input"):
+    with pytest.raises(ArtifactError, match="contains the input"):
         require_replaceable([tmp_path], "poses", [photographs])
 
 

@@ -121,7 +121,7 @@ def test_queries_of_key_views_are_announced_before_those_of_all_views(run, tmp_p
         '  hilsplat query photos/desk "..."',
         "  hilsplat view photos/desk",
     ]
-    assert lines[6:] == ["photos/desk answers from all photographs"]
+    assert lines[6:] == ["photos/desk uses all photographs"]
 
 
 def test_errors_are_shown_in_full_and_a_retry_counts_once(run):

@@ -57,9 +57,9 @@ def problems(expected: dict[Path, Expected] | None = None) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"settings": {"theta": 0.6}}, "made with theta 0.9, and the configuration says 0.6"),
+        ({"settings": {"theta": 0.6}}, "made with theta 0.9, but the configuration has 0.6"),
         ({"settings": {"theta": 0.9, "new": 1}}, "made with new None"),
-        ({"seed": 8}, "made with seed 7, and the configuration says 8"),
+        ({"seed": 8}, "made with seed 7, but the configuration has 8"),
         ({"stage": "clip"}, "stage coverage_tree made it, not clip"),
     ],
 )
@@ -73,7 +73,7 @@ def test_missing_and_cut_files_are_found(results):
     (MASKS / "b.npz").write_text("longer")
     (TREE / "a.npz").unlink()
     assert problems() == {
-        "masks": "b.npz is not as it was written",
+        "masks": "b.npz was changed after it was written",
         "coverage_tree": "a.npz is missing in coverage_tree",
     }
     shutil.rmtree(MASKS)
@@ -100,7 +100,7 @@ def test_every_byte_is_read_after_a_writer_that_did_not_finish(results):
     assert problems() == {}, "sizes agree"
     with pytest.raises(KeyboardInterrupt), output_lock(MASKS):
         raise KeyboardInterrupt
-    assert problems()["masks"] == "masks is not as it was written"
+    assert problems()["masks"] == "masks was changed after it was written"
     (MASKS / "a.npz").write_text("one")
     assert problems() == {}, "it had not replaced anything"
     with output_lock(MASKS):
@@ -172,9 +172,9 @@ def test_verify_reads_every_byte_and_prints_the_repair(results):
     assert not is_whole
     assert report.splitlines() == [
         f"stale    {TREE}: its input masks has changed: {MASKS}",
-        f"damaged  {MASKS}: masks is not as it was written",
+        f"damaged  {MASKS}: masks was changed after it was written",
         "2 artifacts in results: 1 stale, 1 damaged",
-        f"to make them again: snakemake --cores 2 --forcerun {TREE} {MASKS}",
+        f"to rebuild them: snakemake --cores 2 --forcerun {TREE} {MASKS}",
     ]
 
 
@@ -184,5 +184,5 @@ def test_verify_finds_a_missing_input_and_damaged_provenance(results):
     assert "masks is missing" in report and "its input masks is missing" in report
     provenance_path(MASKS).write_text("{")
     assert "its provenance is damaged" in verify(results)[0]
-    with pytest.raises(ArtifactError, match="holds no artifact"):
+    with pytest.raises(ArtifactError, match="contains no artifact"):
         verify(Path("photos"))
