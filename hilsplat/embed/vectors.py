@@ -44,8 +44,7 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
 
 def require_every_vector(vectors: Shaped[np.ndarray, "M C"], clip_folder: Path, purpose: str) -> None:
     """Raise an ArtifactError unless every mask has a vector, not only the best crops of nodes."""
-    without = int((~vectors.any(axis=1)).sum())
-    if without:
+    if without := int((~vectors.any(axis=1)).sum()):
         raise ArtifactError(
             f"{without} of {len(vectors)} masks have no CLIP vector in {clip_folder}; {purpose} needs all",
             fix="set clip.crops: masks, and rerun the clip stage; or take the vectors of a variant with "

@@ -1,12 +1,19 @@
-"""`hilsplat models get`: download of models from the hub; only complete, checked models are installed."""
+"""`hilsplat models get`: download of models from the hub; only complete, checked models are installed.
 
+PyTorch weights are exported to ONNX networks by optimum, in a separate process (the extra `export`).
+"""
+
+import importlib.util
 import logging
+import os
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +24,7 @@ from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, Repo
 from huggingface_hub.utils import disable_progress_bars
 
 from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
-from hilsplat.base.errors import DiskSpaceError, DownloadError, HilsplatError
+from hilsplat.base.errors import DiskSpaceError, DownloadError, HilsplatError, ModelError
 from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.catalogue import (
@@ -31,8 +38,7 @@ from hilsplat.hub.catalogue import (
     read_listing,
     usual_files,
 )
-from hilsplat.hub.export import export_networks, require_exporter
-from hilsplat.models.onnx_graph import split_whole
+from hilsplat.models.onnx_graph import split_whole, whole_clip
 from hilsplat.models.store import RECOMMENDED, real_model, user_models
 
 logger = logging.getLogger(__name__)
@@ -48,6 +54,10 @@ SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
 EXPORT_FACTOR = 4
 """Disk space for an export, as a multiple of the weights' size: weights, whole network, and its halves."""
+NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
+"""Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
+INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
+LAST_LINES = 15  # of the exporter's output, shown in an error
 
 
 @dataclass(frozen=True)
@@ -228,8 +238,9 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
         disable_progress_bars()
     for wait_s in (*WAITS_S, None):
         try:
-            where = {"revision": listing.revision, "local_dir": staging}
-            huggingface_hub.hf_hub_download(listing.repository, file.path, **where)
+            huggingface_hub.hf_hub_download(
+                listing.repository, file.path, revision=listing.revision, local_dir=staging
+            )
         except CUT as error:
             if wait_s is None:
                 raise
@@ -332,3 +343,47 @@ def _innermost(error: BaseException) -> str:
     while (cause := error.__cause__ or error.__context__) is not None:
         error = cause
     return str(error) or type(error).__name__
+
+
+def require_exporter(what: str) -> None:
+    """Refuse to continue without the exporter's packages, before anything is downloaded."""
+    if missing := [name for name in NEEDED if not _is_installed(name)]:
+        raise ModelError(
+            f"{what} has no ONNX networks, and the packages that export them are not installed",
+            expected="the extra export: optimum-onnx, transformers, torch, pillow",
+            found=f"no {', '.join(missing)}",
+            fix=f"{INSTALL}, then run the command again",
+        )
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the parent package is missing
+        return False
+
+
+def export_networks(weights: Path, out: Path) -> dict[str, str]:
+    """Export the networks of a SAM or CLIP saved by transformers; return the exporter's package versions.
+
+    If the exporter fails, its last lines are in the error.
+    """
+    logger.info("exporting to ONNX; this takes a few minutes and about three times the weights in memory")
+    words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
+    done = subprocess.run(
+        [sys.executable, "-m", "optimum.commands.optimum_cli", *words],
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        lines = (done.stdout + done.stderr).strip().splitlines()[-LAST_LINES:]
+        raise ModelError(
+            f"the weights in {weights} cannot be exported: the exporter ended with {done.returncode}",
+            found="\n            ".join(lines) or "no output",
+            fix=f"install the tested versions ({INSTALL}), then run the command again",
+        )
+    if whole_clip(out) is not None:
+        split_whole(out)
+    return {name: metadata.version(name) for name in ("optimum-onnx", "transformers", "torch")}

@@ -11,7 +11,7 @@ from hilsplat.models.store import (
     user_models,
 )
 
-COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<14} {}"
+COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<11} {}"
 
 
 def models_table() -> str:
@@ -21,10 +21,10 @@ def models_table() -> str:
 
     def state(name: str) -> str:
         if name not in here:
-            return "part of it" if (user_models() / f".{name}.part").is_dir() else ""
-        return "here, in use" if str(here[name].folder) in chosen else "here"
+            return "incomplete" if (user_models() / f".{name}.part").is_dir() else ""
+        return "in use" if str(here[name].folder) in chosen else "installed"
 
-    lines = [COLUMNS.format("name", "kind", "MB", "licence", "", "what for")]
+    lines = [COLUMNS.format("name", "kind", "MB", "licence", "", "use")]
     for release in RELEASES:
         kind, use = release.family.upper(), release.use
         if release.name in RECOMMENDED:
@@ -55,4 +55,4 @@ def check_models() -> tuple[str, int]:
         except HilsplatError as error:
             texts.append(f"{folder} does not work: {error}")
             num_failed += 1
-    return "\n\n".join(texts) or "there is no model", num_failed
+    return "\n\n".join(texts) or "no model is installed", num_failed

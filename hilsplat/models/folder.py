@@ -128,21 +128,21 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: 
     variants = variants_of(folder, name)
     if any(file.endswith(".onnx") for file in missing) and variants:
         listed = ", ".join(repr(each) for each in variants)
-        way_out = f"its networks exist in variants: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+        remedy = f"its networks exist in variants: set {SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
-        way_out = f"split its single network into the two that are needed: hilsplat models split {folder}"
+        remedy = f"split its single network into the two that are needed: hilsplat models split {folder}"
     elif any(file.endswith(TORCH_SUFFIXES) for file in found) and not any(folder.rglob("*.onnx")):
-        way_out = (
+        remedy = (
             "these are PyTorch weights, and hilsplat reads ONNX networks: fetch an ONNX export of the model "
             "(hilsplat models get), or export it (docs/models.md)"
         )
     else:
-        way_out = "fetch or export the whole model again"
+        remedy = "fetch or export the whole model again"
     return ModelError(
         f"model folder {folder} lacks {', '.join(missing)}",
         expected=", ".join(expected),
         found=", ".join(found[:20]),
-        fix=way_out + fix,
+        fix=remedy + fix,
     )
 
 

@@ -55,13 +55,11 @@ RELEASES = (
         "clip-vit-b-16-laion2b",
         "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
         600,
-        "words as in LangSplat and the paper; exported here (extra export)",
+        "queries as in LangSplat and the paper; exported here (extra export)",
         "clip",
         "MIT",
     ),
-    Release(
-        "clip-vit-base-patch16", "Xenova/clip-vit-base-patch16", 601, "words, ready to use", "clip", "MIT"
-    ),
+    Release("clip-vit-base-patch16", "Xenova/clip-vit-base-patch16", 601, "queries", "clip", "MIT"),
 )
 """Released models, in the order of preference of `auto` within each family."""
 

@@ -81,8 +81,7 @@ REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, 
 prompts are no faster per prompt."""
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Prompts on which the factored decoder is compared with the network, and the largest difference allowed."""
-OWN = "mask_generation"
-"""Key of `config.json` under which a model specifies its own `Thresholds`."""
+OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
 
 
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:

@@ -6,8 +6,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 
-BOXES_AT_ONCE = 256
-"""Boxes compared with all following ones in one step."""
+BOXES_AT_ONCE = 256  # boxes compared with all following ones in one step
 INNER_COVERED = 0.85
 """A mask counts as contained if at least this share of it is inside another mask (LangSplat)."""
 INNER_COVERS = 0.5
@@ -120,8 +119,7 @@ def keep_best_masks(
       `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
       contained mask whichever score is higher (masks then nest between levels only), and
       `inner = 0` drops none (masks also nest within levels).
-    As in LangSplat, dropped rows still drop others. The result follows from three matrix comparisons, so it
-    does not depend on the order in which rows are visited.
+    As in LangSplat, dropped rows still drop others, so the result doesn't depend on the order of visits.
     """
     area_px = np.diagonal(overlap_px)
     union_px = area_px[:, None] + area_px[None, :] - overlap_px

@@ -2,11 +2,11 @@
 
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
-from onnx import TensorProto, helper
-from tokenizers import Tokenizer, models, pre_tokenizers
+from onnx import helper
 
 from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
@@ -18,42 +18,18 @@ from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
+from tests.unit.finished_desk import write_colour_clip
 from tests.unit.segment.handmade import pack, save_network, save_scene, tensor
-
-WORDS = ["red", "green", "blue"]
-
-
-def save_vision(folder: Path, nodes: list, constants: dict[str, np.ndarray]) -> None:
-    inputs, outputs = [tensor("pixel_values", ["batch", 3, 4, 4])], [tensor("image_embeds", ["batch", 3])]
-    save_network(folder / "vision_model.onnx", nodes, inputs, outputs, constants)
 
 
 @pytest.fixture
 def colour_clip(tmp_path) -> Path:
-    """A CLIP of 4-px crops: an image is its mean colour, a text the sum of its words' colours."""
-    folder = tmp_path / "clip"
-    mean = helper.make_node("ReduceMean", ["pixel_values"], ["image_embeds"], axes=[2, 3], keepdims=0)
-    save_vision(folder, [mean], {})
-    save_network(
-        folder / "text_model.onnx",
-        [
-            helper.make_node("Gather", ["table", "input_ids"], ["words"]),
-            helper.make_node("ReduceSum", ["words", "one"], ["text_embeds"], keepdims=0),
-        ],
-        [tensor("input_ids", ["batch", "words_of_text"], TensorProto.INT64)],
-        [tensor("text_embeds", ["batch", 3])],
-        {"table": np.eye(4, 3, -1, np.float32), "one": np.array([1])},
-    )
-    config = {"model_type": "clip", "text_config": {"max_position_embeddings": 4}}
-    preprocessing = {"crop_size": {"height": 4, "width": 4}, "image_mean": [0] * 3, "image_std": [1] * 3}
-    (folder / "config.json").write_text(json.dumps(config))
-    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
-    tokenizer = Tokenizer(
-        models.WordLevel({"[UNK]": 0} | {word: 1 + n for n, word in enumerate(WORDS)}, "[UNK]")
-    )
-    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
-    tokenizer.save(str(folder / "tokenizer.json"))
-    return folder
+    """A CLIP of 4-px crops: an image is its mean colour, a text the sum of its words' colours.
+
+    mug is red, handle green, book blue.
+    """
+    write_colour_clip(tmp_path / "clip")
+    return tmp_path / "clip"
 
 
 def two_colours() -> tuple[np.ndarray, np.ndarray]:
@@ -65,29 +41,20 @@ def two_colours() -> tuple[np.ndarray, np.ndarray]:
     return image, mask
 
 
-def test_pixels_outside_the_mask_do_not_reach_the_vector(colour_clip):
-    image, mask = two_colours()
-    vectors = ClipModel.load(colour_clip).embed_masks(image, pack([mask, ~mask]))
+def test_the_settings_determine_the_pixels_of_a_crop(colour_clip):
+    model, (image, mask) = ClipModel.load(colour_clip), two_colours()
+    vectors = model.embed_masks(image, pack([mask, ~mask]))
+    np.testing.assert_array_equal(vectors, np.array([[1, 0, 0], [0, 1, 0]], np.float16))  # pixels inside only
     assert vectors.dtype == np.float16
-    np.testing.assert_array_equal(vectors, np.array([[1, 0, 0], [0, 1, 0]], np.float16))
-
-
-def test_kept_background_mixes_in_by_hand(colour_clip):
-    image, mask = two_colours()
     mask[0, 7] = True  # the box is the whole image, half red and half green
-    vectors = ClipModel.load(colour_clip).embed_masks(image, pack([mask]), ClipSettings(background="keep"))
-    np.testing.assert_allclose(vectors, [[0.5**0.5, 0.5**0.5, 0]], atol=1e-3)
-
-
-def test_langsplats_crop_leaves_out_the_last_row_and_column_of_the_box(colour_clip):
-    image = np.zeros((8, 8, 3), dtype=np.uint8)
-    image[:5, :5, 1] = 255  # green, but for a red square of 4 x 4 at its top left
-    image[:4, :4] = (255, 0, 0)
-    mask = np.zeros((8, 8), dtype=bool)
+    kept = model.embed_masks(image, pack([mask]), ClipSettings(background="keep"))
+    np.testing.assert_allclose(kept, [[0.5**0.5, 0.5**0.5, 0]], atol=1e-3)
+    # LangSplat omits the last row and column of the box: a red square of 4 x 4 remains of 5 x 5 pixels
+    mask[:] = False
     mask[:5, :5] = True
-    model = ClipModel.load(colour_clip)
-    (langsplat,) = model.embed_masks(image, pack([mask]), ClipSettings(crop="langsplat"))
-    assert langsplat.tolist() == [1, 0, 0]
+    image[:5, :5] = (0, 255, 0)
+    image[:4, :4] = (255, 0, 0)
+    assert model.embed_masks(image, pack([mask]), ClipSettings(crop="langsplat")).tolist() == [[1, 0, 0]]
     (box,) = model.embed_masks(image, pack([mask]))
     np.testing.assert_allclose(box, np.array([16, 9, 0]) / np.hypot(16, 9), atol=1e-2)
 
@@ -101,35 +68,27 @@ def test_vectors_do_not_depend_on_batch_or_threads(colour_clip, batch, threads):
     found = ClipModel.load(colour_clip, threads).embed_masks(image, masks, ClipSettings(batch=batch))
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_allclose(np.linalg.norm(expected.astype(float), axis=1), 1, atol=2e-3)
+    none = HierarchicalMasks.concatenate([], (12, 10))
+    assert ClipModel.load(colour_clip).embed_masks(image, none).shape == (0, 3)
 
 
-def test_no_masks_give_no_rows_of_the_right_width(colour_clip):
-    none = HierarchicalMasks.concatenate([], (8, 8))
-    assert ClipModel.load(colour_clip).embed_masks(np.zeros((8, 8, 3), np.uint8), none).shape == (0, 3)
-
-
-def test_texts_are_unit_vectors_in_order(colour_clip):
-    vectors = ClipModel.load(colour_clip).embed_texts(["blue", "red green", "red red green"])
+def test_texts_are_unit_vectors_in_order_and_inserted_into_the_template(colour_clip):
+    vectors = ClipModel.load(colour_clip).embed_texts(["book", "mug handle", "mug mug handle"])
     expected = [[0, 0, 1], [0.5**0.5, 0.5**0.5, 0], [2 / 5**0.5, 1 / 5**0.5, 0]]
     np.testing.assert_allclose(vectors, expected, atol=1e-6)
+    in_template = ClipModel.load(colour_clip, template="handle {}").embed_texts(["mug"])
+    np.testing.assert_array_equal(in_template, vectors[1:2])
 
 
-def test_every_text_is_put_into_the_template(colour_clip):
-    plain = ClipModel.load(colour_clip)
-    asked = ClipModel.load(colour_clip, template="blue {} thing").embed_texts(["red"])
-    np.testing.assert_array_equal(asked, plain.embed_texts(["blue red thing"]))
-    np.testing.assert_allclose(asked, [[0.5**0.5, 0, 0.5**0.5]], atol=1e-6)
-
-
-def test_a_text_that_was_asked_before_runs_no_network(colour_clip, monkeypatch):
+def test_a_repeated_text_runs_no_network(colour_clip, monkeypatch):
     model = ClipModel.load(colour_clip)
-    first = model.embed_texts(["blue", "red"])
+    first = model.embed_texts(["book", "mug"])
     monkeypatch.setattr(model, "text", None)
-    np.testing.assert_array_equal(model.embed_texts(["red", "blue", "red"]), first[[1, 0, 1]])
+    np.testing.assert_array_equal(model.embed_texts(["mug", "book", "mug"]), first[[1, 0, 1]])
 
 
 @pytest.mark.parametrize("template", ["a photo", "a {} of a {}", "{0}", "{"])
-def test_a_template_names_the_text_once(template):
+def test_a_template_contains_the_text_once(template):
     with pytest.raises(SettingsError, match=r"evaluate\.template"):
         parse_section("evaluate", json.dumps({"template": template}))
 
@@ -143,25 +102,24 @@ def test_vectors_of_another_width_are_refused(colour_clip):
         model.require_width(512, "autoencoder a")
 
 
-def test_long_texts_are_cut_and_say_so(colour_clip, caplog):
-    vectors = ClipModel.load(colour_clip).embed_texts(["red red red red green"])
+def test_long_texts_are_truncated_with_a_warning(colour_clip, caplog):
+    config = {"model_type": "clip", "text_config": {"max_position_embeddings": 4}}
+    (colour_clip / "config.json").write_text(json.dumps(config))
+    vectors = ClipModel.load(colour_clip).embed_texts(["mug mug mug mug handle"])
     np.testing.assert_allclose(vectors, [[1, 0, 0]])
     assert "cut off after 4 tokens" in caplog.text
 
 
-def test_text_without_a_word_is_refused(colour_clip):
+def test_a_text_without_a_word_is_refused(colour_clip):
     with pytest.raises(ModelError, match="text '' has no token"):
         ClipModel.load(colour_clip).embed_texts([""])
 
 
 def test_zero_vectors_stay_zero():
-    assert unit(np.array([[0.0, 0.0], [3.0, 4.0]], np.float32)).tolist() == [
-        [0, 0],
-        [pytest.approx(0.6), pytest.approx(0.8)],
-    ]
+    np.testing.assert_allclose(unit(np.array([[0, 0], [3, 4]], np.float32)), [[0, 0], [0.6, 0.8]], rtol=1e-6)
 
 
-def test_missing_tokenizer_is_named(colour_clip):
+def test_a_missing_tokenizer_is_reported(colour_clip):
     (colour_clip / "tokenizer.json").unlink()
     with pytest.raises(ModelError, match=r"lacks tokenizer.json"):
         ClipModel.load(colour_clip)
@@ -169,8 +127,7 @@ def test_missing_tokenizer_is_named(colour_clip):
 
 def test_check_describes_the_model(colour_clip):
     text = check_model(colour_clip)
-    assert "kind       clip" in text
-    assert "vectors    3 numbers" in text
+    assert "kind       clip" in text and "vectors    3 numbers" in text
     assert ClipModel.load(colour_clip).digest in text
 
 
@@ -185,7 +142,7 @@ def red_scene(tmp_path) -> tuple[Path, Path]:
     return save_scene(tmp_path / "scene", dict.fromkeys(names, image)), tmp_path / "masks"
 
 
-def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour_clip, tmp_path, monkeypatch):
+def test_finished_views_are_reused(red_scene, colour_clip, tmp_path, monkeypatch):
     scene, masks = red_scene
     settings = ClipSettings(model=str(colour_clip))
     run_clip(scene, masks, None, tmp_path / "first", tmp_path / "cache", settings, threads=2)
@@ -193,10 +150,7 @@ def test_stage_writes_a_row_per_mask_and_reuses_finished_views(red_scene, colour
     assert read_index(tmp_path / "first")["dim"] == 3
     assert digests_in(tmp_path / "first") == digests_in(masks)
 
-    def refuse(self: Network, **feeds: np.ndarray):
-        raise AssertionError("the network ran again")
-
-    monkeypatch.setattr(Network, "__call__", refuse)
+    monkeypatch.setattr(Network, "__call__", pytest.fail)
     run_clip(scene, masks, None, tmp_path / "second", tmp_path / "cache", settings, threads=1)
     assert sha256_of_path(tmp_path / "first") == sha256_of_path(tmp_path / "second")
 
@@ -213,17 +167,10 @@ def test_only_the_best_crops_of_each_node_are_embedded_and_never_twice(red_scene
     found = [read_npy(tmp_path / "best" / f"{view}.png.npy").tolist() for view in (0, 1)]
     assert found == [[[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 0, 0]]]
 
-    embedded = []
-    embed_crops = ClipModel.embed_crops
-
-    def counted(model: ClipModel, crops: np.ndarray) -> np.ndarray:
-        embedded.append(len(crops))
-        return embed_crops(model, crops)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ClipModel, "embed_crops", counted)
+    embed = ClipModel.embed_crops
+    with patch.object(ClipModel, "embed_crops", autospec=True, side_effect=embed) as embedded:
         run_clip(scene, masks, None, tmp_path / "all", cache, settings, threads=1)
-    assert sum(embedded) == 1  # both views are one picture with the same masks
+    assert [len(call.args[1]) for call in embedded.call_args_list] == [1]  # both views have the same crops
     run_clip(scene, masks, None, tmp_path / "fresh", tmp_path / "other", settings, threads=1)
     assert sha256_of_path(tmp_path / "all") == sha256_of_path(tmp_path / "fresh")
 
@@ -250,7 +197,8 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
         helper.make_node("Flatten", ["pixel_values"], ["flat"], name="flatten"),
         helper.make_node("MatMul", ["flat", "weights"], ["image_embeds"], name="product"),
     ]
-    save_vision(colour_clip, nodes, {"weights": weights})
+    inputs, outputs = [tensor("pixel_values", ["batch", 3, 4, 4])], [tensor("image_embeds", ["batch", 3])]
+    save_network(colour_clip / "vision_model.onnx", nodes, inputs, outputs, {"weights": weights})
     settings = ClipSettings(model=str(colour_clip))
     with caplog.at_level("INFO"):
         run_clip(scene, masks, None, tmp_path / "auto", tmp_path / "cache", settings, threads=1)
@@ -276,9 +224,7 @@ def with_shuffled_rows(masks: Path) -> None:
     ("change", "words"),
     [(with_another_view, r"7\.png"), (with_shuffled_rows, r"contains other masks \(view 0\.png\)")],
 )
-def test_masks_that_do_not_belong_to_scene_or_index_are_refused(
-    red_scene, colour_clip, tmp_path, change, words
-):
+def test_masks_of_another_scene_or_index_are_refused(red_scene, colour_clip, tmp_path, change, words):
     scene, masks = red_scene
     change(masks)
     settings = ClipSettings(model=str(colour_clip))
@@ -295,12 +241,12 @@ def test_the_clip_of_an_artifact_is_found_with_its_variant(red_scene, colour_cli
     assert open_clip_of(tmp_path / "vectors").text.path.name == "text_model_fp16.onnx"
 
 
-def test_a_query_does_not_open_the_network_of_pictures(colour_clip, tmp_path):
+def test_queries_do_not_open_the_image_network(colour_clip, tmp_path):
     model = ClipModel.load(colour_clip)
     write_index(tmp_path / "vectors", {}, model=str(colour_clip), model_sha256=model.digest)
     opened = open_clip_of(tmp_path / "vectors")
     assert "vision" not in vars(opened)
-    assert opened.width == model.width == len(opened.embed_texts(["red"])[0])
+    assert opened.width == model.width == len(opened.embed_texts(["mug"])[0])
     assert "vision" not in vars(opened)
     picture = np.zeros((6, 6, 3), np.uint8)
     np.testing.assert_array_equal(opened.embed_picture(picture), model.embed_picture(picture))

@@ -1,4 +1,4 @@
-"""LangSplat's files: what is written is read back, and what others wrote is checked."""
+"""LangSplat's files: exported files are read back, and files of other programs are checked."""
 
 from pathlib import Path
 
@@ -60,16 +60,12 @@ def test_maps_by_hand():
     assert maps.dtype == np.float32
     # default: all four masks, the small ones on top; then s, m, l, rows counted through
     assert rows.tolist() == [0, 1, 2, 3, 2, 3, 1, 0]
-    assert maps[0, 1, 1] == 0
-    assert maps[0, 3, 3] == 1
     # the larger subpart comes first
-    assert (maps[0, 4, 3], maps[1, 4, 3], maps[1, 2, 2]) == (2, 4, 5)
-    assert set(np.unique(maps[2])) == {-1, 6}
-    assert set(np.unique(maps[3])) == {-1, 7}
-    assert maps[3, 0, 0] == -1
+    assert (maps[0, 1, 1], maps[0, 3, 3], maps[0, 4, 3], maps[1, 4, 3], maps[1, 2, 2]) == (0, 1, 2, 4, 5)
+    assert (set(np.unique(maps[2])), set(np.unique(maps[3])), maps[3, 0, 0]) == ({-1, 6}, {-1, 7}, -1)
 
 
-def test_what_is_written_is_read_back(ours, scene, tmp_path):
+def test_exported_files_are_read_back(ours, scene, tmp_path):
     masks_folder, clip_folder = ours
     write_langsplat(masks_folder, clip_folder, tmp_path / "files")
     names = sorted(path.name for path in (tmp_path / "files").glob("*.npy"))
@@ -86,7 +82,7 @@ def test_what_is_written_is_read_back(ours, scene, tmp_path):
     np.testing.assert_allclose(clip.astype(float), unit_rows(4).astype(float), atol=1e-3)
 
 
-def test_levels_run_the_other_way_in_the_files(tmp_path):
+def test_levels_have_the_reverse_order_in_the_files(tmp_path):
     maps = np.full((4, 2, 4), -1, np.float32)
     maps[0] = 0  # mixed: left out
     maps[1, 0, 0], maps[2, 0, 1], maps[3, 0, 2] = 1, 2, 3
@@ -96,9 +92,6 @@ def test_levels_run_the_other_way_in_the_files(tmp_path):
     assert masks.level.tolist() == [1, 2, 3]
     assert masks.box_xyxy[:, 0].tolist() == [2, 1, 0]
     np.testing.assert_array_equal(vectors, np.eye(5, dtype=np.float16)[[3, 2, 1]])
-
-
-def test_a_scene_without_any_mask_at_a_level_is_read(tmp_path):
     np.save(tmp_path / "x_s.npy", np.full((4, 2, 4), -1, np.float32))
     np.save(tmp_path / "x_f.npy", np.zeros((0, 5), np.float32))
     masks, vectors = read_view(tmp_path, "x.jpg", (2, 4))
@@ -125,14 +118,14 @@ def test_maps_of_another_size_are_resized_and_of_another_shape_refused(ours, tmp
         (np.array([{"a": 1}], dtype=object), np.zeros((1, 5)), "cannot be read"),
     ],
 )
-def test_strange_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vectors, words):
+def test_invalid_files_are_refused_and_nothing_is_unpickled(tmp_path, maps, vectors, words):
     np.save(tmp_path / "a_s.npy", maps, allow_pickle=True)
     np.save(tmp_path / "a_f.npy", vectors)
     with pytest.raises(ArtifactError, match=words):
         read_view(tmp_path, "a.png", SIZE)
 
 
-def test_views_without_files_are_named_and_most_must_have_them(ours, scene, tmp_path, caplog):
+def test_missing_files_are_reported_and_half_of_the_views_need_them(ours, scene, tmp_path, caplog):
     write_langsplat(*ours, tmp_path / "files")
     (tmp_path / "files" / "b_s.npy").unlink()
     read_masks(scene, tmp_path / "files", tmp_path / "out")
@@ -144,7 +137,7 @@ def test_views_without_files_are_named_and_most_must_have_them(ours, scene, tmp_
     assert not (tmp_path / "other").exists()
 
 
-def test_views_that_differ_after_a_dot_only_are_refused(ours, tmp_path):
+def test_views_that_differ_only_after_a_dot_are_refused(ours, tmp_path):
     masks_folder, clip_folder = ours
     for folder in ours:
         write_index(folder, dict.fromkeys(("a.1.png", "a.2.png"), index_entry(nested())), scene="set/scene")
@@ -175,7 +168,7 @@ def embedded(ours, scene, tmp_path, project) -> ClipModel:
     return model
 
 
-def test_vectors_of_the_same_clip_are_taken(embedded, scene, tmp_path):
+def test_vectors_of_the_same_clip_are_accepted(embedded, scene, tmp_path):
     settings = ClipSettings(model=str(embedded.model.folder))
     read_clip(scene, tmp_path / "files", tmp_path / "out", settings)
     index = read_index(tmp_path / "out")
@@ -191,7 +184,10 @@ def test_vectors_of_the_same_clip_are_taken(embedded, scene, tmp_path):
 
 @pytest.mark.parametrize(
     ("width", "words"),
-    [(100, r"a_f.npy does not belong to the CLIP in"), (None, r"were not computed by the CLIP in(.|\n)*laion2b")],
+    [
+        (100, r"a_f.npy does not belong to the CLIP in"),
+        (None, r"were not computed by the CLIP in(.|\n)*laion2b"),
+    ],
 )
 def test_vectors_of_another_clip_are_refused(embedded, scene, tmp_path, width, words):
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(embedded.width, embedded.width)))

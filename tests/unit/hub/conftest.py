@@ -30,7 +30,7 @@ def pad(network: Path) -> None:
 
 @pytest.fixture(scope="session")
 def repositories(tmp_path_factory) -> dict[str, Path]:
-    """The two models as the hub keeps them: with a card and a second set of networks."""
+    """Repositories of the two models, with a card and a second set of networks."""
     folder = tmp_path_factory.mktemp("hub")
     sam = write_disc_sam(folder / "sam")
     pad(sam / "onnx/vision_encoder.onnx")
@@ -48,7 +48,7 @@ def repositories(tmp_path_factory) -> dict[str, Path]:
 
 
 def point_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What HF_ENDPOINT does when the library is first imported."""
+    """Set the endpoint as HF_ENDPOINT does when the library is first imported."""
     monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", endpoint)
     template = endpoint + "/{repo_id}/resolve/{revision}/{filename}"
     for module in (huggingface_hub.constants, file_download):
@@ -57,7 +57,7 @@ def point_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
-    """The hub; the working directory is an empty project, and nobody sleeps."""
+    """The hub; the working directory is an empty project."""
     with loopback_hub() as served:
         served.repositories.update(repositories)
         point_at(served.endpoint, monkeypatch)
@@ -76,7 +76,7 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
 
 @pytest.fixture
 def waits(monkeypatch) -> list[float]:
-    """Seconds that would have been waited."""
+    """Seconds of the waits, which are skipped."""
     seconds: list[float] = []
     monkeypatch.setattr(get.time, "sleep", seconds.append)
     return seconds

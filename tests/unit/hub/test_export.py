@@ -1,4 +1,4 @@
-"""A CLIP without ready networks is fetched, exported in another process and split, by the real command."""
+"""A CLIP without ONNX networks is fetched, exported in another process and split, by the real command."""
 
 import json
 import os
@@ -10,7 +10,7 @@ import pytest
 
 from hilsplat.base.errors import ModelError
 from hilsplat.embed.clip import ClipModel
-from hilsplat.hub import export
+from hilsplat.hub import get
 from hilsplat.hub.get import get_models
 from hilsplat.models.store import RELEASES
 from tests.unit.export.conftest import clip_parts
@@ -30,7 +30,7 @@ def get_by_command(endpoint: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_weights_are_fetched_exported_split_and_answer_as_transformers(hub, clip_parts):
+def test_exported_weights_give_the_vectors_of_transformers(hub, clip_parts):
     import torch
 
     model, processor, exported = clip_parts
@@ -57,12 +57,12 @@ def test_weights_are_fetched_exported_split_and_answer_as_transformers(hub, clip
 def test_weights_that_cannot_be_exported_show_the_exporter_s_last_lines(tmp_path):
     (tmp_path / "config.json").write_text('{"model_type": "clip"}')
     with pytest.raises(ModelError, match=r"the exporter ended with 1(.|\n)*Error(.|\n)*pip install"):
-        export.export_networks(tmp_path, tmp_path / "out")
+        get.export_networks(tmp_path, tmp_path / "out")
 
 
-def test_without_the_extra_nothing_is_fetched_and_the_message_gives_the_line(hub, clip_parts, monkeypatch):
+def test_without_the_extra_nothing_is_fetched_and_the_error_gives_the_command(hub, clip_parts, monkeypatch):
     hub.repositories[REPOSITORY] = clip_parts[2].parent / "torch"
-    monkeypatch.setattr(export, "NEEDED", (*export.NEEDED, "no_such_exporter.onnx"))
+    monkeypatch.setattr(get, "NEEDED", (*get.NEEDED, "no_such_exporter.onnx"))
     with pytest.raises(ModelError, match=r"no no_such_exporter.onnx\n  fix +pip install .* '\.\[export\]'"):
         get_models([NAME])
     assert not hub.ranges("model.safetensors")

@@ -1,4 +1,4 @@
-"""What counts as a model's files, variants, and the split of a whole CLIP."""
+"""A model's files and variants, and splitting of a whole CLIP."""
 
 import shutil
 
@@ -44,7 +44,7 @@ def test_the_digest_covers_weights_in_a_file_of_any_name(sam, location):
     assert open_model_folder(sam).digest != before
 
 
-def test_weights_of_constants_count_too(tmp_path):
+def test_external_weights_of_constants_are_found(tmp_path):
     value = numpy_helper.from_array(np.ones(4096, np.float32), "value")
     path = tmp_path / "constant.onnx"
     constant = helper.make_node("Constant", [], ["y"], value=value)

@@ -1,4 +1,4 @@
-"""Which models are there, and which of them `auto` means."""
+"""Present models, and the ones that `auto` selects."""
 
 import json
 from pathlib import Path
@@ -6,15 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.configuration import with_models
-from hilsplat.models.store import (
-    RECOMMENDED,
-    RELEASES,
-    model_path,
-    present_models,
-    read_model,
-    real_model,
-    user_models,
-)
+from hilsplat.models.store import model_path, present_models, read_model, real_model, user_models
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
 AUTO = MasksSettings(segmenter="auto", model="auto")
@@ -36,7 +28,7 @@ def models(tmp_path, monkeypatch) -> Path:
     return Path("models")
 
 
-def test_the_embedded_models_say_so_themselves(project):
+def test_embedded_models_are_recognised(project):
     found = {model.folder.name: model.embedded for model in present_models(project / "models")}
     assert found["sam-tiny"] and found["clip-tiny"]
 
@@ -61,7 +53,7 @@ def test_a_real_model_is_used_and_the_best_one_of_several(models):
     assert names == [*released, "zebra-sam", "clip-tiny", "sam-tiny"]
 
 
-def test_what_is_named_is_used_whatever_else_is_there(models):
+def test_named_models_take_precedence(models):
     lay(models / "sam-vit-huge", "sam")
     for section in (MasksSettings(), MasksSettings(segmenter="graph"), ClipSettings(), FieldSettings()):
         assert with_models(section) == section
@@ -74,7 +66,7 @@ def test_what_is_named_is_used_whatever_else_is_there(models):
     assert with_models(lost).segmenter == "sam"
 
 
-def test_what_is_half_there_or_of_another_kind_is_passed_over(models):
+def test_incomplete_and_unsupported_models_are_ignored(models):
     lay(models / ".sam-vit-base.part", "sam")
     lay(models / "bert", "bert")
     for name, config in {"weights": '{"model_type": "sam"}', "list": "[]", "broken": "{"}.items():
@@ -86,7 +78,7 @@ def test_what_is_half_there_or_of_another_kind_is_passed_over(models):
     assert present_models(Path("nowhere")) == []
 
 
-def test_models_of_the_user_are_found_from_any_folder_and_those_of_the_project_come_first(
+def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project(
     models, tmp_path, monkeypatch
 ):
     of_user = tmp_path / "shared"
@@ -107,8 +99,3 @@ def test_without_a_variable_fetched_models_are_in_the_data_folder_of_the_user(mo
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     monkeypatch.setattr("sys.platform", "linux")
     assert user_models() == tmp_path / "hilsplat/models"
-
-
-def test_the_recommended_pair_is_one_of_each_family():
-    by_name = {release.name: release for release in RELEASES}
-    assert [by_name[name].family for name in RECOMMENDED] == ["sam", "clip"]

@@ -29,10 +29,8 @@ def nms(boxes: np.ndarray, scores: np.ndarray, iou_max: float) -> list[int]:
     areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     for row in np.argsort(-scores, kind="stable"):
         for better in kept:
-            low, high = (
-                np.maximum(boxes[row, :2], boxes[better, :2]),
-                np.minimum(boxes[row, 2:], boxes[better, 2:]),
-            )
+            low = np.maximum(boxes[row, :2], boxes[better, :2])
+            high = np.minimum(boxes[row, 2:], boxes[better, 2:])
             shared = np.prod(np.maximum(high - low, 0))
             if shared / max(areas[row] + areas[better] - shared, 1e-9) > iou_max:
                 break
@@ -102,20 +100,14 @@ def generate(
                 mask = np.zeros((height, width), bool)
                 mask[top:bottom, left:right] = large > 0
                 found.append((mask, score, stability, box, (right - left) * (bottom - top)))
-            rows = nms(
-                np.array([one[3] for one in found]).reshape(-1, 4),
-                np.array([one[1] for one in found]),
-                settings.box_nms_iou,
-            )
+            found_boxes = np.array([one[3] for one in found]).reshape(-1, 4)
+            rows = nms(found_boxes, np.array([one[1] for one in found]), settings.box_nms_iou)
             heads[head] += [found[row] for row in rows]
     results = []
     for found in heads:
         if len(boxes) > 1:
-            rows = nms(
-                np.array([one[3] for one in found]),
-                np.array([1 / one[4] for one in found]),
-                settings.box_nms_iou,
-            )
+            preferred = np.array([1 / one[4] for one in found])
+            rows = nms(np.array([one[3] for one in found]), preferred, settings.box_nms_iou)
             found = [found[row] for row in rows]
         cleaned, unchanged = [], []
         for mask, *_ in found:

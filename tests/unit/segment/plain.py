@@ -1,26 +1,19 @@
-"""Plain versions of what the segmenter computes in compiled loops: picture by picture, obviously right."""
+"""Plain versions, one image at a time, of what the segmenter computes in compiled loops."""
 
 import cv2
 import numpy as np
 
 from hilsplat.segment.generate import BAND_PX, Candidates
-from hilsplat.segment.sam import LOGIT_STEP, Frame
+from hilsplat.segment.sam import LOGIT_STEP
 
 
 def quantise(logits: np.ndarray) -> np.ndarray:
-    """Logits in steps, clipped to +-127 of them."""
+    """Round logits to steps, clipped to +-127."""
     return np.clip(np.rint(logits / LOGIT_STEP), -127, 127).astype(np.int8)
 
 
-def restore(steps: np.ndarray, frame: Frame) -> np.ndarray:
-    """One low-resolution mask at the image's size: two bilinear steps, then what exceeds 0."""
-    padded = cv2.resize(steps.astype(np.float32), frame.padded_hw[::-1], interpolation=cv2.INTER_LINEAR)
-    cropped = padded[: frame.resized_hw[0], : frame.resized_hw[1]]
-    return cv2.resize(cropped, frame.original_hw[::-1], interpolation=cv2.INTER_LINEAR) > 0
-
-
 def flatten_far(steps: np.ndarray) -> np.ndarray:
-    """Logits farther than `BAND_PX` from a change of sign become the extreme of their sign."""
+    """Replace logits farther than `BAND_PX` from a change of sign by +-127."""
     inside = (steps > 0).astype(np.uint8)
     window = np.ones((2 * BAND_PX + 1, 2 * BAND_PX + 1), np.uint8)
     band = (cv2.dilate(inside, window) > 0) & (cv2.erode(inside, window) == 0)
@@ -28,7 +21,7 @@ def flatten_far(steps: np.ndarray) -> np.ndarray:
 
 
 def unpacked(candidates: Candidates) -> np.ndarray:
-    """All candidates' logits as whole pictures."""
+    """All candidates' logits as whole images."""
     out = np.full((len(candidates), *candidates.low_hw), -127, np.int8)
     for row, (x0, y0, x1, y1) in enumerate(candidates.window_xyxy):
         values = candidates.logits[candidates.offsets[row] : candidates.offsets[row + 1]]
@@ -37,7 +30,7 @@ def unpacked(candidates: Candidates) -> np.ndarray:
 
 
 def mend(mask: np.ndarray, min_area_px: int) -> np.ndarray:
-    """Small holes filled, then small islands dropped but for the largest; 8-connected."""
+    """Fill small holes, then drop small islands except the largest (8-connected)."""
     cleaned = mask.copy()
     _, holes, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=8)
     for label in range(1, len(stats)):

@@ -113,7 +113,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
         ),
     ],
 )
-def test_the_error_says_what_is_wrong_with_a_folder(own_sam, damage: Callable[[Path], None], words):
+def test_errors_for_damaged_folders(own_sam, damage: Callable[[Path], None], words):
     damage(own_sam)
     with pytest.raises(ModelError, match=words):
         SamModel.load(own_sam)
@@ -141,12 +141,9 @@ def test_networks_may_be_beside_the_configuration(own_sam):
     assert SamModel.load(own_sam).longest_edge == 32
 
 
-def test_a_decoder_that_hides_its_number_of_masks_is_found_out_when_it_runs(tmp_path):
+def test_networks_with_undeclared_shapes_are_checked_when_they_run(tmp_path):
     with pytest.raises(ModelError, match="three masks per prompt"):
         require_three_heads(tmp_path, np.zeros((1, 1, 4)), np.zeros((1, 1, 4, 2, 2)))
-
-
-def test_halves_of_two_clips_are_refused(tmp_path):
     require_one_space(tmp_path, 512, None)
     with pytest.raises(ModelError, match=r"do not belong together(.|\n)*512(.|\n)*768"):
         require_one_space(tmp_path, 512, 768)

@@ -1,4 +1,4 @@
-"""What is kept of the decoder's output gives the same masks as the output itself."""
+"""Candidates give the same masks as the decoder's whole output."""
 
 import zlib
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hilsplat.segment.generate import Candidates, distinct_prompts, keep_candidates, masks_from_candidates
-from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, resized_size
+from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, enlarged, resized_size
 from hilsplat.settings import MasksSettings
-from tests.unit.segment.plain import flatten_far, quantise, restore, smooth_logits, unpacked
+from tests.unit.segment.plain import flatten_far, quantise, smooth_logits, unpacked
 
 EVERYTHING = MasksSettings(
     predicted_iou_min=0, stability_min=0, nms_score=0, min_area_px=1, box_nms_iou=1, nms_iou=1, nms_inner=0
@@ -22,7 +22,7 @@ def candidates_of(logits: np.ndarray, frame: Frame) -> Candidates:
     return keep_candidates(scores, logits, frame, 0, EVERYTHING, NOTHING_DROPPED)
 
 
-def test_windows_hold_the_band_and_outside_is_the_lowest_logit() -> None:
+def test_windows_contain_the_band_around_edges() -> None:
     logits = smooth_logits(12, 48, seed=3)
     kept = candidates_of(logits.reshape(4, 3, 48, 48), Frame((48, 48), (48, 48), (48, 48)))
     assert len(kept) == 12
@@ -32,15 +32,14 @@ def test_windows_hold_the_band_and_outside_is_the_lowest_logit() -> None:
 @pytest.mark.parametrize(
     "original_hw", [(32, 24), (100, 128), (256, 256), (480, 640), (728, 986), (300, 3), (1, 200), (64, 1)]
 )
-def test_masks_of_windows_are_the_decoders_masks_enlarged(original_hw: tuple[int, int], disc_sam) -> None:
+def test_masks_from_windows_equal_enlarged_masks(original_hw: tuple[int, int], disc_sam) -> None:
     model = SamModel.load(disc_sam)
     model.longest_edge, model.padded_hw = 256, (256, 256)
     frame = Frame(original_hw, resized_size(original_hw, 256), (256, 256))
     logits = smooth_logits(30, 64, seed=sum(original_hw))
     kept = candidates_of(logits.reshape(10, 3, 64, 64), frame)
     masks = masks_from_candidates(kept, original_hw, model, EVERYTHING)
-    expected = [restore(steps, frame) for steps in quantise(logits)]
-    expected = [mask for mask in expected if mask.any()]
+    expected = [mask for mask in enlarged(quantise(logits).astype(np.float32), frame) if mask.any()]
     found = list(masks.dense())
     assert len(found) == len(expected) > 5
     for mask in found:  # rounding may decide on the border itself
@@ -55,17 +54,15 @@ def test_windows_compress_well() -> None:
     assert len(zlib.compress(kept.logits, 1)) < len(zlib.compress(quantise(logits), 1)) / 3
 
 
-def test_a_mask_over_the_whole_picture_has_no_edge() -> None:
-    kept = candidates_of(np.full((1, 3, 8, 8), 3, np.float32), Frame((8, 8), (8, 8), (8, 8)))
+def test_full_masks_have_no_edge_and_empty_ones_are_dropped() -> None:
+    frame = Frame((8, 8), (8, 8), (8, 8))
+    kept = candidates_of(np.full((1, 3, 8, 8), 3, np.float32), frame)
     np.testing.assert_array_equal(unpacked(kept), np.full((3, 8, 8), 127))
-
-
-def test_a_mask_without_a_pixel_is_not_a_candidate() -> None:
-    assert len(candidates_of(np.full((2, 3, 8, 8), -3, np.float32), Frame((8, 8), (8, 8), (8, 8)))) == 0
+    assert len(candidates_of(np.full((2, 3, 8, 8), -3, np.float32), frame)) == 0
 
 
 class Previewed(SamModel):
-    """Answers previews with given scores and discs (centre x, radius) in 16 x 16 px."""
+    """A SAM whose previews are given scores and discs (centre x, radius) in 16 x 16 px."""
 
     def __init__(self, scores: list[list[float]], discs: list[list[tuple[float, float]]]) -> None:
         self.scores, self.discs = np.array(scores, np.float32), np.array(discs, np.float32)
@@ -84,7 +81,7 @@ def prompts_of(model: Previewed) -> list[int]:
     return kept["points"][:, 0].astype(int).tolist()
 
 
-def test_prompts_stay_that_have_a_mask_which_repeats_no_better_one() -> None:
+def test_prompts_with_a_mask_that_repeats_no_better_one_are_kept() -> None:
     small, middle, large = (8, 2.2), (8, 4.2), (8, 6.2)
     scores = [[0.5, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.5, 0.4], [0.4, 0.4, 0.05]]
     discs = [[small, middle, large]] * 2 + [[small, (4, 3.2), large], [small, middle, (9, 6.2)]]
@@ -93,5 +90,5 @@ def test_prompts_stay_that_have_a_mask_which_repeats_no_better_one() -> None:
     assert prompts_of(Previewed(scores, discs)) == [0, 1, 2]
 
 
-def test_one_prompt_stays_where_the_preview_shows_nothing() -> None:
+def test_one_prompt_is_kept_if_the_preview_is_empty() -> None:
     assert prompts_of(Previewed([[0.05] * 3] * 3, [[(8, 3)] * 3] * 3)) == [0]

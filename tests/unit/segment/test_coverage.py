@@ -50,7 +50,7 @@ def parents_by_loop(masks: np.ndarray, theta: float, level: np.ndarray) -> list[
         (("####", "####", "#..."), [1, 1, 2], [NONE, NONE, 0]),
         # a parent of the same level is refused
         (("##########", "#####.....", "##........"), [1, 3, 3], [NONE, 0, 0]),
-        # a subpart may hang directly under a whole
+        # the parent of a subpart may be a whole
         (("##...", "#####"), [3, 1], [1, NONE]),
         # the smallest cover wins even if it is the coarser one
         (("##########", "######....", "##........"), [2, 1, 3], [NONE, NONE, 1]),
@@ -98,7 +98,7 @@ def test_the_tree_of_run_lengths_equals_a_loop_over_pairs(masks, data):
     np.testing.assert_array_equal(depth, depths(parent))
 
 
-def test_levels_by_the_tree_are_depths_whatever_head_made_a_mask():
+def test_levels_by_the_tree_are_depths_for_masks_of_any_head():
     masks = rows("##########", "######....", "###.......", "##........", ".......##.")
     by_tree = with_tree_levels(pack(masks, [3, 3, 1, 2, 2]), 0.9)
     assert sorted(zip(by_tree.area_px.tolist(), by_tree.level.tolist(), strict=True)) == [
@@ -111,7 +111,7 @@ def test_levels_by_the_tree_are_depths_whatever_head_made_a_mask():
     assert (by_tree.content_order() == np.arange(5)).all()
 
 
-def test_theta_decides_levels_by_the_tree():
+def test_levels_by_the_tree_depend_on_theta():
     # 3 of the second mask's 4 px are in the first
     found = pack(rows("########..", ".....####."))
     assert with_tree_levels(found, 0.9).level.tolist() == [1, 1]

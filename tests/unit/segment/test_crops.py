@@ -1,4 +1,4 @@
-"""The crop that CLIP sees, on images small enough to check by eye."""
+"""Crops for CLIP, on small images."""
 
 import cv2
 import numpy as np

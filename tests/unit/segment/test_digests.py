@@ -1,4 +1,4 @@
-"""Digests of masks: what changes them, and what they refuse."""
+"""Digests of masks, and artifacts refused because of them."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_a_digest_depends_on_order_size_pixels_levels_and_scores(tmp_path):
     assert digest_of(HierarchicalMasks.load(tmp_path / "v.npz")) == digest_of(two_masks()) == digest_of(masks)
 
 
-def test_loaded_masks_must_be_those_that_are_recorded(tmp_path):
+def test_masks_that_differ_from_the_recorded_digest_are_refused(tmp_path):
     two_masks().take(np.array([1, 0])).save(tmp_path / "v.npz")
     write_index(tmp_path, {"v": index_entry(two_masks())})
     with pytest.raises(MisalignedArtifactError, match=r"v\.npz contains other masks \(view v\)"):
@@ -52,7 +52,7 @@ def test_an_index_without_digests_is_refused(tmp_path, entry):
 
 
 @pytest.mark.parametrize("rows", [[1, 0], [0], None])
-def test_the_view_that_differs_is_named_whichever_side_lacks_it(tmp_path, rows):
+def test_the_error_names_the_view_that_differs_in_either_artifact(tmp_path, rows):
     same = {"u": index_entry(two_masks())}
     more = {} if rows is None else {"v": index_entry(two_masks().take(np.array(rows)))}
     write_index(tmp_path / "clip", {**same, **more})

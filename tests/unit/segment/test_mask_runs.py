@@ -1,4 +1,4 @@
-"""Run-length coded masks: nothing is lost, and overlaps are counted without unpacking everything."""
+"""Run-length encoded masks, compared with dense masks and pycocotools."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_runs_of_a_small_mask_by_hand():
 
 
 @given(nonempty_masks)
-def test_dense_masks_come_back_equal(dense):
+def test_dense_masks_round_trip(dense):
     np.testing.assert_array_equal(pack(dense).dense(), dense)
 
 
@@ -47,7 +47,7 @@ def test_overlaps_of_many_masks_are_counted_band_by_band_and_word_by_word():
 
 
 @given(nonempty_masks)
-def test_areas_and_boxes_follow_from_the_runs(dense):
+def test_areas_and_boxes_match_the_pixels(dense):
     masks = pack(dense)
     np.testing.assert_array_equal(masks.area_px, dense.sum(axis=(1, 2)))
     for mask, (x0, y0, x1, y1) in zip(dense, masks.box_xyxy, strict=True):
@@ -56,7 +56,7 @@ def test_areas_and_boxes_follow_from_the_runs(dense):
 
 
 @given(nonempty_masks, st.data())
-def test_a_window_is_a_part_of_the_picture(dense, data):
+def test_a_window_equals_a_crop_of_the_mask(dense, data):
     masks = pack(dense)
     y0, y1 = sorted(data.draw(st.tuples(st.integers(0, dense.shape[1]), st.integers(0, dense.shape[1]))))
     x0, x1 = sorted(data.draw(st.tuples(st.integers(0, dense.shape[2]), st.integers(0, dense.shape[2]))))
@@ -74,7 +74,7 @@ def test_runs_of_a_label_map_are_those_of_its_regions(labels):
 
 
 @given(nonempty_masks)
-def test_runs_are_those_of_pycocotools_turned_by_a_quarter(dense):
+def test_runs_equal_those_of_pycocotools_for_the_transposed_mask(dense):
     # COCO counts down the columns, we count along the rows
     for mask in dense:
         runs, _ = encode_runs(mask[None])

@@ -22,14 +22,8 @@ from tests.unit.segment.handmade import assert_equal_masks, save_scene, write_di
 
 @pytest.fixture
 def settings(disc_sam) -> MasksSettings:
-    return MasksSettings(
-        precision="fp32",
-        model=str(disc_sam),
-        points_per_side=2,
-        points_per_batch=2,
-        stability_min=0.0,
-        min_area_px=1,
-    )
+    prompts = {"points_per_side": 2, "points_per_batch": 2}
+    return MasksSettings(precision="fp32", model=str(disc_sam), stability_min=0.0, min_area_px=1, **prompts)
 
 
 @pytest.fixture
@@ -65,7 +59,10 @@ def test_second_run_calls_no_network_and_writes_the_same_bytes(scene, tmp_path, 
     stricter = settings.model_copy(update={"predicted_iou_min": 0.75})
     run_masks(scene, tmp_path / "third", tmp_path / "cache", stricter, threads=1)
     assert calls == []
-    entry = read_index(tmp_path / "third")["views"]["000.png"]
+    index = read_index(tmp_path / "third")
+    assert index["model_sha256"] == open_model_folder(Path(settings.model)).digest
+    assert list(index["views"]) == ["000.png", "001.png"]  # no test view
+    entry = index["views"]["000.png"]
     assert (entry["whole"], entry["part"], entry["subpart"]) == (0, 4, 4)
 
 
@@ -78,7 +75,7 @@ def celled(tmp_path) -> MasksSettings:
     )
 
 
-def test_prompts_that_repeat_others_in_the_preview_are_not_decoded(scene, tmp_path, celled, calls):
+def test_prompts_that_repeat_others_in_the_preview_are_skipped(scene, tmp_path, celled, calls):
     run_masks(scene, tmp_path / "some", tmp_path / "cache", celled, threads=1)
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (2 * 16, 2)
     (Path(celled.model) / "onnx" / f"{PREVIEW}.onnx").unlink()
@@ -97,9 +94,7 @@ def test_all_prompts_are_decoded_where_repeated_masks_could_stay(scene, tmp_path
     assert (calls.count(PREVIEW), calls.count(DECODER)) == (0, 16)
 
 
-def test_masks_do_not_depend_on_threads_or_on_memory_which_decides_how_many_views_run_at_once(
-    scene, tmp_path, settings, caplog
-):
+def test_memory_limits_the_views_at_once_and_masks_do_not_depend_on_it(scene, tmp_path, settings, caplog):
     caplog.set_level("INFO")
     for number, (threads, memory) in enumerate([(1, 8000.0), (2, 8000.0), (2, 1.0)]):
         folders = tmp_path / f"masks-{number}", tmp_path / f"cache-{number}"
@@ -108,14 +103,7 @@ def test_masks_do_not_depend_on_threads_or_on_memory_which_decides_how_many_view
     assert len({sha256_of_path(tmp_path / f"masks-{number}") for number in range(3)}) == 1
 
 
-def test_index_names_the_model_and_test_views_stay_out(scene, tmp_path, settings, disc_sam):
-    run_masks(scene, tmp_path / "masks", tmp_path / "cache", settings, threads=1)
-    index = read_index(tmp_path / "masks")
-    assert list(index["views"]) == ["000.png", "001.png"]
-    assert index["model_sha256"] == open_model_folder(disc_sam).digest
-
-
-def test_tree_hangs_discs_into_discs_and_the_overview_shows_both(scene, tmp_path, settings):
+def test_discs_nest_in_the_tree_and_the_overview_shows_them(scene, tmp_path, settings):
     masks_folder, tree_folder = tmp_path / "masks", tmp_path / "coverage_tree"
     run_masks(scene, masks_folder, tmp_path / "cache", settings, threads=1)
     run_coverage_tree(masks_folder, tree_folder, CoverageTreeSettings())
@@ -125,7 +113,7 @@ def test_tree_hangs_discs_into_discs_and_the_overview_shows_both(scene, tmp_path
     np.testing.assert_array_equal(arrays["depth"], masks.level)  # each subpart in a part in a whole
     entry = read_index(tree_folder)["views"]["000.png"]
     assert (entry["roots"], entry["part_with_parent"], entry["subpart_with_parent"]) == (4, 4, 4)
-
+    assert (entry["masks"], entry["deepest"]) == (12, 3)
     masks_overview(scene, masks_folder, tmp_path / "masks.png", tree_folder=tree_folder)
     assert (tmp_path / "masks.png").stat().st_size > 1000
     # four chains of three discs: four rows of three thumbnails
@@ -141,13 +129,13 @@ def test_graph_segmenter_needs_no_model(scene, tmp_path):
     assert read_index(tmp_path / "masks")["segmenter"] == "graph"
 
 
-def test_missing_model_names_the_way_out(scene, tmp_path):
+def test_the_error_for_a_missing_model_suggests_the_graph_segmenter(scene, tmp_path):
     with pytest.raises(ModelError, match=r"model folder .*nowhere is missing(.|\n)*masks.segmenter: graph"):
         run_masks(scene, tmp_path / "masks", tmp_path / "cache", MasksSettings(model="nowhere"), threads=1)
     assert not (tmp_path / "masks").exists()
 
 
-def test_digest_follows_content_and_not_place(disc_sam, own_sam):
+def test_a_models_digest_depends_on_its_content_only(disc_sam, own_sam):
     assert open_model_folder(disc_sam).digest == open_model_folder(own_sam).digest
     settings = json.loads((own_sam / "preprocessor_config.json").read_text())
     (own_sam / "preprocessor_config.json").write_text(json.dumps(settings | {"resample": 3}))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.canned_sam import CannedSam, NetworkClock
-from hilsplat.segment.generate import clean_masks, positive_boxes
+from hilsplat.segment.generate import clean_masks
 from hilsplat.segment.sam import HEADS, Frame, SamModel, full_stability, read_logits
 from hilsplat.segment.suppression import suppress_boxes, suppress_boxes_officially
 from hilsplat.settings import MasksSettings
@@ -55,7 +55,7 @@ def test_full_stability_counts_pixels_of_the_enlarged_logits(original_hw):
     assert np.abs(found - read_logits(logits, 1.0, frame)[1]).max() > 0.003
 
 
-def test_boxes_that_end_inside_decide_otherwise():
+def test_end_exclusive_boxes_give_another_iou_than_official_ones():
     # 4 and 3 columns: IoU 3 / 4; ending at the last one inside, 2 / 3
     boxes = np.array([[0, 0, 4, 9], [0, 0, 3, 9]])
     score = np.array([0.9, 0.8])
@@ -68,21 +68,15 @@ def test_scores_above_one_do_not_outweigh_the_first_rank():
     assert suppress_boxes(boxes, np.array([2.5, 0.1]), 0.5, np.array([0.0, 1.0])).tolist() == [1]
 
 
-def test_equal_scores_go_by_row_officially_and_by_area_here():
+def test_ties_are_broken_by_row_officially_and_by_area_here():
     boxes, score = np.array([[0, 0, 10, 9], [0, 0, 10, 10]]), np.ones(2)
     assert suppress_boxes_officially(boxes, score, 0.5).tolist() == [0]
     assert suppress_boxes(boxes, score, 0.5).tolist() == [1]
 
 
-def test_a_mask_that_is_small_as_a_whole_stays_and_counts_as_changed():
+def test_a_small_mask_can_be_kept_and_counts_as_changed():
     mask = np.zeros((1, 8, 8), bool)
     mask[0, 2:4, 2:4] = True
     masks, changed = clean_masks(pack(mask), 10, keep_small=True)
     np.testing.assert_array_equal(masks.dense(), mask)
     assert changed.tolist() == [True]
-
-
-def test_positive_boxes_by_hand():
-    logits = np.full((2, 4, 6), -1, np.float32)
-    logits[0, 1, 2] = logits[0, 2, 4] = 0.01
-    assert positive_boxes(logits).tolist() == [[2, 1, 5, 3], [0, 0, 0, 0]]

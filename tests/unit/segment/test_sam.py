@@ -1,10 +1,11 @@
-"""Sizes, points and logits on their way into and out of SAM, and its thresholds."""
+"""Conversion of images, points and logits for SAM, and its thresholds."""
 
 import numpy as np
 import pytest
 import torch
 
 from hilsplat.embed.model_check import check_model
+from hilsplat.segment.generate import positive_boxes
 from hilsplat.segment.sam import (
     REAL_SAM,
     Frame,
@@ -71,28 +72,21 @@ def test_logits_are_rounded_to_eighths_and_clipped():
     assert steps[0, 0].tolist() == [0, 0, 1, -2, 127, -127, 2, 2]
 
 
-def test_the_box_holds_what_is_above_zero():
+def test_boxes_of_positive_logits_by_hand():
     logits = np.full((2, 4, 6), -1, np.float32)
     logits[0, 1, 2] = logits[0, 2, 4] = 1
-    _, _, boxes = read_logits(logits, 1.0, SQUARE)
-    assert boxes.tolist() == [[2, 1, 5, 3], [0, 0, 0, 0]]
+    expected = [[2, 1, 5, 3], [0, 0, 0, 0]]
+    assert read_logits(logits, 1.0, SQUARE)[2].tolist() == positive_boxes(logits / 100).tolist() == expected
 
 
-def test_a_released_sam_has_langsplats_thresholds(own_sam):
+def test_thresholds_are_the_settings_else_the_models_else_langsplats(own_sam, project):
+    tiny = project / "models/sam-tiny"
+    assert SamModel.load(tiny).thresholds(MasksSettings()) == OWN_THRESHOLDS == Thresholds(0.35, 0.5, 0.0, 16)
+    assert "thresholds predicted IoU 0.35, stability 0.5, score 0.0" in check_model(tiny)
+    chosen = MasksSettings(stability_min=0.9, points_per_batch=3)
+    assert SamModel.load(own_sam).thresholds(chosen) == Thresholds(0.35, 0.9, 0.0, 3)
     (own_sam / "config.json").write_text('{"model_type": "sam"}')
     assert SamModel.load(own_sam).thresholds(MasksSettings()) == REAL_SAM == Thresholds(0.7, 0.85, 0.7, 8)
-
-
-def test_the_embedded_sam_brings_its_own_thresholds(project):
-    model = SamModel.load(project / "models/sam-tiny")
-    assert model.thresholds(MasksSettings()) == OWN_THRESHOLDS == Thresholds(0.35, 0.5, 0.0, 16)
-    text = check_model(project / "models/sam-tiny")
-    assert "thresholds predicted IoU 0.35, stability 0.5, score 0.0" in text
-
-
-def test_a_setting_wins_over_the_thresholds_of_the_model(disc_sam):
-    chosen = MasksSettings(stability_min=0.9, points_per_batch=3)
-    assert SamModel.load(disc_sam).thresholds(chosen) == Thresholds(0.35, 0.9, 0.0, 3)
 
 
 @pytest.mark.parametrize("length", [1, 7, 48, 90, 500])

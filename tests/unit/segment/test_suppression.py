@@ -1,4 +1,4 @@
-"""Suppression of boxes and masks against small cases by hand and a plain double loop."""
+"""Suppression of boxes and masks against small cases by hand and LangSplat's double loop."""
 
 import numpy as np
 import pytest
@@ -13,6 +13,8 @@ from hilsplat.segment.suppression import (
     suppress_boxes,
     suppress_masks,
 )
+from hilsplat.settings import MasksSettings
+from tests.unit.segment import official
 from tests.unit.segment.handmade import assert_equal_masks, pack
 
 shapes = st.tuples(st.integers(1, 8), st.just(3), st.just(5))
@@ -23,26 +25,6 @@ scores_of = st.sampled_from([0.1, 0.25, 0.5, 0.75, 1.0])
 def overlaps(masks: np.ndarray) -> np.ndarray:
     flat = masks.reshape(len(masks), -1).astype(np.int64)
     return flat @ flat.T
-
-
-def naive_keep(
-    masks: np.ndarray, score: np.ndarray, iou_max: float, score_min: float, inner: float
-) -> list[bool]:
-    """LangSplat's rules, pair by pair."""
-    order = sorted(range(len(masks)), key=lambda row: (-score[row], row))
-    keep = [score[row] >= score_min for row in range(len(masks))]
-    for first in range(len(order)):
-        for second in range(first + 1, len(order)):
-            i, j = order[first], order[second]
-            shared = np.logical_and(masks[i], masks[j]).sum()
-            in_i, in_j = shared / masks[i].sum(), shared / masks[j].sum()
-            if shared / np.logical_or(masks[i], masks[j]).sum() > iou_max:
-                keep[j] = False
-            if in_i < 0.5 and in_j >= 0.85 and in_i * in_j < inner:
-                keep[j] = False
-            if in_j < 0.5 and in_i >= 0.85 and in_i * in_j < inner:
-                keep[i] = False
-    return keep
 
 
 def test_box_iou_by_hand():
@@ -64,15 +46,15 @@ def test_boxes_are_dropped_by_better_ones_that_are_kept(boxes, score, iou_max, k
     assert suppress_boxes(np.array(boxes), np.array(score), iou_max).tolist() == kept
 
 
-def test_a_box_repeats_a_better_one_unless_it_is_steadier():
+def test_a_box_repeats_a_better_one_unless_it_is_more_stable():
     box = [0, 0, 10, 10]
     boxes = np.array([box, box, box, box, [0, 0, 10, 8]])
     score, stability = np.array([0.5, 0.9, 0.8, 0.7, 0.6]), np.array([0.5, 0.6, 0.64, 0.66, 0.1])
-    # 1 is best; 0 and 2 repeat it, 3 is steadier by more than 0.05, and 4 has an IoU of 0.8 with all others
+    # 1 is best; 0 and 2 repeat it, 3 is more stable by more than 0.05, 4 has an IoU of 0.8 with all others
     assert distinct_boxes(boxes, score, stability, iou_max=0.85, slack=0.05).tolist() == [1, 3, 4]
 
 
-def test_a_box_that_is_steadier_by_exactly_the_slack_repeats_a_better_one():
+def test_a_box_that_is_more_stable_by_exactly_the_slack_repeats_a_better_one():
     boxes, score = np.array([[0, 0, 10, 10]] * 3), np.array([0.9, 0.8, 0.7])
     stability = np.array([0.5, 0.75, 0.75 + 2**-20])  # exact in binary
     assert distinct_boxes(boxes, score, stability, iou_max=0.85, slack=0.25).tolist() == [0, 2]
@@ -92,13 +74,12 @@ def test_distinct_boxes_lead_to_the_same_suppression_at_any_threshold(seed, scor
     assert best(np.sort(distinct_boxes(boxes, score, stability, 0.9, slack=0.0))) == best(np.arange(40))
 
 
-def test_contained_mask_goes_even_with_the_better_score():
+def test_a_contained_mask_is_dropped_even_with_the_better_score():
     masks = np.array([[[1, 1, 1, 1, 1]], [[1, 1, 0, 0, 0]]], dtype=bool)
     score = np.array([0.2, 0.9])
-    keep = keep_best_masks(overlaps(masks), score, iou_max=0.8, score_min=0.0, inner=0.5)
-    assert keep.tolist() == [True, False]
-    keep = keep_best_masks(overlaps(masks), score, iou_max=0.8, score_min=0.0, inner=0.0)
-    assert keep.tolist() == [True, True]  # inner 0 keeps nesting inside a level
+    for inner, expected in ((0.5, [True, False]), (0.0, [True, True])):  # 0 keeps nesting inside a level
+        keep = keep_best_masks(overlaps(masks), score, iou_max=0.8, score_min=0.0, inner=inner)
+        assert keep.tolist() == expected
 
 
 @given(
@@ -108,10 +89,11 @@ def test_contained_mask_goes_even_with_the_better_score():
     st.sampled_from([0.0, 0.3]),
     st.sampled_from([0.0, 0.2, 0.5]),
 )
-def test_matrices_agree_with_a_double_loop(masks, data, iou_max, score_min, inner):
+def test_kept_masks_equal_langsplats(masks, data, iou_max, score_min, inner):
     score = np.array(data.draw(st.lists(scores_of, min_size=len(masks), max_size=len(masks))))
     keep = keep_best_masks(overlaps(masks), score, iou_max=iou_max, score_min=score_min, inner=inner)
-    assert keep.tolist() == naive_keep(masks, score, iou_max, score_min, inner)
+    expected = official.suppress(masks, score, MasksSettings(nms_iou=iou_max, nms_inner=inner), score_min)
+    assert np.flatnonzero(keep).tolist() == expected
 
 
 @given(nonempty_masks, st.data())
