@@ -56,7 +56,7 @@ Memory = Annotated[
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="seed for everything random")]
 Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]
 Results = Annotated[Path, typer.Option(help="results folder")]
-DataRoot = Annotated[Path, typer.Option(help="folder that holds the data sets")]
+DataRoot = Annotated[Path, typer.Option(help="folder of the data sets")]
 
 DEFAULT_CACHE = Path("results/.cache")
 MIN_FREE_MIB = 200.0  # minimum free disk space to start a stage
