@@ -75,11 +75,9 @@ def scan_street(
     range_noise_m: float = RANGE_NOISE_M,
     lost_share: float = LOST_SHARE,
 ) -> LidarScan:
-    """Scan a scene from some of its views' positions.
+    """Scan a street from above evenly chosen camera centres, which are in the order of the drive.
 
-    Args:
-        scene: street to scan; its seed also determines noise and losses. The sky returns nothing.
-        camera_centres: positions along the drive, in order; the scanner is above evenly chosen ones.
+    The scene's seed also determines noise and losses. The sky returns nothing.
     """
     rng = np.random.default_rng([scene.seed, 31])
     chosen = np.unique(np.linspace(0, len(camera_centres) - 1, poses).round().astype(int))
@@ -103,11 +101,6 @@ def scan_street(
         points = origin + measured[:, None] * directions[kept]
         rows.append((points, ids[kept], np.full(kept.sum(), pose), measured, beams[kept]))
     points, ids, pose_index, ranges, beam = (np.concatenate(column) for column in zip(*rows, strict=True))
-    return LidarScan(
-        points.astype(np.float32),
-        ids.astype(np.int32),
-        pose_index.astype(np.int32),
-        ranges.astype(np.float32),
-        beam.astype(np.int32),
-        origins,
-    )
+    points, ranges = points.astype(np.float32), ranges.astype(np.float32)
+    ids, pose_index, beam = (column.astype(np.int32) for column in (ids, pose_index, beam))
+    return LidarScan(points, ids, pose_index, ranges, beam, origins)

@@ -31,12 +31,7 @@ Borders = dict[int, dict[int, int]]
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers derived from names, independent of call order and number of threads.
-
-    Attributes:
-        seed: seed of the faults.
-        scene: `<dataset>/<scene>`.
-    """
+    """Random numbers derived from names, independent of call order and number of threads."""
 
     seed: int
     scene: str
@@ -149,11 +144,7 @@ def systematic(fault: str, node: int, view: str, draws: Draws, settings: Perturb
 def cut_in_two(
     mask: Bool[np.ndarray, "H W"], generator: np.random.Generator
 ) -> tuple[Bool[np.ndarray, "H W"], ...]:
-    """Cut a mask along a straight line that leaves 30 to 70 % of it on either side.
-
-    Returns:
-        The two pieces, or only the mask if it is too small to cut.
-    """
+    """Cut a mask along a line that leaves 30 to 70 % on either side, or return it if it is too small."""
     angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
     y, x = np.nonzero(mask)
     along = x * np.cos(angle) + y * np.sin(angle)
@@ -178,14 +169,13 @@ def displaced(
     it depends only on the position: with the same generator, a larger amplitude changes all pixels that a
     smaller one changes, and more.
 
+    The boundary moves inwards by at most half the distance to the innermost pixel, so thin regions become
+    thinner but do not vanish. Image borders are not boundaries.
+
     Args:
         mask: non-empty mask.
         amplitude_px: standard deviation of the displacement; 0 returns the mask itself.
         smooth_px: standard deviation of the field's Gaussian correlation function.
-
-    Returns:
-        The new mask, never empty: the boundary moves inwards by at most half the distance to the innermost
-        pixel, so thin regions become thinner but do not vanish. Image borders are not boundaries.
     """
     if amplitude_px == 0:
         return mask
@@ -216,7 +206,7 @@ def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def beside(level: Level, up: bool) -> Level:
-    """Return an adjacent level; `up` selects the coarser neighbour of part."""
+    """Return an adjacent level; `up` selects whole instead of subpart for a part."""
     if level is not Level.PART:
         return Level.PART
     return Level.WHOLE if up else Level.SUBPART

@@ -15,21 +15,13 @@ from hilsplat.world.rays import RayCaster
 
 @dataclass(frozen=True, eq=False)
 class TrueMesh:
-    """Triangles of a scene, in the frame of its true cameras.
-
-    Attributes:
-        triangles: corner positions, scene units.
-    """
+    """Triangles of a scene, in the frame of its true cameras; corner positions are in scene units."""
 
     triangles: Float32[np.ndarray, "F 3 3"]
 
     @staticmethod
     def load(path: Path) -> "TrueMesh":
-        """Read `truth/mesh.ply`.
-
-        Raises:
-            ArtifactError: if the file is missing or not a mesh.
-        """
+        """Read `truth/mesh.ply`; raise `ArtifactError` if it is missing or not a mesh."""
         try:
             # plyfile memory-maps lists of a known length instead of parsing them one by one.
             record = PlyData.read(path, known_list_len={"face": {"vertex_indices": 3}})

@@ -155,19 +155,9 @@ class Paint:
             Kind, first colour (3) and second colour (3) in linear light, scale, specular, shininess,
             grain, offset (3).
         """
-        return np.array(
-            [
-                KINDS.index(self.kind),
-                *linear_from_srgb(np.array(self.first)),
-                *linear_from_srgb(np.array(self.second)),
-                self.scale,
-                self.specular,
-                self.shininess,
-                self.grain,
-                *self.offset,
-            ],
-            dtype=np.float32,
-        )
+        first, second = (linear_from_srgb(np.array(colour)) for colour in (self.first, self.second))
+        numbers = (self.scale, self.specular, self.shininess, self.grain)
+        return np.array([KINDS.index(self.kind), *first, *second, *numbers, *self.offset], dtype=np.float32)
 
 
 def each_channel(colour: Colour, change: Callable[[float], float]) -> Colour:
@@ -196,9 +186,8 @@ def lab_from_srgb(colour: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*
     xyz = linear_from_srgb(np.asarray(colour, dtype=np.float64)) @ _XYZ_FROM_RGB.T
     t = xyz / _XYZ_FROM_RGB.sum(axis=1)
     f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
-    return np.stack(
-        [116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1
-    )
+    x, y, z = f[..., 0], f[..., 1], f[..., 2]
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
 
 
 _LAB = lab_from_srgb(np.array(list(COLOURS.values())))
@@ -215,7 +204,7 @@ def colour_word(colour: Float[np.ndarray, " 3"]) -> str:
 
 
 def difference(first: Paint, second: Paint) -> float:
-    """Return the distance in L*a*b* between the average colours (`Paint.seen`) of two paints."""
+    """Return the distance in L*a*b* between the average colours of two paints."""
     return float(np.linalg.norm(_seen_lab(first) - _seen_lab(second)))
 
 
@@ -255,9 +244,8 @@ class PaintBox:
         colour = str(rng.choice(fresh))
         if colour in self._left:
             self._left.remove(colour)
-        first = np.clip(
-            np.array(COLOURS[colour]) * rng.uniform(0.9, 1.08) + rng.normal(0, 0.012, 3), 0.03, 0.95
-        )
+        first = np.array(COLOURS[colour]) * rng.uniform(0.9, 1.08) + rng.normal(0, 0.012, 3)
+        first = np.clip(first, 0.03, 0.95)
         paint = Paint(
             colour,
             kind,

@@ -32,11 +32,7 @@ _HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that jitters rays
 
 
 def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
-    """Return the true node id per level and pixel, from one ray through each pixel's centre.
-
-    Returns:
-        Levels whole, part, subpart along the first axis; -1 where the level has no node.
-    """
+    """Return the true node id per level and pixel (-1 none), from one ray through each pixel's centre."""
     return _labels(scene, scene.caster.nearest(*_rays(camera, 1)).triangle, camera.size_hw)
 
 
@@ -46,8 +42,6 @@ def render_view(
     """Render a view with soft shadows, occluded sky light, highlights and solid textures.
 
     Args:
-        scene: scene to render.
-        camera: pose, intrinsics and size of the view.
         samples: sub-samples per pixel side; 3 gives clean edges, 1 is for previews.
         style: light and exposure; None uses the scene's own.
     """
@@ -95,23 +89,9 @@ def _reflected(
     prim = hits.triangle
     count = len(prim)
     points, facets, shading, colours = (np.empty((count, 3), np.float32) for _ in range(4))
-    gloss = np.empty((count, 2), np.float32)
-    _surfaces(
-        prim,
-        hits.u,
-        hits.v,
-        directions,
-        scene.triangles,
-        scene.normals,
-        scene.coords,
-        scene.material_ids,
-        scene.materials,
-        points,
-        facets,
-        shading,
-        colours,
-        gloss,
-    )
+    surface = (points, facets, shading, colours, np.empty((count, 2), np.float32))
+    mesh = (scene.triangles, scene.normals, scene.coords, scene.material_ids, scene.materials)
+    _surfaces(prim, hits.u, hits.v, directions, mesh, surface)
     rays_each = math.ceil(RAYS_PER_PIXEL / samples**2)
     light = np.array([*style.light_position, style.light_radius], np.float32)
     cells, lift = _HASH_CELLS / style.scale, np.float32(_LIFT * style.scale)
@@ -126,24 +106,13 @@ def _reflected(
             share[rows] += ~scene.caster.blocked(starts, toward, reach)
         return share / np.float32(rays_each)
 
-    under_sky, lit = _receivers(prim, points, facets, shading, gloss, light, samples)
+    under_sky, lit = _receivers(prim, surface, light, samples)
+    free_light = free(lit, _light_rays, light, np.float32(style.shadow_reach))
+    free_sky = free(under_sky, _sky_rays, np.float32(OCCLUSION_REACH * style.scale))
+    lights = np.array([style.light_colour, style.sky_colour, style.ground_colour], np.float32)
     image = np.zeros((count // samples**2, 3), np.float32)
-    _shade(
-        prim,
-        directions,
-        points,
-        facets,
-        shading,
-        colours,
-        gloss,
-        free(lit, _light_rays, light, np.float32(style.shadow_reach)),
-        free(under_sky, _sky_rays, np.float32(OCCLUSION_REACH * style.scale)),
-        light,
-        np.array([style.light_colour, style.sky_colour, style.ground_colour], np.float32),
-        np.float32(style.exposure),
-        samples,
-        image,
-    )
+    exposure = np.float32(style.exposure)
+    _shade(prim, directions, surface, free_light, free_sky, light, lights, exposure, samples, image)
     return image
 
 
@@ -177,32 +146,17 @@ def _directions(x_cam, y_cam, rotation, samples, directions):
                     dy = x * rotation[0, 1] + y * rotation[1, 1] + rotation[2, 1]
                     dz = x * rotation[0, 2] + y * rotation[1, 2] + rotation[2, 2]
                     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-                    directions[i, 0], directions[i, 1], directions[i, 2] = (
-                        dx / length,
-                        dy / length,
-                        dz / length,
-                    )
+                    directions[i, 0] = dx / length
+                    directions[i, 1] = dy / length
+                    directions[i, 2] = dz / length
                     i += 1
 
 
 @compiled
-def _surfaces(
-    prim,
-    u,
-    v,
-    directions,
-    triangles,
-    normals,
-    coords,
-    material_ids,
-    materials,
-    points,
-    facets,
-    shading,
-    colours,
-    gloss,
-):
-    """Compute position, facet normal, shading normal, colour and highlight at each hit."""
+def _surfaces(prim, u, v, directions, mesh, surface):
+    """Compute the surface at each hit: position, facet normal, shading normal, colour and highlight."""
+    triangles, normals, coords, material_ids, materials = mesh
+    points, facets, shading, colours, gloss = surface
     places = np.zeros((3, len(prim)))  # in the solid texture, scene units
     for i in range(len(prim)):
         f = prim[i]
@@ -261,12 +215,13 @@ def _to_light(points, facets, shading, i, light):
 
 
 @compiled
-def _receivers(prim, points, facets, shading, gloss, light, samples):
+def _receivers(prim, surface, light, samples):
     """Return the rows that the sky lights (hits on non-luminous surfaces), and those that face the light.
 
     Sky rows are ordered by sub-sample: rays cast together should be nearly parallel, and neighbouring pixels
     use similar directions for the same sub-sample.
     """
+    points, facets, shading, _, gloss = surface
     under_sky, lit = np.empty(len(prim), np.int64), np.empty(len(prim), np.int64)
     skies = lights = 0
     for sample in range(samples * samples):
@@ -284,12 +239,8 @@ def _receivers(prim, points, facets, shading, gloss, light, samples):
 @compiled
 def _cell(points, i, cells, salt):
     """Return a hash in [0, 1) of the small cell of space that contains point i."""
-    return hash01(
-        math.floor(points[i, 0] * cells),
-        math.floor(points[i, 1] * cells),
-        math.floor(points[i, 2] * cells),
-        salt,
-    )
+    x, y, z = points[i, 0] * cells, points[i, 1] * cells, points[i, 2] * cells
+    return hash01(math.floor(x), math.floor(y), math.floor(z), salt)
 
 
 @compiled
@@ -339,23 +290,9 @@ def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_re
 
 
 @compiled
-def _shade(
-    prim,
-    directions,
-    points,
-    facets,
-    shading,
-    colours,
-    gloss,
-    lit,
-    open_sky,
-    light,
-    lights,
-    exposure,
-    samples,
-    image,
-):
+def _shade(prim, directions, surface, lit, open_sky, light, lights, exposure, samples, image):
     """Average the reflected light of all sub-samples into pixels (linear light, compressed highlights)."""
+    points, facets, shading, colours, gloss = surface
     per_pixel = samples * samples
     for i in range(len(prim)):
         pixel = i // per_pixel

@@ -15,11 +15,7 @@ SPLITS = {"training": TRAINING_SEEDS, "development": DEVELOPMENT_SEEDS, "benchma
 
 
 def split_of_seed(seed: int) -> str:
-    """Return the name of the split that contains a scene seed.
-
-    Returns:
-        "training", "development", "benchmark", or "free" for a seed in no split.
-    """
+    """Return "training", "development", "benchmark", or "free" for a seed in no split."""
     for split, seeds in SPLITS.items():
         if seed in seeds:
             return split
@@ -27,11 +23,7 @@ def split_of_seed(seed: int) -> str:
 
 
 def require_split(seed: int, split: str) -> None:
-    """Check that a scene seed is in a split.
-
-    Raises:
-        SceneError: if the seed is not in the split, or the split is unknown.
-    """
+    """Raise `SceneError` if a scene seed is not in a split, or the split is unknown."""
     if split not in SPLITS:
         raise SceneError(f"unknown split {split!r} of scene seeds", expected=f"one of {', '.join(SPLITS)}")
     if seed not in SPLITS[split]:
@@ -40,5 +32,5 @@ def require_split(seed: int, split: str) -> None:
             f"scene seed {seed} is not in the {split} split",
             expected=f"{seeds.start} to {seeds.stop - 1}",
             found=f"{seed}, split {split_of_seed(seed)}",
-            fix="take a seed of the split: trained-on scenes must not be evaluated, nor the reverse",
+            fix="use a seed from this split; scenes for training and for evaluation must differ",
         )

@@ -99,8 +99,10 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
 @cache
 def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 3"]]:
-    """Return the triangles of any box: each corner's side on each axis (-1 or 1), and 1 where a bevel insets
-    it, which is along the two axes other than the normal of its face."""
+    """Return the sides of each triangle's corners on each axis (-1 or 1), and 1 where a bevel insets them.
+
+    A bevel insets a corner along the two axes other than the normal of its face.
+    """
     triangles: list[np.ndarray] = []
 
     def corner(signs: Sequence[float] | np.ndarray, full_axis: int) -> np.ndarray:
@@ -295,26 +297,15 @@ def ring(
     direction[-1] = direction[0]
     away, up = np.cos(around), np.sin(around)
     away[-1], up[-1] = away[0], up[0]
-    normal = np.stack(
-        [
-            direction[:, None, 0] * away,
-            direction[:, None, 1] * away,
-            np.broadcast_to(up, (len(angle), len(up))),
-        ],
-        axis=-1,
-    )
+    x, y = direction[:, None, 0] * away, direction[:, None, 1] * away
+    normal = np.stack([x, y, np.broadcast_to(up, x.shape)], axis=-1)
     points = tube * normal
     points[..., :2] += radius * direction[:, None]
-    corner = [(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1)]
 
     def picked(values: np.ndarray) -> np.ndarray:
-        rows, columns = len(angle) - 1, len(around) - 1
-        return np.concatenate(
-            [
-                np.stack([values[i : i + rows, j : j + columns] for i, j in three], axis=2).reshape(-1, 3, 3)
-                for three in corner
-            ]
-        )
+        """Return the values at the corners of all triangles."""
+        a, b, c, d = values[:-1, :-1], values[1:, :-1], values[1:, 1:], values[:-1, 1:]
+        return np.concatenate([np.stack(three, axis=2).reshape(-1, 3, 3) for three in ((a, b, c), (a, c, d))])
 
     mesh = Mesh(picked(points), picked(normal))
     turned = {"z": mesh, "x": mesh.turned("y", 90), "y": mesh.turned("x", 90)}[axis]

@@ -30,10 +30,7 @@ MESH_EDGE: dict[str, float] = {"room": 0.08}
 
 
 def parse_source(source: str) -> tuple[str, int]:
-    """Parse a source such as "world:tabletop:201".
-
-    Returns:
-        Kind of scene and its seed.
+    """Return the kind of scene and the seed that a source such as "world:tabletop:201" names.
 
     Raises:
         SceneError: if the form differs, the kind is unknown, or the seed is reserved for training.
@@ -50,7 +47,7 @@ def parse_source(source: str) -> tuple[str, int]:
         raise SceneError(
             f"source {source!r} is a scene that the small models were trained on",
             expected=f"a seed outside {TRAINING_SEEDS.start} to {TRAINING_SEEDS.stop - 1}",
-            fix="take a seed from 200 to 299 for scenes that are reported, from 100 to 199 for trials",
+            fix="use a seed from 200 to 299 for reported scenes, or from 100 to 199 for trials",
         )
     return words[1], seed
 
@@ -72,7 +69,7 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
     with stage_log("world", source) as counts:
         scene = _scene(kind, seed, settings.objects)
         if not scene.placed:
-            raise SceneError(f"no object found a place in {source}", fix="take another seed")
+            raise SceneError(f"no object fits into {source}", fix="use another seed")
         cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
         require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
         smallest = smallest_areas(settings.image_px, settings.min_area_px)
@@ -81,9 +78,8 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
         with atomic_folder(out / "images") as folder:
             jobs = [(kind, seed, settings, row) for row in range(settings.views)]
             results = in_processes(_render, jobs, threads)
-            for name, (image, label) in track(
-                zip(cameras.names, results, strict=True), "rendered views", total=len(cameras)
-            ):
+            views = zip(cameras.names, results, strict=True)
+            for name, (image, label) in track(views, "rendered views", total=len(cameras)):
                 write_png(folder / name, image)
                 labels[name] = {level: label[level.index] for level in LEVELS}
                 annotated[name] = annotated_nodes(label, scene.nodes, scene.background, smallest)
@@ -96,14 +92,11 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
                 centres = np.stack([cameras[name].centre for name in cameras.names])
                 scan_street(scene, centres).save(folder / "lidar.npz")
             write_json(folder / "scene.json", _record(source, scene))
-            write_index(
-                folder, {name: {"annotated": len(ids)} for name, ids in annotated.items()}, source=source
-            )
+            index = {name: {"annotated": len(ids)} for name, ids in annotated.items()}
+            write_index(folder, index, source=source)
+        placed = f"{len(scene.placed)} of {scene.asked}"
         counts.update(
-            views=len(cameras),
-            objects=f"{len(scene.placed)} of {scene.asked}",
-            nodes=len(scene.nodes),
-            triangles=len(scene.triangles),
+            views=len(cameras), objects=placed, nodes=len(scene.nodes), triangles=len(scene.triangles)
         )
 
 

@@ -118,15 +118,13 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         return float(cell & 1), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 21)
     if kind == 3:  # spots
         nearest, _, identity = cell_noise(0.7 * x, 0.7 * y, 0.7 * z, 31)
-        return 1 - step_between(
-            nearest, 0.22 + 0.14 * identity, 0.27 + 0.14 * identity
-        ), 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 35)
+        share = 1 - step_between(nearest, 0.22 + 0.14 * identity, 0.27 + 0.14 * identity)
+        return share, 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 35)
     if kind == 4:  # wood: rings around a tilted axis and fine fibres along it
         rx = x + 0.9 * value_noise(0.4 * x, 0.4 * y, 0.12 * z, 41)
         ry = y + 0.25 * z
-        rings = math.sin(
-            2.2 * math.sqrt(rx * rx + ry * ry) + 2.5 * value_noise(0.6 * x, 0.6 * y, 0.2 * z, 42)
-        )
+        bend = value_noise(0.6 * x, 0.6 * y, 0.2 * z, 42)
+        rings = math.sin(2.2 * math.sqrt(rx * rx + ry * ry) + 2.5 * bend)
         fibre = value_noise(6 * x, 6 * y, 0.7 * z, 43)
         return 0.55 * step_between(rings, -0.7, 0.9) + 0.4 * fibre, 0.9 + 0.2 * fibre
     if kind == 5:  # stone: clouds and thin veins
@@ -139,9 +137,8 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         return identity, (0.7 + 0.3 * seam) * (0.8 + 0.45 * math.fabs(math.sin(37.0 * identity)))
     if kind == 7:  # weave
         warp, weft = math.sin(math.pi * (x + 0.4 * y)), math.sin(math.pi * (z - 0.4 * y))
-        return step_between(warp * weft, -0.5, 0.5), 0.88 + 0.2 * fractal_noise(
-            0.3 * x, 0.3 * y, 0.3 * z, 3, 71
-        )
+        cloud = fractal_noise(0.3 * x, 0.3 * y, 0.3 * z, 3, 71)
+        return step_between(warp * weft, -0.5, 0.5), 0.88 + 0.2 * cloud
     if kind == 8:  # brushed metal: streaks around z
         streak = value_noise(0.8 * x, 0.8 * y, 11 * z, 81)
         cloud = fractal_noise(0.9 * x, 0.9 * y, 0.9 * z, 3, 83)
@@ -150,9 +147,8 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         course = math.floor(0.9 * z)
         along = 0.36 * (x + y) + 0.5 * (course & 1)
         brick = math.floor(along)
-        joint = min(
-            min(along - brick, brick + 1 - along) / 0.36, min(0.9 * z - course, course + 1 - 0.9 * z) / 0.9
-        )
+        across = min(0.9 * z - course, course + 1 - 0.9 * z)
+        joint = min(min(along - brick, brick + 1 - along) / 0.36, across / 0.9)
         tone = hash01(brick, course, 0, 91)
         return 1 - step_between(joint, 0.05, 0.1), 0.78 + 0.4 * tone
     if kind == 11:  # floor tiles: squares in x and y, which upright faces show as stripes
@@ -165,9 +161,8 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         stroke = fractal_noise(2.4 * x + 1.2 * z, 2.4 * y, 0.9 * z, 3, 101)
         cloud = fractal_noise(0.4 * x, 0.4 * y, 0.4 * z, 2, 105)
         return step_between(0.65 * stroke + 0.35 * cloud, 0.3, 0.7), 0.85 + 0.3 * stroke
-    return step_between(fractal_noise(x, y, z, 4, 1), 0.3, 0.72), 0.95 + 0.1 * value_noise(
-        4 * x, 4 * y, 4 * z, 7
-    )
+    mottle = step_between(fractal_noise(x, y, z, 4, 1), 0.3, 0.72)
+    return mottle, 0.95 + 0.1 * value_noise(4 * x, 4 * y, 4 * z, 7)
 
 
 @compiled(error_model="numpy")  # a loop that may raise is not vectorised

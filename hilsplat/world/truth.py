@@ -40,7 +40,6 @@ def annotated_nodes(
 
     Args:
         labels: node id per level and pixel, -1 for none.
-        nodes: all nodes of the scene.
         background: ids that are never scored (table, floor, walls).
         smallest: minimum area of a scored text per level, px.
     """
@@ -67,11 +66,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     vertex only if their faces have equal ids, so both sides of a border have their own vertices. Protocols
     that score vertices, such as ScanNet's, need evenly spaced visible vertices; a plain wall has only four.
 
-    Args:
-        path: file to write.
-        scene: scene to write, in the coordinates of the true cameras.
-        cameras: the views of the scene.
-        longest_edge: longer edges are halved until none is left, scene units; None keeps the triangles.
+    Edges longer than `longest_edge` (scene units) are halved until none is left; None keeps the triangles.
     """
     triangles, owner = scene.triangles, np.arange(len(scene.triangles))
     if longest_edge is not None:
@@ -80,43 +75,25 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     # float32 represents ids exactly up to 2**24, so ids and positions fit in one array.
     rows = np.concatenate([np.repeat(ids, 3, axis=0).astype(np.float32), triangles.reshape(-1, 3)], axis=1)
     unique, index = unique_rows(rows)
-    vertices = np.empty(
-        len(unique),
-        dtype=[
-            *((axis, "<f4") for axis in "xyz"),
-            *((level.label, "<i4") for level in LEVELS),
-            ("views", "u1"),
-        ],
-    )
+    id_fields = [(level.label, "<i4") for level in LEVELS]
+    vertices = np.empty(len(unique), [*((axis, "<f4") for axis in "xyz"), *id_fields, ("views", "u1")])
     for column, axis in enumerate("xyz"):
         vertices[axis] = unique[:, 3 + column]
     for level in LEVELS:
         vertices[level.label] = unique[:, level.index]
     vertices["views"] = np.minimum(views_of_points(scene, cameras, np.ascontiguousarray(unique[:, 3:])), 255)
-    faces = np.empty(
-        len(triangles),
-        dtype=[("count", "u1"), ("corners", "<i4", 3), *((level.label, "<i4") for level in LEVELS)],
-    )
+    faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3), *id_fields])
     faces["count"] = 3
     faces["corners"] = index.reshape(-1, 3)
     for level in LEVELS:
         faces[level.label] = ids[:, level.index]
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"element vertex {len(vertices)}",
-            *(f"property float {axis}" for axis in "xyz"),
-            *(f"property int {level.label}" for level in LEVELS),
-            "property uchar views",
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            *(f"property int {level.label}" for level in LEVELS),
-            "end_header\n",
-        ]
-    )
+    id_lines = [f"property int {level.label}" for level in LEVELS]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [*(f"property float {axis}" for axis in "xyz"), *id_lines, "property uchar views"]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += [*id_lines, "end_header\n"]
     with atomic_path(path) as temporary:
-        temporary.write_bytes(header.encode() + vertices.tobytes() + faces.tobytes())
+        temporary.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
 
 def unique_rows(
@@ -159,10 +136,6 @@ def refined(
     """Halve all edges longer than `longest_edge` until none is left.
 
     Whether an edge is halved depends only on its two ends, so no cracks open between adjacent triangles.
-
-    Args:
-        triangles: corners, scene units.
-        longest_edge: scene units.
 
     Returns:
         The smaller triangles, and the row of `triangles` that contains each.

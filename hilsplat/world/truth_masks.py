@@ -32,15 +32,8 @@ SEGMENTER = "truth-perturbed"
 """Name of the segmenter, and prefix of its masks' label."""
 
 FAULTS = (
-    "boundary_px",
-    "merge",
-    "split",
-    "missing",
-    "missing_level",
-    "wrong_level",
-    "dropped_views",
-    "systematic_merge",
-    "systematic_missing",
+    *("boundary_px", "merge", "split", "missing", "missing_level", "wrong_level", "dropped_views"),
+    *("systematic_merge", "systematic_missing"),
 )
 """Settings of `PerturbSettings` that change masks; if all are 0, the masks are exact."""
 
@@ -50,13 +43,8 @@ def run_truth_masks(
 ) -> None:
     """Write masks of every training view from the true labels, with faults (see `mask_faults.faulty_masks`).
 
-    Args:
-        truth: the truth folder of a synthetic scene, with annotations and `scene.json`, which lists the
-            surroundings.
-        out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json`, as in the masks stage;
-            the index also holds the requested faults and, per view, the number of faults.
-        min_area_px: smaller true regions give no mask (`masks.min_area_px`).
-        threads: number of views processed at once; the result does not depend on it.
+    The index also contains the requested faults and, per view, the number of faults. The result does not
+    depend on `threads`.
 
     Raises:
         MisalignedArtifactError: if label images differ in size from the cameras.
@@ -95,20 +83,10 @@ def run_truth_masks(
             for view, (masks, faults) in zip(views, track(found, "masks of views", len(views)), strict=True):
                 masks.save(folder / f"{view}.npz")
                 index[view] = {**index_entry(masks), "faults": faults}
-            write_index(
-                folder,
-                index,
-                scene=scene.name,
-                segmenter=SEGMENTER,
-                model=None,
-                model_sha256=None,
-                label=label,
-                perturb=settings.model_dump(mode="json"),
-            )
-        counts.update(
-            views=len(views),
-            **{level.label: sum(entry[level.label] for entry in index.values()) for level in LEVELS},
-        )
+            made_by = {"segmenter": SEGMENTER, "model": None, "model_sha256": None, "label": label}
+            write_index(folder, index, scene=scene.name, **made_by, perturb=settings.model_dump(mode="json"))
+        masks_per_level = {level.label: sum(row[level.label] for row in index.values()) for level in LEVELS}
+        counts.update(views=len(views), **masks_per_level)
 
 
 def true_labels(annotations: HierarchyAnnotations, view: str) -> Int32[np.ndarray, "3 H W"]:

@@ -255,12 +255,11 @@ def birdhouse(b: Builder) -> None:
         roof.put(roof_paint, slab.moved(0, side * (half / 2 + 0.035), low + h + rise / 2 + 0.015))
     shape = box((w * 1.18, 0.10, 0.075), (0, 0, low + h + rise + 0.035), 0.02)
     roof.subpart("ridge, ridge beam", "wood", shape)
-    feather = b.paint("plain red blue yellow orange teal purple")
     z = low + h + rise + 0.18
     path = [(-0.10, 0, z), (-0.28, 0, z + 0.06)]
     shapes = [ellipsoid((0.155, 0.115, 0.115), (0, 0, z))]
     shapes += [sphere(0.095, (0.12, 0, z + 0.115)), sweep(path, [0.075, 0.04])]
-    bird = b.part("bird, little bird", feather, *shapes)
+    bird = b.part("bird, little bird", "plain red blue yellow orange teal purple", *shapes)
     shape = lathe([(0, 0), (0.075, 0), (0, 0.17)], 14).turned("y", 90).moved(0.195, 0, z + 0.11)
     bird.subpart("beak, bill", "plain orange yellow black", shape)
     shapes = [ellipsoid((0.12, 0.045, 0.07), (-0.04, s * 0.11, z + 0.02)) for s in (-1, 1)]

@@ -35,8 +35,7 @@ class ModelNode:
     Attributes:
         level: 1 whole, 2 part, 3 subpart.
         parent: row of the node one level up in the object, -1 for the whole.
-        text: canonical query for the node, such as "bear head".
-        synonyms: equivalent queries.
+        text: canonical query for the node, such as "bear head"; `synonyms` are equivalent.
         colour: word for its prevailing colour.
     """
 
@@ -52,10 +51,8 @@ class ObjectModel:
     """One object in its own frame, with its lowest point at z = 0 and its front towards +x.
 
     Attributes:
-        name: class, such as "bear".
         nodes: its tree; row 0 is the whole.
-        triangles: corner positions.
-        normals: shading normals at the corners.
+        triangles: corner positions; `normals` are the shading normals at the corners.
         node_ids: rows in `nodes` of each triangle (whole, part, subpart; -1 none).
         material_ids: rows of `materials`.
         materials: shader parameters (`Paint.row`).
@@ -143,7 +140,7 @@ class Builder:
 
     def build(self) -> ObjectModel:
         """Return the object with its lowest point at z = 0 and contrast between parts that touch."""
-        triples: list[tuple[int, int, int]] = []
+        triples = []
         for node in self.nodes:
             part, subpart = {1: (NONE, NONE), 2: (node.row, NONE), 3: (node.parent, node.row)}[node.level]
             triples.append((0, part, subpart))
@@ -204,12 +201,9 @@ class Builder:
             for other, paint in settled.items():
                 if parents & set(groups[other]):
                     rivals.append((paint, PARENT_CONTRAST))
-                elif any(
-                    _touch(boxes[row], boxes[near], reach)
-                    for row in rows
-                    for near in groups[other]
-                    if near in boxes
-                ):
+                    continue
+                near = [boxes[other_row] for other_row in groups[other] if other_row in boxes]
+                if any(_touch(boxes[row], box, reach) for row in rows for box in near):
                     rivals.append((paint, NEIGHBOUR_CONTRAST))
             settled[key] = _distinct(main, rivals)
             for row in rows:

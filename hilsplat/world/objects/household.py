@@ -83,10 +83,9 @@ def lamp(b: Builder) -> None:
 
     profile = [(shade_r, low), (upper, h), (upper - 0.03, h), (shade_r - 0.03, low), (shade_r, low)]
     shade = b.part("shade, lampshade", cloth, lathe(profile))
-    trim = b.paint("cloth")
     profile = [(shade_r - 0.035, low - 0.01), (shade_r + 0.022, low - 0.01)]
     profile += [(radius(low + 0.115) + 0.022, low + 0.115), (radius(low + 0.115), low + 0.12)]
-    shade.subpart("border, trim", trim, lathe(profile))
+    shade.subpart("border, trim", "cloth", lathe(profile))
     profile = [(0, h - 0.03), (upper - 0.01, h - 0.03), (0.06, h + 0.01), (0.075, h + 0.07), (0, h + 0.12)]
     shade.subpart("finial, top knob", accent, lathe(profile))
 
@@ -224,10 +223,9 @@ def guitar(b: Builder) -> None:
         for k in range(2):
             y, up = side * (0.14 + 0.025 * k), high + 0.08 + 0.12 * k
             pegs.put(metal, box((0.08, 0.13, 0.095), (x - 0.045, y, up), 0.02))
-    paint = b.paint("metal")
     shapes = [box((0.42, 0.52, 0.05), (0, 0, 0.025), 0.015)]
     shapes += [box((0.06, 0.06, 0.5), (-x - 0.05, 0, 0.27), 0.01)]
-    stand = b.part("stand, foot, support", paint, *shapes)
+    stand = b.part("stand, foot, support", "metal", *shapes)
     shapes = [box((0.30, 0.10, 0.14), (0, side * 0.2, 0.09), 0.03) for side in (-1, 1)]
     stand.subpart("pads, cushions", "plastic", *shapes)
 

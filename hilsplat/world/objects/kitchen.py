@@ -102,19 +102,21 @@ def frying_pan(b: Builder) -> None:
     profile = [(r - 0.02, h - 0.01), (r * 0.80, 0.035), (0, 0.03)]
     pan.subpart("inside, cooking surface", inner, lathe(profile, 36), at="of")
     pan.subpart("rim, edge", "ceramic", ring(r + 0.005, 0.042, (0, 0, h), segments=36), at="of")
-    white = b.paint("snow white")
     blobs = ((0.20, -0.05, -0.03), (0.14, 0.07, 0.07), (0.13, -0.06, 0.12))
     shapes = [ellipsoid((size, size * 0.85, 0.035), (x, y, 0.055)) for size, x, y in blobs]
-    egg = b.part("fried egg, egg", white, *shapes)
+    egg = b.part("fried egg, egg", "snow white", *shapes)
     shape = ellipsoid((0.13, 0.13, 0.085), (-0.02, 0.02, 0.085))
     egg.subpart("yolk, egg yellow", "plastic yellow orange", shape)
     bacon = b.part("bacon, bacon strip")
     strip = b.paint("plain red brown pink")
-    fat = b.paint("plain beige white yellow orange")
     for k in range(5):
         x = -0.18 + 0.09 * k
         bacon.put(strip, box((0.095, 0.13, 0.05), (x, -0.26 + 0.02 * (k % 2), 0.075 + 0.02 * (k % 2)), 0.01))
-    bacon.subpart("fat, fat stripe", fat, box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01))
+    bacon.subpart(
+        "fat, fat stripe",
+        "plain beige white yellow orange",
+        box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01),
+    )
     path = [(r * 0.9, 0, h * 0.7), (r + 0.12, 0, h + 0.07), (r + 0.22, 0, h + 0.11)]
     handle = b.part("handle", "metal", sweep(path, [0.07, 0.065, 0.065]))
     end = r + 0.46
@@ -188,9 +190,8 @@ def fruit_basket(b: Builder) -> None:
     ]
     shape = sweep(curve, [0.05, 0.07, 0.085, 0.09, 0.09, 0.09, 0.085, 0.07, 0.05])
     banana = b.part("banana, bananas", "plain yellow green", shape)
-    dark = b.paint("plain brown black")
     shapes = [sphere(0.068, tuple(curve[0])), sphere(0.068, tuple(curve[-1]))]
-    banana.subpart("tips, ends", dark, *shapes, at="of")
+    banana.subpart("tips, ends", "plain brown black", *shapes, at="of")
 
 
 def ice_cream(b: Builder) -> None:

@@ -161,9 +161,12 @@ def television(b: Builder) -> None:
     tall, low = width * 0.58, 0.1
     case = b.part("case, frame", dark, box((0.06, width, tall), (0, 0, low + tall / 2), 0.012))
     case.subpart("bar, speaker bar", "plain", box((0.05, width * 0.9, 0.045), (0.02, 0, low + 0.03), 0.01))
-    sky = b.paint("plain blue teal purple")
     middle = low + tall / 2 + 0.022
-    screen = b.part("screen, display", sky, box((0.02, width - 0.06, tall - 0.09), (0.028, 0, middle)))
+    screen = b.part(
+        "screen, display",
+        "plain blue teal purple",
+        box((0.02, width - 0.06, tall - 0.09), (0.028, 0, middle)),
+    )
     shape = disc(tall * 0.14, 0.0, 0.012, 28).moved(0.034, width * 0.2, middle + tall * 0.16)
     screen.subpart("sun, ball", "plain yellow orange white red", shape)
     shape = box((0.012, width - 0.06, tall * 0.24), (0.036, 0, middle - (tall - 0.09) / 2 + tall * 0.12))

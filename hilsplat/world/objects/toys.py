@@ -261,9 +261,8 @@ def penguin(b: Builder) -> None:
         eyes.put("plastic black", sphere(0.062, (r * 0.48 + 0.075, side * 0.09, z + 0.04)))
     shape = lathe([(0, 0), (0.105, 0), (0.08, 0.1), (0, 0.23)]).turned("y", 90).moved(r * 0.55, 0, z - 0.06)
     head.subpart("beak, bill", orange, shape)
-    cloth = b.paint("cloth")
     neck = z - r * 0.60
-    scarf = b.part("scarf, shawl", cloth, ring(r * 0.68, 0.075, (0.0, 0, neck)))
+    scarf = b.part("scarf, shawl", "cloth", ring(r * 0.68, 0.075, (0.0, 0, neck)))
     shape = box((0.07, 0.16, 0.32), (r * 0.84, 0.16, neck - 0.14), 0.025)
     scarf.subpart("end, fringe", "cloth", shape, at="of")
     tip_paint = b.paint("fur")

@@ -117,9 +117,8 @@ def airplane(b: Builder) -> None:
     profile += [(r, length * 0.88), (r * 0.8, length * 0.97), (0, length)]
     hull = lathe(profile).turned("y", 90).moved(-length * 0.58, 0, z)
     body = b.part("fuselage, body", skin, hull)
-    glass = b.paint("plastic blue teal black white")
     shape = ellipsoid((0.20, 0.115, 0.13), (length * 0.13, 0, z + r * 0.82))
-    body.subpart("cockpit, windows, canopy", glass, shape)
+    body.subpart("cockpit, windows, canopy", "plastic blue teal black white", shape)
     body.subpart("band, stripe", "plain", disc(r * 0.90, -length * 0.20, -length * 0.09).moved(z=z))
     x = length * 0.42
     shapes = [box((0.045, 0.09, 0.56), (x + 0.07, 0, 0), 0.015).turned("x", a).moved(z=z) for a in (30, 120)]

@@ -19,12 +19,9 @@ TRIES = 120
 
 @dataclass(frozen=True)
 class Room:
-    """Interior of a room, with the middle of its floor at the origin; walls 0 to 3 face +x, +y, -x, -y.
+    """Width (x), depth (y) and height of a room, m; the origin is in the middle of the floor.
 
-    Attributes:
-        width: length along x, m.
-        depth: length along y, m.
-        height: height of the ceiling, m.
+    Walls 0 to 3 face +x, +y, -x, -y.
     """
 
     width: float
@@ -48,12 +45,7 @@ def yaw_of_wall(wall: int) -> float:
 
 @dataclass(frozen=True)
 class Space:
-    """An axis-aligned box of occupied space, m.
-
-    Attributes:
-        low: its lowest corner.
-        high: its highest corner.
-    """
+    """Lowest and highest corner of an axis-aligned box of occupied space, m."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -92,46 +84,36 @@ class FloorPlan:
             return False
         return space.high[2] <= PATH_LOW or space.distance_xy(self.path) >= PATH_GAP
 
-    def take(self, space: Space) -> None:
-        """Mark a box as occupied."""
-        self.taken.append(space)
-
     def wall_spot(
         self,
         rng: np.random.Generator,
         size: Float[np.ndarray, " 3"],
         base_z: float,
         clear: float,
-        walls: tuple[int, ...] = (0, 1, 2, 3),
         gap: float = WALL_GAP,
     ) -> tuple[int, Float[np.ndarray, " 2"], Space] | None:
         """Find a random free place at a wall for an object that faces the room.
 
         Args:
-            rng: source of the candidate places.
             size: depth, width and height of the object in its own frame, m.
             base_z: height of its lowest point, m.
             clear: depth that must be free in front of it, m; it is not reserved afterwards.
-            walls: allowed walls.
             gap: distance from the wall, m.
 
         Returns:
             The wall, the object's centre in x and y, and the space it occupies; None if no place is found.
         """
         for _ in range(TRIES):
-            wall = int(rng.choice(walls))
+            wall = int(rng.choice((0, 1, 2, 3)))
             slack = self.room.wall_length(wall) / 2 - size[1] / 2 - 0.04
             if slack <= 0:
                 continue
             along = float(rng.uniform(-slack, slack))
             spot = self.room.at_wall(wall, along, gap + size[0] / 2)
             space = turned_space(spot, size, yaw_of_wall(wall), base_z)
-            front = turned_space(
-                self.room.at_wall(wall, along, gap + (size[0] + clear) / 2),
-                np.array([size[0] + clear, size[1], size[2]]),
-                yaw_of_wall(wall),
-                base_z,
-            )
+            deeper = np.array([size[0] + clear, size[1], size[2]])
+            middle = self.room.at_wall(wall, along, gap + deeper[0] / 2)
+            front = turned_space(middle, deeper, yaw_of_wall(wall), base_z)
             if self.free(space) and not any(front.meets(other, 0.0) for other in self.taken):
                 return wall, spot, space
         return None

@@ -35,12 +35,9 @@ KINDS: dict[str, SceneKind] = {
 
 
 def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
-    """Build a scene.
+    """Build a scene with a number of objects; on a street, of vehicles and people.
 
-    Args:
-        kind: one of `KINDS`.
-        seed: not negative; the same seed and number of objects give the same scene.
-        objects: number of objects to place; on a street, of vehicles and people.
+    The same seed and number give the same scene.
 
     Raises:
         SceneError: if the kind is unknown or a number is out of range.

@@ -97,36 +97,20 @@ class _Furnishing:
         return build_object(name, rng) if thing else build_furniture(name, rng)
 
     def put(
-        self,
-        name: str,
-        model: ObjectModel,
-        spot: np.ndarray,
-        yaw_deg: float,
-        base_z: float = 0.0,
-        scale: float = 1.0,
-    ) -> Space:
-        """Add an object centred at `spot` in x and y and return the space it occupies."""
+        self, model: ObjectModel, spot: np.ndarray, yaw_deg: float, base_z: float = 0.0, scale: float = 1.0
+    ) -> None:
+        """Add an object centred at `spot` in x and y."""
         low, high = model.triangles.min(axis=(0, 1)) * scale, model.triangles.max(axis=(0, 1)) * scale
         middle = (low + high)[:2] / 2
         xy = spot - rotation_about("z", yaw_deg)[:2, :2] @ middle
         node = self.assembly.add_object(model, scale, xy, yaw_deg, base_z)
         added = self.assembly.triangles[-1]
-        centre, radius = footprint_of(added)
+        (x, y), radius = footprint_of(added)
         space = Space.of(added.reshape(-1, 3))
-        self.placed.append(
-            PlacedObject(
-                name,
-                node,
-                (float(centre[0]), float(centre[1])),
-                radius,
-                space.high[2] - base_z,
-                yaw_deg,
-                base_z,
-            )
-        )
-        if name in SUPPORTS:
-            self.supports.append(_support(model, added, SUPPORTS[name]))
-        return space
+        size = (radius, space.high[2] - base_z)
+        self.placed.append(PlacedObject(model.name, node, (float(x), float(y)), *size, yaw_deg, base_z))
+        if model.name in SUPPORTS:
+            self.supports.append(_support(model, added, SUPPORTS[model.name]))
 
 
 class Support(NamedTuple):
@@ -181,7 +165,9 @@ def build_room(seed: int, objects: int) -> WorldScene:
     fixtures = _add_fixtures(work, rng)
     furniture = _furnish(work, rng, max(1, round(FURNITURE_SHARE * objects)))
     pictures = _hang_pictures(work, rng)
-    things = sum(_add_thing(work, rng, name) for name in _thing_names(rng, objects - furniture))
+    count = objects - furniture
+    names = [str(name) for _ in range(1 + count // len(ROOM_THINGS)) for name in rng.permutation(ROOM_THINGS)]
+    things = sum(_add_thing(work, rng, name) for name in names[:count])
     logger.info(
         "scene room:%d: %d pieces of furniture, %d things of %d objects asked, %d fixtures: %s",
         seed, furniture, things, objects, fixtures + pictures, ", ".join(thing.name for thing in work.placed),
@@ -201,17 +187,18 @@ def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
     reach = room.wall_length(door_wall) / 2 - size[1] / 2 - 0.12
     along = float(rng.choice([-1, 1]) * reach * rng.uniform(0.6, 1.0))
     yaw = yaw_of_wall(door_wall)
-    work.put("door", model, room.at_wall(door_wall, along, size[0] / 2), yaw)
+    work.put(model, room.at_wall(door_wall, along, size[0] / 2), yaw)
     # The entrance and the swing of the door stay free.
-    plan.take(turned_space(room.at_wall(door_wall, along, 0.4), np.array([0.8, size[1], 2.1]), yaw, 0.0))
+    entrance = room.at_wall(door_wall, along, 0.4)
+    plan.taken.append(turned_space(entrance, np.array([0.8, size[1], 2.1]), yaw, 0.0))
     window, curtain = work.model("window"), work.model("curtain")
-    yaw, sill = yaw_of_wall(window_wall), 0.92
+    yaw = yaw_of_wall(window_wall)
     along = float(rng.uniform(-0.3, 0.3))
-    for name, model, base_z in (("window", window, sill), ("curtain", curtain, 0.84)):
+    for model, base_z in ((window, 0.92), (curtain, 0.84)):
         size = size_of(model)
         spot = room.at_wall(window_wall, along, size[0] / 2)
-        work.put(name, model, spot, yaw, base_z)
-    plan.take(turned_space(spot, size, yaw, base_z))
+        work.put(model, spot, yaw, base_z)
+    plan.taken.append(turned_space(spot, size, yaw, base_z))
     return 3
 
 
@@ -254,8 +241,8 @@ def _put_at_wall(work: _Furnishing, rng: np.random.Generator, piece: Piece) -> b
     if found is None:
         return False
     wall, spot, space = found
-    work.plan.take(space)
-    work.put(piece.name, model, spot, yaw_of_wall(wall))
+    work.plan.taken.append(space)
+    work.put(model, spot, yaw_of_wall(wall))
     return True
 
 
@@ -277,7 +264,7 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
         spot = middle + turn @ np.array([ON_TOP[name], 0.0])
         radius = float(np.linalg.norm(size[:2]) / 2)
         support.stand.append((spot, radius))
-        work.put(name, model, spot, owner.yaw_deg, support.height_at(spot, 0.4 * radius))
+        work.put(model, spot, owner.yaw_deg, support.height_at(spot, 0.4 * radius))
         return True
     for side in rng.permutation([-1.0, 1.0]):
         if where == "before":
@@ -288,8 +275,8 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
         spot = middle + turn @ offset
         space = turned_space(spot, size + np.array([0, 0, 0.45 if name in SUPPORTS else 0.0]), yaw, 0.0)
         if work.plan.free(space, 0.02):
-            work.plan.take(space)
-            work.put(name, model, spot, yaw)
+            work.plan.taken.append(space)
+            work.put(model, spot, yaw)
             return True
     return False
 
@@ -304,10 +291,10 @@ def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> i
         spot = rng.uniform(-1, 1, 2) * np.array([1.6, 1.0]) * (0.15 + 0.006 * attempt)
         space = turned_space(spot, np.array([size[0], size[1], size_of(model)[2] + 0.46]), yaw, 0.0)
         if work.plan.free(space, 0.25):
-            work.plan.take(space)
+            work.plan.taken.append(space)
             if with_rug:
-                work.put("rug", rug, spot, yaw)
-            work.put("table", model, spot, yaw, base_z)
+                work.put(rug, spot, yaw)
+            work.put(model, spot, yaw, base_z)
             return 1 + with_rug
     return 0
 
@@ -321,19 +308,14 @@ def _hang_pictures(work: _Furnishing, rng: np.random.Generator) -> int:
         found = work.plan.wall_spot(rng, size_of(model), base_z, 0.25, gap=0.0)
         if found is not None:
             wall, spot, space = found
-            work.plan.take(space)
-            work.put(name, model, spot, yaw_of_wall(wall), base_z)
+            work.plan.taken.append(space)
+            work.put(model, spot, yaw_of_wall(wall), base_z)
             hung += 1
     return hung
 
 
-def _thing_names(rng: np.random.Generator, count: int) -> list[str]:
-    order = [str(name) for _ in range(1 + count // len(ROOM_THINGS)) for name in rng.permutation(ROOM_THINGS)]
-    return order[:count]
-
-
 def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
-    """Place a thing on the emptiest possible support, else on the floor at a wall; return whether it fits."""
+    """Place a thing on furniture or the floor, facing the middle of the room; return whether it fits."""
     model = work.model(name, thing=True)
     _, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
@@ -343,6 +325,21 @@ def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
     pattern = model.materials.copy()
     pattern[:, 7] *= PATTERN_FACTOR  # cells of the texture per metre, see Paint.row
     model = replace(model, materials=pattern)
+    found = _thing_spot(work, rng, radius, height * scale)
+    if found is None:
+        logger.warning("scene room:%d: no place left for the %s", work.seed, name)
+        return False
+    spot, base_z = found
+    yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + rng.uniform(-50, 50))
+    # The footprint is a circle that rotates about its centre, so any yaw keeps it in place.
+    work.put(model, spot, yaw, base_z, scale)
+    return True
+
+
+def _thing_spot(
+    work: _Furnishing, rng: np.random.Generator, radius: float, height: float
+) -> tuple[np.ndarray, float] | None:
+    """Return x, y and base height on the emptiest support with a free place, else on the floor at a wall."""
     order = sorted(range(len(work.supports)), key=lambda row: (len(work.supports[row].stand), rng.random()))
     for row in order:
         support = work.supports[row]
@@ -354,40 +351,21 @@ def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
             spot = rng.uniform(low, high)
             if all(np.linalg.norm(spot - other) > radius + size + 0.02 for other, size in support.stand):
                 support.stand.append((spot, radius))
-                _stand(work, rng, name, model, spot, support.height_at(spot, 0.6 * radius), scale)
-                return True
-    size = np.array([2 * radius, 2 * radius, height * scale])
+                return spot, support.height_at(spot, 0.6 * radius)
+    size = np.array([2 * radius, 2 * radius, height])
     found = work.plan.wall_spot(rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
     if found is None:
-        logger.warning("scene room:%d: no place left for the %s", work.seed, name)
-        return False
-    work.plan.take(found[2])
-    _stand(work, rng, name, model, found[1], 0.0, scale)
-    return True
-
-
-def _stand(
-    work: _Furnishing,
-    rng: np.random.Generator,
-    name: str,
-    model: ObjectModel,
-    spot: np.ndarray,
-    base_z: float,
-    scale: float,
-) -> None:
-    """Place a thing with its front roughly towards the middle of the room."""
-    yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + rng.uniform(-50, 50))
-    # The footprint is a circle that rotates about its centre, so any yaw keeps it in place.
-    work.put(name, model, spot, yaw, base_z, scale)
+        return None
+    work.plan.taken.append(found[2])
+    return found[1], 0.0
 
 
 def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None:
     """Add floor, walls with skirting and ceiling, textured for structure from motion."""
     paints = PaintBox(rng)
     w, d, h = room.width, room.depth, room.height
-    floor = paints.draw(str(rng.choice(["wood", "wood", "stone", "collage", "cloth"])), scale=0.45).paled(
-        FLOOR_PALE
-    )
+    group = str(rng.choice(["wood", "wood", "stone", "collage", "cloth"]))
+    floor = paints.draw(group, scale=0.45).paled(FLOOR_PALE)
     ceiling = paints.draw("plain white beige", scale=0.4).paled(CEILING_PALE)
     skirting = paints.draw("wood")
     plane = _plane(w, d)
@@ -422,11 +400,7 @@ def _style(room: Room, rng: np.random.Generator) -> Style:
     place = rng.uniform(-0.4, 0.4, 2)
     light = np.array([1.0 + 0.05 * warm, 0.97, 0.92 - 0.08 * warm]) * rng.uniform(0.27, 0.33)
     sky = np.array([0.50 - 0.04 * warm, 0.51, 0.53 + 0.04 * warm]) * rng.uniform(0.92, 1.05)
-    return Style(
-        (float(place[0]), float(place[1]), room.height - 0.02),
-        float(rng.uniform(0.5, 0.7)),
-        tuple(light.tolist()),
-        tuple(sky.tolist()),
-        tuple((sky * np.array([1.12, 1.06, 0.98])).tolist()),
-        float(rng.uniform(1.05, 1.2)),
-    )
+    position = (float(place[0]), float(place[1]), room.height - 0.02)
+    radius = float(rng.uniform(0.5, 0.7))
+    colours = [tuple(c.tolist()) for c in (light, sky, sky * np.array([1.12, 1.06, 0.98]))]
+    return Style(position, radius, *colours, float(rng.uniform(1.05, 1.2)))

@@ -47,14 +47,10 @@ class Style:
         warm = rng.uniform(-1.3, 1.3)
         light = np.array([1.0 + 0.06 * warm, 0.97, 0.92 - 0.12 * warm]) * rng.uniform(0.8, 1.2)
         sky = np.array([0.44 - 0.05 * warm, 0.46, 0.50 + 0.05 * warm]) * rng.uniform(0.75, 1.2)
-        return Style(
-            (float(away * np.cos(azimuth)), float(away * np.sin(azimuth)), float(rng.uniform(3.2, 4.2))),
-            float(rng.uniform(0.25, 0.75)),
-            tuple(light.tolist()),
-            tuple(sky.tolist()),
-            tuple((sky * np.array([0.58, 0.5, 0.42])).tolist()),
-            float(rng.uniform(1.15, 1.5)),
-        )
+        x, y, z = away * np.cos(azimuth), away * np.sin(azimuth), rng.uniform(3.2, 4.2)
+        radius = float(rng.uniform(0.25, 0.75))
+        colours = [tuple(c.tolist()) for c in (light, sky, sky * np.array([0.58, 0.5, 0.42]))]
+        return Style((float(x), float(y), float(z)), radius, *colours, float(rng.uniform(1.15, 1.5)))
 
 
 @dataclass(frozen=True)
@@ -176,21 +172,16 @@ class Assembly:
         self, kind: str, seed: int, asked: int, placed: Sequence[PlacedObject], style: Style
     ) -> WorldScene:
         """Return the scene with everything added so far."""
-        return WorldScene(
-            kind,
-            seed,
-            asked,
-            tuple(placed),
-            np.concatenate(self.triangles).astype(np.float32),
-            np.concatenate(self.normals).astype(np.float32),
-            np.concatenate(self.coords).astype(np.float32),
-            np.concatenate(self.node_ids).astype(np.int32),
-            np.concatenate(self.material_ids).astype(np.int32),
-            np.concatenate(self.materials).astype(np.float32),
-            tuple(self.nodes),
-            frozenset(self.background),
-            style,
+        triangles, normals, coords, materials = (
+            np.concatenate(rows).astype(np.float32)
+            for rows in (self.triangles, self.normals, self.coords, self.materials)
         )
+        node_ids, material_ids = (
+            np.concatenate(rows).astype(np.int32) for rows in (self.node_ids, self.material_ids)
+        )
+        arrays = (triangles, normals, coords, node_ids, material_ids, materials)
+        nodes, background = tuple(self.nodes), frozenset(self.background)
+        return WorldScene(kind, seed, asked, tuple(placed), *arrays, nodes, background, style)
 
 
 def footprint_of(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, " 2"], float]:

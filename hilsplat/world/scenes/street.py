@@ -240,48 +240,29 @@ def _daylight(rng: np.random.Generator) -> Style:
     # The shader's light falls off as 13 / distance^2, which is about 1 above a table.
     sun *= SUN_DISTANCE**2 / 13.0
     sky = np.array([0.40, 0.45, 0.54]) * rng.uniform(0.9, 1.1)
-    position = tuple((SUN_DISTANCE * toward).tolist())
-    ground = tuple((sky * np.array([0.62, 0.56, 0.48])).tolist())
-    return Style(
-        position,
-        14.0,
-        tuple(sun.tolist()),
-        tuple(sky.tolist()),
-        ground,
-        float(rng.uniform(1.0, 1.15)),
-        SCALE,
-        45.0,
-    )
-
-
-def drive_poses(scene: WorldScene, views: int) -> list[tuple[Float[np.ndarray, " 3"], float]]:
-    """Return centre and yaw in degrees of the camera in each view.
-
-    The camera moves along its lane and sways, while its yaw sweeps between the two sides of the street in
-    steps of 9 degrees. Fewer views shorten the drive rather than increase the steps.
-    """
-    rng = np.random.default_rng([scene.seed, 25])
-    length = DRIVE_X[1] - DRIVE_X[0]
-    step = min(MAX_STEP, length / max(1, views - 1))
-    start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2
-    poses = []
-    for i in range(views):
-        phase = (i % SWEEP_VIEWS) / SWEEP_VIEWS
-        yaw = SWEEP_DEG * (4 * abs(phase - 0.5) - 1) + float(rng.uniform(-2, 2))
-        middle = np.array([start + i * step, LANE_Y + SWAY_M * np.sin(2 * np.pi * phase), CAMERA_Z])
-        poses.append((middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12]), yaw))
-    return poses
+    ground = sky * np.array([0.62, 0.56, 0.48])
+    position, *colours = (tuple(each.tolist()) for each in (SUN_DISTANCE * toward, sun, sky, ground))
+    return Style(position, 14.0, *colours, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
 
 
 def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
     """Return the cameras of a drive along the street, for the global mapper (see `docs/world.md`).
 
-    `arc_deg` is unused, because a drive is not a ring.
+    The camera moves along its lane and sways, while its yaw sweeps between the two sides of the street in
+    steps of 9 degrees. Fewer views shorten the drive rather than increase the steps. `arc_deg` is unused,
+    because a drive is not a ring.
     """
-    rng = np.random.default_rng([scene.seed, 26])
+    rng, pitch_rng = (np.random.default_rng([scene.seed, purpose]) for purpose in (25, 26))
+    length = DRIVE_X[1] - DRIVE_X[0]
+    step = min(MAX_STEP, length / max(1, views - 1))
+    start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2
     transforms = []
-    for centre, yaw in drive_poses(scene, views):
-        transforms.append(looking_at(centre, centre + _heading(yaw, float(rng.uniform(-1, 3)))))
+    for i in range(views):
+        phase = (i % SWEEP_VIEWS) / SWEEP_VIEWS
+        yaw = SWEEP_DEG * (4 * abs(phase - 0.5) - 1) + float(rng.uniform(-2, 2))
+        middle = np.array([start + i * step, LANE_Y + SWAY_M * np.sin(2 * np.pi * phase), CAMERA_Z])
+        centre = middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12])
+        transforms.append(looking_at(centre, centre + _heading(yaw, float(pitch_rng.uniform(-1, 3)))))
     return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
 
 

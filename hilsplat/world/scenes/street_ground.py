@@ -27,9 +27,8 @@ def add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
     """
     middle, length = (ROAD_X[0] + ROAD_X[1]) / 2, ROAD_X[1] - ROAD_X[0]
     tar, pale = float(rng.uniform(0.34, 0.44)), rng.uniform(0.02, 0.06, 3)
-    asphalt = _paint(
-        "grey", "mottled", (tar, tar, 1.03 * tar), tuple((1.22 * tar + pale).tolist()), 22.0, rng
-    )
+    lighter = tuple((1.22 * tar + pale).tolist())
+    asphalt = _paint("grey", "mottled", (tar, tar, 1.03 * tar), lighter, 22.0, rng)
     flags = _paint("beige", "collage", (0.66, 0.62, 0.56), (0.55, 0.53, 0.52), float(rng.uniform(8, 12)), rng)
     stone = _paint("white", "stone", (0.78, 0.77, 0.74), (0.62, 0.62, 0.62), 10.0, rng)
     lines = _paint("white", "mottled", (0.88, 0.88, 0.86), (0.72, 0.72, 0.70), 10.0, rng)
@@ -39,14 +38,12 @@ def add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
     assembly.add_surroundings("road", ("street", "asphalt", "roadway"), road)
     assembly.add_surroundings("lane marker", ("lane marking", "road marking"), [(_markings(), lines)])
     kerbs, walks = [], []
+    wide = FRONT - KERB - 0.2
     for side in (-1, 1):
-        kerbs.append(
-            (box((length, 0.2, WALK_Z + 0.1), (middle, side * (KERB + 0.1), WALK_Z / 2 - 0.05)), stone)
-        )
-        wide = FRONT - KERB - 0.2
-        walks.append(
-            (box((length, wide + 0.6, 0.2), (middle, side * (KERB + 0.5 + wide / 2), WALK_Z - 0.1)), flags)
-        )
+        kerb = box((length, 0.2, WALK_Z + 0.1), (middle, side * (KERB + 0.1), WALK_Z / 2 - 0.05))
+        walk = box((length, wide + 0.6, 0.2), (middle, side * (KERB + 0.5 + wide / 2), WALK_Z - 0.1))
+        kerbs.append((kerb, stone))
+        walks.append((walk, flags))
     assembly.add_surroundings("curb", ("kerb", "curbstone"), kerbs)
     assembly.add_surroundings("sidewalk", ("pavement", "footpath"), walks)
     lawn = box((2 * DOME_RADIUS, 2 * DOME_RADIUS, 0.2), (middle, 0, -0.13))

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.world.objects.builder import CORNERS
 from hilsplat.world.objects.catalogue import TABLETOP, build_object
 from hilsplat.world.paints import Paint, PaintBox
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
@@ -109,9 +110,8 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> None:
     assembly.add_surroundings("floor", ("ground", f"{floor.colour} floor"), [(ground, floor)])
     if rng.random() < 0.5:
         woven = _fabric(paints, 0.35).paled(0.35)
-        mesh = cylinder(1.0, FLOOR_Z, FLOOR_Z + 0.02, 48).scaled(
-            rng.uniform(1.3, 1.8), rng.uniform(1.3, 1.8), 1
-        )
+        mesh = cylinder(1.0, FLOOR_Z, FLOOR_Z + 0.02, 48)
+        mesh = mesh.scaled(rng.uniform(1.3, 1.8), rng.uniform(1.3, 1.8), 1)
         if rng.random() < 0.5:
             mesh = box((2.9, rng.uniform(2.2, 2.9), 0.03), (0, 0, FLOOR_Z + 0.01))
         mesh = mesh.turned("z", float(rng.uniform(0, 180)))
@@ -141,9 +141,8 @@ def _add_room(assembly: Assembly, rng: np.random.Generator) -> None:
 
 def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -> None:
     """Add a round, square or octagonal table of about `TABLE_RADIUS`, sometimes with a cloth."""
-    top = paints.draw(
-        str(rng.choice(["wood", "wood", "stone", "collage", "plain", "tiles"])), scale=0.6
-    ).paled(0.45)
+    group = str(rng.choice(["wood", "wood", "stone", "collage", "plain", "tiles"]))
+    top = paints.draw(group, scale=0.6).paled(0.45)
     leg = paints.draw("wood")
     outer = TABLE_RADIUS * 1.12
     shape = str(rng.choice(["round", "square", "octagonal"], p=[0.5, 0.35, 0.15]))
@@ -165,9 +164,9 @@ def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -
         table.append((cylinder(0.45, FLOOR_Z, FLOOR_Z + 0.06), leg))
     else:
         away = 0.62 * TABLE_RADIUS
-        for x in (-away, away):
-            for y in (-away, away):
-                table.append((box((0.12, 0.12, -FLOOR_Z), (x, y, FLOOR_Z / 2 - 0.03), 0.01), leg))
+        for x, y in CORNERS:
+            foot = (x * away, y * away, FLOOR_Z / 2 - 0.03)
+            table.append((box((0.12, 0.12, -FLOOR_Z), foot, 0.01), leg))
     texts = (f"{shape} table", f"{top.colour} table", "table top")
     assembly.add_surroundings("table", texts, table)
     if cloth:
@@ -202,11 +201,7 @@ def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """Return a random camera for training.
-
-    Half of the cameras see the whole table, as in `ring_cameras`; the others look at one object from nearer.
-    Their fields of view vary.
-    """
+    """Return a random camera for training that sees the whole table or, in half of the draws, one object."""
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
     nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps sizes
     if scene.placed and rng.random() < 0.5:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilsplat.segment.masks import HierarchicalMasks
 from models.training.data import LabelledNode, LabelledViews
 
 
@@ -36,3 +37,10 @@ def drawn_views(count: int, size: int, seed: int = 0) -> LabelledViews:
         LabelledNode(1, -1, ("coin", "green coin")),
     )
     return LabelledViews(images, labels, (nodes,) * count)
+
+
+def drawn_masks(*masks_of_level: tuple[int, np.ndarray]) -> HierarchicalMasks:
+    """Masks of a view, given with their levels; all scores are 1."""
+    ones = np.ones(len(masks_of_level), np.float32)
+    level = np.array([level for level, _ in masks_of_level], np.uint8)
+    return HierarchicalMasks.from_dense(np.stack([mask for _, mask in masks_of_level]), level, ones, ones)

@@ -6,19 +6,11 @@ import numpy as np
 import pytest
 
 from hilsplat.segment.crops import square_crop
-from hilsplat.segment.masks import HierarchicalMasks
 from models.training.clip import CANONICAL, CROP_PX
 from models.training.crops import Captioner, best_node, list_crops, list_segmented, roughen
 from models.training.measure_clip import coloured_text
 from models.training.train_clip import SIBLINGS, CropDraw, crop_weights
-from tests.unit.training.drawn import drawn_views
-
-
-def drawn_masks(*masks_of_level: tuple[int, np.ndarray]) -> HierarchicalMasks:
-    """Masks as a segmenter gives them, each with a level."""
-    ones = np.ones(len(masks_of_level), np.float32)
-    level = np.array([level for level, _ in masks_of_level], np.uint8)
-    return HierarchicalMasks.from_dense(np.stack([mask for _, mask in masks_of_level]), level, ones, ones)
+from tests.unit.training.drawn import drawn_masks, drawn_views
 
 
 def test_best_node_prefers_the_level_that_drew_the_mask_where_regions_coincide():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from hilsplat.segment.masks import HierarchicalMasks
 from models.training.batches import CropStage
 from models.training.clip import contrastive_loss
 from models.training.crops import list_crops, list_segmented
@@ -15,7 +14,7 @@ from models.training.sam_loss import segmentation_loss
 from models.training.steps import Budget, learning_rate, prefetched
 from models.training.train_clip import train_clip
 from models.training.train_sam import stage_of_draw, train_sam
-from tests.unit.training.drawn import drawn_views
+from tests.unit.training.drawn import drawn_masks, drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8, 128),)
 WINDOWS = {"stages": SMALL, "grown_stages": (CropStage(1.0, 64, 2, 12, 96),)}
@@ -155,10 +154,7 @@ def test_measured_iou_is_between_none_and_the_best_head(trained):
 def test_recall_counts_regions_that_a_mask_of_their_level_covers():
     views = drawn_views(1, 64)
     labels = views.labels[0]
-    ones = np.ones(2, np.float32)
-    masks = HierarchicalMasks.from_dense(
-        np.stack([labels[0] == 0, labels[1] == 1]), np.array([1, 1], np.uint8), ones, ones
-    )
+    masks = drawn_masks((1, labels[0] == 0), (1, labels[1] == 1))
     found = measure_everything([masks], views)
     # of ball and coin the ball is found; its half is found as a whole only, where it fits nothing
     assert (found["whole"]["recall"], found["whole"]["n"]) == (0.5, 2)
@@ -167,15 +163,7 @@ def test_recall_counts_regions_that_a_mask_of_their_level_covers():
 
 def test_clip_learns_and_is_measured(tmp_path):
     views, unseen = drawn_views(6, 64), drawn_views(2, 64, seed=9)
-    masks = [
-        HierarchicalMasks.from_dense(
-            np.stack([view[0] == 0, view[0] == 3, view[1] == 1]),
-            np.array([1, 1, 2], np.uint8),
-            np.ones(3, np.float32),
-            np.ones(3, np.float32),
-        )
-        for view in unseen.labels
-    ]
+    masks = [drawn_masks((1, of[0] == 0), (1, of[0] == 3), (2, of[1] == 1)) for of in unseen.labels]
     crops, others = list_crops(views), list_crops(unseen, masks)
     vision, text, tokenizer, curve = train_clip(
         crops, others, Budget(steps=40), 0, tmp_path, batch=24, tuning=FAST

@@ -1,4 +1,4 @@
-"""Labels follow analytic projection; a surface point looks the same from everywhere."""
+"""Label images match analytic projection, and a surface point has the same colour in all views."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.scenes.scene import Style, WorldScene
 from hilsplat.world.scenes.tabletop import ring_cameras, training_camera
 from hilsplat.world.shapes import Mesh, box, joined, sphere
-from hilsplat.world.textures import fractal_noise, grains, hash01, pattern
+from hilsplat.world.textures import fractal_noise, grains, hash01
 from hilsplat.world.views import looking_at, pinhole
 from tests.unit.world.depth import depth_view
 
@@ -57,16 +57,6 @@ def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
     return ((seen @ camera.K.T)[:, :2] / seen[:, 2:]).T
 
 
-def test_label_image_of_a_sphere_is_its_analytic_silhouette():
-    # A sphere of radius r at distance d on the axis is a disc of radius f * r / sqrt(d^2 - r^2).
-    camera = camera_at((0, -3.0, 0), side_px=96, fov_deg=2 * np.degrees(np.arctan(48 / 150)))
-    labels = label_view(scene_of(sphere(0.5, segments=96)), camera)[0]
-    radius = 150 * 0.5 / np.sqrt(9 - 0.25)
-    away = np.hypot(*(np.mgrid[:96, :96] + 0.5 - 48))
-    certain = np.abs(away - radius) > 0.6  # the facets lie up to 0.9 % inside the sphere
-    assert np.array_equal((labels == 0)[certain], (away < radius)[certain])
-
-
 def test_image_axes_are_x_right_and_y_down():
     # From +x, looking at the origin, +y is to the right and +z is up.
     for index, place in enumerate([(0.0, 0.4, 0.0), (0.0, 0.0, 0.4)]):
@@ -95,7 +85,7 @@ def test_a_surface_point_has_one_colour_in_all_views():
     assert np.median(difference) < 4 and np.corrcoef(found[0].ravel(), found[1].ravel())[0, 1] > 0.93
 
 
-def test_a_shadow_falls_where_the_light_is_hidden():
+def test_the_floor_below_a_slab_is_in_shadow():
     # Light straight above a floating slab: the floor right below is dark, far from it bright.
     scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.02), (0, 0, 0.8))))
     style = Style(light_position=(0.0, 0.0, 4.0))
@@ -105,12 +95,10 @@ def test_a_shadow_falls_where_the_light_is_hidden():
     assert under < 0.75 * beside
 
 
-def test_the_hash_of_a_cell_is_its_chain_of_mixing_steps():
+def test_the_hash_of_a_cell_equals_a_reference_in_python_integers():
     def reference(*cell):
-        h = (
-            sum(a * b for a, b in zip(cell, (0x27D4EB2D, 0x165667B1, 0x1B873593, 0x2545F491), strict=True))
-            % 2**32
-        )
+        factors = (0x27D4EB2D, 0x165667B1, 0x1B873593, 0x2545F491)
+        h = sum(a * b for a, b in zip(cell, factors, strict=True)) % 2**32
         h = (h ^ h >> 15) * 0x2C1B3C6D % 2**32
         h = (h ^ h >> 12) * 0x297A2D39 % 2**32
         return (h ^ h >> 15) / 2**32
@@ -119,14 +107,14 @@ def test_the_hash_of_a_cell_is_its_chain_of_mixing_steps():
     assert [hash01(*cell) for cell in cells] == [reference(*cell) for cell in cells.tolist()]
 
 
-def test_grain_of_many_points_has_the_bits_of_plain_noise():
+def test_vectorised_grain_is_bit_identical_to_fractal_noise():
     points = np.random.default_rng(0).uniform(-5, 5, (1001, 3))
     plain = [fractal_noise(*(16.0 * point), 4, 201) for point in points]
     assert np.array_equal(grains(*np.ascontiguousarray(points.T)), plain)
 
 
 @pytest.mark.parametrize("samples", (2, 3))
-def test_image_and_labels_at_once_are_those_of_one_at_a_time_in_bands_of_any_height(monkeypatch, samples):
+def test_image_and_labels_do_not_depend_on_the_height_of_bands(monkeypatch, samples):
     scene = build_scene("tabletop", 100, 3)
     camera = ring_cameras(scene, 12, 48, 100.0)["005.png"]
     plain = render_view(scene, camera, samples), label_view(scene, camera)
@@ -135,7 +123,7 @@ def test_image_and_labels_at_once_are_those_of_one_at_a_time_in_bands_of_any_hei
         assert all(map(np.array_equal, render_and_label(scene, camera, samples), plain))
 
 
-def test_only_shadow_rays_that_cannot_matter_are_left_out(monkeypatch):
+def test_omitted_shadow_rays_do_not_change_the_image(monkeypatch):
     scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.6), (0, 0, 0.8))))
     style = Style(light_position=(1.0, 0.0, 4.0))
     camera = camera_at((-2.0, 0, 0.9))
@@ -149,28 +137,6 @@ def test_only_shadow_rays_that_cannot_matter_are_left_out(monkeypatch):
     assert np.array_equal(image, render_view(scene, camera, 3, style)) and rays[2] == rays[3] == rays[1]
 
 
-def test_bricks_have_joints_along_every_upright_wall():
-    # Along a course of a wall at x = const or y = const the share of mortar must rise and fall.
-    z = 0.555 / 0.9  # the middle of a course, in pattern cells
-    for wall in ("x", "y"):
-        along = np.linspace(0, 30, 600)
-        shares = [pattern(9, *((3.3, a, z) if wall == "x" else (a, 3.3, z)))[0] for a in along]
-        joints = np.count_nonzero(np.diff((np.array(shares) > 0.5).astype(int)) == 1)
-        assert joints == pytest.approx(30 * 0.36, abs=1.1)  # bricks are 1 / 0.36 cells long
-
-
-def test_most_visible_subparts_of_a_ring_view_have_a_hundred_pixels():
-    areas = []
-    for seed in (100, 101, 102):
-        scene = build_scene("tabletop", seed, 7)
-        cameras = ring_cameras(scene, 40, 384)
-        for name in cameras.names[seed % 8 :: 8]:
-            ids, counts = np.unique(label_view(scene, cameras[name])[2], return_counts=True)
-            areas.extend(counts[ids >= 0])
-    # The prototype had 42 % below 100 px at 256 px, which is 19 % here; hidden ones stay small.
-    assert (np.array(areas) < 100).mean() < 0.22 and np.median(areas) > 220
-
-
 def test_ring_cameras_alternate_in_elevation_and_are_nine_degrees_apart():
     cameras = ring_cameras(build_scene("tabletop", 100, 1), 40, 256)
     centres = np.stack([cameras[name].centre for name in cameras.names])
@@ -182,14 +148,14 @@ def test_ring_cameras_alternate_in_elevation_and_are_nine_degrees_apart():
     assert np.linalg.det(rotations) == pytest.approx(1.0)
 
 
-def test_an_arc_covers_its_azimuth_around_the_front():
+def test_an_arc_is_centred_on_the_front():
     cameras = ring_cameras(build_scene("tabletop", 100, 1), 12, 128, 100.0)
     centres = np.stack([cameras[name].centre for name in cameras.names[:: len(cameras) - 1]])
     azimuth = np.degrees(np.arctan2(centres[:, 1], centres[:, 0]))
     assert azimuth[0] == pytest.approx(-50, abs=1.1) and azimuth[-1] == pytest.approx(50, abs=1.1)
 
 
-def test_random_cameras_see_objects():
+def test_training_cameras_see_objects():
     scene = build_scene("tabletop", 100, 6)
     rng = np.random.default_rng(0)
     for _ in range(10):

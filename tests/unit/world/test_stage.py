@@ -1,8 +1,7 @@
-"""The world stage writes images for the next stages, and truth for evaluation alone."""
+"""The world stage writes images for the next stages, and truth for evaluation only."""
 
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from hilsplat.base.artifacts import read_index, read_json, sha256_of_path
 from hilsplat.base.errors import ArtifactError, SceneError
@@ -13,9 +12,9 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnota
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
 from hilsplat.world.objects.catalogue import GENERATOR_VERSION
+from hilsplat.world.pictures import show_world
 from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import build_scene
-from hilsplat.world.sheet import node_colours, show_world, tree_lines
 from hilsplat.world.stage import parse_source, run_world
 from hilsplat.world.truth import annotated_nodes, smallest_areas
 
@@ -29,7 +28,7 @@ def world(tmp_path_factory):
     return folder
 
 
-def test_images_and_truth_belong_together(world):
+def test_label_images_match_the_cameras_and_the_scene(world):
     assert [path.name for path in list_images(world / "images")] == ["000.png", "001.png", "002.png"]
     assert read_image(world / "images" / "000.png").shape == (64, 64, 3)
     cameras = Cameras.load(world / "truth" / "cameras.npz")
@@ -44,7 +43,7 @@ def test_images_and_truth_belong_together(world):
         assert list(read_index(world / folder)["views"]) == list(cameras.names)
 
 
-def test_true_regions_nest(world):
+def test_true_regions_are_inside_their_parents(world):
     truth = HierarchyAnnotations.load(world / "truth")
     for view, ids in truth.views.items():
         assert ids
@@ -53,31 +52,21 @@ def test_true_regions_nest(world):
                 assert not (truth.mask(view, [node.id]) & ~truth.mask(view, [node.parent])).any()
 
 
-def test_the_room_is_never_scored(world):
+def test_surroundings_are_never_scored(world):
     truth = HierarchyAnnotations.load(world / "truth")
     background = read_json(world / "truth" / "scene.json")["background"]
     assert {"table", "floor", "wall"} <= {truth.nodes[node].text for node in background}
     assert not any(set(background) & set(ids) for ids in truth.views.values())
 
 
-def test_the_record_says_what_was_placed(world):
+def test_the_record_lists_the_placed_objects(world):
     record = read_json(world / "truth" / "scene.json")
     assert (record["kind"], record["seed"], record["split"]) == ("tabletop", 100, "development")
     assert record["generator_version"] == GENERATOR_VERSION
     assert record["objects_asked"] == 3 and record["objects_placed"] == len(record["placed"]) == 3
 
 
-def test_the_mesh_carries_node_ids(world):
-    scene = build_scene("tabletop", 100, 3)
-    mesh = PlyData.read(world / "truth" / "mesh.ply")
-    faces = mesh["face"].data
-    corners = np.stack([mesh["vertex"][axis] for axis in "xyz"], axis=1)
-    triangles = corners[np.stack(faces["vertex_indices"])]
-    assert np.array_equal(triangles, scene.triangles)
-    assert np.array_equal(np.stack([faces[level.label] for level in LEVELS], axis=1), scene.node_ids)
-
-
-def test_bytes_do_not_depend_on_run_or_threads(world, tmp_path):
+def test_reruns_with_any_number_of_threads_give_the_same_bytes(world, tmp_path):
     run_world("world:tabletop:100", SETTINGS, tmp_path / "again", threads=2)
     for folder in ("images", "truth"):
         assert sha256_of_path(world / folder) == sha256_of_path(tmp_path / "again" / folder)
@@ -100,37 +89,25 @@ def test_instances_of_a_text_are_annotated_together_or_not_at_all():
     assert annotated_nodes(labels, nodes, {4}, smallest) == (0, 1, 2)
 
 
-def test_the_smallest_subpart_scales_with_the_area_of_the_view():
+def test_the_minimum_area_of_subparts_scales_with_the_view():
     assert smallest_areas(384, 60) == {Level.WHOLE: 60, Level.PART: 60, Level.SUBPART: 100}
     assert smallest_areas(192, 60)[Level.SUBPART] == pytest.approx(25)
 
 
 @pytest.mark.parametrize("source", ["tabletop:100", "world:forest:1", "world:tabletop:-1", "world:tabletop"])
-def test_a_malformed_source_is_answered_with_the_form(source):
+def test_the_error_about_a_malformed_source_shows_the_form(source):
     with pytest.raises(SceneError, match=r"expected  world:<kind>:<seed>, where kind is one of: tabletop"):
         parse_source(source)
 
 
-def test_scenes_that_trained_the_models_are_refused():
+def test_training_seeds_are_refused():
     with pytest.raises(SceneError, match="that the small models were trained on"):
         parse_source("world:tabletop:1000003")
     assert parse_source("world:tabletop:201") == ("tabletop", 201)
 
 
-def test_the_contact_sheet_is_drawn(world, tmp_path):
+def test_a_contact_sheet_is_drawn(world, tmp_path):
     show_world(world, tmp_path / "sheet.png")
     assert min(read_image(tmp_path / "sheet.png").shape[:2]) > 400
     with pytest.raises(ArtifactError, match="missing or incomplete"):
         show_world(tmp_path, tmp_path / "sheet.png")
-
-
-def test_the_tree_lists_a_shared_text_once():
-    nodes = (
-        AnnotatedNode(0, 1, -1, "chair"),
-        AnnotatedNode(1, 2, 0, "chair leg"),
-        AnnotatedNode(2, 3, 1, "chair foot"),
-        AnnotatedNode(3, 2, 0, "chair leg"),
-        AnnotatedNode(4, 3, 3, "chair foot"),
-    )
-    assert [(depth, node.id) for depth, node in tree_lines(nodes)] == [(0, 0), (1, 1), (2, 2)]
-    assert len(np.unique(node_colours(100), axis=0)) > 95

@@ -1,14 +1,12 @@
-"""Streets follow from their seed, nothing in them collides, and the drive keeps its distances."""
+"""Nothing in a street collides, and the cameras of the drive are close enough for structure from motion."""
 
 import itertools
-import logging
 
 import numpy as np
 import pytest
 
 from hilsplat.world.objects.catalogue import STREET, build_street_object
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.scenes.street import (
     LANE_Y,
@@ -30,18 +28,15 @@ def things(scene: WorldScene) -> list[int]:
     return sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
 
 
-def test_texts_name_the_thing_and_its_waymo_class():
-    synonyms = {
-        name: build_street_object(name, np.random.default_rng(0)).nodes[0].synonyms for name in STREET
-    }
-    for name in VEHICLES:
-        assert "vehicle" in synonyms[name]
-    assert "sign" in synonyms["traffic sign"]
-    assert "vegetation" in synonyms["tree"] and "vegetation" in synonyms["bush"]
-    assert "tree trunk" in {node.text for node in build_street_object("tree", np.random.default_rng(0)).nodes}
+def test_synonyms_include_the_waymo_class():
+    models = {name: build_street_object(name, np.random.default_rng(0)) for name in STREET}
+    classes = dict.fromkeys(VEHICLES, "vehicle") | {"traffic sign": "sign"}
+    for name, waymo_class in (classes | dict.fromkeys(("tree", "bush"), "vegetation")).items():
+        assert waymo_class in models[name].nodes[0].synonyms
+    assert "tree trunk" in {node.text for node in models["tree"].nodes}
 
 
-def test_no_part_of_a_thing_reaches_into_another_thing(street):
+def test_boxes_of_parts_of_different_objects_do_not_intersect(street):
     boxes = {}
     for node in things(street):
         own = street.node_ids[:, 0] == node
@@ -51,7 +46,7 @@ def test_no_part_of_a_thing_reaches_into_another_thing(street):
         assert apart.any(axis=2).all()  # apart along some axis, for every pair of parts
 
 
-def test_things_stand_where_they_belong(street):
+def test_vehicles_are_on_the_road_and_pedestrians_on_the_sidewalk(street):
     for node in things(street):
         text = street.nodes[node].text
         points = street.triangles[street.node_ids[:, 0] == node].reshape(-1, 3)
@@ -64,29 +59,18 @@ def test_things_stand_where_they_belong(street):
             assert np.abs(points[:, 1]).min() > KERB and np.abs(points[:, 1]).max() < FRONT
 
 
-def test_another_seed_gives_another_street_and_the_log_says_what_was_placed(caplog, street):
-    with caplog.at_level(logging.INFO, logger="hilsplat.world.scenes.street"):
-        scene = build_scene("street", 103, 3)
-    assert len(scene.placed) == 3
-    for thing in scene.placed:
-        assert scene.nodes[thing.node].text == thing.name
-        assert thing.name in VEHICLES | {"pedestrian", "cyclist"}
-    assert scene.nodes != street.nodes
-    assert "3 of 3 vehicles and people placed" in caplog.text
-
-
-def test_seven_things_make_a_street_with_the_classes_that_matter(street):
+def test_a_street_with_seven_objects_has_the_main_classes(street):
     texts = {street.nodes[node].text for node in things(street)}
     assert {"car", "pedestrian", "cyclist", "building", "tree", "traffic sign", "traffic light"} <= texts
     assert texts & {"truck", "bus"}
 
 
-def test_every_ray_from_the_road_meets_something_labelled(street):
+def test_every_pixel_of_a_drive_view_has_a_label(street):
     labels = label_view(street, drive_cameras(street, 40, 64)["020.png"])
     assert (labels[0] >= 0).all()
 
 
-def test_the_sky_shines_and_is_not_shaded(street):
+def test_the_sky_is_self_luminous(street):
     # Straight up from the road there is only sky; its colours lie between blue and white.
     up = looking_at(np.array([0.0, LANE_Y, 1.8]), np.array([0.3, LANE_Y, 12.0]))
     camera = drive_cameras(street, 3, 16)["001.png"]
@@ -97,7 +81,7 @@ def test_the_sky_shines_and_is_not_shaded(street):
     assert (image[..., 2] >= image[..., 0]).all() and image[..., 2].min() > 200
 
 
-def test_neighbouring_views_are_near_and_see_the_same_things(street):
+def test_neighbouring_views_differ_little_in_position_and_direction(street):
     cameras = drive_cameras(street, 40, 64)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     forward = cameras.cam_from_world[:, 2, :3]
@@ -109,28 +93,27 @@ def test_neighbouring_views_are_near_and_see_the_same_things(street):
     assert turn.max() < 9 + 4 + 5  # the sweep, the jitter of yaw and that of pitch
     yaw = np.degrees(np.arctan2(forward[:, 1], forward[:, 0]))
     assert yaw.max() == pytest.approx(SWEEP_DEG, abs=2.1) and yaw.min() == pytest.approx(-SWEEP_DEG, abs=2.1)
-    # The driver stays in the own lane.
+    # The camera stays in its own lane.
     assert (centres[:, 1] > -LANE + 0.3).all() and (centres[:, 1] < 0).all()
 
 
-def test_few_views_make_a_shorter_drive_not_a_coarser_one(street):
+def test_fewer_views_shorten_the_drive_and_keep_the_step(street):
     cameras = drive_cameras(street, 6, 64)
     x = [cameras[name].centre[0] for name in cameras.names]
     assert x[-1] - x[0] == pytest.approx(5 * MAX_STEP, abs=0.11)
 
 
-def test_the_drive_runs_into_nothing(street):
+def test_cameras_of_the_drive_are_outside_all_objects(street):
     cameras = drive_cameras(street, 40, 64)
     for node in things(street):
         points = street.triangles[street.node_ids[:, 0] == node].reshape(-1, 3)
+        low, high = points.min(axis=0) - 0.2, points.max(axis=0) + 0.2
         for name in cameras.names:
-            inside = (points.min(axis=0) - 0.2 < cameras[name].centre) & (
-                cameras[name].centre < points.max(axis=0) + 0.2
-            )
-            assert not inside.all()
+            centre = cameras[name].centre
+            assert not ((low < centre) & (centre < high)).all()
 
 
-def test_training_cameras_are_outdoors_and_half_look_at_one_thing(street):
+def test_training_cameras_are_outside_objects_and_half_are_close_ups(street):
     rng = np.random.default_rng(0)
     large = 0
     for _ in range(16):

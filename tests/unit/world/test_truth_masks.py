@@ -14,8 +14,8 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.cli import stage_commands
 from hilsplat.cli import stage as around
+from hilsplat.cli import stage_commands
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene

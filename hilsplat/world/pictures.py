@@ -1,0 +1,244 @@
+"""Pictures of the synthetic world: one object of each class, scenes with their labels, contact sheets."""
+
+import logging
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Int32, UInt8
+
+from hilsplat.base.artifacts import atomic_path, read_index, read_json
+from hilsplat.base.files import list_images
+from hilsplat.base.images import read_image
+from hilsplat.base.levels import LEVELS, NONE, Level
+from hilsplat.base.provenance import SOFTWARE, require_own_picture
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
+from hilsplat.scene.cameras import Camera
+from hilsplat.world.objects.builder import ObjectModel
+from hilsplat.world.objects.catalogue import TABLETOP, build_object
+from hilsplat.world.paints import Paint
+from hilsplat.world.render import label_view, render_view
+from hilsplat.world.scenes.kinds import build_scene, scene_cameras
+from hilsplat.world.scenes.scene import Assembly, Style, WorldScene, footprint_of
+from hilsplat.world.shapes import box
+from hilsplat.world.views import looking_at, on_sphere, pinhole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+logger = logging.getLogger(__name__)
+
+CLASS_PX = 150
+CLASS_COLUMNS = 9
+SCENE_PX = 256
+PANEL_INCHES = 1.95
+OBJECTS = 7
+AZIMUTH_DEG = 25.0
+ELEVATION_DEG = 30.0
+RADIUS = 0.36
+"""Radius to which an object is scaled in its picture; tall objects are scaled by their height."""
+
+VIEWS_SHOWN = 4
+LINES_SHOWN = 52
+"""Maximum number of tree lines in a column, for legibility."""
+
+_GREYS = ((0.66, 0.66, 0.64), (0.63, 0.63, 0.61))
+_GROUND = Paint("grey", "mottled", *_GREYS, 3.0, 0.0, 10.0, 0.1, (5.0, 6.0, 7.0))
+
+
+def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> None:
+    """Draw one object of each named tabletop class, as PNG."""
+    from matplotlib.figure import Figure
+
+    rows = -(-len(names) // CLASS_COLUMNS)
+    figure = Figure(figsize=(1.5 * CLASS_COLUMNS, 1.68 * rows), dpi=100)
+    for index, name in enumerate(names):
+        logger.info("draw %s", name)
+        scene, camera = _alone(build_object(name, np.random.default_rng(seed)))
+        axes = figure.add_subplot(rows, CLASS_COLUMNS, index + 1)
+        axes.imshow(render_view(scene, camera, 3))
+        axes.set_axis_off()
+        axes.set_title(name, fontsize=10, pad=3)
+    figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.965, wspace=0.03, hspace=0.17)
+    _write(figure, out)
+
+
+def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
+    """Return a scene with one object on plain ground, and a camera whose view the object fills."""
+    centre, radius = footprint_of(model.triangles)
+    height = float(model.triangles[..., 2].max())
+    scale = min(RADIUS / radius, 2.7 * RADIUS / height)
+    assembly = Assembly()
+    assembly.add_object(model, scale, -centre * scale, 0.0)
+    assembly.add_surroundings("ground", (), [(box((8, 8, 0.1), (0, 0, -0.05)), _GROUND)])
+    style = Style(light_position=(1.2, -1.0, 3.6), exposure=1.3)
+    scene = assembly.finished(model.name, 0, 1, (), style)
+    middle = np.array([0, 0, 0.48 * height * scale])
+    pose = looking_at(middle + on_sphere(AZIMUTH_DEG, ELEVATION_DEG, 1.9), middle)
+    reach = max(0.90 * RADIUS, 0.60 * height * scale)
+    fov_deg = 2 * float(np.degrees(np.arctan(reach / 1.75)))
+    return scene, Camera("class.png", pose, pinhole(CLASS_PX, fov_deg), (CLASS_PX, CLASS_PX))
+
+
+def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
+    """Draw a view of each of some scenes with its true labels by level, as PNG.
+
+    Raises:
+        SceneError: if the kind is unknown.
+    """
+    from matplotlib.figure import Figure
+
+    across = 2  # scenes side by side, each with four panels
+    rows = -(-len(seeds) // across)
+    figure = Figure(figsize=(PANEL_INCHES * 4 * across, PANEL_INCHES * rows + 0.25), dpi=100)
+    titles = ["", *(level.label for level in LEVELS)]
+    for index, seed in enumerate(seeds):
+        logger.info("draw %s:%d", kind, seed)
+        scene = build_scene(kind, seed, OBJECTS)
+        cameras = scene_cameras(scene, 40, SCENE_PX, 360)
+        camera = cameras[cameras.names[(17 + 6 * index) % len(cameras)]]
+        labels, colours = label_view(scene, camera), node_colours(len(scene.nodes))
+        for shade, node in enumerate(sorted(scene.background)):
+            colours[node] = 60 + 18 * shade  # greys: never scored
+        panels = [render_view(scene, camera, 3)]
+        nearest = labels[0]  # the node at the level, or at the next coarser level that has one
+        for level in LEVELS:
+            nearest = np.where(labels[level.index] >= 0, labels[level.index], nearest)
+            panels.append(coloured(nearest, colours))
+        for column, (title, panel) in enumerate(zip(titles, panels, strict=True)):
+            axes = figure.add_subplot(rows, 4 * across, index * 4 + column + 1)
+            axes.imshow(panel, interpolation="nearest" if column else None)
+            axes.set_axis_off()
+            if index < across:
+                axes.set_title(title or "view", fontsize=10, pad=3)
+            if column == 0:
+                place = {"va": "top", "transform": axes.transAxes}
+                axes.text(0.03, 0.97, f"{kind} {seed}", color="white", fontsize=7.5, **place)
+    top = 1 - 0.24 / (PANEL_INCHES * rows + 0.25)
+    figure.subplots_adjust(left=0.003, right=0.997, bottom=0.005, top=top, wspace=0.025, hspace=0.03)
+    _write(figure, out)
+
+
+def _write(figure: "Figure", out: Path) -> None:
+    """Write a figure as PNG with a dithered palette of 256 colours, which halves the file size."""
+    from PIL import Image, PngImagePlugin
+
+    full = BytesIO()
+    figure.savefig(full, format="png")
+    with Image.open(full) as picture:
+        pixels = picture.convert("RGB")
+    palette = pixels.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
+    reduced = pixels.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+    own = PngImagePlugin.PngInfo()
+    for key, value in SOFTWARE.items():
+        own.add_text(key, value)
+    require_own_picture(out)
+    with atomic_path(out) as temporary:
+        reduced.save(temporary, format="PNG", optimize=True, pnginfo=own)
+
+
+def show_world(world_folder: Path, out: Path) -> None:
+    """Draw some views of a finished world stage with their labels by level, and the tree of texts, as PNG.
+
+    Each text is marked in the colour of its region; texts that no view annotates are in brackets.
+
+    Raises:
+        ArtifactError: if the folder is missing or incomplete.
+    """
+    from matplotlib.figure import Figure
+
+    truth_folder, images_folder = Path(world_folder) / "truth", Path(world_folder) / "images"
+    for folder in (truth_folder, images_folder):
+        read_index(folder)
+    record = read_json(truth_folder / "scene.json")
+    truth = HierarchyAnnotations.load(truth_folder)
+    images = list_images(images_folder)
+    picked = [images[i] for i in np.linspace(0, len(images) - 1, min(VIEWS_SHOWN, len(images))).astype(int)]
+    colours = node_colours(len(truth.nodes))
+    scored = {node for ids in truth.views.values() for node in ids}
+    lines = tree_lines(truth.nodes)
+    columns = -(-len(lines) // LINES_SHOWN)
+    figure = Figure(figsize=(10.5 + 2.6 * columns, 2.7 * len(picked) + 0.6), dpi=110)
+    widths = [1] * 4 + [0.95] * columns
+    top = 1 - 0.55 / (2.7 * len(picked) + 0.6)
+    margins = {"left": 0.01, "right": 0.99, "bottom": 0.01, "top": top, "wspace": 0.03, "hspace": 0.04}
+    grid = figure.add_gridspec(len(picked), 4 + columns, width_ratios=widths, **margins)
+    for row, image in enumerate(picked):
+        panels = [("view", read_image(image))]
+        panels += [(level.label, _panel(truth, image.name, level, colours)) for level in LEVELS]
+        for column, (title, pixels) in enumerate(panels):
+            axes = figure.add_subplot(grid[row, column])
+            axes.imshow(pixels, interpolation="nearest")
+            axes.set_axis_off()
+            if row == 0:
+                axes.set_title(title, fontsize=10)
+            if column == 0:
+                place = {"va": "top", "transform": axes.transAxes}
+                axes.text(0.02, 0.97, image.name, color="white", fontsize=8, **place)
+    per_column = -(-len(lines) // columns)
+    for column in range(columns):
+        axes = figure.add_subplot(grid[:, 4 + column])
+        axes.set_axis_off()
+        axes.set(xlim=(0, 1), ylim=(per_column, 0))
+        for row, (depth, node) in enumerate(lines[column * per_column : (column + 1) * per_column]):
+            shown = node.text if node.id in scored else f"[{node.text}]"
+            y, x = row + 0.5, 0.06 + 0.09 * depth
+            axes.plot(x - 0.025, y, "s", color=colours[node.id] / 255, markersize=6)
+            axes.text(x, y, shown, fontsize=9, va="center", weight="bold" if depth == 0 else "normal")
+    figure.suptitle(
+        f"{record['source']} (generator {record['generator_version']}, {record['split']} seed): "
+        f"{record['objects_placed']} of {record['objects_asked']} objects placed, {len(images)} views",
+        fontsize=11,
+    )
+    require_own_picture(out)
+    with atomic_path(out) as temporary:
+        figure.savefig(temporary, format="png", metadata=SOFTWARE)
+
+
+def _panel(
+    truth: HierarchyAnnotations, view: str, level: Level, colours: UInt8[np.ndarray, "N 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the labels of a level as colours, with the whole in dark grey where the level has no node."""
+    labels = truth.label_image(view, level)
+    panel = coloured(labels, colours)
+    whole = coloured(truth.label_image(view, Level.WHOLE), colours).mean(axis=-1, keepdims=True)
+    return np.where(labels[..., None] >= 0, panel, (0.28 * whole).astype(np.uint8))
+
+
+def node_colours(count: int) -> UInt8[np.ndarray, "N 3"]:
+    """Return a colour per node; consecutive nodes have very different hues (golden-ratio steps)."""
+    hue = (0.13 + 0.618034 * np.arange(count)) % 1
+    value = 0.70 + 0.30 * ((np.arange(count) // 3) % 2)
+    saturation = 0.55 + 0.35 * ((np.arange(count) // 2) % 2)
+    channel = (hue[:, None] * 6 + np.array([5.0, 3.0, 1.0])) % 6
+    ramp = np.clip(np.minimum(channel, 4 - channel), 0, 1)
+    return (255 * value[:, None] * (1 - saturation[:, None] * ramp)).astype(np.uint8)
+
+
+def coloured(
+    labels: Int32[np.ndarray, "H W"], colours: UInt8[np.ndarray, "N 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return a label image as colours, black where there is no node."""
+    table = np.concatenate([colours, np.zeros((1, 3), np.uint8)])  # row -1 is black
+    return table[labels]
+
+
+def tree_lines(nodes: tuple[AnnotatedNode, ...]) -> list[tuple[int, AnnotatedNode]]:
+    """Return nodes with their depth, depth first; siblings with the same text are listed once."""
+    children: dict[int, list[AnnotatedNode]] = {}
+    for node in nodes:
+        children.setdefault(node.parent, []).append(node)
+    lines: list[tuple[int, AnnotatedNode]] = []
+
+    def walk(parent: int, depth: int) -> None:
+        first: dict[str, AnnotatedNode] = {}
+        for node in children.get(parent, []):
+            first.setdefault(node.text, node)
+        for node in first.values():
+            lines.append((depth, node))
+            walk(node.id, depth + 1)
+
+    walk(NONE, 0)
+    return lines
