@@ -180,20 +180,20 @@ def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as folder:
-        said = Path(folder) / "said"
+        stderr = Path(folder) / "stderr"
         try:
-            with _pool(1, _begin_alone, os.getpid(), said) as pool:
+            with _pool(1, _begin_alone, os.getpid(), stderr) as pool:
                 return pool.submit(work, *given).result()
         except BrokenProcessPool:
-            last = said.read_text(errors="replace")[-2000:] if said.exists() else ""
+            last = stderr.read_text(errors="replace")[-2000:] if stderr.exists() else ""
             raise ChildProcessError(
                 f"{work.__module__}.{work.__name__} was ended by a library\n{last}"
             ) from None
 
 
-def _begin_alone(parent: int, said: Path) -> None:
+def _begin_alone(parent: int, stderr: Path) -> None:
     end_with_parent(parent)
-    with said.open("wb") as stream:
+    with stderr.open("wb") as stream:
         os.dup2(stream.fileno(), 2)
 
 

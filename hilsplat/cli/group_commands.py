@@ -165,7 +165,7 @@ def models_list() -> None:
 
 @models_app.command("check")
 def models_check(
-    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all that are here")] = None,
+    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all installed")] = None,
     variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
 ) -> None:
     """Describe a model folder, or all installed ones, and time one image."""

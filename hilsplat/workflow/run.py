@@ -239,8 +239,8 @@ def _cores_of(command: Sequence[str]) -> int:
     """Return the number after `--cores`, or all cores of this process."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--cores", "-c", default="all")
-    asked = parser.parse_known_args(list(command))[0].cores
-    return int(asked) if asked.isdigit() and int(asked) else _all_cores()
+    cores = parser.parse_known_args(list(command))[0].cores
+    return int(cores) if cores.isdigit() and int(cores) else _all_cores()
 
 
 def _all_cores() -> int:
