@@ -38,9 +38,7 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
     """Compute y[r, c] = sum over k of a[r, k] x[k, c]; add it to y unless `begin`.
 
-    Args:
-        y, a, x: flat arrays, each with the index of its first element and the row stride.
-        rows, inner, columns: sizes; columns are a multiple of 16.
+    Each flat array has the index of its first element and its row stride; `columns` is a multiple of 16.
     """
     c = 0
     while c < columns:
@@ -73,12 +71,9 @@ def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, 
 @compiled
 @no_type_check
 def linear(x, weights, bias, rows, inner, y):
-    """Compute y = x W + bias.
+    """Compute y (rows, outer) = x (rows, inner) W + bias; outer is a multiple of 16.
 
-    Args:
-        x: (rows, inner).
-        weights: W in panels of 16 columns, each (inner, 16).
-        y: (rows, outer); outer is a multiple of 16.
+    `weights` contains W in panels of 16 columns, each (inner, 16).
     """
     outer = len(bias)
     for r in range(rows):
@@ -90,13 +85,18 @@ def linear(x, weights, bias, rows, inner, y):
 
 @compiled
 @no_type_check
-def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns, x_step, x_head, y_step, y_head):
-    """Run `multiply` for each head: `a` is contiguous, `x` and `y` have a stride between heads."""
+def dense(y, y0, a, a0, x, x0, rows, inner, columns, begin):
+    """Run `multiply` with contiguous matrices."""
+    multiply(y, y0, columns, a, a0, inner, x, x0, columns, rows, inner, columns, begin)
+
+
+@compiled
+@no_type_check
+def by_head(y, y0, a, a0, x, x0, heads, rows, inner, columns):
+    """Run `dense` for each head."""
     for h in range(heads):
-        multiply(
-            y, y0 + h * y_head, y_step, a, a0 + h * rows * inner, inner, x, x0 + h * x_head, x_step,
-            rows, inner, columns, True,
-        )  # fmt: skip
+        to, of, at = y0 + h * rows * columns, a0 + h * rows * inner, x0 + h * inner * columns
+        dense(y, to, a, of, x, at, rows, inner, columns, True)
 
 
 @compiled
@@ -124,10 +124,8 @@ def scale_and_shift(y, x, x0, scale, shift, shift0, rows, pixels):
 def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
     """Compute the softmax over the tokens of each head at each pixel, without each head's last token.
 
-    Args:
-        s: base-2 scores (H, T, P), overwritten.
-        offset, scale: `offset[h, t] * scale[p]` is added to the scores.
-        e: shares (H, T - 1, P).
+    `offset[h, t] * scale[p]` is added to the base-2 scores `s` (H, T, P), which are overwritten; the result
+    is `e` (H, T - 1, P).
     """
     for h in range(heads):
         for c in range(0, pixels, WIDTH):
@@ -201,13 +199,11 @@ def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, widt
 @compiled
 @no_type_check
 def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, heads, tokens, pixels, depth):
-    """Add a block to the weighted sums over pixels of values (per head) and of factors.
+    """Add a block to the weighted sums over pixels of values (H, P, depth) and of factors `e_t` (P, factors).
 
     Args:
         sums: (H * T, width): values, factors, and the columns of `pixel_weights`.
         w, scaled: weights (H * T, P) for the factors, and for the values.
-        values: (H, P, depth).
-        e_t: (P, factors).
     """
     for h in range(heads):
         multiply(
@@ -249,10 +245,8 @@ def read_image(sizes, rows, keys, values, top, sums):
     top[:], sums[:] = np.float32(-1e30), ZERO
     for b in range(blocks):
         for i in range(number):
-            by_head(
-                s, 0, rows, i * all_rows * dim, keys, b * heads * dim * pixels, heads, tokens, dim, pixels,
-                pixels, dim * pixels, pixels, tokens * pixels,
-            )  # fmt: skip
+            base = b * heads * dim * pixels
+            by_head(s, 0, rows, i * all_rows * dim, keys, base, heads, tokens, dim, pixels)
             at = i * all_rows * width
             pixel_weights(
                 s, scaled, none, 0, ones, zeros, top, i * all_rows, sums, at, width, all_rows, pixels
@@ -267,10 +261,8 @@ def read_image(sizes, rows, keys, values, top, sums):
 def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
     """Compute the shares of the tokens in each pixel at the first layer (H, T - 1, P)."""
     _, _, heads, tokens, dim, pixels, _ = sizes
-    by_head(
-        s, 0, rows, i * heads * tokens * dim, queries, b * heads * dim * pixels, heads, tokens, dim, pixels,
-        pixels, dim * pixels, pixels, tokens * pixels,
-    )  # fmt: skip
+    base = b * heads * dim * pixels
+    by_head(s, 0, rows, i * heads * tokens * dim, queries, base, heads, tokens, dim, pixels)
     token_shares(s, none, 0, ones, heads, tokens, pixels, e, 0)
 
 
@@ -282,13 +274,8 @@ def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, 
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     base = b * heads * dim * pixels
     scale_and_shift(q, scaled_q, base, s1, fixed_q, base, heads * dim, pixels)
-    by_head(
-        s, 0, rows, i * all_rows * dim, q, 0, heads, tokens, dim, pixels,
-        pixels, dim * pixels, pixels, tokens * pixels,
-    )  # fmt: skip
-    multiply(
-        s, 0, pixels, low, i * all_rows * factors, factors, e, 0, pixels, all_rows, factors, pixels, False
-    )
+    by_head(s, 0, rows, i * all_rows * dim, q, 0, heads, tokens, dim, pixels)
+    dense(s, 0, low, i * all_rows * factors, e, 0, all_rows, factors, pixels, False)
     token_shares(s, offset, i * all_rows, s1, heads, tokens, pixels, e, factors * pixels)
 
 
@@ -298,10 +285,8 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
     """Add a block to an attention of tokens to pixels whose keys and values are sums of factors.
 
     Args:
-        sizes: as in `read_image`.
-        b, i: indices of block and prompt.
-        image: `FirstLayer` or `SecondLayer`; `u` scales its keys and values.
-        prompt: `FirstPrompts` or `SecondPrompts`.
+        sizes, b, i: as in `read_image`; indices of block and prompt.
+        image, prompt: of the first or second layer; `u` scales the image's keys and values.
         u, v: scales of the pixels (P), as in `pixel_weights`.
         e: factors (padded, P); only the first `factors` rows are used.
         e_t, k, s, scaled: buffers for transposed factors, keys, scores and weights; overwritten.
@@ -312,14 +297,8 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
     width = depth + padded + WIDTH
     at = i * all_rows * width
     scale_and_shift(k, image.scaled_keys, base, u, image.fixed_keys, base, heads * dim, pixels)
-    by_head(
-        s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels,
-        pixels, dim * pixels, pixels, tokens * pixels,
-    )  # fmt: skip
-    multiply(
-        s, 0, pixels, prompt.low, i * all_rows * factors, factors, e, 0, pixels,
-        all_rows, factors, pixels, False,
-    )  # fmt: skip
+    by_head(s, 0, prompt.queries, i * all_rows * dim, k, 0, heads, tokens, dim, pixels)
+    dense(s, 0, prompt.low, i * all_rows * factors, e, 0, all_rows, factors, pixels, False)
     pixel_weights(
         s, scaled, prompt.offset, 2 * i * all_rows, u, v, top, i * all_rows, sums, at, width, all_rows, pixels
     )
@@ -338,8 +317,7 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
     Args:
         sizes: as in `read_image`.
         channels, eps: parameters of the layer norm.
-        image: `FirstLayer`.
-        prompt: `FirstPrompts`.
+        image, prompt: `FirstLayer`, `FirstPrompts`.
         top, sums: as in `pixel_weights`; sums (prompts, H * T, depth + padded + 16); overwritten.
         s1_out: layer norm scale of each pixel (prompts, blocks, P).
         e_out: factors times that scale (prompts, blocks, padded, P).
@@ -359,15 +337,10 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
         base = b * heads * dim * pixels
         for i in range(number):
             first_factors(sizes, b, i, prompt.update_keys, image.queries, s, e, none, ones)
-            by_head(
-                y, 0, prompt.twice_changes, i * factors * dim, image.before, base, heads, tokens - 1, dim,
-                pixels, pixels, dim * pixels, pixels, (tokens - 1) * pixels,
-            )  # fmt: skip
+            changes, rows = prompt.twice_changes, tokens - 1
+            by_head(y, 0, changes, i * factors * dim, image.before, base, heads, rows, dim, pixels)
             multiply_below(y, pixels, prompt.gram, i * factors * factors, e, factors, pixels)
-            multiply(
-                last, 0, pixels, prompt.last, i * heads * dim, 0, image.before, base, pixels,
-                1, heads * dim, pixels, True,
-            )  # fmt: skip
+            dense(last, 0, prompt.last, i * heads * dim, image.before, base, 1, heads * dim, pixels, True)
             for c in range(0, pixels, WIDTH):
                 p = b * pixels + c
                 total = load(image.square, p) + load_same(prompt.square, i)
@@ -393,8 +366,7 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
     """Compute the second attention of pixels to tokens, its layer norm, and the final attention of tokens.
 
     Args:
-        image: `SecondLayer`.
-        prompt: `SecondPrompts`.
+        image, prompt: `SecondLayer`, `SecondPrompts`.
         s1_in, e_in: outputs of `update_and_read_first`.
         s2_out: scale of each pixel by this layer norm (prompts, blocks, P).
         e_out: factors of both layers times this scale (prompts, blocks, padded, P).
@@ -408,11 +380,8 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
     e, e_t = np.zeros(padded * pixels, np.float32), np.empty(padded * pixels, np.float32)
     y, k = np.empty(both * pixels, np.float32), np.empty(heads * dim * pixels, np.float32)
     last, late = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
-    s1, s2, s12 = (
-        np.empty(pixels, np.float32),
-        np.empty(pixels, np.float32),
-        np.empty(pixels, np.float32),
-    )
+    s1, s2 = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
+    s12 = np.empty(pixels, np.float32)
     top[:], sums[:] = np.float32(-1e30), ZERO
     share, small, two = lanes(np.float32(1 / channels)), lanes(np.float32(eps)), lanes(TWO)
     for b in range(blocks):
@@ -425,28 +394,19 @@ def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top
                 sizes, b, i, prompt.update_keys, prompt.update_low, prompt.update_offset,
                 image.scaled_queries, image.fixed_queries, s1, k, s, e,
             )  # fmt: skip
-            by_head(
-                y, 0, prompt.twice_changes, i * both * dim, image.before_first, base, heads, tokens - 1, dim,
-                pixels, pixels, dim * pixels, pixels, (tokens - 1) * pixels,
-            )  # fmt: skip
-            by_head(
-                y, factors * pixels, prompt.twice_changes, (i * both + factors) * dim, image.before_second,
-                base, heads, tokens - 1, dim, pixels, pixels, dim * pixels, pixels, (tokens - 1) * pixels,
-            )  # fmt: skip
+            at_first, at_second = i * both * dim, (i * both + factors) * dim
+            changes, rows, half = prompt.twice_changes, tokens - 1, factors * pixels
+            by_head(y, 0, changes, at_first, image.before_first, base, heads, rows, dim, pixels)
+            by_head(y, half, changes, at_second, image.before_second, base, heads, rows, dim, pixels)
             for c in range(0, pixels, WIDTH):
                 scale = load(s1, c)
                 for f in range(both):
                     own = load(y, f * pixels + c) + load_same(prompt.linear, 2 * (i * both + f))
                     store(y, f * pixels + c, scale * own + load_same(prompt.linear, 2 * (i * both + f) + 1))
             multiply_below(y, pixels, prompt.gram, i * both * both, e, both, pixels)
-            multiply(
-                last, 0, pixels, prompt.last, 2 * i * heads * dim, 0, image.before_first, base, pixels,
-                1, heads * dim, pixels, True,
-            )  # fmt: skip
-            multiply(
-                late, 0, pixels, prompt.last, (2 * i + 1) * heads * dim, 0, image.before_second, base, pixels,
-                1, heads * dim, pixels, True,
-            )  # fmt: skip
+            inner, at_last = heads * dim, 2 * i * heads * dim
+            dense(last, 0, prompt.last, at_last, image.before_first, base, 1, inner, pixels, True)
+            dense(late, 0, prompt.last, at_last + inner, image.before_second, base, 1, inner, pixels, True)
             for c in range(0, pixels, WIDTH):
                 p = b * pixels + c
                 scale = load(s1, c)
@@ -521,9 +481,7 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
     Args:
         fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first of them.
         eps: epsilon of the layer norm between the two upscalings.
-        weights: `Upscaling`.
-        image: `MaskImage`.
-        prompt: `MaskPrompts`.
+        weights, image, prompt: `Upscaling`, `MaskImage`, `MaskPrompts`.
         e_in, padded: factors times their scales (prompts, blocks, padded, P).
         grid_width: width of the image side, pixels.
         out: (prompts, masks, rows, columns), flat.
@@ -531,8 +489,7 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
     number, blocks, heads, tokens, _, pixels, _ = sizes
     both = 2 * heads * (tokens - 1)
     wide, narrow, masks = len(weights.norm_scale), len(weights.bias), prompt.masks
-    parts = 4 if fine else 1
-    step = 4 if fine else 1
+    parts = step = 4 if fine else 1
     out_width = grid_width * step
     out_size = blocks * pixels * step * step
     x, y = np.empty(wide * pixels, np.float32), np.empty(narrow * pixels, np.float32)
@@ -552,18 +509,13 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
                         k = i * 4 * wide + row + f
                         place = (b * 4 * wide + row + f) * pixels + c
                         value = scale * (load(image.scaled, place) + load_same(prompt.both_scales, k))
-                        value = (
-                            value
-                            + second * load_same(prompt.second_scale, k)
-                            + load_same(weights.fixed, row + f)
-                        )
+                        value = value + second * load_same(prompt.second_scale, k)
+                        value = value + load_same(weights.fixed, row + f)
                         if len(image.detail):
                             value = value + load(image.detail, place)
                         store(x, f * pixels + c, value)
-                multiply(
-                    x, 0, pixels, prompt.factors, (i * 4 * wide + row) * both, both,
-                    e_in, at * padded, pixels, wide, both, pixels, False,
-                )  # fmt: skip
+                of = (i * 4 * wide + row) * both
+                dense(x, 0, prompt.factors, of, e_in, at * padded, wide, both, pixels, False)
                 for c in range(0, pixels, WIDTH):
                     square = lanes(ZERO)
                     for f in range(wide):
@@ -575,10 +527,7 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
                         value = value * load_same(weights.norm_scale, f) + load_same(weights.norm_shift, f)
                         store(x, f * pixels + c, gelu(value))
                 for little in range(parts):
-                    multiply(
-                        y, 0, pixels, weights.second, little * narrow * wide, wide, x, 0, pixels,
-                        narrow, wide, pixels, True,
-                    )  # fmt: skip
+                    dense(y, 0, weights.second, little * narrow * wide, x, 0, narrow, wide, pixels, True)
                     for f in range(narrow):
                         for c in range(0, pixels, WIDTH):
                             value = load(y, f * pixels + c) + load_same(weights.bias, f)
@@ -586,10 +535,7 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
                                 place = ((b * 4 + big) * 4 + little) * narrow + f
                                 value = value + load(image.finest, place * pixels + c)
                             store(y, f * pixels + c, gelu(value))
-                    multiply(
-                        found, 0, pixels, prompt.combine, i * masks * narrow, narrow, y, 0, pixels,
-                        masks, narrow, pixels, True,
-                    )  # fmt: skip
+                    dense(found, 0, prompt.combine, i * masks * narrow, y, 0, masks, narrow, pixels, True)
                     shift = (2 * (big // 2) + little // 2) * out_width + 2 * (big % 2) + little % 2
                     for m in range(masks):
                         to = (i * masks + m) * out_size + shift

@@ -10,13 +10,12 @@ from hilsplat.base.compiled import compiled
 @compiled
 @no_type_check
 def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
-    """Quantise logits, and compute each mask's box and the areas for its stability.
+    """Quantise logits (K, h, w), and compute each mask's box and the areas for its stability.
 
     Args:
-        logits: float32 (K, h, w).
         per_unit: steps per unit of logit.
         upper, lower: the two stability thresholds, whole steps.
-        valid_h, valid_w: rows and columns that hold the image.
+        valid_h, valid_w: rows and columns of the image.
 
     Returns:
         steps int8 (K, h, w) in -127..127; pixels of the image above `upper` and above `lower`;
@@ -75,13 +74,9 @@ def edge_windows(steps, rows, boxes, reach):
     offsets = np.zeros(len(rows) + 1, np.int64)
     for place in range(len(rows)):
         x0, y0, x1, y1 = boxes[rows[place]]
-        windows[place] = (
-            max(x0 - reach, 0),
-            max(y0 - reach, 0),
-            min(x1 + reach, width),
-            min(y1 + reach, height),
-        )
-        x0, y0, x1, y1 = windows[place]
+        x0, y0 = max(x0 - reach, 0), max(y0 - reach, 0)
+        x1, y1 = min(x1 + reach, width), min(y1 + reach, height)
+        windows[place] = x0, y0, x1, y1
         offsets[place + 1] = offsets[place] + (y1 - y0) * (x1 - x0)
     out = np.empty(offsets[-1], steps.dtype)
     for place in range(len(rows)):
