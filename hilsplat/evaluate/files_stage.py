@@ -18,19 +18,10 @@ from hilsplat.base.progress import stage_log
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.evaluate.asked import Asked
+from hilsplat.evaluate.extra_protocols import Extra
 from hilsplat.evaluate.metrics.instances import InstanceMatches
+from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.answers import mask_rows
-from hilsplat.evaluate.protocols.cards import (
-    INSTANCES,
-    LERF_LANGSPLAT,
-    LERF_OPENGAUSSIAN,
-    LEVEL_GIVEN,
-    MASK,
-    OVS_ARGMAX,
-    OVS_NODES,
-    ProtocolCard,
-)
 from hilsplat.evaluate.protocols.flat_views import argmax_rows
 from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_points
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, annotated_truths
@@ -47,7 +38,7 @@ METHOD = "files"
 WORDS = "masks of files"
 """Bracketed suffix of a protocol's name: masks were supplied, so its map rule was not applied."""
 
-MASK_METRICS = (*MASK, "acc_25", "acc_50")
+MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
 """Metrics of masks; those of maps cannot be computed."""
 
 FOREGROUND = 128
@@ -98,14 +89,14 @@ def run_evaluate_files(
         views: dict[str, Callable[[], ViewTruth]] = {}
         points: Mapping[str, LabelledPoints] = {}
         if truth is not None and scene is not None:
-            asked = Asked.of_world(kind)
-            if any((predictions / f"{each}.txt").is_file() for each in _files_of(asked.points)):
+            extra = Extra.of_world(kind)
+            if any((predictions / f"{each}.txt").is_file() for each in _files_of(extra.points)):
                 points = labelled_points(truth.parent, kind)
             else:
                 least_px = min_region_px or EvaluateSettings().min_region_px
                 views = annotated_truths(truth, Scene.load(scene), least_px)
         else:
-            dataset, known, asked = Asked.open(labels, data_root)
+            dataset, known, extra = Extra.open(labels, data_root)
             name = labels.partition("/")[2]
             if isinstance(known, PointScene):
                 points = known.truth
@@ -120,9 +111,9 @@ def run_evaluate_files(
         def keep(view: str, measured: Measured) -> None:
             scores.append(Score(dataset, name, method, "-", view=view, **vars(measured)))
 
-        for view, row in _mask_rows(predictions, views, asked) if views else ():
+        for view, row in _mask_rows(predictions, views, extra) if views else ():
             keep(view, row)
-        for each in _point_rows(predictions, points, asked) if points else ():
+        for each in _point_rows(predictions, points, extra) if points else ():
             if isinstance(each, Measured):
                 keep("", each)
             else:
@@ -133,7 +124,7 @@ def run_evaluate_files(
 
 
 def _mask_rows(
-    predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], asked: Asked
+    predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], extra: Extra
 ) -> Iterator[tuple[str, Measured]]:
     """Yield the rows of all views; all are read before scoring, so that a missing one is reported at once."""
     found = {view: read_view_masks(predictions, view) for view in views}
@@ -150,7 +141,7 @@ def _mask_rows(
         masks = found[view]
         _check(view, masks, truth, texts)
         if "" in levels:
-            for row in _flat_rows(masks, truth, asked):
+            for row in _flat_rows(masks, truth, extra):
                 yield view, row
         if levels - {""}:
             for row in _level_rows(masks, truth):
@@ -180,26 +171,26 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
             )
 
 
-def _flat_rows(masks: Masks, truth: ViewTruth, asked: Asked) -> Iterator[Measured]:
+def _flat_rows(masks: Masks, truth: ViewTruth, extra: Extra) -> Iterator[Measured]:
     """Yield rows of masks without a level, for all texts under LERF's protocols, then the data set's own."""
     for query in truth.categories:
-        for card in (LERF_LANGSPLAT, LERF_OPENGAUSSIAN):
+        for card in (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN):
             yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
-    words = [*(["wholes"] if asked.level is Level.WHOLE else []), WORDS]
-    queries = [query for query in truth.queries if query.level is asked.level]
-    flat = [*truth.categories, *truth.absent] if asked.level is None else queries
-    for card in asked.flat:
-        if card is OVS_NODES:  # masks from files are not nodes of a tree
+    words = [*(["wholes"] if extra.level is Level.WHOLE else []), WORDS]
+    queries = [query for query in truth.queries if query.level is extra.level]
+    flat = [*truth.categories, *truth.absent] if extra.level is None else queries
+    for card in extra.flat:
+        if card is cards.OVS_NODES:  # masks from files are not nodes of a tree
             continue
-        if card is OVS_ARGMAX:
-            yield from argmax_rows(METHOD, flat, partial(_cosine, masks), words, asked.level is not None)
+        if card is cards.OVS_ARGMAX:
+            yield from argmax_rows(METHOD, flat, partial(_cosine, masks), words, extra.level is not None)
             continue
         for query in flat:
             yield from _text_rows(card, replace(query, level=None), masks.get(("", query.text)), words)
 
 
 def _text_rows(
-    card: ProtocolCard, query: Query, mask: Bool[np.ndarray, "H W"] | None, words: list[str]
+    card: cards.ProtocolCard, query: Query, mask: Bool[np.ndarray, "H W"] | None, words: list[str]
 ) -> Iterator[Measured]:
     region = query.region(card.truth)
     if not region.any() or (mask is None and card.missing == "left out"):
@@ -221,10 +212,10 @@ def _cosine(
 
 def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
     """Yield the rows of masks at levels, and their hierarchical consistency."""
-    protocol = LEVEL_GIVEN.labelled([WORDS])
+    protocol = cards.LEVEL_GIVEN.labelled([WORDS])
     for query in truth.queries:
         assert query.level is not None
-        yield from _text_rows(LEVEL_GIVEN, query, masks.get((query.level.label, query.text)), [WORDS])
+        yield from _text_rows(cards.LEVEL_GIVEN, query, masks.get((query.level.label, query.text)), [WORDS])
 
     def mask_of(path: tuple[str, ...]) -> Bool[np.ndarray, "H W"]:
         found = masks.get((Level(len(path)).label, path[-1]))
@@ -233,25 +224,25 @@ def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
     yield from consistency_rows(METHOD, protocol, truth, mask_of)
 
 
-def _files_of(cards: tuple[ProtocolCard, ...]) -> list[str]:
+def _files_of(protocols: Sequence[cards.ProtocolCard]) -> list[str]:
     """Return the names, without suffix, of the files read under point protocols."""
-    names = ["instances"] if INSTANCES in cards else []
-    for card in cards:
-        names += [card.classes, class_set(card.classes)[0]] if card is not INSTANCES else []
+    names = ["instances"] if cards.INSTANCES in protocols else []
+    for card in protocols:
+        names += [card.classes, class_set(card.classes)[0]] if card is not cards.INSTANCES else []
     return list(dict.fromkeys(names))
 
 
 def _point_rows(
-    predictions: Path, truth: Mapping[str, LabelledPoints], asked: Asked
+    predictions: Path, truth: Mapping[str, LabelledPoints], extra: Extra
 ) -> Iterator[Measured | InstanceMatches]:
     """Yield the rows of points under each protocol whose file exists, and the matches of instances."""
     scored = []
-    for card in asked.points:
+    for card in extra.points:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:
             continue
         points = truth[labelling]
-        if card is INSTANCES:
+        if card is cards.INSTANCES:
             path = predictions / "instances.txt"
             if path.is_file():
                 yield instance_scan(points, classes, *read_point_instances(path, len(points)))
@@ -268,7 +259,7 @@ def _point_rows(
     if not scored:
         raise ArtifactError(
             f"{predictions} has no point labels",
-            expected=" or ".join(f"{each}.txt" for each in _files_of(asked.points)),
+            expected=" or ".join(f"{each}.txt" for each in _files_of(extra.points)),
             fix="write one class id per point and line",
         )
 

@@ -8,9 +8,9 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.evaluate.asked import Asked
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
 from hilsplat.evaluate.diagnostics.world_answers import measure_world_consistency
+from hilsplat.evaluate.extra_protocols import Extra
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
@@ -64,7 +64,7 @@ def run_evaluate(
         parts: the finished scene; its test views were held out from all earlier stages.
         dataset: data set in every row, as are `scene` and `variant`.
         truth: truth folder of a synthetic scene.
-        kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Asked.of_world`).
+        kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Extra.of_world`).
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
     Raises:
@@ -81,9 +81,9 @@ def run_evaluate(
         scores.append(Score(data, scene, variant, label, view=view, **vars(measured)))
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        scored: list[tuple[str, Annotations, Asked]] = [Asked.open(name, data_root) for name in labels]
+        scored: list[tuple[str, Annotations, Extra]] = [Extra.open(name, data_root) for name in labels]
         if truth is not None:
-            scored.append((dataset, truth, Asked.of_world(kind)))
+            scored.append((dataset, truth, Extra.of_world(kind)))
         if not scored:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
@@ -104,7 +104,7 @@ def run_evaluate(
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
-                        seconds = timed(answers, view, texts, settings)
+                        seconds = query_seconds(answers, view, texts, settings)
                     answers.forget(view)  # reused memory need not be cleared again
                 if isinstance(known, Path) and truths and settings.view_consistency:
                     for view, row in measure_world_consistency(
@@ -140,19 +140,19 @@ def known_truths(
 def point_rows(
     answers: LanguageScene,
     known: Annotations,
-    asked: Asked,
+    extra: Extra,
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
     """Yield rows of labelled points and matches of instances; nothing if no protocol scores points."""
-    if not asked.points or isinstance(known, LabelledScene):
+    if not extra.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
         for sentence in known.warnings:
             logger.warning("%s: %s", known.name, sentence)
         points, transform = known.truth, answers.scene.scene_from_source
     else:
-        kind = "street" if any(card.classes.startswith("waymo") for card in asked.points) else "room"
+        kind = "street" if any(card.classes.startswith("waymo") for card in extra.points) else "room"
         points = labelled_points(known.parent, kind)
         true, found = Cameras.load(known / "cameras.npz"), answers.scene.cameras
         transform = scene_from_true(true, found)
@@ -163,13 +163,11 @@ def point_rows(
                 answers.scene.name,
                 error,
             )
-    methods = [method for method in settings.methods if method != "tree-path"]
-    yield from measure_scene_points(
-        answers, points, transform, asked.points, methods, settings.points, threads
-    )
+    modes = (settings.methods, settings.points, threads)
+    yield from measure_scene_points(answers, points, transform, extra.points, *modes)
 
 
-def timed(
+def query_seconds(
     answers: LanguageScene, view: str, texts: Sequence[str], settings: EvaluateSettings
 ) -> dict[str, float]:
     """Return the seconds that field and tree take for one query in a view (see `costs.time_queries`)."""
@@ -182,7 +180,6 @@ def timed(
     def by_tree(text: str) -> object:
         return answers.node_masks(view, answers.select((text,), view=view).ids)
 
-    asks = {"field": by_field, "tree": by_tree}
-    return time_queries(
-        answers, {name: ask for name, ask in asks.items() if name in settings.methods}, view, texts
-    )
+    queries = {"field": by_field, "tree": by_tree}
+    timed = {method: queries[method] for method in filter(settings.methods.__contains__, queries)}
+    return time_queries(answers, timed, view, texts)

@@ -50,13 +50,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
 
 def camera_error(true: Cameras, found: Cameras, scene_from_true: Float64[np.ndarray, "4 4"]) -> float:
     """Return the median distance of estimated camera centres from the true ones, true units."""
-    scale = np.cbrt(np.linalg.det(scene_from_true[:3, :3]))
-    known = set(true.names)
-    apart = [
-        np.linalg.norm(
-            scene_from_true[:3, :3] @ true[name].centre + scene_from_true[:3, 3] - found[name].centre
-        )
-        for name in found.names
-        if name in known
-    ]
-    return float(np.median(apart) / scale)
+    turned, offset = scene_from_true[:3, :3], scene_from_true[:3, 3]
+    shared = [name for name in found.names if name in set(true.names)]
+    apart = [np.linalg.norm(turned @ true[name].centre + offset - found[name].centre) for name in shared]
+    return float(np.median(apart) / np.cbrt(np.linalg.det(turned)))

@@ -44,12 +44,12 @@ class Answerer:
         """Return the answers to queries in their views, at their levels if they have one."""
         if self.method == "tree":
             return [shown.tree_mask(self.scene) for shown in rows]
-        rule, asked = rule_of(evaluate), defaultdict[str, list[str]](list)
+        rule, texts_of = rule_of(evaluate), defaultdict[str, list[str]](list)
         for shown in rows:
-            asked[shown.view].append(shown.path[-1])
+            texts_of[shown.view].append(shown.path[-1])
         maps = {  # all texts of a view together, because a network decodes its pixels at every call
             view: dict(zip(texts, np.asarray(self.scene.field_relevancy(texts, view)), strict=True))
-            for view, texts in asked.items()
+            for view, texts in texts_of.items()
         }
         return [
             relevancy_mask(SmoothedRelevancy.of(maps[row.view][row.path[-1]], rule), row.level, rule)[0]
@@ -158,8 +158,8 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
     for number, (axes, row) in enumerate(zip(by_query, rows, strict=False)):
         image = first.image(row.view)
         title = f"truth, {row.view}" if row.truth is not None else row.view
-        asked = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
-        show(axes[0], paint_answer(image, None, row.truth), asked + title)
+        query = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
+        show(axes[0], paint_answer(image, None, row.truth), query + title)
         if not many:
             label_left(axes[0], row.text, row.level)
         for place, method, masks in zip(axes[1:], methods, answers, strict=True):
@@ -177,8 +177,8 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
     """Draw one row per method, one column per view, to compare a method's answers across views."""
     first = methods[0].scene
     scene = first.scene
-    asked = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
-    figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {asked}")
+    query = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
+    figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {query}")
     answers = [method.masks(rows, evaluate) for method in methods]
     for column, row in enumerate(rows):
         image = first.image(row.view)

@@ -8,15 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.masks import (
-    argmax_masks,
-    boundary_iou,
-    exceeds,
-    hits_a_box,
-    hits_the_mask,
-    iou,
-    pixel_accuracy,
-)
+from hilsplat.evaluate.metrics import masks
 from hilsplat.evaluate.protocols.cards import LERF_LANGSPLAT
 from hilsplat.evaluate.protocols.view_truth import Query
 from hilsplat.evaluate.scores import Measured
@@ -47,14 +39,12 @@ class PackedMasks:
         self.bits: dict[tuple, np.ndarray] = {}
 
     def put(self, key: tuple, mask: np.ndarray) -> None:
-        """Store a mask."""
         self.bits[key] = np.packbits(mask)
 
     def __contains__(self, key: tuple) -> bool:
         return key in self.bits
 
     def get(self, key: tuple) -> np.ndarray:
-        """Return a mask, unpacked."""
         return unpacked(self.bits[key], self.size_hw)
 
 
@@ -102,12 +92,12 @@ def mask_rows(
     """Yield a row per metric of one mask; `points_xy` are the relevancy peaks, for localization."""
     level = query.level.label if query.level else ""
     values = {
-        "iou": lambda: iou(mask, query.truth),
-        "boundary_iou": lambda: boundary_iou(mask, query.truth),
-        "acc_25": lambda: exceeds(mask, query.truth, 0.25),
-        "acc_50": lambda: exceeds(mask, query.truth, 0.5),
-        "localization_box": lambda: float(hits_a_box(points_xy, query.boxes_xyxy)),
-        "localization_mask": lambda: float(hits_the_mask(points_xy, query.truth)),
+        "iou": lambda: masks.iou(mask, query.truth),
+        "boundary_iou": lambda: masks.boundary_iou(mask, query.truth),
+        "acc_25": lambda: masks.exceeds(mask, query.truth, 0.25),
+        "acc_50": lambda: masks.exceeds(mask, query.truth, 0.5),
+        "localization_box": lambda: float(masks.hits_a_box(points_xy, query.boxes_xyxy)),
+        "localization_mask": lambda: float(masks.hits_the_mask(points_xy, query.truth)),
     }
     for metric in metrics:
         yield Measured(method, query.text, level, metric, protocol, values[metric]())
@@ -124,8 +114,8 @@ def class_map_rows(
 
     `similarity` is the cosine of each pixel with each text. Texts are sorted, because the first wins ties.
     """
-    prediction = argmax_masks(similarity)
+    prediction = masks.argmax_masks(similarity)
     for row, text in enumerate(texts):
-        yield Measured(method, text, "", "iou", protocol, iou(prediction[row], truth[row]))
-    accuracy = pixel_accuracy(prediction, truth)
+        yield Measured(method, text, "", "iou", protocol, masks.iou(prediction[row], truth[row]))
+    accuracy = masks.pixel_accuracy(prediction, truth)
     yield Measured(method, "", "", "pixel_accuracy", protocol, accuracy, truth[0].size)

@@ -66,7 +66,6 @@ class ProtocolCard:
 
     @property
     def full_name(self) -> str:
-        """Name and version."""
         return f"{self.name}@{self.version}"
 
     def labelled(self, departures: Iterable[str] = ()) -> str:

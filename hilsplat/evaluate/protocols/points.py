@@ -20,16 +20,8 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES, splits_of
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
+from hilsplat.evaluate.metrics import instances
 from hilsplat.evaluate.metrics import point_classes as means
-from hilsplat.evaluate.metrics.instances import (
-    CLASS_STRIDE,
-    InstanceMatches,
-    ap,
-    ap25,
-    ap50,
-    average_precision,
-    match_instances,
-)
 from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou, pooled
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
 from hilsplat.evaluate.protocols.carry import CarriedPoints, Mode, carried_to, classify
@@ -124,18 +116,24 @@ def _counts_of(rows: Iterable[Any], classes: ClassSet) -> ClassCounts:
     return ClassCounts(hits, truth, union - truth + hits)
 
 
-def measure_instances(method: str, scans: Mapping[str, InstanceMatches], carried: str) -> Iterator[Measured]:
+def measure_instances(
+    method: str, scans: Mapping[str, instances.InstanceMatches], carried: str
+) -> Iterator[Measured]:
     """Yield AP, AP50 and AP25 over all scans, and AP of each split; `n` is the number of scans.
 
     Scans without predictions must be included: their instances are misses. Nothing is yielded if no scan has
     an instance.
     """
-    precisions = average_precision(list(scans.values()))
+    precisions = instances.average_precision(list(scans.values()))
     if np.isnan(precisions).all():
         return
-    values = {"ap": ap(precisions), "ap50": ap50(precisions), "ap25": ap25(precisions)}
+    values = {
+        "ap": instances.ap(precisions),
+        "ap50": instances.ap50(precisions),
+        "ap25": instances.ap25(precisions),
+    }
     for split, members in splits_of(SCANNET200_INSTANCES).items():
-        values[f"ap_{split}"] = ap(precisions[np.array(members)])
+        values[f"ap_{split}"] = instances.ap(precisions[np.array(members)])
     protocol = INSTANCES.labelled([f"points: {carried}"])
     for metric, value in values.items():
         yield Measured(method, "", "", metric, protocol, value, len(scans))
@@ -162,7 +160,7 @@ def point_classes(
 
 def node_instances(
     scene: "LanguageScene", carried: CarriedPoints, truth: LabelledPoints, classes: ClassSet
-) -> InstanceMatches:
+) -> instances.InstanceMatches:
     """Match the nodes at level whole to the truth; a node's best cosine gives class and confidence."""
     tree = scene.tree
     nodes = tree.nodes_of(LEVEL)
@@ -183,12 +181,12 @@ def instance_scan(
     masks: Bool[np.ndarray, "M P"],
     class_ids: Int[np.ndarray, " M"],
     confidences: Float[np.ndarray, " M"],
-) -> InstanceMatches:
+) -> instances.InstanceMatches:
     """Match predicted instances, with class ids as in the data set's files, to the labelled instances."""
     labels = classes.labels(truth.class_id)
     ids = np.array([0, *classes.ids])[labels]
-    of_points = np.where(labels > 0, ids * CLASS_STRIDE + truth.instance_id, 0).astype(np.int64)
-    return match_instances(of_points, masks, class_ids, confidences, classes.ids)
+    of_points = np.where(labels > 0, ids * instances.CLASS_STRIDE + truth.instance_id, 0).astype(np.int64)
+    return instances.match_instances(of_points, masks, class_ids, confidences, classes.ids)
 
 
 def class_set(name: str) -> tuple[str, ClassSet]:
@@ -205,7 +203,7 @@ def measure_scene_points(
     methods: Sequence[str],
     mode: Mode,
     threads: int = 1,
-) -> Iterator[Measured | tuple[str, InstanceMatches]]:
+) -> Iterator[Measured | tuple[str, instances.InstanceMatches]]:
     """Yield the rows of one scene under point protocols, and the instance matches of the tree.
 
     Labelled points are given by labelling, in metres; `scene_from_points` is a similarity transform.

@@ -88,7 +88,7 @@ class ViewTruth:
                     path = annotations.path_of(node)
                     by_path[path] = by_path[path] | region if path in by_path else region
         large = {path: region for path, region in by_path.items() if np.count_nonzero(region) >= min_px}
-        return ViewTruth(tuple(queries), _united(queries), large)
+        return ViewTruth(tuple(queries), _merged(queries, by_level=False), large)
 
     @staticmethod
     def of_regions(
@@ -104,33 +104,19 @@ class ViewTruth:
             image_hw: size of the image, if different.
         """
         small_hw = eighth_of(image_hw or size_hw)
-        masks = [(region, region.mask(size_hw)) for region in regions]
-        groups: dict[tuple[str, Level | None], list[tuple[LabelledRegion, np.ndarray]]] = {}
+        single: list[Query] = []
         by_path: dict[tuple[str, ...], np.ndarray] = {}
-        for region, mask in masks:
-            if not mask.any() and region.level is not None:
+        for region in regions:
+            mask, path, level = region.mask(size_hw), region.path, region.level
+            if level is not None and not mask.any():
                 continue
-            groups.setdefault((region.text, region.level), []).append((region, mask))
-            if region.level is not None and len(region.path) == int(region.level):
-                path = region.path
+            grey = region.mask(size_hw, any_grey=True) if region.any_grey else None
+            small = region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))]
+            single.append(Query(region.text, level, (path,), mask, region.boxes(size_hw), grey, small))
+            if level is not None and len(path) == int(level):
                 by_path[path] = by_path[path] | mask if path in by_path else mask
-        queries = []
-        for (text, level), same in groups.items():
-            own = [region for region, _ in same]
-            with_grey = own if any(region.any_grey for region in own) else []
-            small = [region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))] for region in own]
-            queries.append(
-                Query(
-                    text,
-                    level,
-                    tuple(dict.fromkeys(region.path for region in own)),
-                    np.any([mask for _, mask in same], axis=0),
-                    np.concatenate([region.boxes(size_hw) for region in own]),
-                    _union(region.mask(size_hw, any_grey=True) for region in with_grey),
-                    _union(small),
-                )
-            )
-        united = _united(queries)
+        queries = _merged(single, by_level=True)
+        united = _merged(queries, by_level=False)
         return ViewTruth(
             tuple(query for query in queries if query.level is not None),
             tuple(query for query in united if query.truth.any()),
@@ -165,26 +151,20 @@ class ViewTruth:
         ]
 
 
-def _united(queries: Iterable[Query]) -> tuple[Query, ...]:
-    """Return one query per text, merged over levels."""
-    by_text: dict[str, list[Query]] = {}
+def _merged(queries: Iterable[Query], by_level: bool) -> tuple[Query, ...]:
+    """Return one query per text, or per text and level."""
+    groups: dict[tuple[str, Level | None], list[Query]] = {}
     for query in queries:
-        by_text.setdefault(query.text, []).append(query)
-    united = []
-    for text, same in by_text.items():
+        groups.setdefault((query.text, query.level if by_level else None), []).append(query)
+    merged = []
+    for (text, level), same in groups.items():
+        paths = tuple(dict.fromkeys(path for query in same for path in query.paths))
+        truth = np.any([query.truth for query in same], axis=0)
+        boxes = np.concatenate([query.boxes_xyxy for query in same])
         with_grey = same if any(query.any_grey is not None for query in same) else []
-        united.append(
-            Query(
-                text,
-                None,
-                tuple(path for query in same for path in query.paths),
-                np.any([query.truth for query in same], axis=0),
-                np.concatenate([query.boxes_xyxy for query in same]),
-                _union(query.region("any grey") for query in with_grey),
-                _union(query.eighth for query in same),
-            )
-        )
-    return tuple(united)
+        grey = _union(query.region("any grey") for query in with_grey)
+        merged.append(Query(text, level, paths, truth, boxes, grey, _union(query.eighth for query in same)))
+    return tuple(merged)
 
 
 def _union(masks: Iterable[np.ndarray | None]) -> np.ndarray | None:

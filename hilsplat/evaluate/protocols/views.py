@@ -24,13 +24,7 @@ import numpy as np
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.evaluate.metrics.hierarchy import (
-    READINGS,
-    Family,
-    consistency_of_families,
-    consistency_per_child,
-    mean_over_parents,
-)
+from hilsplat.evaluate.metrics import hierarchy
 from hilsplat.evaluate.metrics.masks import best_threshold_iou, peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
@@ -39,22 +33,8 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     mean_filter,
     relevancy_mask,
 )
+from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.answers import NO_POINTS, PackedMasks, Selections, ViewMaps, mask_rows
-from hilsplat.evaluate.protocols.cards import (
-    ANCESTORS,
-    ANNOTATIONS,
-    CANONICAL,
-    LERF_LANGSPLAT,
-    LEVEL_AUTO,
-    LEVEL_GIVEN,
-    MASK,
-    NODE_SELECT,
-    PATH,
-    RELEVANCY_SCALE,
-    SCENE_WIDE,
-    TREE_NODES,
-    ProtocolCard,
-)
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.evaluate.scores import Measured
@@ -79,7 +59,7 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
     )
 
 
-def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str:
+def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) -> str:
     """Return the protocol name of a row: the card's name and deviating settings that affect this method."""
     if method == "truth":
         return card.labelled()
@@ -89,26 +69,26 @@ def label_of(card: ProtocolCard, method: str, settings: EvaluateSettings) -> str
         words += rule.departures(RelevancyRule())
     else:  # nodes are selected without thresholds; localization and diagnostics still use smoothed maps
         words += RelevancyRule(rule.filter_px, rule.mix).departures(RelevancyRule())
-        if settings.node_select != NODE_SELECT:
+        if settings.node_select != cards.NODE_SELECT:
             words.append(f"node share {settings.node_select:g}")
-        if method == "tree" and settings.ancestors != ANCESTORS:
+        if method == "tree" and settings.ancestors != cards.ANCESTORS:
             words.append(f"ancestors {settings.ancestors:g}")
     return card.labelled([*words, *relevancy_departures(settings)])
 
 
 def given_key(method: str, query: Query, settings: EvaluateSettings) -> tuple:
     """Return the key under which the answer at the query's level is stored."""
-    return (method, label_of(LEVEL_GIVEN, method, settings), query.text, query.level)
+    return (method, label_of(cards.LEVEL_GIVEN, method, settings), query.text, query.level)
 
 
 def relevancy_departures(settings: EvaluateSettings) -> list[str]:
     """Return descriptions of the settings that change the relevancy itself."""
     words = []
-    if settings.canonical != CANONICAL:
+    if settings.canonical != cards.CANONICAL:
         words.append(f"canonical {'+'.join(settings.canonical)}")
     if settings.template != "{}":
         words.append(f"texts as {settings.template.replace('{}', '...')}")
-    if settings.relevancy_scale != RELEVANCY_SCALE:
+    if settings.relevancy_scale != cards.RELEVANCY_SCALE:
         words.append(f"relevancy scale {settings.relevancy_scale:g}")
     return words
 
@@ -162,9 +142,9 @@ def measure_view(
                 mask = None
                 if category.truth.any():
                     smoothed = SmoothedRelevancy.of(found[row], rule)
-                    flat, answer = LERF_LANGSPLAT, partial(by_map, smoothed)
+                    flat, answer = cards.LERF_LANGSPLAT, partial(by_map, smoothed)
                     if method == "tree":
-                        flat, answer = TREE_NODES, partial(by_nodes, category.text)
+                        flat, answer = cards.TREE_NODES, partial(by_nodes, category.text)
                         yield from answers.scene_wide_rows(queries)
                         mask = by_nodes(category.text, None) if also is not None else None
                     yield from answers.rows(method, flat, smoothed, answer, category, queries)
@@ -205,7 +185,7 @@ class _ViewAnswers:
     def rows(
         self,
         method: str,
-        flat: ProtocolCard,
+        flat: cards.ProtocolCard,
         smoothed: SmoothedRelevancy,
         answer: Callable[[Level | None], np.ndarray],
         category: Query,
@@ -219,7 +199,7 @@ class _ViewAnswers:
             queries: the text at each level.
         """
         united, given, auto = (
-            label_of(card, method, self.settings) for card in (flat, LEVEL_GIVEN, LEVEL_AUTO)
+            label_of(card, method, self.settings) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)
         )
         auto_mask = answer(None)
         auto_points, _ = peak_points(smoothed.filtered, None)
@@ -237,15 +217,15 @@ class _ViewAnswers:
 
     def scene_wide_rows(self, queries: Sequence[Query]) -> Iterator[Measured]:
         """Yield the rows of the tree's answers for the whole scene, without localization (per view)."""
-        protocol = label_of(SCENE_WIDE, "tree", self.settings)
+        protocol = label_of(cards.SCENE_WIDE, "tree", self.settings)
         for query in queries:
             mask = self.of_nodes((query.text,), query.level, scene_wide=True)
-            yield from mask_rows("tree", query, protocol, mask, NO_POINTS, MASK)
+            yield from mask_rows("tree", query, protocol, mask, NO_POINTS, cards.MASK)
             self.masks.put(("tree", protocol, query.text, query.level), mask)
 
     def path_rows(self, relevancy: np.ndarray, queries: Sequence[Query]) -> Iterator[Measured]:
         """Yield the rows of answers to paths; localization searches the parent's predicted mask, if any."""
-        protocol = label_of(PATH, "tree-path", self.settings)
+        protocol = label_of(cards.PATH, "tree-path", self.settings)
         size_hw = self.masks.size_hw
         side_px = filter_side_px(self.settings.filter_px, size_hw[0])
         for query in queries:
@@ -266,23 +246,25 @@ class _ViewAnswers:
 
     def consistency_rows(self, truth: ViewTruth) -> Iterator[Measured]:
         """Yield the HC of every method and of the annotations; nothing for a view without parents."""
-        cards = {
-            "truth": (ANNOTATIONS,),
-            "field": (LEVEL_AUTO, LEVEL_GIVEN),
-            "tree": (LEVEL_AUTO, LEVEL_GIVEN, SCENE_WIDE),
-            "tree-path": (PATH,),
+        of_methods = {
+            "truth": (cards.ANNOTATIONS,),
+            "field": (cards.LEVEL_AUTO, cards.LEVEL_GIVEN),
+            "tree": (cards.LEVEL_AUTO, cards.LEVEL_GIVEN, cards.SCENE_WIDE),
+            "tree-path": (cards.PATH,),
         }
 
-        def mask_of(method: str, card: ProtocolCard, protocol: str, path: tuple[str, ...]) -> np.ndarray:
-            if card is ANNOTATIONS:
+        def mask_of(
+            method: str, card: cards.ProtocolCard, protocol: str, path: tuple[str, ...]
+        ) -> np.ndarray:
+            if card is cards.ANNOTATIONS:
                 return truth.regions[path]
-            if card is PATH:
+            if card is cards.PATH:
                 return self.masks.get((method, protocol, path))
-            key = path[-1:] if card is LEVEL_AUTO else (path[-1], Level(len(path)))
+            key = path[-1:] if card is cards.LEVEL_AUTO else (path[-1], Level(len(path)))
             return truth.own_part(path, self.masks.get((method, protocol, *key)))
 
-        for method, of_method in cards.items():
-            for card in of_method if method in ("truth", *self.settings.methods) else ():
+        for method in ("truth", *self.settings.methods):
+            for card in of_methods[method]:
                 protocol = label_of(card, method, self.settings)
                 yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
 
@@ -297,15 +279,17 @@ def consistency_rows(
         return
     families = [
         [
-            Family(mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent])
+            hierarchy.Family(
+                mask_of(parent), tuple(mask_of(child) for child in children), truth.regions[parent]
+            )
             for parent, children in transition
         ]
         for transition in transitions
     ]
-    for reading in READINGS:
-        scores = consistency_of_families(families, reading)
+    for reading in hierarchy.READINGS:
+        scores = hierarchy.consistency_of_families(families, reading)
         for suffix, pooled in (("", False), ("_pooled", True)):
-            value = mean_over_parents(scores, pooled)
+            value = hierarchy.mean_over_parents(scores, pooled)
             yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
-    per_child = consistency_per_child(families)
+    per_child = hierarchy.consistency_per_child(families)
     yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)

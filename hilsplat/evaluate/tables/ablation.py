@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING
 
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH
-from hilsplat.evaluate.tables.measured import (
-    level_averages_of_scenes,
-    level_cells,
-    measured_blocks,
-    same_row,
-    table_value,
-    with_seeds,
-)
+from hilsplat.evaluate.tables import measured
 from hilsplat.evaluate.tables.rows import Block, Cell, Sources, Table
 
 if TYPE_CHECKING:
@@ -89,8 +82,8 @@ def component_blocks(
     sources: Sources, methods: tuple[str, ...] = ("field", "tree", "tree-path")
 ) -> list[Block]:
     """Return one row per variant and method, all protocols of the ablation side by side."""
-    scores = with_seeds(sources.scores)
-    blocks = measured_blocks(
+    scores = measured.with_seeds(sources.scores)
+    blocks = measured.measured_blocks(
         replace(sources, scores=sources.scores[sources.scores["method"].isin(methods)]),
         (f"{LEVEL_GIVEN.name}@", f"{PATH.name}@"),
         lambda part: component_cells(scores, part),
@@ -108,16 +101,16 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
     """
     own = part.iloc[0]["dataset"]
     lerf, ovs3d = ("lerf_ovs", "3d_ovs") if own in LEVELLED else (own, own)
-    flat, ovs = same_row(scores, part, FLAT, lerf), same_row(scores, part, OVS, ovs3d)
-    levels = level_cells(part)
+    flat, ovs = measured.same_row(scores, part, FLAT, lerf), measured.same_row(scores, part, OVS, ovs3d)
+    levels = measured.level_cells(part)
     return {
-        "LERF localization": Cell.percent(table_value(flat, "localization_box")),
-        "LERF mIoU": Cell.percent(table_value(flat, "iou")),
-        "3D-OVS mIoU": Cell.percent(table_value(ovs, "iou")),
+        "LERF localization": Cell.percent(measured.table_value(flat, "localization_box")),
+        "LERF mIoU": Cell.percent(measured.table_value(flat, "iou")),
+        "3D-OVS mIoU": Cell.percent(measured.table_value(ovs, "iou")),
         **{name: cell for name, cell in levels.items() if name != "Avg"},
         "Hi-LERF mIoU": levels["Avg"],
-        "Hi-LERF HC": Cell.percent(table_value(part, "hc_containment")),
-        "Avg, best threshold": level_cells(part, "best_threshold_iou")["Avg"],
+        "Hi-LERF HC": Cell.percent(measured.table_value(part, "hc_containment")),
+        "Avg, best threshold": measured.level_cells(part, "best_threshold_iou")["Avg"],
     }
 
 
@@ -132,7 +125,7 @@ def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
         default &= scores[key] == first[key]
     if (first["variant"], first["method"]) == ("default", "field"):
         return Cell()
-    ours, others = (level_averages_of_scenes(rows, "iou") for rows in (part, scores[default]))
+    ours, others = (measured.level_averages_of_scenes(rows, "iou") for rows in (part, scores[default]))
     differences = 100 * (ours - others).dropna()
     if not len(differences):
         return Cell()

@@ -52,24 +52,24 @@ class Cost:
 
 
 def time_queries(
-    answers: "LanguageScene", asks: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
+    answers: "LanguageScene", queries: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
 ) -> dict[str, float]:
     """Return the seconds of one query per method: text, weights of the view, relevancy and mask.
 
-    The view's weights and the text's vector are timed once and added, because later queries reuse them. Each
-    function of `asks` maps a text to its mask, with weights and vectors cached; the median over texts counts.
+    The view's weights and the text's vector are timed once and added, because later queries reuse them.
+    `queries` compute the mask of a text, with weights and vectors cached; the median over texts is used.
     """
     start = time.perf_counter()
     answers.encode_texts([texts[0]])
     answers.pixel_weights(view)
     shared_s = time.perf_counter() - start
     seconds = {}
-    for method, ask in asks.items():
-        ask(texts[0])  # compiles and fills caches
+    for method, query in queries.items():
+        query(texts[0])  # compiles and fills caches
         taken = []
         for text in texts:
             start = time.perf_counter()
-            ask(text)
+            query(text)
             taken.append(time.perf_counter() - start)
         seconds[method] = shared_s + sorted(taken)[len(taken) // 2]
     return seconds

@@ -61,12 +61,9 @@ def as_csv(table: Table) -> str:
 
 
 def _csv_value(cell: Cell, kind: str) -> str:
-    if cell.text == "-":
-        return ""
     if kind == "reported" or cell.value is None or cell.text.isdigit():
-        return cell.text
-    spread = f" ± {cell.spread:.2f}" if cell.spread is not None else ""
-    return f"{cell.value:.2f}{spread}"
+        return "" if cell.text == "-" else cell.text
+    return f"{cell.value:.2f}" + (f" ± {cell.spread:.2f}" if cell.spread is not None else "")
 
 
 def shown_rows(block: Block, notes: dict[str, int]) -> Iterator[tuple[list[str], list[tuple[str, int, str]]]]:

@@ -5,16 +5,7 @@ from typing import TYPE_CHECKING
 
 from hilsplat.evaluate.metrics.hierarchy import READINGS
 from hilsplat.evaluate.protocols.cards import LERF_MASK, LEVEL_GIVEN, VIEW_CONSISTENCY
-from hilsplat.evaluate.tables.measured import (
-    kind_and_title,
-    level_cells,
-    measured_blocks,
-    same_row,
-    scene_cells,
-    share_above,
-    table_value,
-    with_seeds,
-)
+from hilsplat.evaluate.tables import measured
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources, Table
 
 if TYPE_CHECKING:
@@ -34,23 +25,23 @@ def hierarchy_table(sources: Sources) -> Table:
     blocks = [
         sources.reported(data, rename=partial(column_of_data, data)) for data in ("Hi-LERF", "Hi-3DOVS")
     ]
-    scores = with_seeds(sources.scores)
+    scores = measured.with_seeds(sources.scores)
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         ious = part[part["metric"] == "iou"]
         cells = {
-            **level_cells(part),
-            "Acc@0.25": Cell.percent(share_above(part, "iou", 0.25)),
-            **{f"HC {name}": Cell.percent(table_value(part, f"hc_{name}")) for name in READINGS},
-            "Avg, best threshold": level_cells(part, "best_threshold_iou")["Avg"],
+            **measured.level_cells(part),
+            "Acc@0.25": Cell.percent(measured.share_above(part, "iou", 0.25)),
+            **{f"HC {name}": Cell.percent(measured.table_value(part, f"hc_{name}")) for name in READINGS},
+            "Avg, best threshold": measured.level_cells(part, "best_threshold_iou")["Avg"],
             "Pairs": Cell(str(len(ious)), float(len(ious))) if len(ious) else Cell(),
         }
         if part["protocol"].iloc[0].startswith(LEVEL_GIVEN.full_name):
-            same = same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
-            cells["View consistency"] = level_cells(same, "view_consistency")["Avg"]
+            same = measured.same_row(scores, part, (VIEW_CONSISTENCY.full_name,))
+            cells["View consistency"] = measured.level_cells(same, "view_consistency")["Avg"]
         return cells
 
-    blocks += measured_blocks(
+    blocks += measured.measured_blocks(
         sources,
         ("hierarchy/",),
         cells_of,
@@ -90,16 +81,16 @@ def frames_table(sources: Sources, data: str) -> Table:
         if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):
             texts.setdefault((row.dataset, row.scene, row.view), set()).add((row.query, row.level))
     views: dict[str, dict[str, list[str]]] = {}
-    for (dataset, scene, view), asked in sorted(texts.items()):
+    for (dataset, scene, view), of_view in sorted(texts.items()):
         name = view.rpartition(".")[0] or view
-        views.setdefault(dataset, {}).setdefault(scene, []).append(f"{name} ({len(asked)} texts)")
+        views.setdefault(dataset, {}).setdefault(scene, []).append(f"{name} ({len(of_view)} texts)")
     blocks = [sources.reported(data, families=False)]
     for dataset, of_scenes in views.items():
         rows = []
         for number in range(max(map(len, of_scenes.values()))):
             cells = {scene: Cell(names[number]) for scene, names in of_scenes.items() if number < len(names)}
             rows.append(Row({"Frame": str(number + 1)}, cells, None))
-        blocks.append(Block(*kind_and_title(dataset), tuple(rows), tuple(sorted(of_scenes))))
+        blocks.append(Block(*measured.kind_and_title(dataset), tuple(rows), tuple(sorted(of_scenes))))
     footnotes = ("Measured rows: views that were scored, with the number of texts asked at levels.",)
     return sources.finished(f"frames-{data.lower()}", f"{data}: frames", blocks, footnotes)
 
@@ -115,10 +106,10 @@ def lerf_table(sources: Sources) -> Table:
 
     blocks = [sources.reported("LERF")]
     for prefix in ("lerf/", LERF_MASK.name):
-        blocks += measured_blocks(
+        blocks += measured.measured_blocks(
             sources,
             (prefix,),
-            lambda part: scene_cells(part, metrics),
+            lambda part: measured.scene_cells(part, metrics),
             columns_of,
             ranked_by_protocol=False,
         )
@@ -144,15 +135,17 @@ def ovs_table(sources: Sources) -> Table:
         return [*(f"{scene} mIoU" for scene in scenes), "Overall mIoU", "Overall accuracy"]
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
-        cells = scene_cells(part, {"mIoU": "iou"})
+        cells = measured.scene_cells(part, {"mIoU": "iou"})
         del cells["Average mIoU"]
         if (part["dataset"] == "3d_ovs").all():
             part = part[part["scene"].isin(OVS_SCENES)]
-        overall, accuracy = (Cell.percent(table_value(part, name)) for name in ("iou", "pixel_accuracy"))
+        overall, accuracy = (
+            Cell.percent(measured.table_value(part, name)) for name in ("iou", "pixel_accuracy")
+        )
         return {**cells, "Overall mIoU": overall, "Overall accuracy": accuracy}
 
     blocks = [sources.reported("3D-OVS")]
-    blocks += measured_blocks(sources, ("3d-ovs/",), cells_of, columns_of)
+    blocks += measured.measured_blocks(sources, ("3d-ovs/",), cells_of, columns_of)
     footnotes = (
         "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean of the scenes, on 3D-OVS of "
         f"the five that the paper has ({', '.join(OVS_SCENES)}).",

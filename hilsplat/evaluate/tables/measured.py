@@ -10,14 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.evaluate.protocols.cards import (
-    ANNOTATIONS,
-    LEVEL_AUTO,
-    LEVEL_GIVEN,
-    PATH,
-    SCENE_WIDE,
-    card_of,
-)
+from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources
 from hilsplat.segment.origin import made_from_truth
 
@@ -34,11 +27,11 @@ ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth":
 """Method -> its name in rows, in row order."""
 
 PROTOCOLS = {
-    LEVEL_GIVEN.full_name: "level given",
-    SCENE_WIDE.full_name: "level given, scene-wide",
-    LEVEL_AUTO.full_name: "level chosen",
-    PATH.full_name: "path of texts",
-    ANNOTATIONS.full_name: "reference",
+    cards.LEVEL_GIVEN.full_name: "level given",
+    cards.SCENE_WIDE.full_name: "level given, scene-wide",
+    cards.LEVEL_AUTO.full_name: "level chosen",
+    cards.PATH.full_name: "path of texts",
+    cards.ANNOTATIONS.full_name: "reference",
 }
 """Protocol -> its name in tables; other protocols keep their own."""
 
@@ -209,7 +202,7 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
     kept = rows[rows["metric"] == metric]
     if level is not None:
         kept = kept[kept["level"] == level]
-    orders = {card_of(label).averaging for label in kept["protocol"].unique()}
+    orders = {cards.card_of(label).averaging for label in kept["protocol"].unique()}
     assert len(orders) <= 1, f"rows of several averaging orders: {sorted(orders)}"
     assert "pooled" not in orders, "pooled protocols have no number per scene"
     if "classes" in orders:

@@ -1,9 +1,18 @@
-"""The stage functions on a whole scene folder; only the opening of model files is replaced."""
+"""The evaluate and figures stages, and the scores of labels of published data sets."""
 
+import numpy as np
+import pytest
 from PIL import Image
 
+from hilsplat.base.errors import SceneError
+from hilsplat.base.levels import Level
+from hilsplat.datasets.labelled import LabelledScene
+from hilsplat.datasets.registry import open_labelled
+from hilsplat.evaluate.extra_protocols import Extra
 from hilsplat.evaluate.figures import panel
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.settings import EvaluateSettings, FiguresSettings
+from tests.unit.evaluate.builders import box, region_of
 
 
 def test_only_test_views_are_scored_and_evaluating_twice_gives_the_same_bytes(opened, tmp_path):
@@ -40,3 +49,101 @@ def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opene
         assert picture.width == 1430
     assert (tmp_path / "registration.png").read_bytes() == b"cameras"
     assert (tmp_path / "fit.png").read_bytes() == b"renders"
+
+
+def labelled(block_world, views=("001.png",), levels=True):
+    """Labels that say what the block world's annotations say; without levels, flat."""
+    annotations = block_world.annotations
+    regions = tuple(
+        region_of(
+            annotations.mask("001.png", [node.id]),
+            node.text,
+            Level(node.level) if levels else None,
+            annotations.path_of(node.id) if levels else (),
+        )
+        for node in annotations.nodes
+    )
+    return LabelledScene("hi_lerf", "blocks", {}, None, dict.fromkeys(views, regions))
+
+
+@pytest.fixture
+def rows(opened, monkeypatch, tmp_path):
+    """Function that evaluates the block world and returns its scores, sorted."""
+
+    def evaluate(labels=None):
+        monkeypatch.setattr(Extra, "open", staticmethod(lambda name, data_root: (name, labels, Extra())))
+        given = {"truth": None, "labels": ["lerf"]} if labels else {}
+        scores = opened.evaluate(tmp_path / "scores.csv", dataset="lerf", **given)
+        keys = ["view", "method", "query", "level", "metric", "protocol"]
+        return scores.sort_values(keys, kind="stable").reset_index(drop=True)
+
+    return evaluate
+
+
+def test_labels_give_the_scores_of_the_same_annotations_and_flat_ones_those_of_lerf(block_world, rows):
+    annotated = rows()
+    assert len(annotated) > 50
+    assert rows(labelled(block_world)).equals(annotated)
+    flat = rows(labelled(block_world, levels=False))
+    assert {protocol.split("@")[0] for protocol in flat["protocol"]} == {"lerf/langsplat", "lerf/tree-nodes"}
+    of_lerf = annotated[annotated["protocol"].str.startswith("lerf/")].reset_index(drop=True)
+    assert flat.equals(of_lerf)
+
+
+def test_every_labelled_view_is_scored_held_out_or_not(block_world, rows):
+    scores = rows(labelled(block_world, views=("000.png", "001.png"), levels=False))
+    assert set(scores["view"]) == {"000.png", "001.png"}
+
+
+def test_labelled_views_without_pose_are_named(block_world, rows):
+    with pytest.raises(SceneError, match=r"have no pose: 007\.png\n"):
+        rows(labelled(block_world, views=("001.png", "007.png")))
+
+
+def test_labels_of_another_shape_than_the_view_are_refused(rows):
+    wide = region_of(np.ones((64, 80), bool), "bear")
+    scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)})
+    with pytest.raises(SceneError, match=r"label of view 001.png does not fit"):
+        rows(scene)
+
+
+def test_regions_of_one_text_are_merged_and_keep_their_boxes():
+    left, right = box((1, 3), (0, 2), (4, 6)), box((0, 2), (4, 6), (4, 6))
+    boxes = np.array([[4, 0, 5, 3]])
+    truth = ViewTruth.of_regions([region_of(left, "paw"), region_of(right, "paw", boxes=boxes)], (4, 6))
+    (paw,) = truth.categories
+    assert not truth.queries and paw.level is None
+    assert np.array_equal(paw.truth, left | right)
+    assert paw.boxes_xyxy.tolist() == [[0, 1, 1, 2], [4, 0, 5, 3]]  # extent, and as annotated
+
+
+def test_regions_without_a_pixel_are_absent():
+    truth = ViewTruth.of_regions([region_of(np.zeros((4, 6), bool), "ring")], (4, 6))
+    assert truth.categories == () and [query.text for query in truth.absent] == ["ring"]
+
+
+def test_a_region_with_a_broken_chain_is_queried_but_belongs_to_no_family():
+    mask = np.ones((4, 6), bool)
+    bear = region_of(mask, "bear", Level.WHOLE)
+    head = region_of(mask, "head", Level.PART, ("bear", "head"))
+    tail = region_of(mask, "tail", Level.PART, ("tail",))
+    truth = ViewTruth.of_regions([bear, head, tail], (4, 6))
+    assert [query.text for query in truth.queries] == ["bear", "head", "tail"]
+    assert truth.families() == [[(("bear",), [("bear", "head")])], []]
+
+
+def test_labels_shrink_as_public_evaluators_shrink_them():
+    # OpenCV's nearest takes the pixel under the corner; at an eighth, Pillow takes the one under the centre.
+    mask = np.zeros((48, 48), bool)
+    mask[0::3, 0::3] = True
+    (dots,) = ViewTruth.of_regions([region_of(mask, "dots")], (16, 16), (32, 32)).categories
+    assert dots.truth.all()
+    assert dots.eighth.shape == (4, 4)
+    small = Image.fromarray(mask).resize((4, 4), Image.Resampling.NEAREST)
+    np.testing.assert_array_equal(dots.eighth, np.asarray(small))
+
+
+@pytest.mark.parametrize(("name", "found"), [("lerf_ovs", "no scene"), ("scannet/scene0000_00", "on points")])
+def test_names_without_image_labels_are_refused(tmp_path, name, found):
+    with pytest.raises(SceneError, match=found):
+        open_labelled(name, tmp_path)

@@ -23,7 +23,7 @@ STAND_INS: Mapping[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Asked:
+class Extra:
     """Protocols beyond those that score every labelled image (`protocols.views`).
 
     `level` is the level whose texts the flat protocols query; None if the labels have no levels.
@@ -34,7 +34,7 @@ class Asked:
     level: Level | None = None
 
     @staticmethod
-    def of_world(kind: str) -> "Asked":
+    def of_world(kind: str) -> "Extra":
         """Return the protocols of a synthetic scene; none for kind "", a SceneError for an unknown kind."""
         if kind and kind not in STAND_INS:
             raise SceneError(
@@ -42,17 +42,17 @@ class Asked:
                 expected=f"one of {', '.join(STAND_INS)}",
                 fix="correct the kind, or leave it out",
             )
-        return Asked.of(STAND_INS.get(kind, ()), Level.WHOLE)
+        return Extra.of(STAND_INS.get(kind, ()), Level.WHOLE)
 
     @staticmethod
-    def of(names: tuple[str, ...], level: Level | None = None) -> "Asked":
+    def of(names: tuple[str, ...], level: Level | None = None) -> "Extra":
         """Sort named protocols into those for images and those for points."""
         cards = [card_named(name) for name in names]
         points = tuple(card for card in cards if card.classes)
-        return Asked(tuple(card for card in cards if not card.classes), points, level)
+        return Extra(tuple(card for card in cards if not card.classes), points, level)
 
     @staticmethod
-    def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Asked]":
+    def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Extra]":
         """Return data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines"."""
         dataset = name.partition("/")[0]
-        return dataset, open_labels(name, data_root), Asked.of(dataset_of(dataset).protocols)
+        return dataset, open_labels(name, data_root), Extra.of(dataset_of(dataset).protocols)
