@@ -93,11 +93,7 @@ class Contributions:
         raise ArtifactError(f"{self.folder} holds neither G nor W", fix="run the contributions stage again")
 
     def _mapped(self, name: str) -> np.ndarray:
-        """Memory-map an array from its file, read-only.
-
-        Raises:
-            ArtifactError: if the file is missing or has changed.
-        """
+        """Memory-map an array from its file, read-only; a missing or changed file raises ArtifactError."""
         path = sealed(self.folder, f"{name}.npy")
         mode: Literal["r"] | None = "r" if path.stat().st_size > HEADER_BYTES else None
         return np.load(path, mmap_mode=mode, allow_pickle=False).view(np.ndarray)

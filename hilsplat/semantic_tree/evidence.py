@@ -55,11 +55,8 @@ def mask_evidence(
     both full sizes). Masks that share Gaussians are no evidence if each view sees less than `min_covisible`
     of the other mask. If masks share none, each counts if the other's view sees at least that share of it.
 
-    Args:
-        shares: s, one row per mask of a level; zero if the Gaussian is not visible in the mask's view.
-        importance: w, such as the mean visible mass.
-        min_covisible: pairs that see a smaller share of each other are dropped.
-        threads: the result does not depend on it.
+    Shares have one row per mask of a level, and are zero if the Gaussian is not visible in the mask's view.
+    The result does not depend on the number of threads.
     """
 
     num, share = len(view), shares.data.astype(np.float64)

@@ -64,12 +64,8 @@ def guided_points(
 ) -> Float[np.ndarray, "P 2"]:
     """Return a prompt in the middle of each node, and the grid points that no subpart covers; (x, y), px.
 
-    The middle is the pixel farthest from the region's border.
-
-    Args:
-        labels: node that each pixel shows at each level, -1 for none.
-        grid: points of the unit square (x, y).
-        min_area_px: smaller regions get no prompt.
+    The middle is the pixel farthest from the region's border. `labels` are the nodes that pixels show at each
+    level, -1 for none; `grid` has points of the unit square.
     """
     found = []
     for node_of_pixel in labels.values():

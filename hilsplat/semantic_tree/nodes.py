@@ -77,12 +77,8 @@ def level_nodes(
     A cluster whose Gaussians go to other clusters, such as a duplicate, could select nothing. A cluster
     therefore becomes a node only if at least `min_views` masks fit it best.
 
-    Args:
-        weights: S of the masks.
-        mass: visible mass of each Gaussian in each view, px.
-        visible: which Gaussians each view sees.
-        importance: mean visible mass, px.
-        total_mass: visible mass of each Gaussian, summed over views, px.
+    `weights` is S of the masks, `mass` the visible mass of each Gaussian in each view, `importance` its mean
+    over the views that see the Gaussian, and `total_mass` its sum (px).
     """
     place = view[_row_of(weights)], weights.indices
     shares = weights.astype(np.float64)

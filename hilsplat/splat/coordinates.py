@@ -165,11 +165,9 @@ def import_gaussians(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.
 
-    A PLY of this package is moved to the source's coordinates by the transform in the JSON file beside it.
-
-    Args:
-        dataparser: nerfstudio's `dataparser_transforms.json`, if the PLY is in its training coordinates.
-        transforms: `transforms.json` with the source's poses, required by `dataparser`.
+    A PLY of this package is moved to the source's coordinates by the transform in the JSON file beside it. A
+    PLY in nerfstudio's training coordinates needs its `dataparser_transforms.json`, and the `transforms.json`
+    with the source's poses.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.

@@ -136,10 +136,7 @@ def scale_factor(
     Gaussian of opacity `opacity` and deviation 1 has sqrt(2 pi) opacity. (Paper, Eq. 9, whose double
     sum is this one, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
 
-    Args:
-        opacity: opacity of the original Gaussian.
-        shared: `shared_opacity(opacity, number)`.
-        number: Gaussians that share the place, 1 to MAX_TOGETHER.
+    `shared` is `shared_opacity(opacity, number)` of the original Gaussian; 1 to MAX_TOGETHER share the place.
     """
     k = np.arange(1, MAX_TOGETHER + 1)
     signs = np.where(k % 2 == 1, 1.0, -1.0) / np.sqrt(k)
@@ -193,12 +190,8 @@ def add_noise(
 
     The step is noise weight x rate of the means x gate x covariance x normal numbers, limited to the extent.
     The paper assumes scenes of extent 1; here the covariance is in units of the extent, so that the result
-    does not depend on the scene's unit.
-
-    Args:
-        rate_of_means: step size of the means, in units of the extent.
-        extent: radius of the cameras, scene units.
-        threads: the result has the same bytes for any number.
+    does not depend on the scene's unit. `rate_of_means` is in units of the extent, too. The result has the
+    same bytes for any number of threads.
     """
     p = adam.parameters
     normal = generator.standard_normal(p["means"].shape, dtype=np.float32)

@@ -59,11 +59,7 @@ def _adam(arrays: list[np.ndarray], rates: list[float], t: int, threads: int) ->
 
 @dataclass
 class Adam:
-    """Parameters and running moments of their gradients, all updated in place.
-
-    Attributes:
-        parameters, first, second: arrays by field, with one row per Gaussian.
-    """
+    """Parameters and running moments of their gradients: arrays by field, all updated in place."""
 
     parameters: dict[str, np.ndarray]
     first: dict[str, np.ndarray]

@@ -153,12 +153,9 @@ def photometric_loss(
     ssim_weight: float,
     threads: int = 1,
 ) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
-    """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7).
+    """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7: w = 0.2).
 
-    Args:
-        image, target: RGB in [0, 1].
-        ssim_weight: w; 3DGS uses 0.2.
-        threads: the result has the same bytes for any number.
+    Images are RGB in [0, 1]. The result has the same bytes for any number of threads.
     """
     height, width, _ = image.shape
     num = 3 * width

@@ -42,12 +42,8 @@ def fractional_bits(gaussians: Gaussians) -> int:
 def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) -> bytes:
     """Return some Gaussians as an SPZ file; equal Gaussians give equal bytes.
 
-    Positions beyond 2**(23 - bits), a thousand times the spread of the scene, are clipped.
-
-    Args:
-        gaussians: harmonics beyond degree 3 are omitted.
-        rows: Gaussians to write, in this order; spatially sorted rows compress best.
-        bits: output of `fractional_bits`.
+    Positions beyond 2**(23 - bits), a thousand times the spread of the scene, are clipped, and harmonics
+    beyond degree 3 omitted. Spatially sorted rows compress best. `bits` is the output of `fractional_bits`.
     """
     degree = min(gaussians.sh_degree, 3)
     sh = gaussians.sh[rows, : (degree + 1) ** 2]

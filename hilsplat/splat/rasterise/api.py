@@ -92,14 +92,10 @@ def draw(
 def pixel_weights(
     gaussians: Gaussians, camera: Camera, *, min_weight: float, threads: int = 1, device: Device = "cpu"
 ) -> csr_matrix:
-    """Return the blending weight alpha_i T_i of each Gaussian at each pixel, as a sparse matrix.
+    """Return the blending weight alpha_i T_i of each Gaussian at each pixel: a float32 matrix (H W, N).
 
-    Args:
-        min_weight: smaller weights are omitted; 0 keeps all that are drawn.
-
-    Returns:
-        float32 matrix (H W, N) with row-major pixels as rows, and sorted columns. With min_weight 0, the
-        rows sum to the view's alpha.
+    Rows are row-major pixels; columns are sorted. Weights below `min_weight` are omitted; with 0, rows sum to
+    the view's alpha.
     """
     if device == "cuda":
         from hilsplat.splat.rasterise import cuda

@@ -166,11 +166,9 @@ def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaus
 
 
 def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:
-    """Sort the drawn Gaussians by depth and count them per tile.
+    """Sort the drawn Gaussians by depth (positive float32) and count them per tile.
 
-    Args:
-        box: first and last pixel column, first and last pixel row; last < first: not drawn.
-        depths: positive float32 depths.
+    `box` is the first and last pixel column, and the first and last pixel row; last < first: not drawn.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
     # positive floats and their bits have the same order

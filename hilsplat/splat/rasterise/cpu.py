@@ -134,15 +134,11 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
 
 @dataclass(frozen=True)
 class Band:
-    """Filled lists of tiles begin..end, as arguments of the kernels.
-
-    Attributes:
-        lists: base, tiles_x, tile_start, tile_end, gaussian, reach; see `blend`.
-    """
+    """Filled lists of tiles begin..end, as arguments of the kernels (see `blend`)."""
 
     begin: int
     end: int
-    lists: tuple[Any, ...]
+    lists: tuple[Any, ...]  # base, tiles_x, tile_start, tile_end, gaussian, reach
 
     def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
         """Call `work(begin, end, lists, *arguments)` over ranges that cover the band's tiles, on threads."""

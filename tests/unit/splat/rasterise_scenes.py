@@ -50,7 +50,7 @@ def round_gaussian(opacity: float, scale: float, depth: float) -> Gaussians:
     return plain
 
 
-def rows(gaussians: Gaussians, chosen: slice) -> Gaussians:
+def rows(gaussians: Gaussians, chosen: slice | np.ndarray) -> Gaussians:
     """Some of the Gaussians."""
     return Gaussians(*(getattr(gaussians, name)[chosen] for name in FIELDS))
 
