@@ -26,6 +26,7 @@ from hilsplat.world.shapes import box
 from hilsplat.world.views import looking_at, on_sphere, pinhole
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 logger = logging.getLogger(__name__)
@@ -114,11 +115,15 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
             if index < across:
                 axes.set_title(title or "view", fontsize=10, pad=3)
             if column == 0:
-                place = {"va": "top", "transform": axes.transAxes}
-                axes.text(0.03, 0.97, f"{kind} {seed}", color="white", fontsize=7.5, **place)
+                _write_name(axes, 0.03, f"{kind} {seed}", 7.5)
     top = 1 - 0.24 / (PANEL_INCHES * rows + 0.25)
     figure.subplots_adjust(left=0.003, right=0.997, bottom=0.005, top=top, wspace=0.025, hspace=0.03)
     _write(figure, out)
+
+
+def _write_name(axes: "Axes", x: float, name: str, fontsize: float | int) -> None:
+    """Write a name in the top left corner of a panel."""
+    axes.text(x, 0.97, name, color="white", fontsize=fontsize, va="top", transform=axes.transAxes)
 
 
 def _write(figure: "Figure", out: Path) -> None:
@@ -175,8 +180,7 @@ def show_world(world_folder: Path, out: Path) -> None:
             if row == 0:
                 axes.set_title(title, fontsize=10)
             if column == 0:
-                place = {"va": "top", "transform": axes.transAxes}
-                axes.text(0.02, 0.97, image.name, color="white", fontsize=8, **place)
+                _write_name(axes, 0.02, image.name, 8)
     per_column = -(-len(lines) // columns)
     for column in range(columns):
         axes = figure.add_subplot(grid[:, 4 + column])

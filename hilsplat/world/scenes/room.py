@@ -104,7 +104,7 @@ class _Furnishing:
         middle = (low + high)[:2] / 2
         xy = spot - rotation_about("z", yaw_deg)[:2, :2] @ middle
         node = self.assembly.add_object(model, scale, xy, yaw_deg, base_z)
-        added = self.assembly.triangles[-1]
+        added = self.assembly.pieces[-1][0]
         (x, y), radius = footprint_of(added)
         space = Space.of(added.reshape(-1, 3))
         size = (radius, space.high[2] - base_z)
@@ -234,15 +234,18 @@ def _furnish(work: _Furnishing, rng: np.random.Generator, count: int) -> int:
     return done
 
 
-def _put_at_wall(work: _Furnishing, rng: np.random.Generator, piece: Piece) -> bool:
+def _put_at_wall(
+    work: _Furnishing, rng: np.random.Generator, piece: Piece, base_z: float = 0.0, gap: float = WALL_GAP
+) -> bool:
+    """Place a piece at a wall, and return whether it fits."""
     model = work.model(piece.name)
-    size = size_of(model)
-    found = work.plan.wall_spot(rng, size + np.array([0, 0, piece.above]), 0.0, piece.clear)
+    size = size_of(model) + np.array([0, 0, piece.above])
+    found = work.plan.wall_spot(rng, size, base_z, piece.clear, gap)
     if found is None:
         return False
     wall, spot, space = found
     work.plan.taken.append(space)
-    work.put(model, spot, yaw_of_wall(wall))
+    work.put(model, spot, yaw_of_wall(wall), base_z)
     return True
 
 
@@ -256,7 +259,7 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
     size = size_of(model)
     owner = work.placed[owner_row]
     turn = rotation_about("z", owner.yaw_deg)[:2, :2]
-    corners = np.concatenate(work.assembly.triangles[owner_row])
+    corners = np.concatenate(work.assembly.pieces[owner_row][0])
     middle = np.array(owner.centre_xy)
     half_depth, half_width = np.ptp((corners[:, :2] - middle) @ turn, axis=0) / 2
     if where == "on":
@@ -301,17 +304,9 @@ def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> i
 
 def _hang_pictures(work: _Furnishing, rng: np.random.Generator) -> int:
     """Hang a picture, and another or a mirror, on free wall space at eye height; return their number."""
-    hung = 0
-    for name in ("picture", str(rng.choice(["picture", "mirror"]))):
-        model = work.model(name)
-        base_z = float(rng.uniform(1.28, 1.4))
-        found = work.plan.wall_spot(rng, size_of(model), base_z, 0.25, gap=0.0)
-        if found is not None:
-            wall, spot, space = found
-            work.plan.taken.append(space)
-            work.put(model, spot, yaw_of_wall(wall), base_z)
-            hung += 1
-    return hung
+    names = ("picture", str(rng.choice(["picture", "mirror"])))
+    pieces = [Piece(name, 0.0, 0.25) for name in names]
+    return sum(_put_at_wall(work, rng, piece, float(rng.uniform(1.28, 1.4)), gap=0.0) for piece in pieces)
 
 
 def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
@@ -402,5 +397,6 @@ def _style(room: Room, rng: np.random.Generator) -> Style:
     sky = np.array([0.50 - 0.04 * warm, 0.51, 0.53 + 0.04 * warm]) * rng.uniform(0.92, 1.05)
     position = (float(place[0]), float(place[1]), room.height - 0.02)
     radius = float(rng.uniform(0.5, 0.7))
-    colours = [tuple(c.tolist()) for c in (light, sky, sky * np.array([1.12, 1.06, 0.98]))]
-    return Style(position, radius, *colours, float(rng.uniform(1.05, 1.2)))
+    ground = sky * np.array([1.12, 1.06, 0.98])
+    lamp, above, below = (tuple(colour.tolist()) for colour in (light, sky, ground))
+    return Style(position, radius, lamp, above, below, float(rng.uniform(1.05, 1.2)))

@@ -49,8 +49,10 @@ class Style:
         sky = np.array([0.44 - 0.05 * warm, 0.46, 0.50 + 0.05 * warm]) * rng.uniform(0.75, 1.2)
         x, y, z = away * np.cos(azimuth), away * np.sin(azimuth), rng.uniform(3.2, 4.2)
         radius = float(rng.uniform(0.25, 0.75))
-        colours = [tuple(c.tolist()) for c in (light, sky, sky * np.array([0.58, 0.5, 0.42]))]
-        return Style((float(x), float(y), float(z)), radius, *colours, float(rng.uniform(1.15, 1.5)))
+        ground = sky * np.array([0.58, 0.5, 0.42])
+        sun, above, below = (tuple(colour.tolist()) for colour in (light, sky, ground))
+        exposure = float(rng.uniform(1.15, 1.5))
+        return Style((float(x), float(y), float(z)), radius, sun, above, below, exposure)
 
 
 @dataclass(frozen=True)
@@ -120,17 +122,15 @@ class WorldScene:
 class Assembly:
     """Triangles, materials and nodes of a scene under construction.
 
+    Each piece has the columns of `WorldScene` from `triangles` to `material_ids`.
+
     Args:
         scale: scene units per unit of the solid textures, as in `Style.scale`.
     """
 
     def __init__(self, scale: float = 1.0) -> None:
         self.scale = scale
-        self.triangles: list[np.ndarray] = []
-        self.normals: list[np.ndarray] = []
-        self.coords: list[np.ndarray] = []
-        self.node_ids: list[np.ndarray] = []
-        self.material_ids: list[np.ndarray] = []
+        self.pieces: list[tuple[np.ndarray, ...]] = []
         self.materials: list[np.ndarray] = []
         self.nodes: list[AnnotatedNode] = []
         self.background: list[int] = []
@@ -145,11 +145,10 @@ class Assembly:
             self.nodes.append(AnnotatedNode(first + row, node.level, parent, node.text, node.synonyms))
         rotation = rotation_about("z", yaw_deg)
         local = model.triangles * scale
-        self.coords.append(local / self.scale)
-        self.triangles.append(local @ rotation.T + np.array([xy[0], xy[1], base_z]))
-        self.normals.append(model.normals @ rotation.T)
-        self.node_ids.append(np.where(model.node_ids == NONE, NONE, model.node_ids + first))
-        self.material_ids.append(model.material_ids + materials)
+        triangles = local @ rotation.T + np.array([xy[0], xy[1], base_z])
+        node_ids = np.where(model.node_ids == NONE, NONE, model.node_ids + first)
+        mesh = (triangles, model.normals @ rotation.T, local / self.scale)
+        self.pieces.append((*mesh, node_ids, model.material_ids + materials))
         self.materials.append(model.materials)
         return first
 
@@ -161,24 +160,21 @@ class Assembly:
         self.background.append(node)
         self.nodes.append(AnnotatedNode(node, 1, NONE, text, synonyms))
         for mesh, paint in pieces:
-            self.coords.append(mesh.triangles / self.scale)
-            self.triangles.append(mesh.triangles)
-            self.normals.append(mesh.normals)
-            self.node_ids.append(np.tile(np.array([node, NONE, NONE], np.int32), (len(mesh), 1)))
-            self.material_ids.append(np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32))
+            node_ids = np.tile(np.array([node, NONE, NONE], np.int32), (len(mesh), 1))
+            material_ids = np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32)
+            self.pieces.append(
+                (mesh.triangles, mesh.normals, mesh.triangles / self.scale, node_ids, material_ids)
+            )
             self.materials.append(paint.row()[None])
 
     def finished(
         self, kind: str, seed: int, asked: int, placed: Sequence[PlacedObject], style: Style
     ) -> WorldScene:
         """Return the scene with everything added so far."""
-        triangles, normals, coords, materials = (
-            np.concatenate(rows).astype(np.float32)
-            for rows in (self.triangles, self.normals, self.coords, self.materials)
-        )
-        node_ids, material_ids = (
-            np.concatenate(rows).astype(np.int32) for rows in (self.node_ids, self.material_ids)
-        )
+        columns = [np.concatenate(column) for column in zip(*self.pieces, strict=True)]
+        triangles, normals, coords = (column.astype(np.float32) for column in columns[:3])
+        node_ids, material_ids = (column.astype(np.int32) for column in columns[3:])
+        materials = np.concatenate(self.materials).astype(np.float32)
         arrays = (triangles, normals, coords, node_ids, material_ids, materials)
         nodes, background = tuple(self.nodes), frozenset(self.background)
         return WorldScene(kind, seed, asked, tuple(placed), *arrays, nodes, background, style)

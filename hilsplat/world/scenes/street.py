@@ -17,7 +17,7 @@ from hilsplat.world.objects.catalogue import build_street_object
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.scenes.street_ground import FRONT, KERB, LANE, SCALE, add_ground
 from hilsplat.world.shapes import rotation_about
-from hilsplat.world.views import looking_at, numbered_cameras, pinhole
+from hilsplat.world.views import looking_at, numbered_cameras, on_sphere, pinhole
 
 logger = logging.getLogger(__name__)
 
@@ -53,23 +53,6 @@ FOV_DEG = 62.0
 SUN_DISTANCE = 1000.0
 
 
-class _Boxes:
-    """Occupied axis-aligned boxes, one per part of each thing placed so far."""
-
-    def __init__(self) -> None:
-        self.low = np.zeros((0, 3))
-        self.high = np.zeros((0, 3))
-
-    def free(self, low: Float[np.ndarray, "P 3"], high: Float[np.ndarray, "P 3"]) -> bool:
-        """Return whether no box, grown by `GAP`, intersects an occupied one."""
-        apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
-        return bool(apart.any(axis=2).all())
-
-    def take(self, low: Float[np.ndarray, "P 3"], high: Float[np.ndarray, "P 3"]) -> None:
-        """Add boxes."""
-        self.low, self.high = np.concatenate([self.low, low]), np.concatenate([self.high, high])
-
-
 class _Spot(NamedTuple):
     """Place for an object: (x, y), base height and rotation."""
 
@@ -94,7 +77,7 @@ class _Street:
         self.seed = seed
         self.rng = np.random.default_rng([seed, 21])
         self.assembly = Assembly(SCALE)
-        self.boxes = _Boxes()
+        self.low, self.high = np.zeros((0, 3)), np.zeros((0, 3))  # boxes around the parts placed so far
         self.drawn = 0
 
     def draw(self, name: str) -> ObjectModel:
@@ -106,9 +89,10 @@ class _Street:
         """Place an object at a spot and return it, or return None if it would intersect another."""
         turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array([spot.x, spot.y, spot.z])
         low, high = part_boxes(turned, model.node_ids[:, 1])
-        if not self.boxes.free(low, high):
+        apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
+        if not apart.any(axis=2).all():
             return None
-        self.boxes.take(low, high)
+        self.low, self.high = np.concatenate([self.low, low]), np.concatenate([self.high, high])
         node = self.assembly.add_object(model, 1.0, np.array([spot.x, spot.y]), spot.yaw_deg, spot.z)
         centre, radius = footprint_of(turned)
         height = float(model.triangles[..., 2].max())
@@ -230,7 +214,7 @@ def _add_buildings(street: _Street) -> int:
 
 
 def _daylight(rng: np.random.Generator) -> Style:
-    """Draw sun and sky; the sun is far away, so its light is nearly constant along the street."""
+    """Draw sun and sky; the sun is far away, so that its light is nearly constant along the street."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38, 62))
     warm = rng.uniform(0, 1)
     toward = np.array(
@@ -241,8 +225,9 @@ def _daylight(rng: np.random.Generator) -> Style:
     sun *= SUN_DISTANCE**2 / 13.0
     sky = np.array([0.40, 0.45, 0.54]) * rng.uniform(0.9, 1.1)
     ground = sky * np.array([0.62, 0.56, 0.48])
-    position, *colours = (tuple(each.tolist()) for each in (SUN_DISTANCE * toward, sun, sky, ground))
-    return Style(position, 14.0, *colours, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
+    vectors = (SUN_DISTANCE * toward, sun, sky, ground)
+    position, light, above, below = (tuple(vector.tolist()) for vector in vectors)
+    return Style(position, 14.0, light, above, below, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
 
 
 def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
@@ -262,14 +247,8 @@ def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
         yaw = SWEEP_DEG * (4 * abs(phase - 0.5) - 1) + float(rng.uniform(-2, 2))
         middle = np.array([start + i * step, LANE_Y + SWAY_M * np.sin(2 * np.pi * phase), CAMERA_Z])
         centre = middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12])
-        transforms.append(looking_at(centre, centre + _heading(yaw, float(pitch_rng.uniform(-1, 3)))))
+        transforms.append(looking_at(centre, centre + on_sphere(yaw, float(pitch_rng.uniform(-1, 3)), 1.0)))
     return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
-
-
-def _heading(yaw_deg: float, pitch_deg: float) -> Float[np.ndarray, " 3"]:
-    """Return the unit vector of a viewing direction; positive pitch looks up."""
-    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
-    return np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
@@ -279,7 +258,7 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
     if pose is None:
         centre = np.array([rng.uniform(DRIVE_X[0], 14), rng.uniform(-2.4, -0.8), rng.uniform(1.5, 2.4)])
         yaw = rng.uniform(-60, 60) if rng.random() < 0.85 else rng.uniform(90, 270)
-        pose = looking_at(centre, centre + _heading(yaw, rng.uniform(-6, 6)))
+        pose = looking_at(centre, centre + on_sphere(yaw, rng.uniform(-6, 6), 1.0))
     return Camera("random.png", pose, intrinsics, (image_px, image_px))
 
 
@@ -298,7 +277,7 @@ def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, 
         size = float(np.linalg.norm(high - low))
         toward = np.degrees(np.arctan2(-target[1], 0.3)) + rng.uniform(-70, 70)
         away = rng.uniform(0.7, 1.5) * size
-        centre = target + away * _heading(float(toward), 0.0)
+        centre = target + away * on_sphere(float(toward), 0.0, 1.0)
         centre[2] = rng.uniform(0.9, 2.6)
         inside = (corners.reshape(-1, 3).min(axis=0) < centre) & (centre < high)
         if abs(centre[1]) > FRONT - 0.5 or inside.all():

@@ -1,6 +1,4 @@
-"""The exported networks are what they were before export, for every batch size."""
-
-import json
+"""Exported networks equal the torch networks for every batch size."""
 
 import numpy as np
 import onnxruntime
@@ -99,7 +97,7 @@ def test_the_preview_is_every_second_row_and_column_of_the_masks(sam):
 
 
 @pytest.mark.parametrize("cells", [16, 23])
-def test_masks_answered_in_bands_are_those_of_all_pixels_at_once(sam, cells):
+def test_masks_decoded_in_bands_equal_masks_decoded_at_once(sam, cells):
     _, decoder, _ = sam
     generator = torch.Generator().manual_seed(cells)
     embeddings = torch.randn(2, EMBEDDING, cells, cells, generator=generator)
@@ -118,7 +116,7 @@ def test_masks_answered_in_bands_are_those_of_all_pixels_at_once(sam, cells):
     assert torch.allclose(scores, expected_scores, atol=1e-5)
 
 
-def test_padding_points_change_nothing(sam):
+def test_padding_points_do_not_change_masks(sam):
     _, decoder, _ = sam
     embeddings = torch.randn(1, EMBEDDING, 64, 64, generator=torch.Generator().manual_seed(3))
     positional = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]]), 64)
@@ -129,14 +127,6 @@ def test_padding_points_change_nothing(sam):
         padded = decoder(two, torch.tensor([[[1, -1]]]), embeddings, positional)
     assert torch.allclose(alone[1], padded[1], atol=1e-5)
     assert torch.allclose(alone[0], padded[0], atol=1e-6)
-
-
-def test_sam_folder_says_how_to_prepare_an_image(sam):
-    folder = sam[2]
-    assert json.loads((folder / "config.json").read_text())["model_type"] == "sam"
-    prepare = json.loads((folder / "preprocessor_config.json").read_text())
-    assert prepare["size"] == {"longest_edge": 384}
-    assert prepare["pad_size"] == {"height": 384, "width": 384}
 
 
 def test_exported_clip_equals_torch(tmp_path):
@@ -166,7 +156,7 @@ def test_exported_clip_equals_torch(tmp_path):
         assert np.abs(found - expected).max() < 1e-3
 
 
-def test_tokenizer_lowers_pads_and_knows_what_it_does_not_know():
+def test_the_tokenizer_lowers_case_pads_and_maps_unknown_words():
     tokenizer = word_tokenizer(["bear", "head of the bear"])
     # words in order: bear 2, head 3, of 4, the 5
     assert tokenizer.encode("HEAD of the Bear").ids == [3, 4, 5, 2]

@@ -1,4 +1,4 @@
-"""Lidar points lie on surfaces, and a camera that sees one gives it the same label."""
+"""Lidar points are on surfaces and have the labels that cameras see there."""
 
 import cv2
 import numpy as np
@@ -34,10 +34,9 @@ def centres(cameras):
 def test_beams_span_the_inclinations_of_the_scanner():
     directions = beam_directions(8).reshape(BEAMS, 8, 3)
     up = np.degrees(np.arcsin(directions[..., 2]))
-    half = (INCLINATION_DEG[1] - INCLINATION_DEG[0]) / BEAMS / 2  # beams sit in the middle of their share
-    assert up[0] == pytest.approx(INCLINATION_DEG[0] + half) and up[-1] == pytest.approx(
-        INCLINATION_DEG[1] - half
-    )
+    low, high = INCLINATION_DEG
+    half = (high - low) / BEAMS / 2  # each beam is in the middle of its share
+    assert up[0] == pytest.approx(low + half) and up[-1] == pytest.approx(high - half)
     assert np.linalg.norm(directions, axis=-1) == pytest.approx(1.0)
 
 
@@ -47,9 +46,8 @@ def test_beams_below_the_horizon_measure_the_flat_road(street, centres):
     road = next(node.id for node in street.nodes if node.text == "road")
     on_road = scan.node_ids[:, 0] == road
     height = scan.origins[scan.pose_index, 2]
-    down = -np.radians(
-        INCLINATION_DEG[0] + (scan.beam + 0.5) / BEAMS * (INCLINATION_DEG[1] - INCLINATION_DEG[0])
-    )
+    low, high = INCLINATION_DEG
+    down = -np.radians(low + (scan.beam + 0.5) / BEAMS * (high - low))
     expected = height / np.sin(down)
     assert on_road.sum() > 1000
     # Repaired patches are up to 6 mm above the road.
@@ -57,19 +55,19 @@ def test_beams_below_the_horizon_measure_the_flat_road(street, centres):
     assert np.median(np.abs(scan.range_m - expected)[on_road]) < 1e-3
 
 
-def test_points_are_origin_plus_range_and_the_noise_is_small(street, centres):
+def test_points_are_at_the_measured_range_and_noise_has_the_stated_deviation(street, centres):
     scan = scan_street(street, centres, azimuth_steps=90, poses=3)
     exact = scan_street(street, centres, azimuth_steps=90, poses=3, range_noise_m=0.0)
     assert scan.origins == pytest.approx(centres[[0, 20, 39]] + [0, 0, ABOVE_CAMERA_M])
     away = np.linalg.norm(scan.points - scan.origins[scan.pose_index], axis=1)
     assert away == pytest.approx(scan.range_m, abs=1e-4)
-    assert np.array_equal(scan.node_ids, exact.node_ids)  # noise moves points, it relabels none
+    assert np.array_equal(scan.node_ids, exact.node_ids)  # noise moves points and changes no label
     error = (scan.range_m - exact.range_m).astype(np.float64)
     assert error.std() == pytest.approx(0.015, rel=0.1) and abs(error.mean()) < 0.001
     assert scan.range_m.max() < MAX_RANGE_M + 0.1
 
 
-def test_the_sky_returns_nothing_and_some_returns_are_lost(street, centres):
+def test_the_sky_gives_no_return_and_a_share_of_returns_is_dropped(street, centres):
     full = scan_street(street, centres, azimuth_steps=200, poses=1, lost_share=0.0)
     some = scan_street(street, centres, azimuth_steps=200, poses=1, lost_share=0.2)
     texts = {street.nodes[node].text for node in np.unique(full.node_ids[:, 0])}
@@ -77,7 +75,7 @@ def test_the_sky_returns_nothing_and_some_returns_are_lost(street, centres):
     assert len(some.points) / len(full.points) == pytest.approx(0.8, abs=0.02)
 
 
-def test_a_camera_labels_points_as_the_scanner_does(street, cameras, centres):
+def test_visible_points_have_the_label_of_their_pixel(street, cameras, centres):
     scan = scan_street(street, centres)
     assert 50_000 < len(scan.points) < 150_000
     for name in ("004.png", "021.png"):
@@ -101,7 +99,7 @@ def test_a_camera_labels_points_as_the_scanner_does(street, cameras, centres):
             assert (image[row, column] == ids[:, level.index])[within].mean() > least
 
 
-def test_the_truth_of_a_street_has_the_scan_of_its_views(tmp_path):
+def test_the_truth_folder_of_a_street_contains_the_scan_of_its_views(tmp_path):
     settings = WorldSettings(views=3, image_px=48, objects=3, samples=1)
     run_world("world:street:100", settings, tmp_path, threads=1)
     scene = build_scene("street", 100, 3)

@@ -1,4 +1,4 @@
-"""Faults in true masks: none gives the truth, rates come out, systematic ones repeat, order is nothing."""
+"""Faults in true masks occur at their rates, and systematic faults repeat across views."""
 
 import itertools
 
@@ -73,7 +73,7 @@ def within_binomial_bounds(successes: int, trials: int, probability: float) -> b
     return abs(successes - trials * probability) <= 4 * sigma
 
 
-def test_without_faults_the_masks_are_the_truth():
+def test_without_faults_the_masks_are_the_true_regions():
     masks, counts = with_faults()
     for level in LEVELS:
         assert regions(masks, level) == true_regions(level)
@@ -83,7 +83,7 @@ def test_without_faults_the_masks_are_the_truth():
     assert not any(counts.values())
 
 
-def test_the_surroundings_are_left_out_on_request():
+def test_the_background_setting_omits_the_surroundings():
     masks, _ = with_faults(background=False)
     assert regions(masks, Level.WHOLE) == true_regions(Level.WHOLE, skip=TRUTH.background)
 
@@ -94,7 +94,7 @@ def test_small_regions_give_no_mask():
     assert len(masks.rows_of(Level.WHOLE)) == OBJECTS + 1
 
 
-def test_siblings_touch_and_strangers_and_the_floor_do_not():
+def test_only_siblings_have_common_borders():
     borders = sibling_borders(LABELS[1], TRUTH)
     assert borders[1] == {2: 4}
     assert borders[2] == {1: 4}
@@ -113,7 +113,7 @@ def test_siblings_touch_and_strangers_and_the_floor_do_not():
         ("wrong_level", {"wrong_level": 0.2}, 3 * OBJECTS + 1, 0.2),
     ],
 )
-def test_faults_come_at_their_rates(fault, settings, trials, probability):
+def test_faults_occur_at_their_rates(fault, settings, trials, probability):
     views = [with_faults(f"{view:03d}.png", **settings) for view in range(12)]
     counts = sum(counts[fault] for _, counts in views)
     assert within_binomial_bounds(counts, 12 * trials, probability)
@@ -121,7 +121,7 @@ def test_faults_come_at_their_rates(fault, settings, trials, probability):
         assert sum(3 * OBJECTS + 1 - len(masks) for masks, _ in views) == counts
 
 
-def test_a_merge_unites_both_parts():
+def test_a_merged_mask_covers_both_parts():
     masks, counts = with_faults(merge=1)
     assert counts["merged"] == OBJECTS
     assert regions(masks, Level.PART) == true_regions(Level.WHOLE, skip=TRUTH.background)
@@ -131,7 +131,7 @@ def test_a_merge_unites_both_parts():
     assert masks.stability[masks.rows_of(Level.PART)] == pytest.approx(0.75)
 
 
-def test_splits_cover_what_they_cut():
+def test_the_pieces_of_a_split_mask_cover_it():
     masks, counts = with_faults(split=1)
     assert counts["split"] == 3 * OBJECTS + 1
     for level in (Level.WHOLE, Level.PART):
@@ -153,7 +153,7 @@ def test_a_cut_leaves_between_30_and_70_percent_on_either_side():
 
 def test_a_wrong_level_is_one_step_away():
     masks, _ = with_faults(wrong_level=1)
-    # every whole stands at part; of the parts about half go up and half go down
+    # Every whole becomes a part; about half of the parts become wholes, the others subparts.
     assert len(masks.rows_of(Level.PART)) == OBJECTS + 1
     assert within_binomial_bounds(len(masks.rows_of(Level.WHOLE)), 2 * OBJECTS, 0.5)
     assert len(masks.rows_of(Level.WHOLE)) + len(masks.rows_of(Level.SUBPART)) == 2 * OBJECTS
@@ -191,7 +191,7 @@ def test_a_systematic_merge_repeats_in_its_share_of_the_views():
     assert (merged[merged > 0] >= 0.9 * views - 4 * np.sqrt(views * 0.09)).all()
 
 
-def test_a_systematic_gap_is_the_same_node_in_its_share_of_the_views():
+def test_a_systematically_missing_node_is_missing_in_its_share_of_the_views():
     views = 25
     parts = [LABELS[1] == node for node in range(3 * OBJECTS) if node % 3]
     seen = times_found(views, parts, systematic_missing=0.2)
@@ -206,7 +206,7 @@ def test_a_higher_probability_only_adds_faults():
     assert many < few < true_regions(Level.PART)
 
 
-def test_faults_follow_the_seed_the_scene_and_the_view_alone():
+def test_faults_depend_only_on_seed_scene_and_view():
     settings = PerturbSettings()
 
     def content(view, draws):
@@ -220,7 +220,7 @@ def test_faults_follow_the_seed_the_scene_and_the_view_alone():
         assert content("a.png", other) != first
 
 
-def test_chances_are_even():
+def test_chances_are_uniform():
     draws = Draws(0, "set/scene")
     values = np.array([draws.chance("coin", number) for number in range(4000)])
     assert values.min() >= 0
@@ -239,7 +239,7 @@ def iou(a, b) -> float:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_rougher_boundary_lowers_the_iou_every_time(seed):
+def test_a_larger_amplitude_lowers_the_iou_and_changes_more_pixels(seed):
     mask = disc(25)
     amplitudes = [0, 0.5, 1, 2, 4, 8]
     rough = [displaced(mask, a, 6, np.random.default_rng(seed)) for a in amplitudes]
@@ -250,7 +250,7 @@ def test_a_rougher_boundary_lowers_the_iou_every_time(seed):
         assert not ((less ^ mask) & ~(more ^ mask)).any()
 
 
-def test_a_boundary_moves_by_its_amplitude():
+def test_the_standard_deviation_of_a_boundary_is_the_amplitude():
     mask = np.zeros((64, 64), bool)
     mask[:, :32] = True
     shifts = [displaced(mask, 2.0, 6.0, np.random.default_rng(seed)).sum(axis=1) - 32 for seed in range(100)]
@@ -261,13 +261,10 @@ def test_a_boundary_moves_by_its_amplitude():
     assert np.abs(shifts).max() <= 6
 
 
-def test_thin_things_grow_thinner_and_do_not_vanish():
+def test_thin_masks_do_not_vanish_and_a_mask_of_the_whole_view_is_unchanged():
     bar = np.zeros((32, 32), bool)
     bar[16, 4:28] = True
     for seed in range(10):
         assert (displaced(bar, 8, 3, np.random.default_rng(seed)) & bar).sum() == 24
-
-
-def test_what_fills_the_view_stays():
     full = np.ones((16, 16), bool)
     assert displaced(full, 4, 3, np.random.default_rng(0)).all()

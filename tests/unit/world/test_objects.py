@@ -1,4 +1,4 @@
-"""Every object is a true tree, and its texts tell its nodes apart."""
+"""Every object is a tree whose texts identify its nodes, and touching parts differ in colour."""
 
 from functools import cache
 
@@ -83,7 +83,7 @@ CLASSES = [
 
 
 @pytest.mark.parametrize(("build", "name", "sizes"), CLASSES)
-def test_every_class_has_two_parts_and_two_subparts_and_true_nesting(build, name, sizes):
+def test_every_class_has_two_parts_and_two_subparts_with_consistent_ids(build, name, sizes):
     for model in (built(name, build), build(name, np.random.default_rng(1))):
         texts = {level: {node.text for node in model.nodes if node.level == level} for level in (1, 2, 3)}
         assert texts[1] == {name}
@@ -96,7 +96,7 @@ def test_every_class_has_two_parts_and_two_subparts_and_true_nesting(build, name
         fine = subpart >= 0
         assert (levels[subpart[fine]] == 3).all()
         assert (parents[subpart[fine]] == part[fine]).all()
-        # No node without a triangle: a text that nothing answers could never be found.
+        # Each node has a triangle: otherwise, no pixel could answer its text.
         assert set(np.unique(model.node_ids)) - {-1} == set(range(len(model.nodes)))
         assert model.triangles[..., 2].min() == pytest.approx(0.0, abs=1e-9)
         assert np.linalg.norm(model.normals, axis=-1) == pytest.approx(1.0, abs=1e-6)
@@ -133,19 +133,19 @@ def main_materials(model, chosen):
 
 
 @pytest.mark.parametrize("name", TABLETOP)
-def test_a_subpart_differs_in_colour_from_the_part_it_sits_on(name):
+def test_a_subpart_differs_in_colour_from_its_part(name):
     model = built(name)
     part, subpart = model.node_ids[:, 1], model.node_ids[:, 2]
     for row in np.unique(subpart[subpart >= 0]):
         parent = model.nodes[row].parent
         own = (part == parent) & (subpart < 0)
-        if not own.any():  # a row of books is nothing but its books
+        if not own.any():  # a row of books has no surface besides its books
             continue
         of_subpart = seen_lab(model.materials, main_materials(model, subpart == row))
         of_part = seen_lab(model.materials, main_materials(model, own))
         apart = np.linalg.norm(of_subpart[:, None] - of_part, axis=-1).min(axis=1)
-        # Of a subpart in two colours (the bow of a boot) one may be its part's. Things with a prescribed
-        # colour (a green leaf on a green apple) may come a little closer than the builder asks for.
+        # A subpart in two colours (the bow of a boot) may share one with its part. With a prescribed colour
+        # (a green leaf on a green apple), the contrast may be a little below the builder's minimum.
         assert apart.max() > 0.6 * PARENT_CONTRAST, model.nodes[row].text
 
 
@@ -166,13 +166,13 @@ def test_two_parts_of_one_paint_become_two_shades_where_they_touch():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_share_of_a_texture_that_shows_its_second_colour_is_as_stated(kind):
+def test_the_share_of_the_second_colour_is_as_stated(kind):
     points = np.random.default_rng(0).uniform(50, 450, (4000, 3))
     share = np.mean([pattern(KINDS.index(kind), *point)[0] for point in points])
     assert share == pytest.approx(TEXTURES[kind].second_share, abs=0.03)
 
 
-def test_a_colour_word_is_that_of_the_nearest_colour_and_paints_keep_theirs():
+def test_colour_words_match_the_average_colour():
     for word, colour in COLOURS.items():
         assert colour_word(np.array(colour)) == word
     # L*a*b* of pure sRGB red, from the CIE formulas: 53.24, 80.09, 67.20.
@@ -185,12 +185,12 @@ def test_a_colour_word_is_that_of_the_nearest_colour_and_paints_keep_theirs():
             assert colour_word(paint.paled(0.4).seen) == paint.paled(0.4).colour
 
 
-def test_a_shade_stays_within_the_colours_and_goes_the_way_it_says():
+def test_shades_are_darker_below_1_and_lighter_above():
     paint = Paint("red", "mottled", (0.7, 0.2, 0.2), (0.5, 0.1, 0.1), 9.0, 0.0, 1.0, 0.0, (0.0, 0.0, 0.0))
     assert paint.shaded(0.5).seen.max() < paint.seen.max() < paint.shaded(1.5).seen.max() <= 0.95
 
 
-def test_texts_carry_aliases_attributes_and_relations():
+def test_synonyms_contain_aliases_attributes_and_relations():
     model = build_object("bear", np.random.default_rng(0))
     whole = model.nodes[0]
     assert "teddy bear" in whole.synonyms
@@ -208,6 +208,6 @@ def test_texts_carry_aliases_attributes_and_relations():
         (build_street_object, "unknown class of a street 'unicorn'\n  expected  one of car, truck"),
     ],
 )
-def test_an_unknown_class_names_the_known_ones(build, message):
+def test_the_error_about_an_unknown_class_lists_the_known_ones(build, message):
     with pytest.raises(SceneError, match=message):
         build("unicorn", np.random.default_rng(0))

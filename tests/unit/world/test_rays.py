@@ -1,4 +1,4 @@
-"""Rays cast in packets meet what they meet one by one."""
+"""Rays cast in packets have the hits of rays cast one by one."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def rays_at(triangles, count):
 
 
 @pytest.mark.parametrize("count", (0, 1, 15, 16, 4001))
-def test_packets_meet_what_single_rays_meet(triangles, count):
+def test_packets_have_the_hits_of_single_rays(triangles, count):
     origins, directions = rays_at(triangles, count)
     plain = EmbreeScene(robust=True)
     TriangleMesh(plain, triangles)
@@ -38,7 +38,7 @@ def test_packets_meet_what_single_rays_meet(triangles, count):
         np.testing.assert_allclose(getattr(hits, weights)[met & same], single[weights][met & same], atol=1e-5)
 
 
-def test_a_ray_is_blocked_if_it_meets_something_within_its_reach(triangles):
+def test_a_ray_is_blocked_if_it_hits_something_within_its_reach(triangles):
     origins, directions = rays_at(triangles, 999)
     caster = RayCaster(triangles)
     distance = caster.nearest(origins, directions).distance
@@ -48,14 +48,13 @@ def test_a_ray_is_blocked_if_it_meets_something_within_its_reach(triangles):
     np.testing.assert_array_equal(caster.blocked(origins, directions, reach), expected)
 
 
-def test_rays_from_one_place_hit_a_triangle_where_worked_out_by_hand():
+def test_hits_of_a_triangle_match_values_worked_by_hand():
     caster = RayCaster(np.array([[[0, 0, 2], [4, 0, 2], [0, 8, 2]]], np.float32))
-    ways = np.array([[1, 1, 2], [0.5, 2, 1], [-1, 1, 2]], np.float32)  # the second's length is half as far
+    ways = np.array([[1, 1, 2], [0.5, 2, 1], [-1, 1, 2]], np.float32)  # the second ends halfway to its hit
     hits = caster.nearest(np.zeros((1, 3), np.float32), ways)
     assert hits.triangle.tolist() == [0, 0, -1]
     assert hits.distance.tolist() == pytest.approx([1, 2, np.inf])
-    assert hits.u[:2].tolist() == pytest.approx([1 / 4, 1 / 4]) and hits.v[:2].tolist() == pytest.approx(
-        [1 / 8, 1 / 2]
-    )
+    assert hits.u[:2].tolist() == pytest.approx([1 / 4, 1 / 4])
+    assert hits.v[:2].tolist() == pytest.approx([1 / 8, 1 / 2])
     reach = np.array([0.9, 2.1, 9], np.float32)
     assert caster.blocked(np.zeros((1, 3), np.float32), ways, reach).tolist() == [False, True, False]

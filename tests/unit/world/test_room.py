@@ -1,4 +1,4 @@
-"""Rooms: furniture touches nothing, everything stands on something, and the cameras' path is free."""
+"""Objects of a room do not intersect, are supported, and leave the camera path free."""
 
 import itertools
 
@@ -35,7 +35,7 @@ def overlap(first, second):
     return float((np.minimum(first[1], second[1]) - np.maximum(first[0], second[0])).min())
 
 
-def test_eight_rooms_hold_the_classes_of_scannet(rooms):
+def test_eight_rooms_contain_the_classes_of_scannet(rooms):
     seen = {node.text for scene in rooms for node in scene.nodes if node.level == 1}
     assert seen >= SCANNET_19 | {"television", "monitor", "nightstand", "tv stand", "lamp", "rug", "stool"}
     for scene in rooms:
@@ -43,7 +43,7 @@ def test_eight_rooms_hold_the_classes_of_scannet(rooms):
         assert len(furniture) >= 8
 
 
-def test_a_room_holds_what_was_asked_and_its_fixtures(rooms):
+def test_a_room_contains_the_requested_objects_and_its_fixtures(rooms):
     for scene in rooms:
         assert len(scene.placed) == scene.asked or scene.asked == 20  # 15 objects do not always fit
         assert len(scene.placed) >= scene.asked - 3
@@ -53,9 +53,9 @@ def test_a_room_holds_what_was_asked_and_its_fixtures(rooms):
     assert asked[9] - asked[1] == 8
 
 
-def test_nothing_in_a_room_runs_into_anything(rooms):
+def test_objects_do_not_intersect(rooms):
     for scene in rooms:
-        # The backsplash of a counter rises behind what stands on it; it is checked as a separate thing.
+        # The backsplash of a counter is behind the objects on it; the next test checks it.
         boxes = [box_of(scene, thing.node, without="counter backsplash") for thing in scene.placed]
         for (a, first), (b, second) in itertools.combinations(zip(scene.placed, boxes, strict=True), 2):
             if {a.name, b.name} == {"window", "curtain"}:
@@ -65,7 +65,7 @@ def test_nothing_in_a_room_runs_into_anything(rooms):
             assert overlap(first, second) < 0.012 or apart > 0, (scene.seed, a.name, b.name)
 
 
-def test_nothing_on_a_counter_runs_into_its_backsplash(rooms):
+def test_objects_on_a_counter_do_not_intersect_its_backsplash(rooms):
     found = 0
     for scene in rooms:
         for node in (node for node in scene.nodes if node.text == "counter backsplash"):
@@ -76,7 +76,7 @@ def test_nothing_on_a_counter_runs_into_its_backsplash(rooms):
     assert found > 5
 
 
-def test_curtains_hang_around_their_window(rooms):
+def test_curtains_are_beside_their_window(rooms):
     for scene in rooms[:5]:
         placed = {thing.name: thing for thing in scene.placed}
         panels = [node.id for node in scene.nodes if node.text == "curtain panel"]
@@ -86,7 +86,7 @@ def test_curtains_hang_around_their_window(rooms):
         assert placed["curtain"].yaw_deg == placed["window"].yaw_deg
 
 
-def test_everything_stands_on_something_or_hangs_on_a_wall(rooms):
+def test_every_object_has_support_or_hangs_on_a_wall(rooms):
     for scene in rooms:
         room = room_of(scene)
         half = np.array([room.width, room.depth]) / 2
@@ -105,7 +105,7 @@ def test_everything_stands_on_something_or_hangs_on_a_wall(rooms):
                 assert gap < 0.01, (scene.seed, thing.name)
 
 
-def test_everything_is_inside_its_room(rooms):
+def test_all_triangles_are_inside_the_room(rooms):
     for scene in rooms:
         room = room_of(scene)
         half = np.array([room.width, room.depth]) / 2 + 1e-5
@@ -114,7 +114,7 @@ def test_everything_is_inside_its_room(rooms):
         assert (np.abs(points[:, :2]) <= half).all() and points[:, 2].min() >= -1e-6
 
 
-def test_cameras_go_round_inside_the_room_and_overlap_enough_for_structure_from_motion(rooms):
+def test_cameras_are_clear_of_objects_and_overlap_enough_for_structure_from_motion(rooms):
     for scene in rooms:
         room, cameras = room_of(scene), scene_cameras(scene, 40, 96, 360)
         ordered = [cameras[name] for name in cameras.names]
@@ -130,7 +130,7 @@ def test_cameras_go_round_inside_the_room_and_overlap_enough_for_structure_from_
             assert 0.1 < np.linalg.norm(a.centre - b.centre) < 0.7
 
 
-def test_training_cameras_are_inside_the_room_and_outside_things(rooms):
+def test_training_cameras_are_inside_the_room_and_outside_objects(rooms):
     rng = np.random.default_rng(3)
     for scene in rooms[:6]:
         room = room_of(scene)

@@ -1,4 +1,4 @@
-"""Scenes follow from their seed, their objects do not touch, and seeds of different use are apart."""
+"""A seed determines its scene, objects do not intersect, and splits of seeds are disjoint."""
 
 import itertools
 from functools import cache
@@ -13,18 +13,18 @@ from hilsplat.world.scenes.tabletop import TABLE_RADIUS
 from hilsplat.world.seeds import SPLITS, require_split, split_of_seed
 
 
-def test_splits_of_seeds_do_not_meet():
+def test_splits_of_seeds_are_disjoint():
     for (_, first), (_, second) in itertools.combinations(SPLITS.items(), 2):
         assert first.stop <= second.start or second.stop <= first.start
 
 
-def test_a_seed_knows_its_split():
+def test_split_of_a_seed():
     assert [split_of_seed(seed) for seed in (99, 100, 199, 200, 299, 300, 1_000_000, 1_999_999)] == [
         "free", "development", "development", "benchmark", "benchmark", "free", "training", "training",
     ]  # fmt: skip
 
 
-def test_a_seed_of_another_split_is_refused():
+def test_a_seed_from_another_split_is_refused():
     require_split(201, "benchmark")
     with pytest.raises(SceneError, match=r"seed 201 is not in the training split"):
         require_split(201, "training")
@@ -69,7 +69,7 @@ def test_placed_objects_do_not_intersect_and_stand_on_the_table():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_ids_of_a_triangle_nest_in_the_scene_too(kind):
+def test_node_ids_of_triangles_follow_the_tree(kind):
     scene = built(kind)
     parents = np.array([node.parent for node in scene.nodes])
     whole, part, subpart = scene.node_ids.T
@@ -87,7 +87,7 @@ def test_ids_of_a_triangle_nest_in_the_scene_too(kind):
         ("street", {"road", "lane marker", "curb", "sidewalk", "ground", "sky"}, set()),
     ],
 )
-def test_the_surroundings_are_background_wholes(kind, always, sometimes):
+def test_surroundings_are_wholes_in_the_background(kind, always, sometimes):
     for seed in (100, 102):
         scene = built(kind, seed)
         texts = [scene.nodes[node].text for node in scene.background]
@@ -95,14 +95,14 @@ def test_the_surroundings_are_background_wholes(kind, always, sometimes):
         assert {scene.nodes[node].level for node in scene.background} == {1}
 
 
-def test_objects_that_find_no_place_are_left_out_and_said(monkeypatch, caplog):
+def test_objects_that_do_not_fit_are_omitted_and_logged(monkeypatch, caplog):
     monkeypatch.setattr(tabletop, "GAP", 5.0)  # wider than the table: a second object has no place
     scene = build_scene("tabletop", 104, 3)
     assert (scene.asked, len(scene.placed)) == (3, 1)
     assert len([record for record in caplog.records if "no place left" in record.message]) == 2
 
 
-def test_an_unknown_kind_names_the_known_ones():
+def test_unknown_kinds_and_invalid_numbers_are_refused():
     with pytest.raises(SceneError, match=r"'forest'\n  expected  one of: tabletop"):
         build_scene("forest", 1, 3)
     with pytest.raises(SceneError, match=r"seed -1, 3 objects"):

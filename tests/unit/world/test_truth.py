@@ -1,4 +1,4 @@
-"""The true mesh: even vertices that know their node at every level and how many views see them."""
+"""The true mesh has short edges, node ids on both sides of borders, and the number of views per vertex."""
 
 from collections import Counter
 
@@ -48,7 +48,7 @@ def test_refined_triangles_cover_the_same_surface_with_short_edges():
 
 
 def test_refined_triangles_have_no_cracks():
-    # Of a closed surface every edge has two triangles; a corner in the middle of an edge would leave one.
+    # Each edge of a closed surface has two triangles; a corner in the middle of an edge would leave one.
     fine, _ = refined(box((2.0, 1.0, 0.3)).triangles.astype(np.float32), 0.4)
     edges = Counter(
         frozenset((tuple(triangle[k].tolist()), tuple(triangle[(k + 1) % 3].tolist())))
@@ -58,13 +58,13 @@ def test_refined_triangles_have_no_cracks():
     assert set(edges.values()) == {2}
 
 
-def test_triangles_that_are_small_enough_stay():
+def test_small_triangles_are_unchanged():
     solid = box((0.2, 0.2, 0.2)).triangles.astype(np.float32)
     fine, owner = refined(solid, 1.0)
     assert np.array_equal(fine, solid) and np.array_equal(owner, np.arange(12))
 
 
-def test_a_vertex_at_a_border_of_nodes_has_one_copy_per_side(tmp_path):
+def test_a_vertex_on_a_border_has_one_copy_per_node(tmp_path):
     # Two triangles of a square share its diagonal; they belong to two wholes, one of which has a part.
     square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32)
     scene = scene_of(square, np.array([[0, -1, -1], [1, 2, -1]]))
@@ -79,7 +79,7 @@ def test_a_vertex_at_a_border_of_nodes_has_one_copy_per_side(tmp_path):
     assert (vertices["views"] == 2).all()
 
 
-def test_a_point_is_seen_by_cameras_that_nothing_hides_it_from():
+def test_hidden_points_are_not_counted_as_seen():
     # A plate at z = 0 under a small plate at z = 1: seen from above, its middle is hidden, its corner not.
     plate = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]], np.float32)
     lid = plate * np.float32(0.2) + np.array([0, 0, 1], np.float32)
@@ -91,7 +91,7 @@ def test_a_point_is_seen_by_cameras_that_nothing_hides_it_from():
     assert views_of_points(scene, near, points).tolist() == [1, 0, 0, 0]
 
 
-def test_rows_are_made_unique_as_numpy_does_it():
+def test_unique_rows_equal_numpys():
     rows = np.random.default_rng(0).integers(-2, 3, (2000, 4)).astype(np.float32)
     unique, index = np.unique(rows, axis=0, return_inverse=True)
     for found, expected in zip(unique_rows(rows), (unique, index.reshape(-1)), strict=True):

@@ -1,4 +1,4 @@
-"""The diagnostic segmenter: exact on request, the same bytes every time, and never by accident."""
+"""The diagnostic segmenter reproduces true regions, is deterministic, and runs only on request."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ EXACT = PerturbSettings(
 
 
 def labels_of(view: int) -> dict[Level, np.ndarray]:
-    """A bear of 12 x 20 px whose head is its left half, moved by the number of the view, on a table."""
+    """Labels of a bear of 12 x 20 px on a table; its head is the left half; each view shifts it by 1 px."""
     labels = np.full((3, *SIZE), -1, np.int32)
     left = 6 + view
     labels[0] = 4
@@ -87,7 +87,7 @@ def test_without_faults_every_true_region_of_every_training_view_is_a_mask(world
         assert not any(index["views"][name]["faults"].values())
 
 
-def test_the_index_says_what_the_masks_are(world):
+def test_the_index_records_segmenter_and_faults(world):
     index = read_index(make(world, settings=PerturbSettings(merge=0.5, seed=7)))
     assert (index["segmenter"], index["model"]) == ("truth-perturbed", None)
     assert index["label"] == "truth-perturbed (seed 7, merge 0.5)"
@@ -105,19 +105,19 @@ def test_the_same_faults_give_the_same_bytes_on_any_number_of_threads(world):
     assert sha256_of_path(other) not in digests
 
 
-def test_labels_name_what_differs_from_the_defaults():
+def test_labels_list_non_default_settings():
     assert faults_label(PerturbSettings()) == "truth-perturbed"
     assert faults_label(EXACT) == "truth-perturbed (exact)"
     assert faults_label(PerturbSettings(missing=(0, 0, 0.5))) == "truth-perturbed (missing 0/0/0.5)"
 
 
-def test_every_fault_is_known_to_the_label():
+def test_all_fault_settings_are_in_the_list_of_faults():
     settings = PerturbSettings.model_fields.keys()
     about_faults = {"seed", "background", "boundary_smooth_px", "systematic_share", "score_noise"}
     assert settings - about_faults == set(FAULTS)
 
 
-def test_label_images_of_another_size_are_refused(world):
+def test_label_images_of_the_wrong_size_are_refused(world):
     for level in LEVELS:
         write_png(world / "truth" / "labels" / f"001.png.{level.label}.png", np.zeros((12, 20), np.uint16))
     with pytest.raises(MisalignedArtifactError, match=r"view 001\.png(.|\n)*24 x 40(.|\n)*12 x 20"):
@@ -125,13 +125,13 @@ def test_label_images_of_another_size_are_refused(world):
     assert not (world / "masks").exists()
 
 
-def test_an_unfinished_truth_is_refused(world):
+def test_an_incomplete_truth_folder_is_refused(world):
     (world / "truth" / "index.json").unlink()
     with pytest.raises(ArtifactError, match="truth is missing or incomplete"):
         make(world)
 
 
-def test_probabilities_stay_probabilities():
+def test_probabilities_above_1_are_refused():
     from hilsplat.configuration import parse_section
 
     with pytest.raises(SettingsError, match=r"perturb\.missing\.2: Input should be less than or equal to 1"):
@@ -140,12 +140,12 @@ def test_probabilities_stay_probabilities():
 
 @pytest.fixture
 def command(world, monkeypatch):
-    """The subcommand `hilsplat masks`, without its hold on the log."""
+    """The subcommand `hilsplat masks` without its logging."""
     monkeypatch.setattr(around, "start_logging", lambda *_, **__: None)
     return lambda **options: stage_commands.masks(scene=world / "scene", out=world / "out", **options)
 
 
-def test_the_command_wants_the_truth_and_records_it(world, command):
+def test_the_command_requires_the_truth_and_records_it(world, command):
     asked = '{"segmenter": "truth-perturbed", "min_area_px": 1}'
     with pytest.raises(HilsplatError, match=r"needs the true labels(.|\n)*--truth results"):
         command(settings=asked)
@@ -157,7 +157,7 @@ def test_the_command_wants_the_truth_and_records_it(world, command):
 
 
 @pytest.mark.parametrize("segmenter", ["sam", "graph"])
-def test_other_segmenters_must_not_see_the_truth(world, command, segmenter):
+def test_other_segmenters_refuse_the_truth(world, command, segmenter):
     with pytest.raises(HilsplatError, match=f"the segmenter {segmenter} must not see the truth"):
         command(settings=f'{{"segmenter": "{segmenter}"}}', truth=world / "truth")
     assert not (world / "out").exists()
