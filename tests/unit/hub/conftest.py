@@ -13,8 +13,11 @@ from onnx import numpy_helper
 
 from hilsplat.hub import get
 from tests.loopback_hub import LoopbackHub, loopback_hub
+from tests.unit.export.conftest import clip_parts, transformers
 from tests.unit.finished_desk import write_colour_clip
 from tests.unit.segment.conftest import write_disc_sam
+
+__all__ = ["clip_parts", "transformers"]
 
 SAM, CLIP = "Xenova/sam-vit-base", "Xenova/clip-vit-base-patch16"
 PADDING_BYTES = 600_000

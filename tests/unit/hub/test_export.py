@@ -13,9 +13,6 @@ from hilsplat.embed.clip import ClipModel
 from hilsplat.hub import get
 from hilsplat.hub.get import get_models
 from hilsplat.models.store import RELEASES
-from tests.unit.export.conftest import clip_parts
-
-__all__ = ["clip_parts"]
 
 NAME = "clip-vit-b-16-laion2b"
 REPOSITORY = next(release.repository for release in RELEASES if release.name == NAME)

@@ -18,10 +18,7 @@ from hilsplat.hub.get import get_models
 from hilsplat.hub.overview import check_models, models_table
 from hilsplat.models.store import real_model
 from tests.loopback_hub import Refusal, git_sha1
-from tests.unit.export.conftest import clip_parts
 from tests.unit.hub.conftest import CLIP, SAM, point_at
-
-__all__ = ["clip_parts"]
 
 ENCODER = "vision_encoder.onnx"
 TARGET = Path("models/sam-vit-base")
