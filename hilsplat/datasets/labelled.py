@@ -154,11 +154,7 @@ class LabelledScene:
 
 
 def images_by_view(folder: Path) -> dict[str, Path]:
-    """Return the image files of a folder by view, sorted by stem.
-
-    Raises:
-        SceneError: the folder is missing or empty, or two images share a stem.
-    """
+    """Return the images of a folder by view, sorted by stem; raise SceneError if none, or two of one stem."""
     files = list_images(folder) if folder.is_dir() else []
     if not files:
         raise SceneError(

@@ -42,11 +42,7 @@ LISTED = "list them with: hilsplat datasets list"
 
 
 def open_labelled(name: str, data_root: Path) -> "LabelledScene":
-    """Open a scene with labels on images, by a name such as "lerf_ovs/figurines".
-
-    Raises:
-        SceneError: there is no such data set, its labels are on points, or the scene cannot be read.
-    """
+    """Open a scene with labels on images, such as "lerf_ovs/figurines"; raise SceneError if there is none."""
     dataset = dataset_of(name.partition("/")[0])
     if dataset.labels != "images":
         raise SceneError(
@@ -60,11 +56,7 @@ def open_labelled(name: str, data_root: Path) -> "LabelledScene":
 
 
 def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
-    """Open a scene with labels on images or points, by a name such as "scannet/scene0000_00".
-
-    Raises:
-        SceneError: there is no such data set, no scene is named, or the scene cannot be read.
-    """
+    """Open a scene with any labels, such as "scannet/scene0000_00"; raise SceneError if it cannot be read."""
     dataset_name, _, scene = name.partition("/")
     dataset = dataset_of(dataset_name)
     if not scene:
@@ -118,11 +110,8 @@ def _presence(dataset: Dataset, data_root: Path) -> list[str]:
 def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
     """Read whole scenes of a data set, by default those at least partly present.
 
-    Returns:
-        A report of what was found, and the number of scenes that cannot be read.
-
-    Raises:
-        SceneError: the data set's folder is missing.
+    Return a report of what was found, and the number of scenes that cannot be read. Raise SceneError if the
+    data set's folder is missing.
     """
     root = dataset.locate(data_root)
     known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))

@@ -58,11 +58,9 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Return labels to score the scene of a row against, as `data set/scene`, its own first.
+    """Return labels to score a row's scene (`dataset/scene`) against, as `data set/scene`, its own first.
 
-    Args:
-        data_root: folder of the data sets; empty for the working folder, which may contain own annotations.
-        row: name of the row, `dataset/scene`.
+    Without `data_root`, the working folder may contain own annotations.
     """
     drawn = (Path(data_root).expanduser() / "annotated" / row).glob("*.json")
     own = (f"annotated/{row}",) if any(drawn) else ()

@@ -109,12 +109,14 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
             notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were left out")
         if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
             notes.append(
-                f"{video.name} ends after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only that "
-                "part is used; copy it again if the rest matters"
+                f"{video.name} breaks off after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only "
+                "that part is used; copy it again if the rest matters"
             )
     chosen = choose_frames(candidates, count)
     if len(chosen) < count:
-        notes.append(f"{len(chosen)} frames instead of {count}: the others differ too little from these")
+        notes.append(
+            f"{len(chosen)} frames instead of {count}: no more of them differ enough from each other"
+        )
     named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
     for position, video in enumerate(videos):
         names = {frame.number: name for name, frame in named.items() if frame.video == position}

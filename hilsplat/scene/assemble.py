@@ -14,7 +14,6 @@ from hilsplat.base.artifacts import atomic_folder, write_json
 from hilsplat.base.images import read_image, write_png
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.lost_views import stack_pictures
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -230,3 +229,13 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     )
     # Without date and library version, the same scene gives the same bytes.
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
+
+
+def stack_pictures(upper: Path, lower: Path) -> None:
+    """Append a picture below another one, in place, and pad the narrower one with white."""
+    pictures = [read_image(path) for path in (upper, lower)]
+    width = max(picture.shape[1] for picture in pictures)
+    stacked = np.full((sum(map(len, pictures)), width, 3), 255, np.uint8)
+    stacked[: len(pictures[0]), : pictures[0].shape[1]] = pictures[0]
+    stacked[len(pictures[0]) :, : pictures[1].shape[1]] = pictures[1]
+    write_png(upper, stacked)

@@ -131,9 +131,8 @@ class KnownPoses:
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
     """Search for poses of COLMAP, transforms files, LLFF, Polycam and Record3D, in this order; None if none.
 
-    Args:
-        named: a COLMAP model, a transforms file, or a folder with either, used instead of the poses in
-            `folder`; `layouts.NO_POSES` to ignore all poses.
+    If `named` is a COLMAP model, a transforms file, or a folder with either, it is used instead of the poses
+    in `folder`; `NO_POSES` ignores all poses.
 
     Raises:
         SceneError: there is a `sparse/` folder without a complete model, or `named` has no poses.

@@ -47,7 +47,7 @@ class PosedImage:
         return np.linalg.inv(self.cam_from_world)
 
 
-def rigid_pose(world_from_cam: Float[np.ndarray, "rows columns"], where: str) -> Float64[np.ndarray, "4 4"]:
+def rigid_pose(world_from_cam: Float[np.ndarray, "..."], where: str) -> Float64[np.ndarray, "4 4"]:
     """Return a camera-to-world matrix, 3 x 4 or 4 x 4, as 4 x 4; refuse one that is not rigid.
 
     Raises:

@@ -11,6 +11,7 @@ import numpy as np
 from hilsplat.base.artifacts import work_folder
 from hilsplat.base.errors import RegistrationError, SceneError
 from hilsplat.base.files import list_images
+from hilsplat.base.images import read_image, resize_to_fit
 from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import stage_log
 from hilsplat.scene.assemble import PosedView, split_views, write_scene
@@ -22,10 +23,10 @@ from hilsplat.scene.features import (
     find_matches,
     incremental_options,
     prepare_images,
+    verified_matches,
 )
 from hilsplat.scene.importers.importing import import_poses
 from hilsplat.scene.layouts import find_known_poses, photo_folder
-from hilsplat.scene.lost_views import name_neighbours, plot_lost
 from hilsplat.scene.sheet import MIN_PHOTOS
 from hilsplat.settings import PosesSettings
 
@@ -42,6 +43,20 @@ LOST_PICTURE = "not_registered.png"
 
 WEAK_POINTS_PER_VIEW = 13
 """Minimum points per registered view in good runs on renders; useless runs had 4 to 18."""
+
+
+NEIGHBOURS = 3
+"""Number of registered photographs reported for each lost one."""
+
+MAX_ROWS = 12
+"""Maximum number of lost photographs in the picture; registration.json lists all of them."""
+
+THUMBNAIL_PX = 400
+
+ADVICE = (
+    "Take more photographs between each of these and those on its right, in steps of less than 10 degrees; "
+    "leave out those that show something else or are blurred."
+)
 
 
 def run_poses(
@@ -124,12 +139,8 @@ def _reconstruct(
     model = models[0] if models else None
     report = registration_report(work_images, matches, models)
     name_neighbours(database, report["views"])
-    report = {
-        "scene": name,
-        "poses": f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}",
-        "seed": seed,
-        **report,
-    }
+    how = f"structure from motion, {settings.mapper} mapper, {matcher} matching, {camera_model}"
+    report = {"scene": name, "poses": how, "seed": seed, **report}
     picture = work / LOST_PICTURE
     has_lost = plot_lost(picture, work / "images", report)
     kept = out.with_name(LOST_PICTURE)
@@ -263,9 +274,8 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
         warnings.append(f"{lost} of {report['images']} views are not registered")
     if len(report["models"]) > 1:
         sizes = ", ".join(str(size) for size in report["models"])
-        warnings.append(
-            f"the views fall into {len(report['models'])} models ({sizes} views); the largest is used"
-        )
+        number = len(report["models"])
+        warnings.append(f"the views fall into {number} models ({sizes} views); the largest is used")
     if report["registered"] and report["points_per_view"] < WEAK_POINTS_PER_VIEW:
         warnings.append(
             f"only {report['points_per_view']} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} "
@@ -302,7 +312,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
         )
     if settings.several_models == "stop" and len(report["models"]) > 1:
         raise RegistrationError(
-            f"the photographs of {name} fall into {len(report['models'])} separate models",
+            f"the photographs of {name} form {len(report['models'])} separate models",
             expected="one model (poses.several_models is stop)",
             found=f"models of {sizes} views; not in the largest:{listing}",
             fix=f"{advice}; to continue with the largest, set poses.several_models to largest",
@@ -311,3 +321,44 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
         logger.warning("%s: %s", name, warning)
     for entry in lost:
         logger.warning("%s: %s is not registered: %s", name, entry["file"], entry["why_not"])
+
+
+def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
+    """Add `belongs_near` to lost views of a report: the registered ones that share most verified matches."""
+    shared = verified_matches(database)
+    for view, entry in views.items():
+        if entry["registered"]:
+            continue
+        near = [(-count, other) for other, count in shared[view].items() if views[other]["registered"]]
+        best = sorted(each for each in near if each[0])[:NEIGHBOURS]
+        entry["belongs_near"] = [{"view": other, "matches": -count} for count, other in best]
+
+
+def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
+    """Draw each lost photograph in a row with its registered neighbours; return False if there is none."""
+    lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
+    if not lost:
+        return False
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = lost[:MAX_ROWS]
+    figure = Figure(figsize=(12, 1.2 + 2.1 * len(shown)), layout="constrained")
+    FigureCanvasAgg(figure)
+    rest = f" (the first {MAX_ROWS})" if len(lost) > MAX_ROWS else ""
+    title = f"{len(lost)} of {report['images']} photographs are not registered{rest}"
+    figure.suptitle(f"{title}\n{ADVICE}", fontsize=10, parse_math=False)
+    cells = figure.subplots(len(shown), 1 + NEIGHBOURS, squeeze=False)
+    for row, (view, entry) in zip(cells, shown, strict=True):
+        near = entry["belongs_near"]
+        titles = [f"{entry['file']}: {entry['why_not'].partition(':')[0]}"]
+        titles += [f"{each['view']}: {each['matches']} shared matches" for each in near]
+        for axes, name, title in zip(row, [view, *(each["view"] for each in near)], titles, strict=False):
+            axes.imshow(resize_to_fit(read_image(images / name), THUMBNAIL_PX))
+            axes.set_title(title, fontsize=7, parse_math=False)
+        for axes in row:
+            axes.set_axis_off()
+        if not near:
+            row[1].text(0, 0.5, "shares no verified match with a registered photograph", fontsize=8)
+    figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
+    return True

@@ -28,6 +28,7 @@ from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import (
     LERF_STEMS,
     OVS_STEMS,
+    TrueWorld,
     write_3d_ovs,
     write_hi,
     write_lerf_mask,
@@ -38,7 +39,6 @@ from tests.unit.datasets.writers.points import (
     write_room_as_scannet,
     write_street_as_waymo,
 )
-from tests.unit.datasets.writers.true_world import TrueWorld
 from tests.workflow.conftest import copy_project
 
 WORLD = WorldSettings(views=12, image_px=128, arc_deg=100, objects=3, samples=1)

@@ -5,8 +5,8 @@ with three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 p
 id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes it
 for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
 
-A frame without an image or a label, an invalid parent, or a child outside its parent causes a warning, never
-an error.
+A frame without an image or a label, an invalid parent, or a child outside its parent causes a warning.
+Missing files, invalid ids and levels, and unusable label files raise SceneError.
 """
 
 from collections.abc import Mapping
@@ -42,11 +42,7 @@ OUTSIDE_SHARE = 0.01
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene of `dataset`: one region per object; several objects may share a text.
-
-    Raises:
-        SceneError: images or labels are missing, or a label file cannot be used.
-    """
+    """Read the labels of a scene of `dataset`: one region per object; several objects may share a text."""
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
     images = images_by_view(source / "images")
@@ -71,9 +67,6 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
 
     Files whose objects have no level are read like LERF-OVS: one region per text. The photographs are the
     scene's own undistorted ones; evaluation compares the labels' size with the scene's cameras.
-
-    Raises:
-        SceneError: there are none, or a label file cannot be used.
     """
     ANNOTATED.require(root, scene)
     warnings: list[str] = []
@@ -87,11 +80,7 @@ def open_annotated(root: Path, scene: str) -> LabelledScene:
 
 
 def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, ...]:
-    """Return one region per object of a file, except for unaccepted proposals; extend `warnings`.
-
-    Raises:
-        SceneError: an id or a level cannot be used.
-    """
+    """Return one region per object of a file, except for unaccepted proposals; extend `warnings`."""
     waiting = [thing for thing in labels.objects if thing.keys.get("origin") == PROPOSED]
     if waiting:
         warnings.append(f"{labels.path.name}: proposals not accepted, left out: {len(waiting)}")
@@ -114,11 +103,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
 
 
 def by_id(labels: IsatFile) -> dict[int, IsatObject]:
-    """Return the objects of a file by `id`; without ids, the pieces of an ISAT group form one object.
-
-    Raises:
-        SceneError: an id is missing or repeated, or a level is not 1, 2 or 3.
-    """
+    """Return the objects of a file by `id`; without ids, the pieces of an ISAT group form one object."""
     objects: dict[int, IsatObject] = {}
     for row, thing in enumerate(labels.objects):
         where = f"{labels.path}, object {row} ({thing.category})"

@@ -1,7 +1,8 @@
 """LERF-Mask: three scenes of LERF with the masks of Gaussian Grouping.
 
 Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` contains
-the masks of the first, `test_mask/1` those of the second. Every mask file is named after its prompt.
+the masks of the first, `test_mask/1` those of the second. Every mask file is named after its prompt. Missing
+parts, and mask folders that don't match the test views, raise SceneError.
 """
 
 from dataclasses import replace
@@ -35,11 +36,7 @@ LAYOUT = """lerf_mask/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the test masks of a scene, such as "figurines"; pixels are read when needed.
-
-    Raises:
-        SceneError: part of the scene is missing, mask folders don't match test views, or a prompt has a dot.
-    """
+    """Read the test masks of a scene, such as "figurines"; pixels are read when needed."""
     DATASET.require(root, scene)
     folder = root / scene
     images = images_by_view(folder / "images")

@@ -3,7 +3,8 @@
 Labels are polygons. Objects of one category in one image form one region with several boxes, and a view is
 queried only for the categories labelled in it. Labels are in `label/<scene>`, beside the scenes. Images are
 matched by name, never by position: LangSplat's own evaluation uses the index of the rendering, which shifts
-if an earlier image was not registered.
+if an earlier image was not registered. A missing part, a labelled frame without an image, or an unusable
+label file raises SceneError.
 """
 
 from dataclasses import replace
@@ -39,11 +40,7 @@ LAYOUT = """lerf_ovs/
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene, such as "figurines"; masks are rasterised when needed.
-
-    Raises:
-        SceneError: a part is missing, a label file cannot be used, or a labelled frame has no image.
-    """
+    """Read the labels of a scene, such as "figurines"; masks are rasterised when needed."""
     DATASET.require(root, scene)
     images = images_by_view(root / scene / "images")
     files = label_files(root / "label" / scene)

@@ -2,7 +2,7 @@
 
 `segmentations/classes.txt` names the classes; the class index is the position in the **sorted** list. Each
 test view is a folder with one mask per class. Only the value 255 is foreground, except under protocols with
-truth `any grey`.
+truth `any grey`. A missing part, mask or image, or an unusable classes.txt, raises SceneError.
 """
 
 from pathlib import Path
@@ -42,9 +42,6 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the segmentations of a scene, such as "bed"; pixels are read when needed.
 
     The regions of a view are ordered like the sorted prompts; some may have no pixels.
-
-    Raises:
-        SceneError: part of the scene or a mask is missing, or a view has no image.
     """
     DATASET.require(root, scene)
     folder = root / scene
@@ -74,11 +71,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
-    """Return the prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first).
-
-    Raises:
-        SceneError: it is missing, empty, not a text file, or names a class twice.
-    """
+    """Return the prompts of `classes.txt`: stripped, without empty lines, sorted (capitals first)."""
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError) as error:

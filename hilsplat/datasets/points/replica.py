@@ -77,10 +77,8 @@ def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
 def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     """Return the posed images of a rendered sequence, by frame number.
 
-    Line n of the pose file is frame n; lines without an image are skipped.
-
-    Returns:
-        The images and a sentence for each item that was skipped.
+    Line n of the pose file is frame n; lines without an image are skipped. Also return a sentence for each
+    item that was skipped.
     """
     pose_file, image_folder, prefix = layout_of(folder)
     path = folder / pose_file
@@ -233,9 +231,7 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
 def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = None) -> LabelledPoints:
     """Read a mesh of the NICE-SLAM package (quads or triangles) with OpenNeRF's text files of vertex labels.
 
-    Args:
-        labels: `semantic_labels_<scene>.txt`.
-        instances: `instance_labels_<scene>.txt` (class * 1000 + instance), if available.
+    These are `semantic_labels_<scene>.txt` and, if available, `instance_labels_<scene>.txt`.
     """
     try:
         mesh = read_ply(mesh_path, 3)

@@ -108,11 +108,7 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
     640), so half a pixel is added to the centre of K.
 
-    Args:
-        every: use every n-th frame by number; lost frames are counted.
-
-    Returns:
-        The images and a sentence for each item that was skipped.
+    Every n-th frame is used, counting lost ones. Also return a sentence for each item that was skipped.
     """
     if not (folder / "color").is_dir():
         raise SceneError(

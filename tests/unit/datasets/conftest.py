@@ -9,7 +9,7 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.scene.cameras import Cameras
-from tests.unit.datasets.writers.true_world import TrueWorld
+from tests.unit.datasets.writers.labelled import TrueWorld
 
 SIZE = (24, 40)
 NAMES = tuple(f"{row:03d}.png" for row in range(4))

@@ -1,16 +1,20 @@
-"""Photographs that cannot be posed are refused with names and numbers; renders are posed."""
+"""Photographs are posed, or refused with names and numbers; lost ones are shown; EXIF gives focal lengths."""
 
 import json
 from pathlib import Path
 
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image, resize_to_fit
-from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, camera_groups, prepare_images
-from hilsplat.scene.poses import check_registration, run_poses
+from hilsplat.scene.assemble import stack_pictures
+from hilsplat.scene.colmap import pycolmap
+from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, camera_groups, exif_focal_px, prepare_images
+from hilsplat.scene.poses import MAX_ROWS, check_registration, name_neighbours, plot_lost, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import view_name, view_names
 from hilsplat.settings import PosesSettings
@@ -183,3 +187,131 @@ def test_too_few_views_and_separate_models_are_refused_as_configured(accepted, r
     check_registration(Path("photos"), "photos/test", accepted, PosesSettings(**settings))
     with pytest.raises(RegistrationError, match=f"(?s){message}"):
         check_registration(Path("photos"), "photos/test", refused, PosesSettings(**settings))
+
+
+def database_with(path, shared):
+    """A database of views a to e with that many verified matches per pair."""
+    with pycolmap.Database.open(path) as opened:
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 50.0, 40, 30)
+        camera_id = opened.write_camera(camera)
+        ids = {name: opened.write_image(pycolmap.Image(name=name, camera_id=camera_id)) for name in "abcde"}
+        for (one, other), count in shared.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.inlier_matches = np.column_stack([np.arange(count)] * 2).astype(np.uint32)
+            opened.write_two_view_geometry(ids[one], ids[other], geometry)
+
+
+def test_lost_views_belong_near_the_registered_ones_with_most_shared_matches(tmp_path):
+    database_with(tmp_path / "db", {"ab": 3, "ac": 9, "ad": 5, "ae": 7, "bc": 80})
+    views = {name: {"registered": name not in "ad"} for name in "abcde"}
+    name_neighbours(tmp_path / "db", views)
+    near = [{"view": "c", "matches": 9}, {"view": "e", "matches": 7}, {"view": "b", "matches": 3}]
+    assert views["a"]["belongs_near"] == near
+    assert views["d"]["belongs_near"] == []
+    assert "belongs_near" not in views["b"]
+
+
+def test_the_picture_has_a_row_for_each_lost_view(tmp_path):
+    write_noise(tmp_path / "images", MAX_ROWS + 3)
+
+    def size_with(lost):
+        views = {
+            f"{number}.png": {
+                "file": f"{number}.jpg",
+                "registered": number >= lost,
+                "why_not": "too few matches: none",
+                "belongs_near": [{"view": "14.png", "matches": 20}][: number % 2],
+            }
+            for number in range(MAX_ROWS + 3)
+        }
+        path = tmp_path / "lost.png"
+        path.unlink(missing_ok=True)
+        if not plot_lost(path, tmp_path / "images", {"images": MAX_ROWS + 3, "views": views}):
+            assert not path.exists()
+            return None
+        return Image.open(path).size
+
+    assert size_with(0) is None
+    width, height = size_with(1)
+    assert size_with(3) == (width, height + 2 * 210)  # 2.1 inches each, 100 dots per inch
+    assert size_with(MAX_ROWS + 2) == size_with(MAX_ROWS)
+
+
+def test_pictures_are_stacked_with_a_white_margin(tmp_path):
+    for name, size in (("upper", (6, 2)), ("lower", (4, 3))):
+        Image.new("RGB", size, (10, 20, 30)).save(tmp_path / f"{name}.png")
+    stack_pictures(tmp_path / "upper.png", tmp_path / "lower.png")
+    found = read_image(tmp_path / "upper.png")
+    assert found.shape == (5, 6, 3)
+    assert (found[2:, 4:] == 255).all()
+    assert (found[2:, :4] == (10, 20, 30)).all()
+
+
+def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
+    plane_views(tmp_path / "photos")
+    write_noise(tmp_path / "other", 1, (160, 160))
+    (tmp_path / "other/0.png").rename(tmp_path / "photos/other.png")
+    pose_photos(tmp_path / "photos", tmp_path / "scene")
+    views = json.loads((tmp_path / "scene/registration.json").read_text())["views"]
+    assert [name for name, entry in views.items() if not entry["registered"]] == ["other.png"]
+    assert views["other.png"]["belongs_near"] == []
+    assert views["other.png"]["why_not"].startswith(("too few matches", "no features"))
+    assert Image.open(tmp_path / "scene/registration.png").size[1] == 600 + 330
+    assert not (tmp_path / "not_registered.png").exists()
+
+    with pytest.raises(RegistrationError, match=r"(?s)too few photographs.*picture .*not_registered\.png"):
+        pose_photos(tmp_path / "photos", tmp_path / "strict", min_registered_share=0.9)
+    assert Image.open(tmp_path / "not_registered.png").size == (1200, 330)
+    pose_photos(tmp_path / "photos", tmp_path / "scene")  # the next success removes it
+    assert not (tmp_path / "not_registered.png").exists()
+
+
+SIZE = (400, 300)  # diagonal 500 px
+
+
+def photograph(path, size=SIZE, orientation=None, **tags):
+    """A photograph with EXIF tags: focal_35, focal, resolution (px per unit), unit, stored (width, px)."""
+    numbers = {"focal_35": 0xA405, "focal": 0x920A, "resolution": 0xA20E, "unit": 0xA210, "stored": 0xA002}
+    exif = Image.Exif()
+    if orientation:
+        exif[0x0112] = orientation
+    ifd = exif.get_ifd(0x8769)
+    for name, value in tags.items():
+        ifd[numbers[name]] = value
+    pillow_heif.register_heif_opener()
+    Image.new("RGB", size, (90, 120, 30)).save(path, exif=exif.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".heic", ".avif", ".webp", ".png", ".tif"])
+def test_the_35_mm_equivalent_is_read_from_every_format(tmp_path, suffix):
+    path = photograph(tmp_path / f"a{suffix}", focal_35=26)
+    # 26 mm on a diagonal of 43.27 mm are 26 / 43.27 of the picture's diagonal
+    assert exif_focal_px(path, (300, 400)) == pytest.approx(500 * 26 / 43.2666)
+
+
+def test_it_is_scaled_with_a_picture_that_is_shrunk_and_rotated(tmp_path):
+    path = photograph(tmp_path / "a.heic", size=(800, 600), orientation=6, focal_35=26)
+    (image,) = prepare_images([path], tmp_path / "work", max_side_px=400)
+    assert image.size_hw == (400, 300)
+    assert image.focal_px == pytest.approx(500 * 26 / 43.2666)
+
+
+@pytest.mark.parametrize(("unit", "resolution"), [(2, 2540.0), (3, 1000.0), (4, 100.0), (None, 2540.0)])
+def test_without_it_focal_length_and_sensor_resolution_are_used(tmp_path, unit, resolution):
+    """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250, in a tenth-size copy 50."""
+    tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution))} | (
+        {"unit": unit} if unit else {}
+    )
+    path = photograph(tmp_path / "a.jpg", stored=400, **tags)
+    assert exif_focal_px(path, (300, 400)) == pytest.approx(500)
+    assert exif_focal_px(path, (150, 200)) == pytest.approx(250)
+    shrunk = photograph(tmp_path / "a.jpg", stored=4000, **tags)
+    assert exif_focal_px(shrunk, (300, 400)) == pytest.approx(50)
+
+
+@pytest.mark.parametrize(
+    "tags", [{}, {"focal": IFDRational(5)}, {"focal_35": 0}, {"focal": IFDRational(1, 0)}]
+)
+def test_without_usable_tags_there_is_none(tmp_path, tags):
+    assert exif_focal_px(photograph(tmp_path / "a.jpg", **tags), (300, 400)) is None

@@ -13,8 +13,7 @@ from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.poses import run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import PosesSettings
-from tests.unit.datasets.writers.labelled import write_3d_ovs, write_lerf_mask
-from tests.unit.datasets.writers.true_world import write_sparse
+from tests.unit.datasets.writers.labelled import write_3d_ovs, write_lerf_mask, write_sparse
 
 BLACK = np.zeros((24, 40), np.uint8)
 

@@ -18,8 +18,8 @@ from hilsplat.datasets.points.replica import (
 )
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.posed_images import PosedImage
+from tests.unit.datasets.writers.labelled import flat_images
 from tests.unit.datasets.writers.points import write_ply, write_sequence
-from tests.unit.datasets.writers.true_world import flat_images
 
 # Three quads in a row, of objects 2, 1 and 3:   0--1--2--3
 #                                                4--5--6--7

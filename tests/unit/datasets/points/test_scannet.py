@@ -15,8 +15,8 @@ from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.importers.known_views import read_transforms
 from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.posed_images import write_posed_images
+from tests.unit.datasets.writers.labelled import flat_images
 from tests.unit.datasets.writers.points import write_label_table, write_ply, write_scan
-from tests.unit.datasets.writers.true_world import flat_images
 
 SCAN = "scene0000_00"
 CATEGORIES = {

@@ -89,12 +89,8 @@ def write_scan(
 ) -> None:
     """Write `scans/<scan>`: frames numbered 0, 1, ..., mesh, labels, segments and aggregation.
 
-    Args:
-        images: all share K and size, as ScanNet's do.
-        object_of_vertex: row of `objects`, -1 for none.
-        objects: raw category of each object.
-        categories: raw category -> (id, NYU40 id).
-        lost: frames that get the infinite pose of lost tracking.
+    All images share K and size. `object_of_vertex` is a row of `objects` (raw categories), -1 for none;
+    `categories` maps them to (id, NYU40 id). Frames in `lost` get the infinite pose of lost tracking.
     """
     folder = root / "scans" / scan
     for name in ("color", "pose", "intrinsic"):
@@ -148,10 +144,8 @@ def write_semantic_mesh(
 ) -> None:
     """Write `mesh_semantic.ply` and `info_semantic.json` of a scene.
 
-    Args:
-        faces: triangles; each becomes a quad whose last corner occurs twice.
-        object_of_face: row of `classes`, -1 for none. In the files objects count from 1.
-        classes: Replica's class id of each object, 0 if it has none for it.
+    Each triangle becomes a quad whose last corner occurs twice. `object_of_face` is a row of `classes` (ids,
+    0 for none), -1 for none; in the files, objects count from 1.
     """
     places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
     colours = dict.fromkeys(("red", "green", "blue"), np.full(len(xyz), 128, dtype=np.uint8))
@@ -281,7 +275,7 @@ LIDAR_AT = (1.4, 0.0, 2.2)
 LIDAR_TURN_DEG = 148.0
 """The lidar is mounted turned, as Waymo's is: columns are counted from the vehicle's back all the same."""
 AZIMUTH_STEPS, BEAMS = 400, 64
-"""Directions per turn of the scan, and evenly spaced beams: columns and rows of the range images."""
+"""Columns and rows of the range images: directions per revolution, and evenly spaced beams."""
 FRAME_MICROS = 100_000
 
 
