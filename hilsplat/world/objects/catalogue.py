@@ -136,7 +136,7 @@ def build_object(name: str, rng: np.random.Generator) -> ObjectModel:
     """Draw an object of a tabletop class with random sizes, colours and materials.
 
     Raises:
-        SceneError: if there is no such class, also from the other `build` functions.
+        SceneError: if there is no such class (from the other `build` functions too).
     """
     return _drawn(name, _TABLETOP, "object class", rng)
 
