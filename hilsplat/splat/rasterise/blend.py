@@ -13,9 +13,9 @@ its own slot for the sums, so the result does not depend on the distribution of 
 
 Alpha is one more channel, of colour 1: the image's alpha is the sum of the weights.
 
-Arguments shared by the kernels: tiles begin..end of a row-major grid with `tiles_x` per row; `lists` is
-base, tiles_x, tile_start, tile_end, gaussian, reach, and the list of tile t is
-gaussian[tile_start[t] - base : tile_end[t] - base]; geometry as written by `project`.
+Arguments shared by the kernels: tiles begin..end of a row-major grid with `tiles_x` per row; the list
+of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geometry as written by
+`project`.
 """
 
 from typing import no_type_check
@@ -132,8 +132,10 @@ def _shine(exponent, light):
 def weigh(block, first, count, reach, records, shades, width, transmittance, entries, weights):
     """Compute the weights of a chunk's Gaussians that reach a block, front to back.
 
-    The chunk is entries first..first + count of the band; channels of Gaussian k start at shades[k * width].
-    Outputs are `entries`, each Gaussian's position in the chunk, and `weights`, its 16 weights.
+    Args:
+        first, count: entries of the chunk in the band.
+        shades: channels; those of Gaussian k start at k * width.
+        entries, weights: outputs: each Gaussian's position in the chunk, and its 16 weights.
 
     Returns:
         number of Gaussians processed before all pixels were finished, and the sums of the first 4 channels.
@@ -177,9 +179,8 @@ def _add_group(sums, at, one, two, three, four):
 
 @compiled
 @no_type_check
-def blend(begin, end, lists, geometry, colours, image, alpha):
+def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geometry, colours, image, alpha):
     """Blend tiles: write premultiplied channels to image (H, W, C) and coverage to alpha (H, W)."""
-    base, tiles_x, tile_start, tile_end, gaussian, reach = lists
     height, width, channels = image.shape
     per_gaussian = (channels + GROUP) // GROUP * GROUP
     stride = LANES * per_gaussian
@@ -197,17 +198,26 @@ def blend(begin, end, lists, geometry, colours, image, alpha):
             alive = unfinished(transmittance)
             if alive == 0:
                 break
-            first, count = chunk - base, min(tile_end[tile] - chunk, CHUNK)
-            gather(first, count, x0, y0, gaussian, geometry, records)
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for k in range(count):
-                i = gaussian[first + k]
+                i = gaussian[chunk - base + k]
                 for channel in range(channels):
                     shades[k * per_gaussian + 1 + channel] = colours[i, channel]
             for block in range(BLOCKS):
                 if not (alive >> block) & 1:
                     continue
                 done, one, two, three, four = weigh(
-                    block, first, count, reach, records, shades, per_gaussian, transmittance, entries, weights
+                    block,
+                    chunk - base,
+                    count,
+                    reach,
+                    records,
+                    shades,
+                    per_gaussian,
+                    transmittance,
+                    entries,
+                    weights,
                 )
                 _add_group(sums, block * stride, one, two, three, four)
                 for group in range(GROUP, per_gaussian, GROUP):
@@ -261,14 +271,28 @@ def _load_gradients(x0, y0, stride, size, flats, grads, to_come):
 @compiled
 @no_type_check
 def blend_backward(
-    begin, end, lists, geometry, colours, image, alpha, grad_image, grad_alpha, slots, columns
+    begin,
+    end,
+    base,
+    tiles_x,
+    tile_start,
+    tile_end,
+    gaussian,
+    reach,
+    geometry,
+    colours,
+    image,
+    alpha,
+    grad_image,
+    grad_alpha,
+    slots,
+    columns,
 ):
     """Compute the gradient of `blend`, in one slot of `columns` numbers per list entry.
 
     A slot contains the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; slots
     behind finished pixels are zero.
     """
-    base, tiles_x, tile_start, tile_end, gaussian, reach = lists
     height, width, channels = image.shape
     transmittance = aligned(PIXELS)
     to_come = aligned(PIXELS)
@@ -283,13 +307,13 @@ def blend_backward(
         _load_gradients(x0, y0, stride, image.shape, flats, grads, to_come)
         alive = unfinished(transmittance)
         for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
-            first, count = chunk - base, min(tile_end[tile] - chunk, CHUNK)
+            count = min(tile_end[tile] - chunk, CHUNK)
             if alive == 0:
-                slots[first * columns : (first + count) * columns] = 0.0
+                slots[(chunk - base) * columns : (chunk - base + count) * columns] = 0.0
                 continue
-            gather(first, count, x0, y0, gaussian, geometry, records)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for k in range(count):
-                slot = first + k
+                slot = chunk - base + k
                 bits = np.int64(reach[slot]) & alive
                 if bits == 0:
                     for column in range(columns):

@@ -141,8 +141,8 @@ class Band:
     lists: tuple[Any, ...]  # base, tiles_x, tile_start, tile_end, gaussian, reach
 
     def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
-        """Call `work(begin, end, lists, *arguments)` over ranges that cover the band's tiles, on threads."""
-        over_ranges(work, self.end - self.begin, threads, self.lists, *arguments, first=self.begin)
+        """Call `work(begin, end, *lists, *arguments)` over ranges that cover the band's tiles, on threads."""
+        over_ranges(work, self.end - self.begin, threads, *self.lists, *arguments, first=self.begin)
 
 
 def tile_lists(view: Projected, threads: int) -> Iterator[Band]:
@@ -215,7 +215,7 @@ def blend_gradients(
     tables = map(np.ascontiguousarray, (p.means, p.log_scales, p.quats, p.sh))
     known = (*tables, view.degree, view.camera, view.geometry, sums)
     outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
-    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, outputs)
+    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, *outputs)
     return out
 
 

@@ -384,13 +384,29 @@ def _axis_backward(camera, scale, i, j, k, shared):
 
 @compiled
 @no_type_check
-def project_backward(begin, end, means, log_scales, quats, sh, degree, camera, geometry, sums, outputs):
+def project_backward(
+    begin,
+    end,
+    means,
+    log_scales,
+    quats,
+    sh,
+    degree,
+    camera,
+    geometry,
+    sums,
+    grad_means,
+    grad_log_scales,
+    grad_quats,
+    grad_opacity_logits,
+    grad_sh,
+    grad_means_px,
+):
     """Compute gradients of groups begin..end of 16 Gaussians from rows of `sums`: moments and dL/dcolours.
 
-    `outputs` are overwritten, with zeros for Gaussians that are not drawn: gradients of means, log scales,
-    quaternions, opacity logits, harmonics and projected means (px).
+    The outputs are overwritten, with zeros for Gaussians that are not drawn. `grad_means_px` is
+    dL/d(projected mean), per pixel.
     """
-    grad_means, grad_log_scales, grad_quats, grad_opacity_logits, grad_sh, grad_means_px = outputs
     fx, fy = camera[12], camera[13]
     rows, columns = aligned(LANES * ROW), aligned(LANES * ROW)
     basis, pulls = aligned(16 * LANES), aligned(16 * LANES)

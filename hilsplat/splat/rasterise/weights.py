@@ -35,9 +35,10 @@ def _place(pixel):
 
 @compiled
 @no_type_check
-def count_weights(begin, end, lists, size_hw, geometry, least, counts):
+def count_weights(
+    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts
+):
     """Count the weights >= `least` of each pixel (row-major) of tiles begin..end."""
-    base, tiles_x, tile_start, tile_end, gaussian, reach = lists
     height, width = size_hw
     transmittance, found = aligned(PIXELS), np.empty(PIXELS, np.int64)
     records = aligned(CHUNK * RECORD)
@@ -48,11 +49,11 @@ def count_weights(begin, end, lists, size_hw, geometry, least, counts):
         for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
             if unfinished(transmittance) == 0:
                 break
-            first, count = chunk - base, min(tile_end[tile] - chunk, CHUNK)
-            gather(first, count, x0, y0, gaussian, geometry, records)
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for block in range(BLOCKS):
                 done = weigh(
-                    block, first, count, reach, records, records, 0, transmittance, entries, by_lane
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
                 )[0]
                 for n in range(done):
                     for lane in range(LANES):
@@ -66,9 +67,24 @@ def count_weights(begin, end, lists, size_hw, geometry, least, counts):
 
 @compiled
 @no_type_check
-def write_weights(begin, end, lists, size_hw, geometry, least, longest, row_start, columns, weights):
+def write_weights(
+    begin,
+    end,
+    base,
+    tiles_x,
+    tile_start,
+    tile_end,
+    gaussian,
+    reach,
+    size_hw,
+    geometry,
+    least,
+    longest,
+    row_start,
+    columns,
+    weights,
+):
     """Write the columns and weights of rows counted by `count_weights`, at most `longest` in each."""
-    base, tiles_x, tile_start, tile_end, gaussian, reach = lists
     height, width = size_hw
     transmittance, size_of = aligned(PIXELS), np.empty(PIXELS, np.int64)
     records = aligned(CHUNK * RECORD)
@@ -83,14 +99,14 @@ def write_weights(begin, end, lists, size_hw, geometry, least, longest, row_star
         for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
             if unfinished(transmittance) == 0:
                 break
-            first, count = chunk - base, min(tile_end[tile] - chunk, CHUNK)
-            gather(first, count, x0, y0, gaussian, geometry, records)
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for block in range(BLOCKS):
                 done = weigh(
-                    block, first, count, reach, records, records, 0, transmittance, entries, by_lane
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
                 )[0]
                 for n in range(done):
-                    rows[n] = gaussian[first + entries[n]]
+                    rows[n] = gaussian[chunk - base + entries[n]]
                 for lane in range(LANES if done else 0):
                     pixel = block * LANES + lane
                     at = pixel * room + size_of[pixel]
@@ -103,12 +119,12 @@ def write_weights(begin, end, lists, size_hw, geometry, least, longest, row_star
             x, y = _place(pixel)
             if x0 + x >= width or y0 + y >= height:
                 continue
-            place, size = pixel * room, size_of[pixel]
-            _rank(held, place, size, rank)
+            first, size = pixel * room, size_of[pixel]
+            _rank(held, first, size, rank)
             start = row_start[(y0 + y) * width + x0 + x]
             for k in range(size):
                 at = start + np.int64(rank[k])
-                columns[at], weights[at] = held_columns[place + k], held_weights[place + k]
+                columns[at], weights[at] = held_columns[first + k], held_weights[first + k]
 
 
 @compiled(inline="always")
