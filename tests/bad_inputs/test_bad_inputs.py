@@ -160,8 +160,7 @@ ROWS = {
     "masks without their arrays": row(
         lambda: write_npz(MASKS / "000.png.npz", other=np.zeros(1)),
         COVERAGE,
-        "000.png.npz lacks",
-        "runs",
+        "000.png.npz lacks size_hw",
         f"--forcerun {MASKS}",
     ),
     "an index whose views are a list": row(
