@@ -68,10 +68,8 @@ def evaluate(
     against: dict[str, Any] = {"truth": truth, "labels": labels or (), "data_root": data_root}
     named = {"dataset": dataset, "scene": name, "variant": variant, "kind": kind}
     read, readers = _truth_inputs(**against)
-    inputs, beside = (
-        {**parts.as_inputs(), **read},
-        (out.with_name("times.csv"), out.with_name("instances.npz")),
-    )
+    inputs = {**parts.as_inputs(), **read}
+    beside = (out.with_name("times.csv"), out.with_name("instances.npz"))
     with stage(
         "evaluate", out, settings=section, threads=threads, inputs=inputs, plugins=readers, beside=beside
     ) as run:
