@@ -138,6 +138,8 @@ def stage(
     except Exception as error:  # unless it is a system error, a bug of ours: log the traceback
         if (problem := system_error(error)) is not None:
             raise problem from error
+        if sys.gettrace() is not None:  # post-mortem of a debugger
+            raise
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
 

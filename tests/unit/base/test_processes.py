@@ -6,13 +6,14 @@ import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from hilsplat.base.processes import in_own_process, in_processes
+from hilsplat.base.processes import in_order, in_own_process, in_processes
 
 
 def square(base: int, number: int) -> tuple[int, int]:
@@ -113,3 +114,13 @@ def test_a_library_that_ends_its_process_raises_an_error():
         in_own_process(os.abort)
     with pytest.raises(ZeroDivisionError):
         in_own_process(divmod, 1, 0)
+
+
+def test_under_a_debugger_items_are_computed_in_the_main_thread():
+    before = sys.gettrace()
+    sys.settrace(lambda *_: None)
+    try:
+        threads = set(in_order(lambda _: threading.get_ident(), range(3), 2))
+    finally:
+        sys.settrace(before)
+    assert threads == {threading.get_ident()}
