@@ -31,8 +31,8 @@ from hilsplat.models.int8 import (
     CHECKED_CROPS,
     WORDS,
     agreement_of_vectors,
+    considers_int8,
     int8_network,
-    may_be_int8,
     use_int8,
 )
 from hilsplat.models.memory import available_mib, needs_of
@@ -160,7 +160,7 @@ def _choose_precision(
     threads: int,
 ) -> None:
     """Switch the model to int8 if the settings require it or it agrees with float32 on crops of the scene."""
-    if settings.precision == "fp32" or not may_be_int8(model.model):
+    if not considers_int8(settings.precision, model.model):
         return
     entries = read_index(masks_folder)["views"]
     rows = chosen or {view: np.arange(entries[view]["whole"]) for view in digests}

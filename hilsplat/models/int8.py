@@ -39,6 +39,13 @@ def may_be_int8(model: ModelFolder) -> bool:
     return execution_providers()[0] == "CPUExecutionProvider" and not model.config.get("world_only")
 
 
+def considers_int8(precision: str, model: ModelFolder) -> bool:
+    """Return whether to compare int8 with float32; log a warning if int8 is required but unavailable."""
+    if precision == "int8" and not may_be_int8(model):
+        logger.warning("%s runs in float32: int8 needs a pretrained model on a CPU", model.folder)
+    return precision != "fp32" and may_be_int8(model)
+
+
 def int8_network(
     model: ModelFolder, name: str, cache: Path, graph: bytes | None = None, exact: Sequence[str] = ()
 ) -> Network:

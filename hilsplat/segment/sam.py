@@ -22,7 +22,7 @@ from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import Level
 from hilsplat.base.processes import in_order
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
-from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, int8_network, may_be_int8, use_int8
+from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
 from hilsplat.models.network import Network, execution_providers, require_three_heads
 from hilsplat.models.onnx_graph import with_rowwise_attention
@@ -142,7 +142,7 @@ class SamModel:
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
         """Use int8 if `masks.precision` requires it, or if its masks of these images agree with float32's."""
-        if precision == "fp32" or not may_be_int8(self.model):
+        if not considers_int8(precision, self.model):
             return
         quantised = self.int8_encoder(cache)
         grid = point_grid(CHECKED_GRID)

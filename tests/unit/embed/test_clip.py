@@ -14,6 +14,8 @@ from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
 from hilsplat.embed.model_check import check_model
 from hilsplat.embed.stage import chosen_masks, run_clip
+from hilsplat.models.folder import open_model_folder
+from hilsplat.models.int8 import considers_int8
 from hilsplat.models.network import Network
 from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
@@ -209,6 +211,13 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     assert read_index(tmp_path / "full")["precision"] == "fp32"
     same = sha256_of_path(tmp_path / "auto") == sha256_of_path(tmp_path / "full")
     assert same == (precision == "fp32")
+
+
+def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(project, caplog):
+    embedded = open_model_folder(project / "models/clip-tiny")
+    assert not considers_int8("auto", embedded) and not caplog.text
+    assert not considers_int8("int8", embedded)
+    assert "clip-tiny runs in float32: int8 needs a pretrained model" in caplog.text
 
 
 def with_another_view(masks: Path) -> None:
