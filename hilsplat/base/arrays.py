@@ -19,7 +19,7 @@ from hilsplat.base.artifacts import atomic_path, parse_json, read_npz, remake
 from hilsplat.base.errors import ArtifactError
 
 Made = TypeVar("Made")
-Limits = Mapping[str, tuple[int | float, int | float]]  # array name -> smallest and largest allowed value
+Limits = Mapping[str, tuple[int | float, int | float]]  # array name -> minimum and maximum
 
 
 def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
@@ -63,7 +63,7 @@ def described(declared: type[AbstractArray]) -> str:
 
 
 def read_into(maker: type[Made], path: Path, limits: Limits | None = None, **more: Any) -> Made:
-    """Create a dataclass instance from the arrays of an .npz file and further fields, `more`.
+    """Create a dataclass instance from the arrays of an .npz file and the other fields, `more`.
 
     Raises:
         ArtifactError: the file is missing, damaged or written by another version of the program, or an array
@@ -83,9 +83,9 @@ def made(
     expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
     if {*arrays, *more} != expected:
         raise ArtifactError(
-            f"{path} is of another version",
+            f"{path} was written by another version",
             expected=", ".join(sorted(expected - set(more))),
-            found=", ".join(sorted(arrays)) or "no array",
+            found=", ".join(sorted(arrays)) or "no arrays",
             fix=remake(path),
         )
     require_types(maker, arrays, path, limits or {})

@@ -42,7 +42,7 @@ def remake(path: Path) -> str:
     """Return the command that rebuilds an artifact, given the artifact or a file in it."""
     places = [place for place in (Path(path), *Path(path).parents) if provenance_path(place).is_file()]
     if not places:
-        return "run the stage that writes it again"
+        return "rerun the stage that writes it"
     place = places[0] / "images" if places[0].name == "world" else places[0]  # its rule declares two folders
     parts = place.parts  # Snakemake identifies files by their paths relative to the project
     start = len(parts) - 1 - parts[::-1].index("results") if "results" in parts else 0
@@ -53,7 +53,7 @@ def remake(path: Path) -> str:
 def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary file that replaces `path` when the block ends without error.
 
-    A `durable` file is flushed to the disk, to survive a power failure. Raise DiskSpaceError if it is full.
+    A `durable` file is flushed to disk, to survive a power failure. A full disk raises DiskSpaceError.
     """
     path = Path(path)
     if is_unfinished(path):  # the file is in a hidden folder that is flushed to the disk later
@@ -124,7 +124,7 @@ def _flush(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # file systems such as 9p have no such operation for folders
+        if error.errno != errno.EINVAL:  # file systems such as 9p cannot flush folders
             raise
     finally:
         os.close(descriptor)
@@ -147,17 +147,17 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""Parts of the messages of C++ and Rust libraries with their own error types: safetensors, SQLite."""
+"""Parts of messages from C++ and Rust libraries with their own error types: safetensors, SQLite."""
 
 FULL_BELOW_MIB = 1.0
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
 """Free space below which errors of C++ libraries, and of libraries that end their process, are attributed to
-a full disk: COLMAP does not report one."""
+a full disk: COLMAP does not report full disks."""
 
 
 @contextmanager
 def explain_full_disk(path: Path) -> Iterator[None]:
-    """Raise DiskSpaceError, with disk and fix, for an error caused by a full disk while `path` is written."""
+    """Raise DiskSpaceError, with disk and fix, if writing `path` fails because the disk is full."""
     try:
         yield
     except HilsplatError:
@@ -194,7 +194,7 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
             f"too little space on the disk of {folder}",
             expected=f"at least {needed_mib:.0f} MiB free",
             found=f"{free_mib:.0f} MiB free",
-            fix="free space, or keep this folder on another disk (a symbolic link will do)",
+            fix="free space, or move this folder to another disk (a symbolic link suffices)",
         )
 
 
@@ -248,8 +248,8 @@ def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durabl
         zipfile.ZipFile(temporary, "w", method, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # Entries opened by name get the time stamp 1980-01-01. They are written in pieces, because memory
-            # may not have space for a copy of a large array or its compressed form.
+            # Entries opened by name get the time stamp 1980-01-01. They are written in pieces, because a
+            # copy of a large array or its compressed form may not fit into memory.
             large = array.nbytes > ZIP64_BYTES
             with archive.open(f"{name}.npy", "w", force_zip64=large) as stream:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
@@ -261,11 +261,11 @@ def read_npz(path: Path, *needed: str) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         if any(isinstance(array, bytes) for array in arrays.values()):  # numpy found no header
-            raise ValueError("it contains other data than arrays")
+            raise ValueError("it contains data other than arrays")
     if lacking := [name for name in needed if name not in arrays]:
         raise ArtifactError(
             f"{path} lacks {', '.join(lacking)}",
-            found=", ".join(sorted(arrays)) or "no array",
+            found=", ".join(sorted(arrays)) or "no arrays",
             fix=remake(path),
         )
     return arrays
@@ -287,7 +287,7 @@ def read_npy(path: Path) -> np.ndarray:
 
 
 def sha256_of_bytes(*parts: bytes) -> str:
-    """Return the SHA-256 of the parts, each preceded by its length so that the boundaries count."""
+    """Return the SHA-256 of the parts, each preceded by its length so that boundaries matter."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
@@ -306,7 +306,7 @@ def sha256_of_file(path: Path) -> str:
 
 
 def sha256_of_path(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the names and bytes of a folder's files that are not hidden."""
+    """Return the SHA-256 of a file, or of the names and bytes of a folder's non-hidden files."""
     path = Path(path)
     if path.is_file():
         return sha256_of_file(path)
@@ -333,7 +333,7 @@ def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
 
 
 SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
-"""Files of an artifact whose checksums are in its index."""
+"""Suffixes of the files whose checksums are in an artifact's index."""
 
 
 def read_index(folder: Path) -> dict[str, Any]:
@@ -357,7 +357,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
         raise ArtifactError(
-            f"{path} is not the index of an artifact, or is of another version", fix=remake(path)
+            f"{path} is not an artifact index, or was written by another version", fix=remake(path)
         )
     if index.pop("seal") != _seal(index):
         raise _changed(path)
@@ -401,7 +401,7 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
     index = read_index(folder)
     if missing := [entry for entry in entries if entry not in index]:
         raise ArtifactError(
-            f"{folder} is of another version",
+            f"{folder} was written by another version",
             expected=f"{', '.join(missing)} in {INDEX}",
             fix=remake(Path(folder)),
         )
@@ -409,13 +409,13 @@ def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
 
 
 class ViewCache:
-    """Finished views of a stage, as .npz files outside its output, so that a rerun after a kill reuses them.
+    """Finished views of a stage, as .npz files outside its output; the rerun of a killed stage reuses them.
 
     Keys must cover all inputs of the result: the digests of image, model and code, and the settings.
 
     Args:
         folder: such as `results/.cache/masks`.
-        compressed: floating-point numbers shrink little, and compression takes time.
+        compressed: compress entries; not useful for floating-point numbers, which shrink little.
     """
 
     def __init__(self, folder: Path, *, compressed: bool = True) -> None:

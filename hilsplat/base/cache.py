@@ -11,11 +11,11 @@ VIEW_CACHES = ("masks", "clip", "contributions")
 """Caches of finished views: a missing entry costs time but does not change a result."""
 
 CHECKPOINTS, FIT_DAYS = "gaussians", 1.0
-"""Cache of the fits' checkpoints, and the age below which one is kept: its fit may still be running."""
+"""Cache of fit checkpoints, and the age below which a checkpoint is kept: its fit may still be running."""
 
 
 def caches(folder: Path) -> dict[str, list[Path]]:
-    """Return the complete entries of each cache in a cache folder, by name of its folder or single file."""
+    """Return the complete entries of each cache in a cache folder, by name of its folder or file."""
     places = sorted(Path(folder).glob("[!.]*"))
     return {place.name: visible_files(place) if place.is_dir() else [place] for place in places}
 
@@ -38,7 +38,7 @@ def prune_cache(
     Args:
         stages: caches to prune; an empty list selects the view caches and, with `days`, the checkpoints.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until at most this much is left. Without limits, no entry is deleted.
+        max_mib: then delete entries until at most this much is left. Without limits, no entries are deleted.
 
     Returns:
         Number of deleted entries, and their size in MiB.
@@ -46,7 +46,7 @@ def prune_cache(
     known = (*VIEW_CACHES, CHECKPOINTS)
     if unknown := sorted(set(stages) - set(known)):
         raise HilsplatError(
-            f"no stage with a cache to prune is called {', '.join(unknown)}",
+            f"unknown cache: {', '.join(unknown)}",
             expected=f"one of {', '.join(known)}",
         )
     # The cache is in the results folder, where killed jobs leave unfinished files beside their outputs.

@@ -35,7 +35,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 class _Stamp:
     """Digest of the imported code that a loop is compiled from, computed when numba first opens its cache.
 
-    It is falsy if the package was edited after the import: numba then neither reads nor writes the cache.
+    It is falsy if the package was edited since its import: numba then neither reads nor writes the cache.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -61,7 +61,7 @@ class _Stamp:
 
 
 class _Notice(event.Listener):
-    """Log message, once, that loops are compiled; loops read from the cache raise no event."""
+    """Listener that logs once that loops are being compiled; loops loaded from the cache raise no event."""
 
     given = False
 
@@ -69,7 +69,7 @@ class _Notice(event.Listener):
         module = happening.data["dispatcher"].py_func.__module__ or ""
         if not self.given and module.split(".")[0] == PACKAGE:
             self.given = True
-            logger.info("compiling kernels, once: about 15 s; later runs load them from disk")
+            logger.info("compiling kernels, which takes about 15 s; later runs load them from disk")
 
     def on_end(self, happening: Any) -> None:
         pass

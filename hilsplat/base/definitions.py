@@ -129,7 +129,7 @@ def _imports(node: ast.stmt, package: str) -> dict[str, Import]:
         parent = parents[: len(parents) - node.level + 1]
         base = ".".join([*parent, *([base] if base else [])])
     if any(alias.name == "*" for alias in node.names) and base.split(".")[0] == PACKAGE:
-        raise HilsplatError(f"a star import of {base} in {package} hides what is used", fix="name the names")
+        raise HilsplatError(f"a star import of {base} in {package} hides the names used", fix="list them")
     return {alias.asname or alias.name: Import(base, alias.name) for alias in node.names}
 
 

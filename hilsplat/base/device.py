@@ -17,7 +17,7 @@ def is_installed(distribution: str) -> bool:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Make torch sum in a fixed order: results are the same bytes for any number of the stage's threads.
+    """Make torch sum in a fixed order, so that results do not depend on the stage's number of threads.
 
     torch stores its thread count per thread, so each thread of a pool must enter this context itself.
     """

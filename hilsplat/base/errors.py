@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class HilsplatError(Exception):
-    """Error that a file, a setting or a user causes; commands print it without a traceback and exit with 1.
+    """Error caused by a file, a setting or a user; commands print it without a traceback and exit with 1.
 
     The message is one sentence that names the file, scene, view or key.
     """
@@ -31,7 +31,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
     if isinstance(error, MemoryError) or by_library:
         return HilsplatError(
             f"there is not enough memory: {error or 'an allocation failed'}",
-            fix="end other programs, raise the limit (ulimit -v), or use smaller or fewer images",
+            fix="close other programs, raise the limit (ulimit -v), or use smaller or fewer images",
         )
     problem = PLACES.get(error.errno or 0) if isinstance(error, OSError) else None
     if problem is None or not isinstance(error, OSError):
@@ -39,7 +39,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
     return HilsplatError(
         f"{error.filename or 'standard output, or an open file,'} {problem}",
         found=error.strerror,
-        fix="choose another place, or free this one",
+        fix="correct the problem, or choose another path",
     )
 
 
@@ -54,7 +54,7 @@ def require_working_directory() -> None:
 
 
 NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/load shared object")
-"""Parts of the messages of libraries that cannot start a thread or be loaded within `ulimit -v`."""
+"""Parts of error messages if `ulimit -v` prevents a library from starting a thread or being loaded."""
 
 PLACES = {
     errno.EACCES: "cannot be read or written: permission denied",
@@ -96,7 +96,7 @@ class ModelError(HilsplatError):
 
 
 class DownloadError(HilsplatError):
-    """A model cannot be downloaded: the hub is unreachable, refuses, or sent bytes with a wrong digest."""
+    """A model cannot be downloaded: the hub is unreachable, denies access, or sent a wrong file."""
 
 
 class ArtifactError(HilsplatError):
@@ -108,7 +108,7 @@ class MisalignedArtifactError(ArtifactError):
 
 
 class EmptyMaskError(HilsplatError):
-    """A mask has no pixel where at least one is needed."""
+    """A mask contains no pixels where at least one is required."""
 
 
 class DiskSpaceError(HilsplatError):
@@ -116,4 +116,4 @@ class DiskSpaceError(HilsplatError):
 
 
 class DeviceError(HilsplatError):
-    """This machine does not have the device that the settings name."""
+    """This machine does not have the device selected in the settings."""

@@ -37,7 +37,7 @@ _PARSING = threading.Lock()
 
 Code = str | Callable[..., Any]
 Key = tuple[str, str]
-"""Module and name of a definition; an empty name stands for the statements that importing the module runs."""
+"""Module and name of a definition; an empty name stands for the statements run by importing the module."""
 
 
 def code_digest(*roots: Code, root: Path = ROOT) -> str:
@@ -168,7 +168,7 @@ def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
         elif name in module_of(source, root).bindings:
             follow(source, (name,))
         else:
-            raise HilsplatError(f"{module} uses {name!r} of {source}, which does not define it")
+            raise HilsplatError(f"{module} uses {name!r} from {source}, which does not define it")
         return f"{source}.{name}"
 
     for place in roots:

@@ -20,13 +20,13 @@ DEEP_MAX = 65535  # largest value of a 16-bit channel; 257 of its steps equal on
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image with Pillow, which reads HEIF (.heic) with the library pillow-heif.
+    """Open an image with Pillow, which reads HEIF (.heic) through pillow-heif.
 
-    Size and EXIF data are read at once, pixels are decoded on demand. A HEIF image is returned upright: its
-    rotation is part of the format, and its EXIF orientation is reset.
+    Size and EXIF data are read immediately; pixels are decoded on demand. A HEIF image is returned upright:
+    its rotation is part of the format, and its EXIF orientation is reset.
 
     Raises:
-        ImageError: its header specifies more pixels than a photograph has.
+        ImageError: the header specifies more pixels than a photograph can have.
     """
     _register_heif()
     try:
@@ -52,7 +52,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image as upright sRGB.
 
     The EXIF orientation is applied. Colours with an embedded profile (Display P3 from phones, Adobe RGB) and
-    CMYK are converted, alpha is dropped, grey is repeated, and 16 bits per channel are rounded to 8.
+    CMYK are converted, alpha is dropped, grey is copied to all channels, and 16 bits become 8.
 
     Raises:
         ImageError: the file is missing, empty, truncated or not an image.
@@ -86,7 +86,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def _frames(image: Image.Image) -> int:
-    """Return the number of animation frames; previews and a phone's additional pictures do not count."""
+    """Return the number of animation frames; previews and a phone's additional pictures are not counted."""
     num_frames = int(getattr(image, "n_frames", 1))
     if num_frames < 2 or image.format in ("MPO", "HEIF"):
         return 1
@@ -98,7 +98,7 @@ def _frames(image: Image.Image) -> int:
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
-    """Convert to sRGB with the embedded profile; if it is missing or damaged, assume that pixels are sRGB."""
+    """Convert to sRGB with the embedded profile; if it is missing or damaged, assume sRGB pixels."""
     profile = image.info.get("icc_profile")
     if profile and image.mode in ("RGB", "RGBA", "CMYK"):
         colours = image.convert("RGB") if image.mode == "RGBA" else image

@@ -23,12 +23,12 @@ WIDE_COLUMNS = 2 * WIDTH if _HAS_AVX512 else WIDTH  # rows and columns whose sum
 def rows_of_products(rows: int) -> Any:
     """Return a function that computes y[r, c] = sum over k of a[r, k] x[k, c] for a fixed number of rows.
 
-    Each number of `x` is loaded once for all rows, and each of `a` once for all columns. Sums are in the
-    order of k. A plain numba loop would spill this many sums to memory.
+    Each element of `x` is loaded once for all rows, and each element of `a` once for all columns. Terms are
+    added in the order of k. A plain numba loop would spill this many sums to memory.
 
     Returns:
         a numba function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide): flat float32
-        arrays, each with the index of its first number and the step from row to row; the number of products;
+        arrays, each with the index of its first element and the step between rows; the number of products;
         whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
     """
 

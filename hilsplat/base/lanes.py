@@ -29,7 +29,7 @@ _INTS = ir.VectorType(_INT, WIDTH)
 # A product and a sum may be fused into one operation with one rounding; reordering is not allowed.
 _FLAGS = ("contract",)
 _RECIPROCAL_BITS = 0x7EF311C7
-"""Twice the exponent bits of 1, minus a correction that balances the first guess's errors on both sides."""
+"""Twice the exponent bits of 1, minus a correction that balances errors of both signs in the first guess."""
 _MASKED_STORE = f"llvm.masked.store.v{WIDTH}f32.p0"
 
 
@@ -106,7 +106,7 @@ def _is_flat(array: Any) -> bool:
 @compiled
 @no_type_check
 def aligned(count):
-    """Allocate float32 numbers from the start of a cache line, so that no vector spans two lines."""
+    """Allocate a float32 array that starts at a cache line, so that no vector spans two lines."""
     room = np.empty(count + WIDTH, np.float32)
     skip = (-(room.ctypes.data // 4)) % WIDTH
     return room[skip : skip + count]
@@ -137,7 +137,7 @@ def load(typingctx, array, index):
 
 @intrinsic
 def load_same(typingctx, array, index):
-    """Load one number of a flat array into all lanes; the index must not be negative."""
+    """Load one element of a flat array into all lanes; the index must not be negative."""
     if not _is_flat(array):
         return None
 
@@ -368,7 +368,7 @@ def store_sums(typingctx, array, index, vectors):
 
 
 def _halved(builder: ir.IRBuilder, vector: ir.Value, combine: Any) -> ir.Value:
-    """Combine the lower and the upper half of a vector until one number is left, in a fixed order."""
+    """Combine the two halves of a vector repeatedly until one number is left, in a fixed order."""
     width = WIDTH
     while width > 1:
         width //= 2
@@ -404,7 +404,7 @@ def lane_max(typingctx, value):
 def transpose(typingctx, source, source_index, source_step, target, target_index, target_step):
     """Transpose a 16 x 16 block while copying it between flat float32 arrays.
 
-    Each array is followed by the index of the block's first number and the step from row to row.
+    Each array is followed by the index of the block's first element and the step between rows.
     """
 
     def codegen(context, builder, sig, args):

@@ -8,7 +8,7 @@ Part = TypeVar("Part")
 
 
 def load(place: str) -> Any:
-    """Import what "module:name" or "module" names."""
+    """Import the object named by "module:name" or "module"."""
     module, _, name = place.partition(":")
     found = importlib.import_module(module)
     return getattr(found, name) if name else found

@@ -34,8 +34,8 @@ PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 def end_with_parent(parent: int) -> None:
     """Kill this process as soon as the process that started it ends for any reason.
 
-    Otherwise the jobs of a killed Snakemake would continue, and write outputs with old settings during the
-    next run. Linux kills the process if no shell is in between; otherwise a thread checks every second.
+    Otherwise jobs of a killed Snakemake process would continue, and write outputs with old settings during
+    the next run. Linux kills the process if no shell is in between; otherwise a thread checks every second.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -52,7 +52,7 @@ def _watch(parent: int) -> None:
 
 
 def end_with_workflow() -> None:
-    """End this process with the Snakemake that started it; do nothing if a user started the command."""
+    """End this process with the Snakemake process that started it, if any."""
     parent = os.environ.pop(PARENT, "")  # popped, because the children of this process have another parent
     if parent.isdecimal():
         end_with_parent(int(parent))
@@ -80,7 +80,7 @@ def is_unfinished(path: Path) -> bool:
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """Create a folder for unfinished files, and delete it at the end.
 
-    A locked file in it shows `remove_leftovers` that the writer is alive: the system releases the lock when
+    A locked file in it tells `remove_leftovers` that the writer is alive: the system releases the lock when
     the writer ends, even if it is killed. Process ids have no meaning in other containers and after a reboot.
     The folder itself is not locked, because NFS locks only files.
     """
@@ -112,7 +112,7 @@ def _discard(folder: Path, lock: IO[bytes]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete the unfinished files below a folder that dead processes of this host left; return their folders.
+    """Delete unfinished files that dead processes of this host left below a folder; return their folders.
 
     Files of live processes, including those in other containers, are kept. So are files of other hosts that
     share the folder, because their locks may be invisible here.
@@ -125,7 +125,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
                 continue
             path = Path(place) / name
             with suppress(BlockingIOError, FileNotFoundError, PermissionError):
-                with (path / LOCK).open("ab") as stream:  # created if missing: a writer may be about to do so
+                with (path / LOCK).open("ab") as stream:  # created if missing, as a writer may be about to
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     _discard(path, stream)
                 removed.append(path)
@@ -163,18 +163,18 @@ def in_processes(
 
 
 def _pool(workers: int, initializer: Callable[..., None], *given: Any) -> Any:
-    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need none
+    from concurrent.futures import ProcessPoolExecutor  # imported late: most commands need no pool
     from multiprocessing import get_context
 
     return ProcessPoolExecutor(workers, get_context("spawn"), initializer, given)
 
 
 def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
-    """Return `work(*given)`, a module-level function, from a process that its libraries may end.
+    """Return `work(*given)`, computed in a separate process that a library may terminate.
 
     Raises:
-        ChildProcessError: the process ended without a result; the message has the last 2000 characters of
-            its stderr, which is not shown otherwise.
+        ChildProcessError: the process ended without a result; the message contains the last 2000 characters
+            of its stderr, which is not shown otherwise.
     """
     from concurrent.futures.process import BrokenProcessPool
     from tempfile import TemporaryDirectory
@@ -187,7 +187,7 @@ def in_own_process(work: Callable[..., Result], *given: Any) -> Result:
         except BrokenProcessPool:
             last = stderr.read_text(errors="replace")[-2000:] if stderr.exists() else ""
             raise ChildProcessError(
-                f"{work.__module__}.{work.__name__} was ended by a library\n{last}"
+                f"{work.__module__}.{work.__name__} was terminated by a library\n{last}"
             ) from None
 
 

@@ -32,7 +32,7 @@ SOFTWARE = {"Software": "hilsplat"}
 
 
 class Inputs:
-    """Inputs of a stage and their digests from before it ran; a missing one raises HilsplatError."""
+    """Inputs of a stage and their digests from before it ran; a missing input raises HilsplatError."""
 
     def __init__(self, stage: str, paths: Mapping[str, Path | Sequence[Path]]) -> None:
         self.stage = stage
@@ -46,7 +46,7 @@ class Inputs:
         self.records = {name: self._record(path) for name, path in paths.items()}
 
     def require_unchanged(self) -> None:
-        """Raise HilsplatError if an input changed; files of the same size, time and inode are not read."""
+        """Raise HilsplatError if an input changed; files with unchanged size, time and inode are not read."""
         now = self._signatures()
         for name, path in self._paths.items():
             before, after = self._files[name], now[name]
@@ -54,8 +54,8 @@ class Inputs:
             if changed and self._record(path) != self.records[name]:
                 raise HilsplatError(
                     f"{self.stage}: input {name} changed while the stage ran: {changed[0]}",
-                    expected="inputs that stay as they are until the stage ends",
-                    found="a new file" if changed[0] not in before else "another file or none",
+                    expected="inputs that do not change until the stage ends",
+                    found="a new file" if changed[0] not in before else "a changed or deleted file",
                     fix="run the stage again",
                 )
 
@@ -210,7 +210,7 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
     """Check that a stage can write its outputs without overwriting unrelated data.
 
     An existing file or folder may be replaced if it is empty, if the same stage wrote it according to the
-    provenance of the first output, or if a writer of it was killed.
+    provenance of the first output, or if a process was killed while writing it.
 
     Raises:
         ArtifactError: an output is or contains an input or the working, home or root folder, or exists and is
@@ -235,9 +235,9 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Raise ArtifactError if a PNG, or a file always written `beside` it, would replace others' files."""
+    """Raise ArtifactError if a PNG, or a file always written `beside` it, would replace a foreign file."""
     if path.suffix.lower() != ".png":
-        raise ArtifactError(f"output {path} is not named as a PNG", expected="a name that ends in .png")
+        raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
     if _is_something(path) and not _is_own_picture(path):
         raise _foreign(path)
     if beside is not None and _is_something(beside) and not _is_something(path):
@@ -253,7 +253,7 @@ def _is_own_picture(path: Path) -> bool:
 
 
 def require_beginning(path: Path, line: str) -> None:
-    """Raise ArtifactError unless a table replaces only one that begins with the same line."""
+    """Raise ArtifactError if a table would replace a file that does not begin with the same line."""
     if not _is_something(path):
         return
     try:
@@ -300,5 +300,5 @@ def _visible(folder: Path) -> list[str]:
 def _described(path: Path) -> str:
     if path.is_dir():
         names = sorted(_visible(path))
-        return f"a folder of {len(names)}: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        return f"a folder of {len(names)} entries: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
     return f"a file of {path.stat().st_size} bytes" if path.is_file() else "neither a file nor a folder"

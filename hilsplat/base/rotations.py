@@ -72,7 +72,7 @@ def multiply(
 
 
 def are_rotations(matrices: Float[np.ndarray, "*n 3 3"], tolerance: float) -> Bool[np.ndarray, "*n"]:
-    """Return whether each matrix is a rotation: finite, no mirror, and R R' within tolerance of identity."""
+    """Return whether each matrix is a rotation: finite, no reflection, R R' close to the identity."""
     finite = np.isfinite(matrices).all(axis=(-2, -1))
     safe = np.where(finite[..., None, None], matrices, 0.0)
     distance = np.abs(safe @ np.swapaxes(safe, -1, -2) - np.eye(3)).max(axis=(-2, -1))

@@ -26,7 +26,7 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
         raise ArtifactError(f"{path} is missing", fix=fix) from error
     if tuple(reader.fieldnames or ()) != tuple(columns):
         raise ArtifactError(
-            f"{path} has other columns",
+            f"{path} has unexpected columns",
             expected=", ".join(columns),
             found=", ".join(reader.fieldnames or ()),
             fix=fix,
@@ -35,7 +35,7 @@ def read_csv(path: Path, columns: Sequence[str], fix: str) -> list[dict[str, str
 
 
 def plain_markdown(text: str) -> str:
-    """Escape the text of a cell, so that Markdown does not read columns, emphasis, links or HTML in it."""
+    """Escape a cell's text so that Markdown does not interpret it as columns, emphasis, links or HTML."""
     for mark in ("|", "*", "]("):
         text = text.replace(mark, f"\\{mark}" if len(mark) == 1 else "]\\(")
     return " ".join(text.replace("<", "&lt;").splitlines())

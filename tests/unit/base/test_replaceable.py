@@ -131,7 +131,7 @@ def test_pictures_replace_only_pictures_of_this_package(tmp_path):
     for path in (photograph, tmp_path / "broken.png"):
         with pytest.raises(ArtifactError, match="hilsplat did not write it"):
             require_own_picture(path)
-    with pytest.raises(ArtifactError, match="not named as a PNG"):
+    with pytest.raises(ArtifactError, match="not a PNG file"):
         require_own_picture(text)
     (tmp_path / "selection.ply").write_text("mine")
     require_own_picture(picture, beside=tmp_path / "selection.ply")
