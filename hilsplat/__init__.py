@@ -1,4 +1,4 @@
-"""Photographs in, a 3D Gaussian scene out that answers text queries at three semantic levels.
+"""Turn photographs into a 3D Gaussian scene that answers text queries at three semantic levels.
 
     import hilsplat
 
@@ -6,8 +6,8 @@
     for hit in scene.query("mug > handle"):
         print(hit.score, hit.level.label, hit.gaussians)
 
-What is named here is the public interface (docs/python.md); everything else may change. Importing it loads
-nothing heavy.
+The names in `__all__` are the public interface (docs/python.md); everything else may change. Importing the
+package loads no large library.
 """
 
 from pathlib import Path

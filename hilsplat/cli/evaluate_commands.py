@@ -21,15 +21,15 @@ from hilsplat.cli.stage import (
 
 Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
 LabelledScene = Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")]
-EvaluateSection = Annotated[str, typer.Option(help="section evaluate as JSON")]
+EvaluateSection = Annotated[str, typer.Option(help="settings of evaluate, as JSON")]
 Kind = Annotated[str, typer.Option(help="kind of a synthetic scene: tabletop, room or street")]
-Queries = Annotated[str, typer.Option(help="JSON list of texts, for a scene without labels")]
+Queries = Annotated[str, typer.Option(help="JSON list of queries, for a scene without labels")]
 
 
 def _truth_inputs(
     truth: Path | None, labels: str | Sequence[str], data_root: Path
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the annotations and label files against which a stage scores, and the readers of the labels."""
+    """Return the annotations and label files that a stage scores against, and the readers of the labels."""
     from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import label_files
 
@@ -48,15 +48,15 @@ def evaluate(
     clip: PathIn,
     masks: PathIn,
     out: PathOut,
-    dataset: Annotated[str, typer.Option(help="data set to name in the scores")],
-    name: Annotated[str, typer.Option(help="scene to name in the scores")],
+    dataset: Annotated[str, typer.Option(help="data set named in the scores")],
+    name: Annotated[str, typer.Option(help="scene named in the scores")],
     truth: Truth = None,
     labels: Annotated[
         list[str] | None, typer.Option(help="or labels of published data sets, such as lerf_ovs/figurines")
     ] = None,
     data_root: DataRoot = Path(),
     kind: Kind = "",
-    variant: Annotated[str, typer.Option(help="variant to name in the scores")] = "default",
+    variant: Annotated[str, typer.Option(help="variant named in the scores")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
 ) -> None:
@@ -78,14 +78,14 @@ def evaluate(
 
 @app.command("evaluate-files")
 def evaluate_files(
-    predictions: Annotated[Path, typer.Argument(help="folder of masks or point labels of any program")],
+    predictions: Annotated[Path, typer.Argument(help="folder of masks or point labels from any program")],
     out: PathOut,
     method: Annotated[str, typer.Option(help="name of the program in the tables")],
     labels: Annotated[str, typer.Option(help="labels of a data set, such as lerf_ovs/figurines")] = "",
     data_root: DataRoot = Path(),
     truth: Truth = None,
     scene: Annotated[
-        Path | None, typer.Option(help="posed scene of a synthetic scene, which has the list of test views")
+        Path | None, typer.Option(help="posed scene of a synthetic scene, which lists the test views")
     ] = None,
     kind: Kind = "",
     dataset: Annotated[str, typer.Option(help="data set of a synthetic scene in the scores")] = "synthetic",
@@ -139,7 +139,7 @@ def figures(
     evaluate: EvaluateSection = "{}",
     threads: Threads = 1,
 ) -> None:
-    """Draw the panel of a scene: photograph, masks, field, relevancy, answers, truth."""
+    """Draw the panel of a scene: photograph, masks, field, relevancy, answers, ground truth."""
     from hilsplat.scene.finished import SceneParts
 
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)

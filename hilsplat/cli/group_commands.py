@@ -22,7 +22,7 @@ from hilsplat.cli.stage import (
 
 SceneWithMasks = Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")]
 MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks to measure")]
-NEIGHBOURS = 2  # nearest views that each view is compared with
+NEIGHBOURS = 2  # number of nearest views that each view is compared with
 
 
 @world_app.command("make")
@@ -32,7 +32,7 @@ def world_make(
     settings: Settings = "{}",
     threads: Threads = 1,
 ) -> None:
-    """Make a synthetic scene: images, and the truth that only evaluate reads."""
+    """Make a synthetic scene: images, and the ground truth that only evaluate reads."""
     section = section_of("world", settings)
     beside = (out / "images", out / "truth")
     with stage("world", out, settings=section, threads=threads, beside=beside) as run:
@@ -41,10 +41,10 @@ def world_make(
 
 @world_app.command("show")
 def world_show(
-    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that was made")],
+    scene: Annotated[str, typer.Argument(help="dataset/scene of a finished synthetic scene")],
     results: Results = Path("results"),
 ) -> None:
-    """Draw a contact sheet beside the scene: views, labels by level, the tree with its texts."""
+    """Draw a contact sheet beside the scene: views, labels by level, and the tree with its texts."""
     from hilsplat.world.pictures import show_world
 
     target = results / scene / "world.png"
@@ -66,7 +66,7 @@ def world_gallery(
     kind: Annotated[str, typer.Argument(help="kind of scene: tabletop, room or street")],
     seeds: Annotated[list[int], typer.Argument(help="seeds of the scenes")],
 ) -> None:
-    """Draw one view of each scene, with its true labels by level, as world_KIND.png."""
+    """Draw one view of each scene, with its ground-truth labels by level, as world_KIND.png."""
     from hilsplat.world.pictures import draw_scenes
 
     target = Path(f"world_{kind}.png")
@@ -98,7 +98,7 @@ def world_masks(
         Path | None, typer.Option(help="PNG, with a CSV and a PDF beside it; default: beside the masks")
     ] = None,
 ) -> None:
-    """Measure masks against the true regions by level, and draw where they fail."""
+    """Compare masks with the ground-truth regions by level, and draw where they fail."""
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
@@ -115,7 +115,7 @@ def world_tree(
     results: Results = Path("results"),
     threads: Threads = 2,
 ) -> None:
-    """Measure the 3D semantic tree against the true nodes: matches, purity, parents.
+    """Compare the 3D semantic tree with the ground-truth nodes: matches, purity, parents.
 
     Writes tree_truth.csv beside the tree.
     """
@@ -134,7 +134,7 @@ def models_get(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="names of `hilsplat models list`, or owner/name on the hub; default: recommended"
+            help="names from `hilsplat models list`, or owner/name on the hub; default: recommended"
         ),
     ] = None,
     revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
@@ -145,7 +145,7 @@ def models_get(
         Path | None, typer.Option(help="models folder; default: HILSPLAT_MODELS, or the user's data folder")
     ] = None,
 ) -> None:
-    """Fetch released models from the model hub and check them.
+    """Download released models from the model hub, and check them.
 
     An interrupted download resumes where it stopped. HF_ENDPOINT, HF_HOME, HF_TOKEN, HF_HUB_OFFLINE and the
     usual proxy variables are respected.
@@ -179,8 +179,8 @@ def models_check(
 
 
 @models_app.command("split")
-def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP")]) -> None:
-    """Split the model.onnx of an exported CLIP into its image and text networks."""
+def models_split(folder: Annotated[Path, typer.Argument(help="folder of an exported CLIP model")]) -> None:
+    """Split the model.onnx of an exported CLIP model into its image and text networks."""
     from hilsplat.models.onnx_graph import split_clip
 
     for path in split_clip(folder):
@@ -202,7 +202,7 @@ def cache_show(
 @cache_app.command("prune")
 def cache_prune(
     context: typer.Context,
-    days: Annotated[float | None, typer.Option(min=0, help="delete entries unused for so many days")] = None,
+    days: Annotated[float | None, typer.Option(min=0, help="delete entries unused for N days")] = None,
     max_mib: Annotated[
         float | None, typer.Option(min=0, help="delete the least recently used until this much is left")
     ] = None,
@@ -273,7 +273,7 @@ def datasets_fits(
     data_root: DataRoot = Path(),
     threads: Threads = 2,
 ) -> None:
-    """Measure how well masks and nodes fit annotated regions, by level and without any text.
+    """Measure how well masks and nodes fit annotated regions, by level and without queries.
 
     Writes label_fits.csv beside the tree.
     """

@@ -41,7 +41,7 @@ def main() -> None:
             raise
         logging.getLogger("hilsplat").error("%s", message)
         sys.exit(1)
-    finally:  # otherwise the garbage collection at exit takes 0.4 s, for objects of numba and matplotlib
+    finally:  # otherwise garbage collection at exit, of numba and matplotlib objects, takes 0.4 s
         gc.freeze()
 
 
@@ -50,11 +50,11 @@ def options(
     version: Annotated[bool, typer.Option("--version", help="print the version and exit")] = False,
     log: Annotated[Path | None, typer.Option(help="write stdout and stderr to this file")] = None,
 ) -> None:
-    """Handle the options before a command."""
+    """Handle the options that precede a command."""
     if log is not None:
         if log.suffix != ".log" and log.is_file() and log.stat().st_size:
             raise HilsplatError(
-                f"--log {log} exists and is not named as a log", fix="name a new file, or one in .log"
+                f"--log {log} exists and is not a .log file", fix="choose a new file, or a .log file"
             )
         try:
             log.parent.mkdir(parents=True, exist_ok=True)

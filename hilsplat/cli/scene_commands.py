@@ -13,7 +13,7 @@ POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute; def
 
 @app.command()
 def init(folder: Annotated[Path, typer.Argument(help="folder of the project")] = Path()) -> None:
-    """Write commented config/config.yaml and config/scenes.tsv to edit; they replace the installed ones."""
+    """Write commented config/config.yaml and config/scenes.tsv to edit; they override the installed files."""
     from hilsplat.workflow.run import start_project
 
     for path in start_project(folder):
@@ -51,19 +51,19 @@ def new(
     name: Annotated[str, typer.Argument(help="name of the scene: letters, digits, . _ -")],
     photos: Annotated[Path, typer.Argument(help="folder of photographs or videos, a video, or a zip file")],
     sheet: Annotated[Path, typer.Option(help="scene sheet")] = Path("config/scenes.tsv"),
-    frames: Annotated[int, typer.Option(min=3, max=1000, help="most frames taken from videos")] = 60,
+    frames: Annotated[int, typer.Option(min=3, max=1000, help="maximum number of video frames")] = 60,
     poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     gaussians: Annotated[
         Path | None, typer.Option(help="3DGS PLY; none: fit; default: the output of 3DGS in the folder")
     ] = None,
     features: Annotated[
-        Path | None, typer.Option(help="LangSplat's features; none: SAM, CLIP; default: those in the folder")
+        Path | None, typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: those found")
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(help="LERF-OVS labels, for scores; none; default: those beside the scene")
+        Path | None, typer.Option(help="LERF-OVS labels, for scores; none: no labels; default: those found")
     ] = None,
 ) -> None:
-    """Add photographs, a video, or a scene of COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.
+    """Add photographs, a video, or a scene from COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.
 
     Reports what was found, what is used, and what is likely to fail.
     """

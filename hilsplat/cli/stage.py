@@ -45,15 +45,15 @@ Threads = Annotated[
     ),
 ]
 MOST_THREADS = max(16, os.cpu_count() or 1)
-"""Maximum number of threads; more only cost start-up time and memory."""
+"""Maximum number of threads; more would only cost start-up time and memory."""
 
 Memory = Annotated[
     float | None,
     typer.Option(
-        min=1, help="memory for views at once, MiB; default: what is free; results do not depend on it"
+        min=1, help="memory for concurrent views, MiB; default: all that is free; results do not depend on it"
     ),
 ]
-Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="seed for everything random")]
+Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
 Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]
 Results = Annotated[Path, typer.Option(help="results folder")]
 DataRoot = Annotated[Path, typer.Option(help="folder of the data sets")]
@@ -63,7 +63,7 @@ MIN_FREE_MIB = 200.0  # minimum free disk space to start a stage
 
 
 def start_logging(*, timestamps: bool = False) -> None:
-    """Send log records to stderr; with timestamps (time, level, logger), unless it is a terminal."""
+    """Send log records to stderr; `timestamps` adds time, level and logger unless stderr is a terminal."""
     root = logging.getLogger()
     root.setLevel(logging.INFO)
     root.handlers.clear()
@@ -135,10 +135,10 @@ def stage(
             )
     except HilsplatError:
         raise
-    except Exception as error:  # unless it is a system error, a bug of ours: log the traceback
+    except Exception as error:  # a system error, or a bug: log the traceback of a bug
         if (problem := system_error(error)) is not None:
             raise problem from error
-        if sys.gettrace() is not None:  # post-mortem of a debugger
+        if sys.gettrace() is not None:  # for post-mortem debugging
             raise
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
@@ -175,12 +175,12 @@ def model_input(section: Any) -> dict[str, Path]:
 
 
 def json_option(option: str, text: str, kind: type) -> Any:
-    """Parse an option in JSON, a list of texts or texts by name; raise SettingsError for anything else."""
+    """Parse a JSON option: a list of texts, or texts by name. Raise SettingsError for anything else."""
     try:
         value = parse_json(text)
     except ValueError as error:
         raise SettingsError(f"{option} is not JSON: {error}", found=text[:80]) from error
     texts = value.values() if isinstance(value, dict) else value
     if not isinstance(value, kind) or not all(isinstance(each, str) for each in texts):
-        raise SettingsError(f"{option} is not a {kind.__name__} of texts, as JSON", found=text[:80])
+        raise SettingsError(f"{option} is not a JSON {kind.__name__} of texts", found=text[:80])
     return value

@@ -23,7 +23,7 @@ from hilsplat.cli.stage import (
 )
 from hilsplat.models.store import AUTO
 
-Features = Annotated[Path | None, typer.Option(help="LangSplat's folder of _s.npy and _f.npy, to import")]
+Features = Annotated[Path | None, typer.Option(help="folder of LangSplat's _s.npy and _f.npy, to import")]
 
 
 @app.command("poses")
@@ -32,7 +32,7 @@ def find_poses(
     out: PathOut,
     name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
     unit: Annotated[str, typer.Option(help="unit of length: metre or arbitrary")] = "arbitrary",
-    render: Annotated[bool, typer.Option(help="the images are renders: an ideal pinhole lens")] = False,
+    render: Annotated[bool, typer.Option(help="the images are renders, with an ideal lens")] = False,
     poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     settings: Settings = "{}",
     seed: Seed = 0,
@@ -54,7 +54,7 @@ def gaussians(
     existing: Annotated[Path | None, typer.Option(help="3DGS PLY, in the source's coordinates")] = None,
     dataparser: Annotated[
         Path | None,
-        typer.Option(help="nerfstudio's dataparser_transforms.json, if that PLY is in its coordinates"),
+        typer.Option(help="dataparser_transforms.json, if the PLY is in nerfstudio's coordinates"),
     ] = None,
     transforms: Annotated[Path | None, typer.Option(help="transforms.json, for --dataparser")] = None,
     cache: Cache = DEFAULT_CACHE,
@@ -76,11 +76,11 @@ def masks(
     scene: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    truth: Annotated[Path | None, typer.Option(help="truth folder, only for truth-perturbed")] = None,
+    truth: Annotated[Path | None, typer.Option(help="ground truth, only for truth-perturbed")] = None,
     gaussians: Annotated[Path | None, typer.Option(help="PLY, for key views and guided prompts")] = None,
     key_masks: Annotated[Path | None, typer.Option(help="masks of the key views, for guided prompts")] = None,
-    semantic_tree: Annotated[Path | None, typer.Option(help="their tree, for guided prompts")] = None,
-    perturb: Annotated[str, typer.Option(help="faults of truth-perturbed, as JSON")] = "{}",
+    semantic_tree: Annotated[Path | None, typer.Option(help="tree of key views, for guided prompts")] = None,
+    perturb: Annotated[str, typer.Option(help="faults for truth-perturbed, as JSON")] = "{}",
     features: Features = None,
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
@@ -91,15 +91,15 @@ def masks(
     is_diagnostic = section.segmenter == "truth-perturbed"
     if is_diagnostic and truth is None:
         raise HilsplatError(
-            "masks: the segmenter truth-perturbed needs the true labels of a synthetic scene",
+            "masks: the segmenter truth-perturbed needs a synthetic scene's ground-truth labels",
             expected="--truth results/<dataset>/<scene>/world/truth",
-            fix="name the folder, or choose masks.segmenter: sam or graph",
+            fix="pass this option, or set masks.segmenter to sam or graph",
         )
     if truth is not None and not is_diagnostic:
         raise HilsplatError(
-            f"masks: the segmenter {section.segmenter} must not see the truth",
+            f"masks: the segmenter {section.segmenter} must not use the ground truth",
             found=f"--truth {truth}",
-            fix="leave out --truth, or set masks.segmenter: truth-perturbed, a diagnostic",
+            fix="omit --truth, or set masks.segmenter to truth-perturbed, a diagnostic",
         )
     if is_diagnostic:
         read, both = {"scene": scene, "truth": truth}, {"masks": section, "perturb": faults}
@@ -114,9 +114,9 @@ def masks(
     if section.key_views < 1:
         if gaussians is None:
             raise HilsplatError(
-                "masks: key views are selected by the Gaussians",
+                "masks: selecting key views requires the Gaussians",
                 expected="--gaussians results/<dataset>/<scene>/gaussians.ply",
-                fix="name the PLY, or set masks.key_views: 1",
+                fix="pass this option, or set masks.key_views to 1",
             )
         inputs |= {"gaussians": gaussians}
         with stage("key_masks", out, settings=section, threads=threads, inputs=inputs) as run:
@@ -144,7 +144,7 @@ def show_masks(
     scene: PathIn,
     masks: PathIn,
     out: Annotated[Path, typer.Option(help="PNG to write, with the trees beside it")] = Path("masks.png"),
-    coverage_tree: Annotated[Path | None, typer.Option(help="coverage trees to draw too")] = None,
+    coverage_tree: Annotated[Path | None, typer.Option(help="coverage trees to draw as well")] = None,
     view: Annotated[str | None, typer.Option(help="name of the view; default: the middle one")] = None,
 ) -> None:
     """Draw a view's masks at three levels, and its coverage trees."""
@@ -159,7 +159,7 @@ def names(
     clip: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    evaluate: Annotated[str, typer.Option(help="settings of evaluate as JSON")] = "{}",
+    evaluate: Annotated[str, typer.Option(help="settings of evaluate, as JSON")] = "{}",
     cache: Cache = DEFAULT_CACHE,
     threads: Threads = 1,
 ) -> None:
@@ -178,7 +178,7 @@ def clip(
     masks: PathIn,
     out: PathOut,
     semantic_tree: Annotated[
-        Path | None, typer.Option(help="embed the crops that show its nodes best; default: every mask")
+        Path | None, typer.Option(help="tree whose nodes select the crops; default: embed every mask")
     ] = None,
     settings: Settings = "{}",
     features: Features = None,
@@ -220,8 +220,8 @@ def semantic_tree(
     masks: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    coverage_tree: Annotated[Path | None, typer.Option(help="for evidence: features")] = None,
-    field_settings: Annotated[str, typer.Option(help="section field as JSON, for evidence: features")] = "{}",
+    coverage_tree: Annotated[Path | None, typer.Option(help="with evidence: features")] = None,
+    field_settings: Annotated[str, typer.Option(help="settings of field, with evidence: features")] = "{}",
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
@@ -230,8 +230,8 @@ def semantic_tree(
     inputs = {"contributions": contributions, "masks": masks, "coverage_tree": coverage_tree}
     if (section.evidence == "features") != (coverage_tree is not None):
         raise SettingsError(
-            "semantic_tree.evidence and the options don't fit together",
-            expected="--coverage-tree with evidence: features, and only there",
+            "semantic_tree.evidence and the options do not match",
+            expected="--coverage-tree only with evidence: features",
         )
     if coverage_tree is None:
         with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs) as run:
@@ -252,7 +252,7 @@ def autoencoder(
     settings: Settings = "{}",
     seed: Seed = 0,
 ) -> None:
-    """Compute the scene's code of CLIP vectors (PCA or autoencoder) and encode the masks."""
+    """Fit the compression of a scene's CLIP vectors (PCA or autoencoder), and encode the masks."""
     section = section_of("autoencoder", settings)
     inputs = {"clip": clip, "semantic_tree": semantic_tree, "contributions": contributions}
     with stage("autoencoder", out, settings=section, seed=seed, inputs=inputs) as run:
@@ -269,11 +269,11 @@ def field(
     scene: Annotated[Path | None, typer.Option(help="posed scene, for trainer: literal")] = None,
     gaussians: Annotated[Path | None, typer.Option(help="3DGS PLY, for trainer: literal")] = None,
     masks: Annotated[Path | None, typer.Option(help="masks of the views, for trainer: literal")] = None,
-    start: Annotated[Path | None, typer.Option(help="first field, for start: langsplat")] = None,
+    start: Annotated[Path | None, typer.Option(help="initial field, for start: langsplat")] = None,
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Solve the language field: regression, L_h, L_ins and L_part over three levels."""
+    """Solve for the language field: regression, L_h, L_ins and L_part over three levels."""
     section = section_of("field", settings)
     inputs = {"contributions": contributions, "coverage_tree": coverage_tree, "autoencoder": autoencoder}
     optional = {"scene": scene, "gaussians": gaussians, "masks": masks, "start": start}
@@ -297,7 +297,7 @@ def method(
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Compute the language field with a baseline, named in the settings."""
+    """Compute the language field with the baseline selected in the settings."""
     from hilsplat.methods.method import MethodInputs
     from hilsplat.methods.registry import METHODS
 

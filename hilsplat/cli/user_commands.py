@@ -25,7 +25,7 @@ def query(
         str, typer.Argument(help="what to look for; 'bear > head > nose' finds noses on heads of bears")
     ],
     level: Annotated[
-        str, typer.Option(help="level of the answers (of a path's last text): auto, whole, part, subpart")
+        str, typer.Option(help="level of answers (or of a path's last text): auto, whole, part, subpart")
     ] = "auto",
     variant: Annotated[str, typer.Option(help="variant to query")] = "default",
     results: Results = Path("results"),
@@ -33,9 +33,9 @@ def query(
     answerer: Annotated[
         str, typer.Option(help="tree: nodes of the semantic tree; field: the paper's language field")
     ] = "tree",
-    view: Annotated[str | None, typer.Option(help="find only what this view shows, such as 000.png")] = None,
+    view: Annotated[str | None, typer.Option(help="search what this view shows, such as 000.png")] = None,
     threshold: Annotated[
-        float | None, typer.Option(help="least score of an answer, 0 to 1; default: answers near the best")
+        float | None, typer.Option(help="minimum score of an answer, 0 to 1; default: near the best score")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="folder for the files; default: queries/TEXT in the scene's folder")
@@ -47,7 +47,7 @@ def query(
     Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
     answers' Gaussians (selection.ply).
     """
-    gc.disable()  # garbage collection would take a tenth of the two seconds
+    gc.disable()  # garbage collection would take a tenth of the query time, two seconds
     try:
         from hilsplat.query.answer import answer
 
@@ -69,13 +69,13 @@ def query(
 
 
 def scene_folder(scene: str, results: Path) -> Path:
-    """Return the folder of a scene, given as name (SettingsError if ambiguous), dataset/scene, or path."""
+    """Return the folder of a scene, given by name (SettingsError if ambiguous), dataset/scene, or path."""
     named, path = results / scene, Path(scene)
     if "/" not in scene:
         found = sorted(folder.parent for folder in results.glob(f"*/{glob.escape(scene)}/scene"))
         if len(found) > 1:
             raise SettingsError(
-                f"{scene!r} names several scenes",
+                f"{scene!r} matches several scenes",
                 expected=f"one of {', '.join(f'{folder.parent.name}/{scene}' for folder in found)}",
             )
         if found:
@@ -145,8 +145,8 @@ def export(
         typer.Option(
             "--as",
             help="tree: nodes as JSON, picture and PLY; ply: a 3DGS PLY; colmap: images and sparse/0; "
-            "nerfstudio: images and transforms.json; langsplat: as colmap, with PLY and language_features; "
-            "labels: the scene's annotations as those of LERF-OVS",
+            "nerfstudio: images and transforms.json; langsplat: colmap plus PLY and language_features; "
+            "labels: the scene's annotations in LERF-OVS format",
         ),
     ] = Form.TREE,
     variant: Annotated[str, typer.Option(help="variant, for tree and langsplat")] = "default",
@@ -205,14 +205,14 @@ def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, t
     return f"wrote labels of {export_labels(opened, folder, data_root, out)} views to {out}"
 
 
-Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any that is free")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="port of the page; 0: any free port")]
 Browser = Annotated[bool, typer.Option(help="open the page in a browser")]
 
 
 @app.command()
 def view(
     scene: SceneName,
-    variant: Annotated[str, typer.Option(help="variant that answers first")] = "default",
+    variant: Annotated[str, typer.Option(help="variant to select first")] = "default",
     results: Results = Path("results"),
     port: Port = 0,
     browser: Browser = True,

@@ -23,7 +23,7 @@ STAGE = " ".join(CONTRIBUTE)
         (f"mkdir gone; cd gone; rmdir ../gone; {QUERY}", "the working directory was deleted"),
         ("query photos/desk mug --out /proc/x", "/proc/x is missing, or cannot be created"),
         ("export photos/desk --out /proc/x", "/proc/x is missing, or cannot be created"),
-        (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not named as a log"),
+        (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not a .log file"),
         ("run -- --cores 0", "with --cores 0 no job could start"),
         ("run -- --config 'only=[1'", "--config is not YAML"),
     ],

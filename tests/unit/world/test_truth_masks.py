@@ -147,7 +147,7 @@ def command(world, monkeypatch):
 
 def test_the_command_requires_the_truth_and_records_it(world, command):
     asked = '{"segmenter": "truth-perturbed", "min_area_px": 1}'
-    with pytest.raises(HilsplatError, match=r"needs the true labels(.|\n)*--truth results"):
+    with pytest.raises(HilsplatError, match=r"needs a synthetic scene(.|\n)*--truth results"):
         command(settings=asked)
     command(settings=asked, truth=world / "truth", perturb='{"seed": 3}')
     record = read_json(provenance_path(world / "out"))
@@ -158,6 +158,6 @@ def test_the_command_requires_the_truth_and_records_it(world, command):
 
 @pytest.mark.parametrize("segmenter", ["sam", "graph"])
 def test_other_segmenters_refuse_the_truth(world, command, segmenter):
-    with pytest.raises(HilsplatError, match=f"the segmenter {segmenter} must not see the truth"):
+    with pytest.raises(HilsplatError, match=f"the segmenter {segmenter} must not use the ground truth"):
         command(settings=f'{{"segmenter": "{segmenter}"}}', truth=world / "truth")
     assert not (world / "out").exists()
