@@ -30,7 +30,7 @@ RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip"
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check; a note is about something optional, a fault makes runs fail or results wrong."""
+    """Result of a check; a note concerns something optional; a fault makes runs fail or results wrong."""
 
     check: str
     state: Literal["ok", "note", "fault"]
@@ -54,9 +54,9 @@ def examine() -> Iterator[Finding]:
 def python() -> Iterator[Finding]:
     required = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     found = platform.python_version()
-    problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is needed"
+    problem = "" if SpecifierSet(required).contains(found) else f"{found}, but {required} is required"
     sound = f"{found} on {platform.system()} {platform.machine()}"
-    yield verdict("python", problem, sound, "use another Python")
+    yield verdict("python", problem, sound, "use another Python version")
 
 
 def libraries() -> Iterator[Finding]:
@@ -92,14 +92,14 @@ def onnx() -> Iterator[Finding]:
 
 
 def cuda() -> Iterator[Finding]:
-    """Check whether torch and gsplat can use CUDA, and whether they render what the CPU renders."""
+    """Check whether torch and gsplat can use CUDA, and whether their renders match the CPU's."""
     from hilsplat.splat.rasterise.device import cuda_disagreement, cuda_problem
 
     if problem := cuda_problem():
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
         yield Finding("cuda", "note", f"{problem}: everything runs on the CPU", fix)
         return
-    sound = "gsplat and the CPU render the same: image, gradients, pixel weights"
+    sound = "gsplat and the CPU agree on image, gradients and pixel weights"
     yield verdict("cuda", cuda_disagreement(), sound, "set device: cpu, and report this output")
 
 
@@ -109,7 +109,7 @@ def kernels() -> Iterator[Finding]:
 
     begin = time.monotonic()
     apart = disagreement("cpu", "cpu")
-    sound = f"a small scene was rendered, {time.monotonic() - begin:.1f} s with compiling"
+    sound = f"a small scene was rendered in {time.monotonic() - begin:.1f} s, including compilation"
     yield verdict("kernels", apart, sound, "reinstall numba and llvmlite")
 
 
@@ -143,7 +143,7 @@ def models() -> Iterator[Finding]:
         yield verdict("models", problem, sound, "pip install onnxruntime instead")
     if missing:
         names = " and no ".join(family.upper() for family in sorted(missing))
-        problem = f"no {names} for photographs: answers about them mean nothing"
+        problem = f"no {names} for photographs: answers about them are meaningless"
         yield Finding("models", "note", problem, f"hilsplat models get ({' and '.join(RECOMMENDED)})")
 
 
@@ -152,7 +152,7 @@ def space() -> Iterator[Finding]:
     try:
         plan = Plan(merged_config([]))
     except HilsplatError as error:
-        fix = "choose scenes, or name them: hilsplat run photos/desk"
+        fix = "select groups of scenes, or name scenes: hilsplat run photos/desk"
         yield Finding("configuration", "note", str(error), fix)
         return
     resources, disk_mb, memory = JobResources(plan), 0.0, (0.0, "", "")
@@ -162,12 +162,12 @@ def space() -> Iterator[Finding]:
             memory = max(memory, (resources.memory_mb(rule)(row, threads=1, attempt=1), rule, row.name))
     folder = existing_folder(plan.results)
     free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30
-    text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes take about {needed:.1f}"
+    text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes need about {needed:.1f}"
     problem = "" if free > needed else text
     yield verdict("disk", problem, text, "free space, or set results to a folder on another disk")
     most, rule, scene = memory
     text = (
-        f"{machine_mib() / 1024:.1f} GiB; the largest job, {rule} of {scene}, takes about {most / 1024:.1f}"
+        f"{machine_mib() / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"
     )
     problem = "" if machine_mib() > most else text
     yield verdict("memory", problem, text, "lower poses.max_side_px or gaussians.max_gaussians")

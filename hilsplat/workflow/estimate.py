@@ -23,7 +23,7 @@ OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
     "Hours can be wrong by a factor of two on another machine. Memory is that of the largest job.",
-    "GPU: published times of a 24 GB card for fits, SAM and CLIP; the cores do the rest.",
+    "GPU: published times of a 24 GB card for fits, SAM and CLIP; the rest runs on the cores.",
 )
 
 KEPT_PROMPTS = 0.3  # share of the previewed prompts whose masks are decoded
@@ -95,7 +95,7 @@ def _aligned(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
 
 
 def forecasts(plan: Plan, cores: int) -> list[str]:
-    """Return a line per scene of photographs that a full-size SAM and CLIP have not yet processed."""
+    """Return a line per scene of photographs that full-size SAM and CLIP models have not yet processed."""
     resources = JobResources(plan)
     lines = []
     for row in plan.scenes:
@@ -135,5 +135,5 @@ def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) ->
     total_s = before_s + rest_s + after_s + NODES * stages.clip.crops_per_node * crop_s
     return (
         f"{row.name}: {first_answer}all photographs in {duration(total_s / cores)}. "
-        f"A photograph takes {full_s:.0f} s of SAM on one of {cores} cores, a crop {crop_s:.2f} s of CLIP."
+        f"On one of {cores} cores, SAM takes {full_s:.0f} s per photograph, and CLIP {crop_s:.2f} s per crop."
     )

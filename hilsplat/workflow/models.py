@@ -50,8 +50,8 @@ def describe_models(stages: StageSettings, features: Path | None = None) -> str:
         return f"masks and their vectors from {features}; text queries by {Path(stages.clip.model).name}"
     masks = {
         "sam": f"masks by {Path(stages.masks.model).name}",
-        "graph": "masks by the graph segmenter, regions of even colour",
-        "truth-perturbed": "masks from the true labels",
+        "graph": "masks by the graph segmenter, regions of uniform colour",
+        "truth-perturbed": "masks from ground-truth labels",
     }[stages.masks.segmenter]
     return f"{masks}; text queries by {Path(stages.clip.model).name}"
 

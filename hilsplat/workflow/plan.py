@@ -29,7 +29,7 @@ from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant,
 from hilsplat.workflow.stages import stage_code
 
 LEAST_PHOTOGRAPHS = 16
-"""Minimum number of photographs of a scene with key views; half of fewer would link too few masks."""
+"""Minimum number of photographs for key views; half of a smaller number would link too few masks."""
 
 
 def any_of(names: Iterable[str]) -> str:
@@ -51,7 +51,7 @@ class Plan:
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        """Read the sheet; raise HilsplatError if it or the configuration is invalid or no scene is left."""
+        """Read the sheet; raise HilsplatError if it or the configuration is invalid or no scenes are left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
         for name in run.every_variant():
@@ -70,7 +70,7 @@ class Plan:
         self.scenes = tuple(row for row in chosen if row.name not in self.absent)
         if not self.scenes:
             raise SettingsError(
-                "there is no scene to run",
+                "there are no scenes to run",
                 expected=f"scenes of {sheet}: {', '.join(f'{row.name} ({row.group})' for row in self.rows)}",
                 found="; ".join(
                     [
@@ -240,7 +240,7 @@ class Plan:
         return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
-        """Return an input of masks that only orders jobs: vectors of key views, before a full-size SAM."""
+        """Return an input of masks that only orders jobs: vectors of key views precede a full-size SAM."""
         row, masks = self.row(job), self.stages(job).masks
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
@@ -251,14 +251,14 @@ class Plan:
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
     def masks_truth(self, job: VariantJob) -> list[str]:
-        """Return the input of masks: the diagnostic's true labels; SettingsError if the scene has none."""
+        """Return the input of masks: the diagnostic's ground-truth labels; SettingsError if none exist."""
         if self.masks_stage(job) != "truth_masks":
             return []
         row = self.row(job)
         if not row.world:
             raise SettingsError(
-                f"{row.name}, variant {job.variant}: masks.segmenter truth-perturbed needs the true labels "
-                "of a synthetic scene, and this scene has none",
+                f"{row.name}, variant {job.variant}: masks.segmenter truth-perturbed needs "
+                "ground-truth labels, which only synthetic scenes have",
                 fix="choose another segmenter, or run the variant on synthetic scenes only",
             )
         return self.data.truth(job)
@@ -310,7 +310,7 @@ class Plan:
         return [self.path(job, "scene"), self.path(job, "gaussians.ply"), self.shared("masks", "masks")(job)]
 
     def first_field(self, job: VariantJob) -> list[str]:
-        """Return the input of field: LangSplat's, to start from; SettingsError if no variant makes one."""
+        """Return the input of field: LangSplat's initial field; SettingsError if no variant computes it."""
         stages, scopes = self.stages(job), self.scopes(self.row(job))
         if stages.field.start != "langsplat":
             return []
@@ -347,7 +347,7 @@ class Plan:
         return json.dumps(self.run.main_variants)
 
     def names(self, _: object) -> str:
-        """Return variant -> its name in tables and figures as JSON; Snakemake would expand a plain text."""
+        """Return each variant's name in tables and figures, as JSON; Snakemake would expand plain text."""
         return inert(json.dumps(dict(self.run.labels)))
 
     def queries(self, job: Job) -> str:
@@ -373,7 +373,7 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
         near = difflib.get_close_matches(key, names, n=1, cutoff=0.85)
         if key not in names and near:
             raise SettingsError(
-                f"{where} of the configuration has the scene {key!r}, which {run.scenes} does not have",
+                f"{where} in the configuration names the scene {key!r}, which is not in {run.scenes}",
                 expected=f"did you mean {near[0]!r}?",
                 fix="correct or remove the name",
             )

@@ -27,7 +27,7 @@ from hilsplat.workflow.scene_data import Job
 REPLACED = frozenset({"progress", "job_started", "workflow_started", "resources_info"})
 """Events that are not printed, besides the start and end of a job."""
 
-SELECTING = "Select jobs to execute..."  # message without an event that is not printed
+SELECTING = "Select jobs to execute..."  # message without an event; it is not printed
 
 TARGETS = ("all", "everything", "tables", "total")  # entries of the job counts that are not jobs
 
@@ -167,7 +167,7 @@ class RunProgress:
         return f"{self.done} of {self.total} done{failed}{left}"
 
     def line(self) -> str:
-        """Return the status line of the terminal; empty if nothing runs."""
+        """Return the terminal's status line; empty if nothing runs."""
         jobs = [self._describe(self.running[number]) for number in sorted(self.running)]
         return f"{self.counts()} | {', '.join(jobs)}" if jobs else ""
 
@@ -179,7 +179,7 @@ class RunProgress:
         return f"{job.name}{loop} {progress[1]} of {progress[2]}"
 
     def seconds_left(self) -> float:
-        """Return the core seconds left divided by the cores, but at least the longest job's seconds."""
+        """Return the core seconds left divided by the cores, but at least those of the longest job."""
         waiting = sum(number * estimates.seconds(rule) for rule, number in self.waiting.items() if number)
         running = [(self._left(job), job.threads) for job in self.running.values()]
         spread = (waiting + sum(left * threads for left, threads in running)) / self.cores

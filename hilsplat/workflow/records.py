@@ -115,20 +115,20 @@ def outdated(plan: Plan) -> dict[str, str]:
 def verify(results: Path) -> tuple[str, bool]:
     """Read every byte of a results folder, or a copy of it, and compare it with the provenance.
 
-    An artifact is damaged if its files differ from what was written. It is stale if other code made it or its
-    inputs have changed. Missing inputs outside the folder are ignored.
+    An artifact is damaged if its files differ from what was written. It is stale if its code
+    or inputs have changed. Missing inputs outside the folder are ignored.
 
     Returns:
-        A report that ends with the Snakemake command that repairs the folder, and whether all is whole.
+        A report that ends with the repairing Snakemake command, and whether all artifacts are whole.
 
     Raises:
-        ArtifactError: the folder contains no artifact.
+        ArtifactError: the folder contains no artifacts.
     """
     results = Path(results)
     paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
     if not paths:
         raise ArtifactError(
-            f"{results} contains no artifact", expected="a results folder, with *.provenance.json in it"
+            f"{results} contains no artifacts", expected="a results folder, with *.provenance.json in it"
         )
     counts, lines, again, records = Counter[str](), [], [], Records(results, every_byte=True)
     for path in track(paths, "artifacts read"):
@@ -137,7 +137,7 @@ def verify(results: Path) -> tuple[str, bool]:
         counts[state] += 1
         if state != WHOLE:
             lines.append(f"{state:<8} {artifact}: {reason}")
-            # The rule of `world` declares two folders in it.
+            # The rule `world` declares two subfolders as its outputs.
             output = artifact / "images" if artifact.name == "world" else artifact
             again.append("/".join(("results", *output.relative_to(results).parts)))
     states = ", ".join(f"{counts[state]} {state}" for state in (WHOLE, STALE, DAMAGED) if counts[state])

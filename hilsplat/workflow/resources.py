@@ -3,8 +3,8 @@
 `resources.tsv` lists for each rule the core seconds per megapixel of all views and the terms of its memory in
 megabytes: a base, per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel of one view
 (`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on disk with
-caches, per megapixel of all views and per thousand Gaussians (for fields: and latent channel). The memory is
-above the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and
+caches, per megapixel of all views and per thousand Gaussians (for fields: times latent channels). The memory
+exceeds the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and
 `train_models` were not measured). Times were measured on the benchmark scenes and can be wrong by a factor of
 three elsewhere. A killed job is retried with twice the memory and time limit.
 """
@@ -39,7 +39,7 @@ RUNNER_MB = 700  # memory of the two Snakemake processes that a cluster job star
 
 COMPARED_MB = (450, 4)  # memory of `comparison` per method: base, and per thousand Gaussians
 
-TIME_FACTOR, LEAST_MINUTES = 6, 10  # time limit of a job divided by its estimate, and the lowest limit
+TIME_FACTOR, LEAST_MINUTES = 6, 10  # time limit of a job divided by its estimate, and the minimum limit
 
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 
@@ -55,7 +55,7 @@ NETWORK_S = 10.0  # core seconds to train an autoencoder
 EMBEDDED_S = {"masks": 1.5, "clip": 0.1}  # core seconds of the embedded models per view
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
-"""Part of a SAM's name -> core seconds to encode a picture; others: SAM 2.1 small (docs/benchmarks.md)."""
+"""Part of a SAM model's name -> core seconds per picture; others: SAM 2.1 small (docs/benchmarks.md)."""
 
 PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
 """Core seconds per SAM prompt, per picture between logits and masks, and per crop in CLIP B/16."""
@@ -64,7 +64,7 @@ PREVIEWED, GUIDED = 0.65, 0.25
 """Relative cost of a prompt with preview, and share of the grid's prompts that guided views use."""
 
 MASKS, NODES = 230, 400
-"""Typical numbers of masks of a photograph and nodes of a room, from `plush_bedroom` (docs/benchmarks.md)."""
+"""Typical numbers of masks per photograph and nodes per room, from `plush_bedroom` (docs/benchmarks.md)."""
 
 UNTRAINED = ("lifted", "occam", "dr_splat")  # baselines without training
 
@@ -72,7 +72,7 @@ UNKNOWN_MP = 0.5  # megapixels of a view if no image header can be read before t
 
 
 class Size(NamedTuple):
-    """Size of a scene; `view_mp` are the megapixels of one view."""
+    """Size of a scene; `view_mp` is the number of megapixels of one view."""
 
     views: int
     view_mp: float
@@ -206,7 +206,7 @@ class JobResources:
         return known or self.plan.stages(row).gaussians.max_gaussians
 
     def _model_mb(self, rule: str, wildcards: Job, threads: int) -> int:
-        """Return the memory of a model with one view per thread, MB; the stage uses less if less is free."""
+        """Return the memory of a model with one view per thread, MB; the stage uses at most what is free."""
         settings = getattr(self.plan.stages(wildcards), rule) if rule in EMBEDDED_S else None
         if settings is None or getattr(settings, "segmenter", "sam") != "sam":
             return 0
@@ -215,7 +215,7 @@ class JobResources:
 
 
 def _sam_s(masks: MasksSettings) -> float:
-    """Return the core seconds of a full-size SAM for a view and its crops, times the share of key views."""
+    """Return a full-size SAM model's core seconds for a view and its crops, times the share of key views."""
     picture_s = next((cost for word, cost in SAM_S.items() if word in masks.model), OTHER_SAM_S)
     pictures = sum(4**layer for layer in range(masks.crop_layers + 1))
     share = 1.0 if masks.generator == "official" else PREVIEWED

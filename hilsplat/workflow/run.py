@@ -1,4 +1,4 @@
-"""`hilsplat run`: Snakemake with the checks and options that users would otherwise type.
+"""`hilsplat run`: Snakemake with checks, and with options that users would otherwise type.
 
 It recovers from a killed run, rebuilds artifacts that don't match their provenance, and starts Snakemake in
 this process. Plain `snakemake --cores 2` gives the same bytes.
@@ -38,13 +38,13 @@ logger = logging.getLogger(__name__)
 STATE = Path(".hilsplat")  # folder in the working folder for locks and markers
 
 UNREGISTERED = "HILSPLAT_UNREGISTERED"
-"""Environment variable of a Snakemake process that takes no lock of ours, such as the one that unlocks."""
+"""Environment variable that makes a Snakemake process skip our lock, as `snakemake --unlock` must."""
 
 TARGET_RULES = ("all", "tables", "efficiency", "train_models")
 """Rules that can be targets; all others have wildcards."""
 
 ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
-"""Snakemake options with which cores and threads are not set here."""
+"""Snakemake options that set cores and threads, so that they are not set here."""
 
 
 _marks: list[TextIOWrapper] = []  # the marker of this process's run, if one is in progress
@@ -55,7 +55,7 @@ def prepare_process() -> TextIOWrapper | None:
 
     Jobs use the interpreter that runs Snakemake, whether or not its environment is activated, and end with
     Snakemake. The lock is shared and is taken before Snakemake's own locks, which record no owner. If no
-    process holds it, Snakemake's locks are left over from a dead run.
+    process holds ours, Snakemake's locks are left over from a dead run.
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     os.environ[PARENT] = str(os.getpid())
@@ -78,7 +78,7 @@ def mark_run() -> None:
 def unmark_run() -> None:
     """Remove the marker of this process's run, and cancel the timers that Snakemake leaves running.
 
-    Snakemake's job rate limit starts a timer after every scheduling, and the process would wait for them all.
+    Snakemake's job rate limit starts a timer after each scheduling step; the process would wait for them all.
     """
     timers = (thread for thread in threading.enumerate() if isinstance(thread, threading.Timer))
     for timer in timers:
@@ -102,7 +102,7 @@ def _locked(name: str, kind: int) -> TextIOWrapper:
 
 
 def start_project(folder: Path) -> list[Path]:
-    """Copy the default configuration and scene sheet into a folder, unless one of them exists there."""
+    """Copy the default configuration and scene sheet into a folder, unless either already exists."""
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:
         if path.exists():
@@ -117,7 +117,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
 
     Args:
         targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
-        options: Snakemake's.
+        options: Snakemake options.
 
     Returns:
         Snakemake's exit status.
@@ -212,7 +212,7 @@ def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Seque
 
 
 def _snakemake(command: Sequence[str], *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a Snakemake command that starts no job and takes no lock in this folder."""
+    """Run a Snakemake command that starts no jobs and takes no lock in this folder."""
     environment = {**os.environ, UNREGISTERED: "1"}
     command = [sys.executable, "-m", *command, *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -255,13 +255,13 @@ def _recover(command: Sequence[str], results: Path) -> None:
     for marker in markers:
         try:
             _locked(marker.name, fcntl.LOCK_EX | fcntl.LOCK_NB).close()
-        except BlockingIOError as error:  # when this run ends, Snakemake would remove the other's locks
+        except BlockingIOError as error:  # at its end, this run would remove the other run's locks
             raise HilsplatError(
-                f"another Snakemake runs in {Path.cwd()}", fix="wait until it ends, or stop it"
+                f"another Snakemake process is running in {Path.cwd()}", fix="wait until it ends, or stop it"
             ) from error
     remove_leftovers(results)
     if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):
-        logger.warning("another machine may be running this workflow; if not: snakemake --unlock")
+        logger.warning("another machine may be running this workflow; if not, run: snakemake --unlock")
         return
     try:
         alone = _locked("processes.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)

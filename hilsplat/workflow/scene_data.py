@@ -1,6 +1,6 @@
 """External files that the jobs of a scene read: photographs, Gaussians and labels.
 
-A *job* is any object with the attributes `dataset` and `scene`, and in the stages of a variant `variant`: the
+A *job* is any object with the attributes `dataset` and `scene` and, in a variant's stages, `variant`: the
 wildcards of a rule, or a row of the sheet. Only evaluation and figures get labels.
 """
 
@@ -100,7 +100,7 @@ class SceneData:
         for path in [*files, *self.existing_gaussians(row), *self.features(row)]:
             if "{" in path or "}" in path:
                 raise SettingsError(
-                    f"{path} of {row.name} cannot be read by the workflow: its name has braces",
+                    f"{path} of {row.name} cannot be read by the workflow: its name contains braces",
                     fix="rename it, or its folder",
                 )
 
@@ -167,7 +167,7 @@ class SceneData:
         return self.truth(job) or self._label_files(self.row(job))
 
     def truth_option(self, job: Job, input: Any) -> str:
-        """Return the options of evaluate: the truth or labels against which a scene is scored."""
+        """Return the options of evaluate: the ground truth or labels that a scene is scored against."""
         row = self.row(job)
         if row.world:
             return f"{truth_argument(input)} --kind {row.world[0]}"
@@ -175,7 +175,7 @@ class SceneData:
         return " ".join([*options, options_of({"data-root": Path(self.data_root)})])
 
     def figure_truth_option(self, job: Job, input: Any) -> str:
-        """Return the options of figures: the truth or labels for queries and outlines, if any."""
+        """Return the options of figures: the ground truth or labels for queries and outlines, if any."""
         row = self.row(job)
         if row.world:
             return truth_argument(input)

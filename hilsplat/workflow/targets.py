@@ -65,7 +65,7 @@ def data_of(row: SceneRow) -> str:
 
 
 def tables(plan: Plan) -> list[str]:
-    """Return every table with variants to compare; all have the paper's rows besides measured ones."""
+    """Return every table with variants to compare; each has the paper's rows besides measured rows."""
     return [
         f"{plan.run.results}/tables/{name}.csv"
         for name, kind in TABLES.items()
@@ -77,7 +77,7 @@ def default(plan: Plan) -> list[str]:
     """Return the pictures of all scenes, the scores of scenes that you annotated, and tables and plots.
 
     Tables and plots need a benchmark scene in the run. A run of photographs would otherwise replace a
-    benchmark's tables by tables with reported rows only.
+    benchmark's tables with tables of reported rows only.
     """
     plots = [
         f"{plan.run.results}/figures/sweep-{name}.png"
@@ -115,7 +115,7 @@ def summary(plan: Plan) -> list[str]:
 
 
 def figures(plan: Plan) -> list[str]:
-    """Return panels, node names, masks against known truth, and method comparisons (for sweep scenes)."""
+    """Return panels, node names, masks against ground truth, and method comparisons (for sweep scenes)."""
     found = []
     for row in plan.scenes:
         compared = not plan.run.sweep_scenes or row.scene in plan.run.sweep_scenes

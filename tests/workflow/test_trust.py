@@ -141,7 +141,7 @@ def test_the_locks_of_a_live_run_are_never_removed(copy_of_finished: Project) ->
         a.kill()
         a.wait()
         refused = project.hilsplat_run(f"{default}/coverage_tree", check=False)
-        assert refused.returncode == 1 and "another Snakemake runs" in refused.stderr
+        assert refused.returncode == 1 and "another Snakemake process is running" in refused.stderr
         left = {path.name: path.read_bytes() for path in locks.iterdir()}
         assert held.items() <= left.items()
         os.killpg(b.pid, signal.SIGCONT)

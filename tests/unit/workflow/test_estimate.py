@@ -82,7 +82,7 @@ def test_first_answer_and_all_photographs_are_predicted(photographs):
     (line,) = estimate.forecasts(found, 2)
     # 15 training views: 150 + 7.5 x 20 + 75 + 400 x 3 x 0.1 = 495 core seconds, then 7.5 x 12.3 + 150 + 200
     assert line.startswith("photos/desk: first answer in about 4 min, all photographs in about 8 min.")
-    assert "20 s of SAM on one of 2 cores, a crop 0.10 s of CLIP" in line
+    assert "On one of 2 cores, SAM takes 20 s per photograph, and CLIP 0.10 s per crop" in line
 
 
 def test_without_key_views_there_is_one_time(photographs):

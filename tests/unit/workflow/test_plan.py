@@ -76,7 +76,7 @@ def test_segments_of_waymo_are_run_without_a_row(tmp_path):
 
 
 def test_a_run_without_scenes_lists_the_known_scenes(tmp_path):
-    with pytest.raises(SettingsError, match=r"no scene to run(.|\n)*rooms/room \(benchmark\)"):
+    with pytest.raises(SettingsError, match=r"no scenes to run(.|\n)*rooms/room \(benchmark\)"):
         plan(tmp_path, groups=["ci"])
 
 

@@ -184,5 +184,5 @@ def test_verify_finds_a_missing_input_and_damaged_provenance(results):
     assert "masks is missing" in report and "its input masks is missing" in report
     provenance_path(MASKS).write_text("{")
     assert "its provenance is damaged" in verify(results)[0]
-    with pytest.raises(ArtifactError, match="contains no artifact"):
+    with pytest.raises(ArtifactError, match="contains no artifacts"):
         verify(Path("photos"))

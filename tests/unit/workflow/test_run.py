@@ -141,7 +141,7 @@ def test_the_locks_of_a_live_run_stay(folder, started, unlocked, is_marked):
     b = subprocess.Popen([sys.executable, "-c", HOLD, *words], stdout=subprocess.PIPE, text=True)
     assert b.stdout.readline() == "held\n"
     if is_marked:
-        with pytest.raises(HilsplatError, match="another Snakemake runs"):
+        with pytest.raises(HilsplatError, match="another Snakemake process is running"):
             runs.run([], [], [])
     else:
         runs.run([], [], [])
