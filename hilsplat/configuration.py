@@ -20,7 +20,7 @@ from hilsplat.settings import LARGEST, ClipSettings, MasksSettings, Section, kno
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
 
-LONGEST_SHOWN = 120  # characters of a value in a message
+LONGEST_SHOWN = 120  # maximum characters of a value in a message
 
 
 class StageSettings(Section):
@@ -81,8 +81,8 @@ Settings = TypeVar("Settings", bound=Section)
 def with_models(section: Settings) -> Settings:
     """Replace `auto` in a section by existing models, so that records name the models that were used.
 
-    `masks.segmenter: auto` selects the SAM in `masks.model` or, if that is also auto, the best pretrained
-    SAM; without a pretrained SAM, it selects the graph segmenter. `masks.model: auto` and `clip.model: auto`
+    `masks.segmenter: auto` selects the SAM model in `masks.model` or, if that is also auto, the best
+    pretrained SAM; without one, it selects the graph segmenter. `masks.model: auto` and `clip.model: auto`
     select the best pretrained model, else the embedded one. Other sections are returned unchanged.
     """
     if isinstance(section, ClipSettings) and section.model == AUTO:
@@ -149,12 +149,12 @@ SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
 class RunSettings(StageSettings):
     """The whole configuration: what to run, and the settings to use."""
 
-    seed: int = knob(0, "seed for everything random", ge=0)
+    seed: int = knob(0, "random seed", ge=0)
     scenes: str = knob("config/scenes.tsv", "scene sheet, relative to the project")
     results: str = knob("results", "results folder, relative to the working folder", pattern="^[^{}<>]+$")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
     only: tuple[str, ...] = knob(
-        (), "the only scenes to run, of any group: table-1, or synthetic/table-1; empty: all of the groups"
+        (), "the only scenes to run, from any group: table-1, or synthetic/table-1; empty: all in the groups"
     )
     # The report shows the data root and cannot escape it.
     data_root: str = knob(
@@ -167,9 +167,9 @@ class RunSettings(StageSettings):
     omega_variants: tuple[str, ...] = knob((), "variants in the sweep over Omega")
     pruning_variants: tuple[str, ...] = knob((), "variants in the table of pruned pairs")
     sweep_scenes: tuple[str, ...] = knob(
-        (), "scenes for ablation, sweeps and pruning; empty: all tabletop and photographed ones"
+        (), "scenes for ablation, sweeps and pruning; empty: all tabletop and photographed scenes"
     )
-    seeds: int = knob(1, "seeds for random training; with several, tables have mean and spread", ge=1, le=10)
+    seeds: int = knob(1, "seeds for random training; if several, tables report mean and spread", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> setting -> value; 'default' always exists"
     )
@@ -188,7 +188,7 @@ class RunSettings(StageSettings):
         return (value,) if isinstance(value, str) else value
 
     def every_variant(self) -> list[str]:
-        """Return all variants per seed, in a table or not: "default", then in the order of `variants`."""
+        """Return all variants, tabulated or not, per seed: "default", then in the order of `variants`."""
         return [
             name for first in dict.fromkeys(["default", *self.variants]) for name in self._all_seeds(first)
         ]
@@ -237,7 +237,7 @@ class RunSettings(StageSettings):
                     )
                 if where.startswith("variants.") and section not in VARIANT_SECTIONS:
                     raise SettingsError(
-                        f"{where}.{section}: a variant cannot change this section, all variants share it",
+                        f"{where}.{section}: variants cannot change this section, which they share",
                         expected=f"one of {', '.join(VARIANT_SECTIONS)}",
                         fix="put it under overrides for a group or a scene, or in another configuration file",
                     )
@@ -259,7 +259,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     """Validate a configuration with variants and overrides; raise SettingsError, which names each bad key."""
     if "\\u0000" in json.dumps(config, default=str):
         raise SettingsError(
-            "a text of the configuration has a null byte", fix="remove it: commands cannot take it"
+            "a text in the configuration contains a null byte", fix="remove it; commands do not accept it"
         )
     try:
         run = RunSettings.model_validate(config)
@@ -272,8 +272,8 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     for name in run.variants:
         if _parts_of(name)[0] in RESERVED:
             raise SettingsError(
-                f"variants.{name}: the folder of a scene has files of this name",
-                expected=f"another name than {', '.join(sorted(RESERVED))}",
+                f"variants.{name}: this name is reserved for files in a scene folder",
+                expected=f"a name other than {', '.join(sorted(RESERVED))}",
                 fix="rename the variant",
             )
     for key, texts in run.queries.items():
@@ -323,7 +323,7 @@ def read_config(path: Path) -> dict[str, Any]:
         fault = "cannot be used" if isinstance(error, yaml.constructor.ConstructorError) else "is not YAML"
         raise SettingsError(
             f"{path}{place} {fault}: {error.problem or error.context}",
-            fix="indent with spaces, close what is open, and quote texts with a colon or braces",
+            fix="indent with spaces, close brackets and quotes, and quote texts with a colon or braces",
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct the path") from error

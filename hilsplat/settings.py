@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 LARGEST = 2_000_000_000
-"""Largest integer in any setting: libraries accept 32 bits, and a run adds up to 10 to its seed."""
+"""Maximum of an integer setting: libraries accept 32 bits, and a run adds up to 10 to its seed."""
 
 
 def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **limits: Any) -> Any:
@@ -57,8 +57,8 @@ class WorldSettings(Section):
 
     views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
     image_px: int = knob(256, "height and width of each view", unit="px", ge=32, le=4096)
-    arc_deg: float = knob(360.0, "azimuth covered by the cameras; a ring is 360", unit="degree", gt=0, le=360)
-    objects: int = knob(6, "objects to place; the log says how many fitted", unit="objects", ge=1, le=30)
+    arc_deg: float = knob(360.0, "azimuth covered by the cameras; 360: a ring", unit="degree", gt=0, le=360)
+    objects: int = knob(6, "objects to place; the log reports how many fit", unit="objects", ge=1, le=30)
     samples: int = knob(3, "samples per pixel along each side", ge=1, le=8)
     min_area_px: int = knob(60, "wholes and parts with less visible area are not scored", unit="px", ge=1)
 
@@ -83,7 +83,7 @@ class PosesSettings(Section):
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     min_registered_share: float = knob(
-        0.7, "poses fail if the largest model has a smaller share of the views", unit="share", gt=0, le=1
+        0.7, "poses fail if the largest model contains a smaller share of the views", unit="share", gt=0, le=1
     )
     several_models: Literal["largest", "stop"] = knob(
         "largest", "if the photographs form several models: use the largest, or stop"
@@ -94,14 +94,14 @@ class PosesSettings(Section):
 class GaussiansSettings(Section):
     """Fit of the 3D Gaussians."""
 
-    iterations: int = knob(3000, "most optimisation steps, each on one view", ge=1, origin="3DGS: 30000")
-    steps_per_view: int = knob(60, "steps per training view, if that is fewer than `iterations`", ge=1)
-    max_gaussians: int = knob(50_000, "largest number of Gaussians at any step", ge=100)
+    iterations: int = knob(3000, "maximum number of steps, each on one view", ge=1, origin="3DGS: 30000")
+    steps_per_view: int = knob(60, "steps per training view, if fewer than `iterations` in total", ge=1)
+    max_gaussians: int = knob(50_000, "maximum number of Gaussians at any step", ge=100)
     image_scale: float = knob(1.0, "scale of the fit's images; 0.5 halves their sides", gt=0, le=1)
     quarter_until: float = knob(0.15, "share of the iterations at quarter size", ge=0, le=1, origin="3DGS: 0")
     half_until: float = knob(0.75, "share of the iterations before full size", ge=0, le=1, origin="3DGS: 0")
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
-    ssim_weight: float = knob(0.2, "weight of D-SSIM in the loss; L1 has the rest", ge=0, le=1, origin="3DGS")
+    ssim_weight: float = knob(0.2, "D-SSIM's share of the loss; the rest is L1", ge=0, le=1, origin="3DGS")
     # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
     # config/paper.yaml uses the published number and sizes of steps.
     means_rate: float = knob(
@@ -113,13 +113,13 @@ class GaussiansSettings(Section):
     scales_rate: float = knob(0.01, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
     quats_rate: float = knob(0.004, "step size of the quaternions", gt=0, origin="3DGS: 1e-3")
     sh_rate: float = knob(
-        4e-3, "step size of constant harmonics; others: a twentieth", gt=0, origin="3DGS: 2.5e-3"
+        4e-3, "step size of constant harmonics; others: 1/20 of it", gt=0, origin="3DGS: 2.5e-3"
     )
     densify_from: float = knob(
-        0.06, "densification: its start, share of iterations", ge=0, le=1, origin="3DGS: 500 / 30000"
+        0.06, "start of densification, as a share of iterations", ge=0, le=1, origin="3DGS: 500 / 30000"
     )
     densify_until: float = knob(
-        0.6, "densification: its end, share of iterations", ge=0, le=1, origin="3DGS: 0.5"
+        0.6, "end of densification, as a share of iterations", ge=0, le=1, origin="3DGS: 0.5"
     )
     densify_every: int = knob(100, "steps between densifications", ge=1, origin="3DGS")
     densify_gradient: float = knob(
@@ -154,13 +154,13 @@ class MasksSettings(Section):
 
     segmenter: Literal["auto", "sam", "graph", "truth-perturbed"] = knob(
         "sam",
-        "sam: the SAM in `model`; graph: OpenCV's graph segmentation, without weights; auto: sam if "
-        "pretrained, else graph; truth-perturbed: a diagnostic, true masks of a synthetic scene with the "
-        "faults in perturb",
+        "sam: the SAM model in `model`; graph: OpenCV's graph segmentation, without weights; auto: sam if "
+        "pretrained, else graph; truth-perturbed: a diagnostic, ground-truth masks of a synthetic scene with "
+        "the faults in perturb",
     )
     model: str = knob(
         "models/sam-tiny",
-        "SAM folder (Hugging Face ONNX export); auto: the best pretrained one, else models/sam-tiny",
+        "SAM folder (Hugging Face ONNX export); auto: the best pretrained SAM, else models/sam-tiny",
     )
     variant: str = knob(
         "",
@@ -169,14 +169,14 @@ class MasksSettings(Section):
     )
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "encoder arithmetic; auto: int8 on a CPU if it agrees with fp32 on the scene, never if embedded",
+        "encoder arithmetic; auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32",
     )
     key_views: float = knob(
         1.0, "share of the training views to segment; below 1: those that see the most Gaussians", gt=0, le=1
     )
     prompts: Literal["grid", "guided"] = knob(
         "grid",
-        "points in views after the key views; guided: nodes of the key views, and grid points that none "
+        "prompts in views after the key views; guided: nodes of the key views, and grid points that no node "
         "explains",
         origin="SAM, LangSplat: grid",
     )
@@ -186,28 +186,28 @@ class MasksSettings(Section):
         "theta",
         origin="paper: three levels by theta; LangSplat: head",
     )
-    theta: float | None = knob(None, "threshold for levels: tree; empty: coverage_tree.theta", gt=0.5, lt=1)
+    theta: float | None = knob(None, "threshold for levels: tree; unset: coverage_tree.theta", gt=0.5, lt=1)
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
         "prompts per decoder call; auto: the model folder's number, else 8 (full-size SAM: 60 MB each)",
         origin="LangSplat: 64",
     )
-    crop_layers: int = knob(0, "layers of crops segmented too", ge=0, le=2, origin="LangSplat: 1")
+    crop_layers: int = knob(0, "layers of crops to segment", ge=0, le=2, origin="LangSplat: 1")
     predicted_iou_min: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "masks need a higher predicted IoU, which may exceed 1; 0: all; auto: the model folder's number, "
-        "else 0.7",
+        "masks need a predicted IoU above this, which may exceed 1; 0: keep all; auto: the model folder's "
+        "number, else 0.7",
         origin="SAM: 0.88, LangSplat: 0.7",
     )
     stability_min: Probability | Auto = knob(
         "auto",
-        "least stability of a mask; auto: the model folder's number, else 0.85",
+        "minimum stability of a mask; auto: the model folder's number, else 0.85",
         origin="SAM: 0.95, LangSplat: 0.85",
     )
     stability: Literal["estimate", "full"] = knob(
         "estimate",
-        "where stability counts pixels; estimate: in the network's small masks; full: in the view",
+        "masks in which stability counts pixels; estimate: the network's small masks; full: full size",
         origin="SAM: full",
     )
     generator: Literal["hilsplat", "official"] = knob(
@@ -223,25 +223,25 @@ class MasksSettings(Section):
         le=1,
         origin="SAM",
     )
-    min_area_px: int = knob(16, "smallest mask, island, hole", unit="px", ge=1, origin="LangSplat: 100")
-    nms_iou: float = knob(0.8, "mask IoU above which the worse is dropped", gt=0, le=1, origin="LangSplat")
+    min_area_px: int = knob(16, "minimum mask, island or hole area", unit="px", ge=1, origin="LangSplat: 100")
+    nms_iou: float = knob(0.8, "IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat")
     nms_score: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "masks need a higher predicted IoU x stability; 0: all; auto: the model folder's number, else 0.7",
+        "predicted IoU x stability must exceed this; 0: keep all; auto: the model folder's number, else 0.7",
         origin="LangSplat: 0.7",
     )
     nms_inner: float = knob(0.5, "threshold for suppressing inner masks", ge=0, le=1, origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
-        (0.12, 0.04, 0.015), "graph: smallest segment at whole, part, subpart, as a share of the image side"
+        (0.12, 0.04, 0.015), "graph: minimum segment at whole, part, subpart, as a share of the image side"
     )
 
 
 class PerturbSettings(Section):
-    """Faults added to true masks, used only with masks.segmenter: truth-perturbed.
+    """Faults added to ground-truth masks, used only with masks.segmenter: truth-perturbed.
 
     The defaults approximate a good SAM on a clean image of about 256 px: slightly more consistent across
-    views than the embedded model (`hilsplat world inconsistency`). With all faults at 0, masks are true. A
-    scene has few wholes, so the effect of systematic faults depends on the seed: average over several seeds.
+    views than the embedded model (`hilsplat world inconsistency`). With all faults at 0, masks equal the
+    ground truth. Scenes have few wholes, so the effect of systematic faults varies: average over seeds.
     """
 
     seed: int = knob(0, "seed of the faults; independent of the run's seed", ge=0)
@@ -275,7 +275,7 @@ class CoverageTreeSettings(Section):
 
     theta: float = knob(
         0.9,
-        "a mask is the child of one that covers more than this share of it",
+        "a mask is the child of a mask that covers more than this share of it",
         unit="share",
         gt=0.5,
         lt=1,
@@ -288,18 +288,18 @@ class ClipSettings(Section):
 
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "image network arithmetic; auto: int8 on a CPU if it agrees with fp32 on crops, never if embedded",
+        "image network; auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32",
     )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
-        "masks to embed; nodes: those that show each node best; masks: all; auto: by autoencoder.targets",
+        "masks to embed; nodes: those showing each node best; masks: all; auto: as autoencoder.targets says",
         origin="paper, LangSplat: masks",
     )
-    crops_per_node: int = knob(5, "nodes: the most crops that a node's vector is averaged from", ge=1, le=32)
+    crops_per_node: int = knob(5, "nodes: maximum number of crops averaged per node", ge=1, le=32)
 
     model: str = knob(
         "models/clip-tiny",
-        "CLIP folder (Hugging Face ONNX export); auto: the best pretrained one, else models/clip-tiny",
+        "CLIP folder (Hugging Face ONNX export); auto: the best pretrained CLIP, else models/clip-tiny",
     )
     variant: str = knob(
         "",
@@ -314,7 +314,7 @@ class ClipSettings(Section):
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )
-    batch: int = knob(1, "crops per network call; more pay on a GPU alone", ge=1, le=4096)
+    batch: int = knob(1, "crops per network call; more are faster only on a GPU", ge=1, le=4096)
 
 
 class ContributionsSettings(Section):
@@ -324,7 +324,7 @@ class ContributionsSettings(Section):
     keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
         "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-"
-        "zeros; none: neither, enough for a semantic tree without a field",
+        "zeros; none: neither, sufficient for a semantic tree without a field",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
         "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
@@ -336,15 +336,15 @@ class SemanticTreeSettings(Section):
 
     evidence: Literal["masks", "features"] = knob(
         "masks",
-        "masks: linked across views; features: Gaussians clustered by features that L alone trains, with "
+        "masks: linked across views; features: Gaussians clustered by features trained by L alone, with "
         "the weights and readings of section field",
         origin="paper: features",
     )
-    feature_size: int = knob(6, "features: numbers of a feature", ge=2, le=64, origin="OpenGaussian: 6")
-    link_threshold: float = knob(0.3, "least pooled IoU to join clusters of masks", gt=0, lt=1)
+    feature_size: int = knob(6, "features: their dimension", ge=2, le=64, origin="OpenGaussian: 6")
+    link_threshold: float = knob(0.3, "minimum pooled IoU to join mask clusters", gt=0, lt=1)
     min_views: int = knob(3, "nodes with masks in fewer views are dropped", ge=1)
     parent_coverage: float = knob(
-        0.5, "a node becomes the child of a coarser one that holds more than this share of it", gt=0, lt=1
+        0.5, "a node is the child of a coarser node that contains more than this share of it", gt=0, lt=1
     )
     whole_side: float = knob(
         0.35, "graph: regions that touch in 3D form wholes up to about this share of a view's side", gt=0
@@ -365,14 +365,14 @@ class AutoencoderSettings(Section):
     latent: int = knob(16, "size d of a latent", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
-        "a mask's vector; node: that of the node that it fits best; mask: its own",
+        "vector that represents a mask; node: its best-fitting node's; mask: its own",
         origin="paper: mask",
     )
     epochs: int = knob(100, "network: passes over all vectors", ge=1, origin="LangSplat: 100")
-    min_steps: int = knob(2000, "network: least number of steps, however few the vectors", ge=1)
+    min_steps: int = knob(2000, "network: minimum number of steps, regardless of the number of vectors", ge=1)
     batch: int = knob(64, "network: vectors per step", ge=2, origin="LangSplat: 64")
     learning_rate: float = knob(
-        2e-3, "network: initial Adam step, cosine decay", gt=0, origin="LangSplat: 7e-4"
+        2e-3, "network: initial Adam step size; cosine decay", gt=0, origin="LangSplat: 7e-4"
     )
     cosine_weight: float = knob(
         1e-3, "network: weight of 1 - cosine in the loss", ge=0, origin="LangSplat: 1e-3"
@@ -398,22 +398,22 @@ class FieldSettings(Section):
     )
     part_mode: Literal["literal", "disentangle"] = knob(
         "disentangle",
-        "literal: Eq. 5 as printed; disentangle: as its prose says, parts repel",
+        "literal: Eq. 5 as printed; disentangle: parts repel each other, as its prose says",
         origin="paper: literal",
     )
     omega: float = knob(10.0, "similarity degree Omega: base of L_ins's distances", gt=1, origin="paper: 10")
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
     start: Literal["average", "median", "random", "langsplat"] = knob(
         "average",
-        "initial features; average, median: of the latents of the masks that show a Gaussian (the "
+        "initial features; average, median: of the latents of masks that contain a Gaussian (the "
         "geometric median is robust, like L1); random: in [-1, 1); langsplat: from a variant with "
         "method.name langsplat and the same autoencoder",
     )
-    ridge: float = knob(0.1, "weight of the pull towards the first features, per visible mass", ge=0)
+    ridge: float = knob(0.1, "weight of the pull towards the initial features, per visible mass", ge=0)
     trainer: Literal["fast", "literal"] = knob(
         "fast",
-        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: render a view, step "
-        "by Adam (iterations, rate), the same objective in hours",
+        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: the same objective by "
+        "rendering a view for each Adam step (iterations, rate), which takes hours",
         origin="paper: literal",
     )
     iterations: int = knob(30_000, "steps of the literal trainer, each on one view", ge=1, origin="paper")
@@ -425,14 +425,14 @@ class FieldSettings(Section):
     )
     min_labelled_share: float = knob(
         0.3,
-        "a Gaussian gets a latent at a level if the level's masks hold this share of its weight; 0: always",
+        "a Gaussian gets a latent at a level if the level's masks contain this share of its weight; 0: all do",
         ge=0,
         lt=1,
         origin="paper, LangSplat: 0",
     )
     cg_steps: int = knob(6, "conjugate-gradient steps on the quadratic losses", ge=0)
-    lbfgs_steps: int = knob(6, "L-BFGS steps, taken if L_ins or L_part has a weight", ge=0)
-    min_mask_px: int = knob(50, "smaller masks take no part in L_ins and L_part", unit="px", ge=1)
+    lbfgs_steps: int = knob(6, "L-BFGS steps, if L_ins or L_part has a weight", ge=0)
+    min_mask_px: int = knob(50, "L_ins and L_part ignore smaller masks", unit="px", ge=1)
     prune_cosine: float = knob(
         1.0,
         "L_ins and L_part omit a mask if the cosine of its mean feature with that of a larger, unrelated "
@@ -450,7 +450,7 @@ class FieldSettings(Section):
     @model_validator(mode="after")
     def _l1_is_literal(self) -> "FieldSettings":
         if self.language == "l1" and self.trainer != "literal":
-            raise ValueError("language l1 needs trainer literal: frozen geometry makes only squares cheap")
+            raise ValueError("language l1 needs trainer literal: the fast trainer solves only for squares")
         return self
 
 
@@ -464,8 +464,8 @@ class MethodSettings(Section):
     )
     steps: int = knob(
         1800,
-        "trained methods: steps, each on one view; langsplat, langsplat_v2 and gaussian_grouping take "
-        "them for each level, the others for all together",
+        "trained methods: steps, each on one view; per level for langsplat, langsplat_v2 and "
+        "gaussian_grouping, otherwise for all levels together",
         ge=1,
         origin="LangSplat, LangSplatV2: 30000",
     )
@@ -478,8 +478,8 @@ class MethodSettings(Section):
     )
     thresholds: tuple[Granularity, Granularity, Granularity] | Auto = knob(
         "auto",
-        "granularity of whole, part, subpart; omniseg3d: least average cosine of a cluster, growing; vch:"
-        " longest edge of a component, falling; auto: the method's own",
+        "granularity of whole, part, subpart; omniseg3d: minimum average cosine of a cluster, increasing; "
+        "vch: maximum edge of a component, decreasing; auto: the method's own",
     )
 
     @property
@@ -509,7 +509,7 @@ class EvaluateSettings(Section):
         origin="LangSplat: 30, paper: 20",
     )
     mix: bool = knob(True, "average the filtered relevancy with the unfiltered one", origin="LangSplat")
-    relevancy_threshold: float = knob(0.4, "map threshold of its mask", ge=0, lt=1, origin="LangSplat, paper")
+    relevancy_threshold: float = knob(0.4, "map threshold for masks", ge=0, lt=1, origin="LangSplat, paper")
     threshold_on: Literal["normalised_pm1", "raw"] = knob(
         "normalised_pm1",
         "scale of the threshold; normalised_pm1: maps stretched to [-1, 1], so 0.4 is 70 % of the range",
@@ -523,17 +523,17 @@ class EvaluateSettings(Section):
     )
     node_select: float = knob(
         0.95,
-        "nodes selected with the best: those whose cosine margin is at most 1 - node_select times the "
-        "range of margins at the level below the best, or three times that if they look like it",
+        "nodes selected with the best: their cosine margin may be lower by 1 - node_select times the level's "
+        "range of margins, or by three times that if they look like the best",
         ge=0,
         le=1,
     )
     ancestors: float = knob(
-        0.2, "share of the ancestors' mean margin added to a node's own, to rank nodes", ge=0
+        0.2, "share of the ancestors' mean margin added to a node's own for ranking", ge=0
     )
-    min_region_px: int = knob(60, "smaller true regions are not scored", unit="px", ge=1)
+    min_region_px: int = knob(60, "smaller ground-truth regions are not scored", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
-        ("tree", "tree-path", "field"), "what answers the queries; each has its rows in the tables"
+        ("tree", "tree-path", "field"), "methods that answer; each has its own rows in the tables"
     )
     view_consistency: bool = knob(True, "score agreement in neighbouring views (synthetic scenes)")
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
@@ -549,7 +549,7 @@ class QuerySettings(Section):
     """Vocabulary for node names and for detecting doubtful answers."""
 
     vocabulary: str = knob(
-        "auto", "text file of words to name nodes; auto: vocabulary.txt of the CLIP, else 1,400 common words"
+        "auto", "text file of node names; auto: the CLIP model's vocabulary.txt, else 1,400 common words"
     )
 
 

@@ -37,7 +37,7 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
         ),
         (
             {"variants": {"x": {"poses": {"mapper": "global"}}}},
-            r"variants\.x\.poses: a variant cannot change this section",
+            r"variants\.x\.poses: variants cannot change this section",
         ),
         ({"main_variants": ["nope"]}, "variant 'nope' is not defined"),
         ({"queries": {"synthetic": ["mug", " "]}}, r"queries\.synthetic: a text is empty"),
@@ -64,7 +64,7 @@ def test_names_that_a_shell_or_a_folder_could_misread_are_refused(where: str, na
 
 @pytest.mark.parametrize("name", ["world", "logs", "queries", "export", "scene", "gaussians", "scene.seed1"])
 def test_a_variant_cannot_have_the_name_of_a_file_in_the_scene_folder(name: str) -> None:
-    with pytest.raises(SettingsError, match="has files of this name"):
+    with pytest.raises(SettingsError, match="is reserved for files"):
         parse_run({"variants": {name: {}}})
 
 
