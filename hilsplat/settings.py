@@ -425,7 +425,7 @@ class FieldSettings(Section):
     )
     min_labelled_share: float = knob(
         0.3,
-        "a Gaussian gets a latent at a level if the level's masks contain this share of its weight; 0: all do",
+        "a Gaussian gets a latent at a level if the level's masks contain this share of its weight; 0: all",
         ge=0,
         lt=1,
         origin="paper, LangSplat: 0",

@@ -30,7 +30,7 @@ SMALL_BYTES = 50_000_000
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
 """Errors of the connection to the hub."""
 WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
-"""Possible paths of a whole CLIP without `.onnx`."""
+"""Possible paths, without `.onnx`, of a network that contains both halves of a CLIP model."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class ModelRequest:
         try:
             validate_repo_id(name)
         except HFValidationError as error:
-            problem = f"{name!r} cannot be a repository: {error}"
+            problem = f"{name!r} is not a repository name: {error}"
             raise DownloadError(problem, fix="write owner/name") from error
         if name.count("/") != 1:
             known = ", ".join(release.name for release in RELEASES)
@@ -93,7 +93,7 @@ class Listing:
 
     repository: str
     revision: str
-    licence: str  # empty if the hub states none
+    licence: str  # empty if the hub reports none
     files: Mapping[str, HubFile]  # by path
 
     def require(self, *paths: str) -> list[HubFile]:
@@ -101,9 +101,9 @@ class Listing:
         if missing := [path for path in paths if path not in self.files]:
             raise DownloadError(
                 f"{self.repository} lacks {', '.join(missing)}",
-                expected="a model in the layout of the Hugging Face ONNX exports, or one to export",
+                expected="a model in the layout of the Hugging Face ONNX exports, or PyTorch weights",
                 found=", ".join(sorted(self.files)[:20]),
-                fix="name another repository (hilsplat models list)",
+                fix="choose another repository (hilsplat models list)",
             )
         return [self.files[path] for path in paths]
 
@@ -114,25 +114,25 @@ class Choice:
 
     files: Mapping[str, str]  # path in the repository -> path in the model folder
     exported: bool = False  # they are PyTorch weights, to be exported as networks
-    split: bool = False  # they are a whole CLIP, to be split into its two networks
+    split: bool = False  # they contain one CLIP network, to be split into its halves
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
     """Request the listing of a repository from the hub.
 
     Raises:
-        requests.RequestException: the hub is unreachable, or refuses.
+        requests.RequestException: the hub is unreachable or denies access.
         OfflineModeIsEnabled: HF_HUB_OFFLINE is set.
-        DownloadError: the hub does not state the size and digest of a file.
+        DownloadError: the hub does not report the size and digest of a file.
     """
     info = huggingface_hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
     files = {}
     for each in info.siblings or ():
         if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
-            continue  # no hub has such a file, and it would be written elsewhere
+            continue  # no hub has such a path, and the file would be written elsewhere
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
-            problem = f"{constants.ENDPOINT} states no size and digest of {each.rfilename} (?blobs=true)"
+            problem = f"{constants.ENDPOINT} reports no size or digest of {each.rfilename} (?blobs=true)"
             raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
         files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
     licence = getattr(info.card_data, "license", None) or ""
@@ -158,7 +158,7 @@ def read_cached_listing(repository: str, revision: str | None) -> Listing | None
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
-    """Choose the files of a model: separate networks, else a whole CLIP, else PyTorch weights.
+    """Choose the files of a model: separate networks, else one CLIP network, else PyTorch weights.
 
     Args:
         config: the repository's config.json.
@@ -179,7 +179,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             f"{listing.repository} contains no supported model",
             expected="; ".join(SUPPORTED.values()),
             found=found,
-            fix="name a SAM or a CLIP (hilsplat models list)",
+            fix="choose a SAM or CLIP model (hilsplat models list)",
         )
     layout, ending = LAYOUTS[kind], f"_{variant}" if variant else ""
     whole = [WHOLES if kind in ("clip", "siglip") else ()]

@@ -45,15 +45,15 @@ logger = logging.getLogger(__name__)
 
 ORIGIN = "origin.json"
 """File in a model folder that records its origin."""
-KEPT = "transferred data is kept, and the transfer is continued"
+KEPT = "transferred data is kept, and the transfer resumes"
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
 """Waits between attempts to download a file."""
 CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
-"""Errors of a connection that breaks."""
+"""Errors of a broken connection."""
 SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
 EXPORT_FACTOR = 4
-"""Disk space for an export, as a multiple of the weights' size: weights, whole network, and its halves."""
+"""Disk space for an export, as a multiple of the weights' size: weights, complete network, and its halves."""
 NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
 """Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
@@ -91,15 +91,15 @@ def get_models(
         the report of `check_model` on each model, and which models are used for photographs.
 
     Raises:
-        DownloadError: the hub is unreachable, refuses, lacks the files, or sends bytes with a wrong digest.
-        DiskSpaceError: the disk is or becomes full; transferred data is kept.
+        DownloadError: the hub is unreachable, denies access, lacks files, or sends bytes with a wrong digest.
+        DiskSpaceError: the disk is full or fills up; transferred data is kept.
         ModelError: a downloaded model does not work, or cannot be exported.
     """
     models = models or user_models()
     if not names:
         logger.info("the recommended pair: %s", " and ".join(RECOMMENDED))
     if revision is not None and len(names) != 1:
-        raise DownloadError(f"--revision needs one model, found {len(names)} names", fix="name one model")
+        raise DownloadError(f"--revision requires one model, found {len(names)} names", fix="pass one model")
     prepared, texts = [], []
     for name in names or RECOMMENDED:
         requested = ModelRequest.named(name, variant)
@@ -108,7 +108,7 @@ def get_models(
             _require_ours(requested, target)
             listing = _listing(requested, revision)
             if _is_present(target, listing):
-                texts.append(f"{target} exists already, from {listing.repository} at {listing.revision}")
+                texts.append(f"{target} already exists, from {listing.repository} at {listing.revision}")
             else:
                 prepared.append(_prepare(requested, listing, target, variant))
     if prepared:
@@ -125,7 +125,7 @@ def _require_ours(requested: ModelRequest, target: Path) -> None:
     origin = _origin(target)
     if target.exists() and origin.get("repository") != requested.repository:
         raise DownloadError(
-            f"{target} exists already and was not fetched from {requested.repository}",
+            f"{target} already exists and was not downloaded from {requested.repository}",
             found=f"{ORIGIN} of {origin['repository']}" if origin else f"no {ORIGIN}",
             fix="rename or remove that folder, then run the command again",
         )
@@ -152,7 +152,7 @@ def _listing(requested: ModelRequest, revision: str | None) -> Listing:
         cached = read_cached_listing(requested.repository, revision)
         if cached is None:
             raise
-        logger.info("the hub is unreachable: %s is read from its local cache", requested.repository)
+        logger.info("the hub is unreachable; %s is read from the local cache", requested.repository)
         return cached
 
 
@@ -165,7 +165,7 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     licence = requested.release.licence if requested.release else "not stated by the hub"
     source = f"{requested.name}: {requested.repository} at {listing.revision[:12]}"
     size = f"{found.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
-    left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB of them still to fetch"
+    left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB of which still to download"
     logger.info("%s, %s, %s; licence: %s", source, size, left, listing.licence or licence)
     if choice.exported:
         require_exporter(requested.repository)
@@ -177,7 +177,7 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
     fetched = sum(each.num_bytes(missing=True) for each in prepared)
     made = sum(each.num_bytes() * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
     free = shutil.disk_usage(models).free
-    logger.info("%.1f MB to fetch; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
+    logger.info("%.1f MB to download; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
     if free < fetched + made + SPARE_BYTES:
         raise DiskSpaceError(
             f"too little space on the disk of {models}",
@@ -224,10 +224,10 @@ def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
     if found != file.digest:
         target.unlink()
         raise DownloadError(
-            f"{file.path} of {listing.repository} arrived with another digest than the hub states",
+            f"{file.path} of {listing.repository} does not have the digest that the hub reports",
             expected=f"digest {file.digest}, {file.size} bytes",
-            found=f"digest {found}, {size} bytes; they were deleted",
-            fix="run the command again; if it happens again, a proxy or mirror changes the file",
+            found=f"digest {found}, {size} bytes; the file was deleted",
+            fix="run the command again; if the error persists, a proxy or mirror changes the file",
         )
     return target
 
@@ -284,13 +284,13 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
     except GatedRepoError as error:
         raise DownloadError(
             f"{requested.repository} requires you to accept its terms before downloading ({_status(error)})",
-            fix=f"accept its terms at {place}, `hf auth login` or set HF_TOKEN, and run the command again",
+            fix=f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again",
         ) from error
     except RepositoryNotFoundError as error:
         raise DownloadError(
             f"the hub has no repository {requested.repository}, or it is private ({_status(error)})",
             expected=place,
-            fix="correct the name (hilsplat models list); for a private one, `hf auth login` or set HF_TOKEN",
+            fix="correct the name (hilsplat models list); if it is private, `hf auth login` or set HF_TOKEN",
         ) from error
     except (requests.RequestException, *OUT_OF_REACH) as error:
         answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
@@ -298,7 +298,7 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
             raise _refused(answered, requested, place) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]
         raise DownloadError(
-            f"{requested.repository} cannot be fetched: {type(error).__name__}, {place} is unreachable",
+            f"{requested.repository} cannot be downloaded: {type(error).__name__}, {place} is unreachable",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again when the hub is reachable ({KEPT}; HF_ENDPOINT sets a mirror, "
             f"HTTPS_PROXY a proxy), or put these files into {models / requested.name} by hand, from {place}: "
@@ -325,7 +325,7 @@ def _refused(error: requests.HTTPError, requested: ModelRequest, place: str) -> 
         )
     if response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
         problem = f"the hub denies access to {of}"
-        fix = f"look at {place}; `hf auth login` or set HF_TOKEN to a token with access"
+        fix = f"see {place}; run `hf auth login`, or set HF_TOKEN to a token with access"
     elif response.status_code == requests.codes.not_found:
         problem = f"the hub does not have this revision or file of {of}"
         fix = f"correct the name or --revision; {place} lists what exists"
@@ -366,9 +366,9 @@ def _is_installed(module: str) -> bool:
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
     """Export the networks of a SAM or CLIP saved by transformers; return the exporter's package versions.
 
-    If the exporter fails, its last lines are in the error.
+    If the exporter fails, the error contains its last lines of output.
     """
-    logger.info("exporting to ONNX; this takes a few minutes and about three times the weights in memory")
+    logger.info("exporting to ONNX; this takes minutes, and about three times the weights' size in memory")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
     done = subprocess.run(
         [sys.executable, "-m", "optimum.commands.optimum_cli", *words],
@@ -380,7 +380,7 @@ def export_networks(weights: Path, out: Path) -> dict[str, str]:
     if done.returncode:
         lines = (done.stdout + done.stderr).strip().splitlines()[-LAST_LINES:]
         raise ModelError(
-            f"the weights in {weights} cannot be exported: the exporter ended with {done.returncode}",
+            f"the weights in {weights} cannot be exported: the exporter exited with {done.returncode}",
             found="\n            ".join(lines) or "no output",
             fix=f"install the tested versions ({INSTALL}), then run the command again",
         )

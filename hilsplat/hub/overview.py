@@ -47,7 +47,7 @@ def models_table() -> str:
 
 
 def check_models() -> tuple[str, int]:
-    """Return the report of `check_model` on every installed model, and the number that do not work."""
+    """Return the report of `check_model` on every installed model, and the number of broken models."""
     texts, num_failed = [], 0
     for folder in [*(model.folder for model in present_models()), *broken_models()]:
         try:

@@ -1,4 +1,4 @@
-"""Finding and checking of model folders in the layouts of published ONNX exports.
+"""Finding and checking model folders in the layouts of published ONNX exports.
 
 A folder contains `config.json`, the preprocessing configuration and the networks as `.onnx` files
 (`layouts.LAYOUTS`). Everything needed to convert a photograph into a network's input is read from the folder,
@@ -20,8 +20,8 @@ from hilsplat.models.network import Network
 from hilsplat.models.onnx_graph import whole_clip
 from hilsplat.models.store import model_path
 
-OTHER_FOLDER = "name a folder in a layout that docs/models.md lists"
-WHOLE_COPY = "fetch a whole copy"
+OTHER_FOLDER = "choose a folder in a layout listed in docs/models.md"
+WHOLE_COPY = "fetch a complete copy"
 SWITCHES = ("do_resize", "do_rescale", "do_normalize")
 """Preprocessing steps that our code always performs."""
 
@@ -44,7 +44,7 @@ class ModelFolder:
 
     @property
     def tokenizer(self) -> Path:
-        """Tokenizer file of a CLIP."""
+        """Tokenizer file of a CLIP model."""
         return self.folder / LAYOUTS[self.layout].tokenizer
 
     @cached_property
@@ -137,7 +137,7 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: 
             "(hilsplat models get), or export it (docs/models.md)"
         )
     else:
-        remedy = "fetch or export the whole model again"
+        remedy = "fetch or export the complete model again"
     return ModelError(
         f"model folder {folder} lacks {', '.join(missing)}",
         expected=", ".join(expected),
@@ -169,7 +169,7 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
         raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
     if switched_off := [key for key in SWITCHES if found.get(key) is False]:
         raise ModelError(
-            f"{path} switches off {', '.join(switched_off)}",
+            f"{path} disables {', '.join(switched_off)}",
             expected="images resized, divided by 255 and normalised, as in the released models",
             fix="export the model again with its own preprocessor",
         )

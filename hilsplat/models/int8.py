@@ -17,21 +17,21 @@ from hilsplat.models.onnx_graph import needed_names
 logger = logging.getLogger(__name__)
 
 RECIPE = "dynamic, per channel, 1"
-"""Version of the quantisation: it changes whenever the same network would give other bytes."""
+"""Version of the quantisation: change it whenever the same network would give different bytes."""
 
 WORDS = (
     *("object", "things", "stuff", "texture", "person", "face", "hand", "animal", "head", "toy", "cup"),
     *("bottle", "plate", "food", "fruit", "table", "chair", "sofa", "bed", "cushion", "blanket", "lamp"),
     *("book", "screen", "door", "window", "wall", "floor", "plant", "tree", "car", "wheel", "button"),
 )
-"""Texts that each crop ranks: the canonical phrases of LERF and everyday words."""
+"""Texts ranked for each crop: the canonical phrases of LERF and everyday words."""
 
 LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
 """Minimum agreement of both precisions: mean IoU of masks from the same prompts, mean cosine of vectors,
 and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views differ
 by more."""
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
-"""Number of crops for checking a CLIP; number of views, and of prompts per side, for checking a SAM."""
+"""Numbers of crops for checking a CLIP model, and of views and prompts per side for a SAM model."""
 
 
 def may_be_int8(model: ModelFolder) -> bool:
@@ -89,7 +89,7 @@ def _quantise(network: Path | bytes, out: Path, exact: Sequence[str]) -> None:
 
 
 def _leading_only_to(graph: Any, outputs: Sequence[str]) -> list[str]:
-    """Return the names of nodes that are needed for the given outputs only."""
+    """Return the names of nodes that only the given outputs need."""
     needed = needed_names(graph, outputs)
     others = needed_names(graph, [each.name for each in graph.output if each.name not in outputs])
     return sorted(
@@ -115,7 +115,7 @@ def use_int8(
     )
     found = {name: float(value[0]) for name, value in kept.items()}
     use = precision == "int8" or all(value >= LEAST[name] for name, value in found.items())
-    measured = ", ".join(f"{name} {value:.4f} (least: {LEAST[name]})" for name, value in found.items())
+    measured = ", ".join(f"{name} {value:.4f} (minimum: {LEAST[name]})" for name, value in found.items())
     logger.info("%s runs in %s. int8 and float32: %s", what, "int8" if use else "float32", measured)
     return use
 

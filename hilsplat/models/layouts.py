@@ -28,7 +28,7 @@ class Layout:
     networks: Mapping[str, NetworkSpec]  # required networks, by the names used in this package
     further: Mapping[str, NetworkSpec] = field(default_factory=dict)  # used if the folder contains them
     preprocessing: str = "preprocessor_config.json"
-    tokenizer: str = ""  # empty if the model does not read texts
+    tokenizer: str = ""  # empty if the model does not process texts
     beside: tuple[str, ...] = ()  # further files that are included in the digest if they exist
 
     @property
@@ -58,7 +58,7 @@ def _places(name: str) -> tuple[str, ...]:
 
 
 def _segmenter(features: Sequence[str], optional: tuple[str, ...] = ()) -> Layout:
-    """Return the layout of a SAM whose encoder passes the named features to its decoder."""
+    """Return the layout of a SAM model whose encoder passes the named features to its decoder."""
     encoded = dict.fromkeys(features, _ANY4)
     encoder = NetworkSpec({"pixel_values": _IMAGE}, encoded, (), _places("vision_encoder"))
     decoder, preview = (
@@ -129,12 +129,12 @@ SUPPORTED = {
 """Supported models by kind, for messages."""
 
 OTHER_TYPES = {
-    "siglip2": "this is a SigLIP 2 of variable resolution (NaFlex); take one of fixed resolution, such as "
+    "siglip2": "this SigLIP 2 model has variable resolution (NaFlex); use one of fixed resolution, such as "
     "siglip2-base-patch16-224",
-    "sam_hq": "take SAM, or SAM 2.1",
-    "sam3": "take SAM 2.1",
-    "sam3_tracker": "take SAM 2.1",
-    "chinese_clip": "take CLIP, SigLIP 2 (many languages) or an open_clip in two folders",
+    "sam_hq": "use SAM or SAM 2.1",
+    "sam3": "use SAM 2.1",
+    "sam3_tracker": "use SAM 2.1",
+    "chinese_clip": "use CLIP, SigLIP 2 (many languages) or an open_clip model in two folders",
 }
 """Unsupported `model_type` -> which model to use instead."""
 

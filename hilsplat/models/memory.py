@@ -14,7 +14,7 @@ ATTENTION_COPIES = 3.5
 """Number of arrays of the size of a layer's attention weights that exist at once. Measured: 2615 MiB for an
 image in SAM ViT-B, whose attention weights take 768 MiB."""
 ACTIVATIONS = 35
-"""Memory of an image in SAM with row-wise attention, in arrays of all patch features. Measured: 475 MiB in
+"""Memory of an image in SAM with row-wise attention, in multiples of all patch features. Measured: 475 MiB in
 ViT-B, whose patch features take 12 MiB."""
 PROMPT_MIB = 64
 """Memory per prompt in SAM's exported decoder, for a 1024 px image. Measured: 507 MiB for 8 in ViT-B."""
@@ -22,8 +22,8 @@ FACTORED_MIB = 250
 """Memory of all prompts of a 1024 px image in the factored decoder. Measured: 104 MiB while 1024 prompts are
 previewed, plus the masks of the prompts that are kept."""
 CLIP_TOKEN_MIB = 0.03
-"""Memory per patch of a crop in a CLIP, besides two arrays of attention weights. Measured: 521 MiB for 64
-crops in ViT-B/16."""
+"""Memory per patch of a crop in a CLIP model, besides two arrays of attention weights. Measured: 521 MiB for
+64 crops in ViT-B/16."""
 UNKNOWN_BYTES_PER_PX = 400
 """Memory for encoding an image, per pixel, if the configuration does not describe the network (sam-tiny)."""
 
@@ -48,7 +48,7 @@ class Needs:
 def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Needs:
     """Estimate the memory of a model from its configuration and file sizes.
 
-    `batch` is the number of prompts (SAM) or crops (CLIP) per call, `as_exported` that of a `SamModel`.
+    `batch` is the number of prompts (SAM) or crops (CLIP) per call; see `SamModel` for `as_exported`.
     """
     files = {*model.networks.values(), *(path for path in model.files if "onnx" in path.name)}
     weights = 1.2 * sum(path.stat().st_size for path in files) / MIB
@@ -74,7 +74,7 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
 def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
     """Return the memory of one layer's attention weights between all patches of an image, MiB.
 
-    Keys missing from the configuration have the defaults of transformers: patches of 16 px and 12 heads. In
+    Keys missing from the configuration default to those of transformers: patches of 16 px and 12 heads. In
     SAM 2, the stage with global attention has a stride of 16 px and 4 heads.
     """
     stages = (vision.get("backbone_config") or {}).get("num_attention_heads_per_stage")

@@ -1,4 +1,4 @@
-"""Opening, checking and running of a network in a model folder."""
+"""Opening, checking and running a network of a model folder."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -75,7 +75,7 @@ class Network:
             raise ModelError(
                 f"network {path} cannot be opened: {error}",
                 found=f"a file of {path.stat().st_size} bytes",
-                fix="export it again, or fetch a whole copy (with its weights file, if it has one)",
+                fix="export it again, or fetch a complete copy (with its weights file, if it has one)",
             ) from error
         self.inputs = {item.name: item for item in self.session.get_inputs()}
         self.outputs = {item.name: item for item in self.session.get_outputs()}
@@ -102,7 +102,7 @@ class Network:
                 name: ", ".join(str(axis or "any") for axis in axes) for name, axes in expected.items()
             }
             raise ModelError(
-                f"network {self.path} has other {what} than expected: {', '.join(wrong)}",
+                f"network {self.path} has unexpected or missing {what}: {', '.join(wrong)}",
                 expected=", ".join(f"{name} ({axes})" for name, axes in axes_of.items()),
                 found=", ".join(f"{name} {list(item.shape)} {item.type}" for name, item in found.items()),
                 fix=EXPORT_AGAIN,
@@ -116,7 +116,7 @@ class Network:
     def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
         """Run the network once, and return the outputs in the order of the spec.
 
-        A ModelError is raised if the network rejects the inputs, or an output has another number of axes.
+        A ModelError is raised if the network rejects the inputs, or an output has the wrong number of axes.
         """
         known = {name: value for name, value in feeds.items() if name in self.inputs}
         cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in known.items()}
@@ -160,7 +160,7 @@ def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int
     if None not in (image_numbers, text_numbers) and image_numbers != text_numbers:
         raise ModelError(
             f"the two networks of {folder} do not belong together",
-            expected=f"text vectors of {image_numbers} numbers, as the image vectors",
+            expected=f"text vectors of {image_numbers} numbers, like the image vectors",
             found=f"{text_numbers} numbers",
             fix="export both networks, with their projections, from one model",
         )

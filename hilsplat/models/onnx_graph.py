@@ -1,7 +1,7 @@
-"""Changes to ONNX graphs: extraction of parts, row-wise global attention, and splitting of whole CLIPs.
+"""Changes to ONNX graphs: extraction of parts, row-wise global attention, and splitting of CLIP models.
 
-`model.onnx`, as optimum exports a CLIP or a SigLIP, takes an image and a text together. The image vectors
-depend only on the image and the text vectors only on the text, so each half is a subgraph.
+`model.onnx`, as exported by optimum from CLIP or SigLIP, accepts an image and a text together. The image
+vectors depend only on the image and the text vectors only on the text, so each half is a subgraph.
 """
 
 from collections.abc import Iterable, Sequence
@@ -45,7 +45,7 @@ def keep_only(model: Any, outputs: Sequence[str]) -> None:
 
 
 def needed_names(graph: Any, outputs: Sequence[str]) -> set[str]:
-    """Return the names of all values that the given values are computed from, and of these."""
+    """Return the names of the given values and of all values that they are computed from."""
     makers = {name: node for node in graph.node for name in node.output}
     needed, waiting = set[str](), list(outputs)
     while waiting:
@@ -75,7 +75,7 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
         side: patches per side of the image.
 
     Returns:
-        the serialised graph, or None if a layer has another form or weights are external or have 16 bits.
+        the serialised graph, or None if a layer has another form, or weights are external or 16-bit.
     """
     import onnx
 
@@ -185,7 +185,7 @@ def whole_clip(folder: Path) -> Path | None:
 
 
 def split_clip(folder: Path) -> list[Path]:
-    """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP's `model.onnx`, which isn't needed then.
+    """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP model's `model.onnx`, which they replace.
 
     A network above 2 GiB has its weights in a separate file (`model.onnx_data`), to which both halves refer.
 
@@ -210,7 +210,7 @@ def split_clip(folder: Path) -> list[Path]:
     missing |= {output for _, output in HALVES.values()} - outputs
     if missing:
         raise ModelError(
-            f"network {whole} is not a whole CLIP: it lacks {', '.join(sorted(missing))}",
+            f"network {whole} is not a complete CLIP model: it lacks {', '.join(sorted(missing))}",
             expected="; ".join(f"{' and '.join(needed)} -> {output}" for needed, output in HALVES.values()),
             found=f"{', '.join(sorted(inputs))} -> {', '.join(sorted(outputs))}",
             fix="export it with optimum's task feature-extraction",
@@ -228,6 +228,6 @@ def split_clip(folder: Path) -> list[Path]:
 
 
 def split_whole(folder: Path) -> None:
-    """Replace a CLIP's `model.onnx` with the networks of `split_clip`; its weight file, if any, is kept."""
+    """Replace a CLIP model's `model.onnx` with the networks of `split_clip`; a weight file is kept."""
     vision, _ = split_clip(folder)
     vision.with_name(WHOLE).unlink()

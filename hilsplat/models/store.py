@@ -22,7 +22,7 @@ MODELS = Path("models")
 FOLDER_VARIABLE = "HILSPLAT_MODELS"
 """Environment variable with the path of `user_models`."""
 AUTO = "auto"
-"""Setting value that selects a pretrained model if there is one."""
+"""Setting value that selects a pretrained model if one is installed."""
 EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
 """Models of the synthetic world that are included in the project."""
 
@@ -111,9 +111,9 @@ def model_path(path: str | Path) -> Path:
 
 
 def present_models(*stores: Path) -> list[PresentModel]:
-    """Return the models in folders, best first: released ones in their order, others by name, embedded last.
+    """Return the models in folders, best first: released models in order, others by name, embedded last.
 
-    If several stores (parent folders of models) contain the same name, the first counts. Default: the
+    If several stores (parent folders of models) contain the same name, the first store is used. Default: the
     project's models, the user's models, and the embedded models of the installation.
     """
     order = {release.name: number for number, release in enumerate(RELEASES)}
@@ -141,7 +141,7 @@ def _folders(*stores: Path) -> list[Path]:
 
 @functools.cache
 def model_digest(folder: Path, cache: Path) -> str:
-    """Return the digest of a model folder, or "... is missing"; the stage reports the fix.
+    """Return the digest of a model folder, or "... is missing"; the stage reports how to fix it.
 
     Digests are kept in `cache` by the sizes and modification times of the files: reading ViT-H takes seconds.
     """

@@ -53,7 +53,7 @@ def test_exported_weights_give_the_vectors_of_transformers(hub, clip_parts):
 
 def test_weights_that_cannot_be_exported_show_the_exporter_s_last_lines(tmp_path):
     (tmp_path / "config.json").write_text('{"model_type": "clip"}')
-    with pytest.raises(ModelError, match=r"the exporter ended with 1(.|\n)*Error(.|\n)*pip install"):
+    with pytest.raises(ModelError, match=r"the exporter exited with 1(.|\n)*Error(.|\n)*pip install"):
         get.export_networks(tmp_path, tmp_path / "out")
 
 

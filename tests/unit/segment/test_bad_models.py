@@ -58,7 +58,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (halved, r"vision_encoder.onnx cannot be opened(.|\n)*fetch a whole copy"),
+        (halved, r"vision_encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
         (partial(replaced, name=ENCODER, content=b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
         (partial(replaced, name=ENCODER, content=LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
         *(
@@ -70,7 +70,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
             for text in (b"[]", b'{"model_type": 3}')
         ),
         (renamed, r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"),
-        (partial(changed, name=PREPROCESSOR, do_normalize=False), "switches off do_normalize"),
+        (partial(changed, name=PREPROCESSOR, do_normalize=False), "disables do_normalize"),
         *(
             (partial(changed, name=PREPROCESSOR, image_std=values), "image_std cannot be used")
             for values in ([0, 1, 1], [-1, 1, 1], "x")
@@ -85,7 +85,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
         ),
         (
             partial(retyped, channels=3, kind=TensorProto.UINT8),
-            r"other inputs than expected: pixel_values(.|\n)*tensor\(uint8\)",
+            r"unexpected or missing inputs: pixel_values(.|\n)*tensor\(uint8\)",
         ),
         (
             partial(retyped, channels=1, kind=TensorProto.FLOAT),
@@ -93,7 +93,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
         ),
         (
             partial(write_disc_sam, points_name="point_coords"),
-            r"other inputs than expected: input_points, point_coords",
+            r"unexpected or missing inputs: input_points, point_coords",
         ),
         (
             partial(write_disc_sam, heads=4),
@@ -107,7 +107,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
             )
             for model_type, words in (
                 (b"siglip2", "variable resolution"),
-                (b"sam3", "take SAM 2.1"),
+                (b"sam3", "use SAM 2.1"),
                 (b"blip", "docs/models.md"),
             )
         ),
