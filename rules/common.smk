@@ -33,7 +33,7 @@ def own_cores():
     except WorkflowError:
         return None
     if cores < 1:
-        raise WorkflowError("with --cores 0 no job could start; expected at least 1")
+        raise WorkflowError("with --cores 0, no job can start; expected at least 1")
     return cores
 
 

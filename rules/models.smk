@@ -1,4 +1,4 @@
-# The small models of the synthetic world. A default run does not train them, because the repository has them.
+# The small models of the synthetic world. A default run does not train them, because the repository contains them.
 rule train_models:
     output:
         directory("<results>/models/sam-tiny"),

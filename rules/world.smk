@@ -1,4 +1,4 @@
-# Synthetic scenes: images for the stages, truth for evaluation, figures and the diagnostic segmenter.
+# Synthetic scenes: images for the stages, ground truth for evaluation, figures and the diagnostic segmenter.
 rule world:
     output:
         images=directory("<results>/{dataset}/{scene}/world/images"),

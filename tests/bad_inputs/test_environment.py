@@ -24,7 +24,7 @@ STAGE = " ".join(CONTRIBUTE)
         ("query photos/desk mug --out /proc/x", "/proc/x is missing, or cannot be created"),
         ("export photos/desk --out /proc/x", "/proc/x is missing, or cannot be created"),
         (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not a .log file"),
-        ("run -- --cores 0", "with --cores 0 no job could start"),
+        ("run -- --cores 0", "with --cores 0, no job can start"),
         ("run -- --config 'only=[1'", "--config is not YAML"),
     ],
 )
