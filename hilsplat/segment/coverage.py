@@ -24,11 +24,11 @@ def coverage_parents(
     Mask `a` is a child of mask `b` if more than `theta` of `a` is inside `b` and less than `theta` of `b` is
     inside `a`. The parent is the smallest such `b`, and on a tie the lower row.
 
-    Departs: the paper leaves open which levels a parent may come from. Here it is coarser than
-    its child; the parent of a subpart may be a whole.
+    Departs: the paper doesn't specify which levels a parent may come from. Here a parent's level is
+    coarser than its child's; the parent of a subpart may be a whole.
 
     Args:
-        overlap_px: pixels that each pair of masks shares; the diagonal contains their areas.
+        overlap_px: number of pixels shared by each pair of masks; the diagonal contains the masks' areas.
         level: `Level` of each mask; None allows parents from any level, as printed in the paper.
         theta: coverage threshold, a share in (0, 1); the paper uses 0.9.
 
@@ -36,7 +36,7 @@ def coverage_parents(
         Row of each mask's parent, or `NONE` if no mask covers it.
 
     Raises:
-        EmptyMaskError: if a mask has no pixel, so that its coverage is undefined.
+        EmptyMaskError: if a mask contains no pixels (its coverage is undefined).
 
     Example:
         >>> overlap_px = np.array([[4, 2], [2, 2]])  # the second mask is inside the first
@@ -45,7 +45,7 @@ def coverage_parents(
     """
     area_px = np.diagonal(overlap_px)
     if not area_px.all():
-        empty = f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} have no pixel"
+        empty = f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} contain no pixels"
         raise EmptyMaskError(empty, fix="drop empty masks before building the coverage tree")
     if not len(area_px):
         return np.zeros(0, dtype=np.int32)
@@ -82,7 +82,7 @@ def with_tree_levels(masks: HierarchicalMasks, theta: float) -> HierarchicalMask
     """Return the masks with levels set to their depths in the view's tree, in `content_order`.
 
     Roots become wholes, their children parts, and all other descendants subparts (a comment in the source of
-    the paper, Sec. III-B), whichever head predicted them.
+    the paper, Sec. III-B), regardless of the head that predicted them.
     """
     depth = depths(coverage_parents(masks.overlaps_px(), None, theta))
     found = replace(masks, level=np.minimum(depth, len(LEVELS)).astype(np.uint8))

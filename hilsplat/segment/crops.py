@@ -19,7 +19,7 @@ def square_crop(
     """Crop a mask's box with a margin, and make it square (`crop_to_square`).
 
     `context` is the margin on each side as a share of the box's longer side, clipped at the image's border.
-    A mask without a pixel raises an EmptyMaskError.
+    Raises an EmptyMaskError for a mask without pixels.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
@@ -42,11 +42,11 @@ def crop_to_square(
     The side of the square is the longer side of the box. Shrinking averages areas; enlarging is bilinear.
 
     Args:
-        box, inside: image and mask in the mask's box.
+        box, inside: image and mask, cropped to the mask's box.
         background: pixels outside the mask: `black`, `keep` (unchanged), or `dim` (0.35 of their brightness).
         size: side of the result, px.
         as_langsplat: follow LangSplat's preprocessing: omit the last row and column of the box (but keep at
-            least one), and resize bilinearly also when shrinking.
+            least one), and use bilinear resizing for shrinking, too.
     """
     if background not in BACKGROUNDS:
         raise ValueError(f"background {background!r} is not one of {', '.join(BACKGROUNDS)}")

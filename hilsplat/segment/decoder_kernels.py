@@ -38,7 +38,7 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
     """Compute y[r, c] = sum over k of a[r, k] x[k, c]; add it to y unless `begin`.
 
-    Each flat array has the index of its first element and its row stride; `columns` is a multiple of 16.
+    Each flat array comes with the index of its first element and a row stride. `columns`: multiple of 16.
     """
     c = 0
     while c < columns:
@@ -153,8 +153,8 @@ def token_shares(s, offset, offset0, scale, heads, tokens, pixels, e, e0):
 def pixel_weights(s, scaled, offset, offset0, u, v, top, top0, sums, sums0, width, rows, pixels):
     """Compute the weights of a block's pixels in softmaxes over all pixels, and update the running sums.
 
-    The largest score of all blocks is known only at the end: when a block has a larger score, the sums so far
-    are scaled down.
+    The maximum score over all blocks is known only at the end, so the running sums are scaled down whenever
+    a block contains a new maximum.
 
     Args:
         s: base-2 scores (rows, P), overwritten by weights.
@@ -203,7 +203,7 @@ def weighted_sums(sums, sums0, width, w, scaled, values, values0, e_t, factors, 
 
     Args:
         sums: (H * T, width): values, factors, and the columns of `pixel_weights`.
-        w, scaled: weights (H * T, P) for the factors, and for the values.
+        w, scaled: weights (H * T, P) of the factors and of the values, respectively.
     """
     for h in range(heads):
         multiply(
@@ -286,7 +286,7 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
 
     Args:
         sizes, b, i: as in `read_image`; indices of block and prompt.
-        image, prompt: of the first or second layer; `u` scales the image's keys and values.
+        image, prompt: arrays of the first or second layer; `u` scales the image's keys and values.
         u, v: scales of the pixels (P), as in `pixel_weights`.
         e: factors (padded, P); only the first `factors` rows are used.
         e_t, k, s, scaled: buffers for transposed factors, keys, scores and weights; overwritten.

@@ -37,18 +37,18 @@ def index_entry(masks: HierarchicalMasks) -> dict[str, int | str]:
 
 
 def digests_in(folder: Path) -> dict[str, str]:
-    """Return the digest of each view's masks, as recorded by masks or an artifact computed from them.
+    """Return the digest of each view's masks, as recorded in the masks or an artifact computed from them.
 
-    An ArtifactError is raised if the artifact is missing, incomplete or of another version of the program.
+    An ArtifactError is raised if the artifact is missing, incomplete or from another version of hilsplat.
     """
     digests: dict[str, str] = {}
     for view, entry in read_full_index(folder, "views")["views"].items():
         digest = entry.get(MASKS_SHA256) if isinstance(entry, dict) else None
         if not isinstance(digest, str):
             raise ArtifactError(
-                f"{folder} is of another version",
+                f"{folder} was written by another version of hilsplat",
                 expected=f"{MASKS_SHA256} of every view in {INDEX}",
-                found=f"none of view {view}",
+                found=f"none for view {view}",
                 fix=remake(Path(folder)),
             )
         digests[view] = digest
@@ -62,7 +62,7 @@ def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> Hierarchi
     """
     path = Path(folder) / f"{view}.npz"
     masks = HierarchicalMasks.load(path)
-    _require_same(view, digests.get(view), digest_of(masks), f"{path} contains other masks", remake(path))
+    _require_same(view, digests.get(view), digest_of(masks), f"{path} contains different masks", remake(path))
     return masks
 
 
@@ -75,8 +75,8 @@ def require_same_masks(folder: Path, other: Path) -> list[str]:
         MisalignedArtifactError: if the digests of a view differ, or only one artifact contains the view.
     """
     found, expected = digests_in(folder), digests_in(other)
-    what = f"{folder} and {other} belong to different masks"
-    fix = f"rerun the stage that writes {folder}; if the error remains, also the one that writes {other}"
+    what = f"{folder} and {other} refer to different masks"
+    fix = f"rerun the stage that writes {folder}; if the error persists, also the one for {other}"
     for view in {**expected, **found}:
         _require_same(view, expected.get(view), found.get(view), what, fix)
     return list(expected)
@@ -86,7 +86,7 @@ def _require_same(view: str, expected: str | None, found: str | None, what: str,
     if found != expected:
         raise MisalignedArtifactError(
             f"{what} (view {view})",
-            expected=f"masks with digest {expected[:12]}" if expected else "no masks of this view",
-            found=f"digest {found[:12]}" if found else "no masks of this view",
+            expected=f"masks with digest {expected[:12]}" if expected else "no masks for this view",
+            found=f"digest {found[:12]}" if found else "no masks for this view",
             fix=fix,
         )

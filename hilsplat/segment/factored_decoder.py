@@ -11,8 +11,8 @@ The weights of a head sum to 1, so its last token contributes the constant b and
 difference from it. The layer norm is then one scale per pixel, computed from |X|^2, from products of X that
 all prompts share, and from B's Gram matrix. Every later projection of the image side is the sum of a
 projection of X, computed once per image, and one of few factors: 2 H (T - 1) after layer 2. Masks are the
-first arrays as large as the image side. Results differ from the network's only by rounding; `SamModel`
-compares a few prompts before it uses this class.
+first per-prompt arrays as large as the image side. Results differ from the network's only by rounding;
+`SamModel` checks this on a few prompts before it uses this class.
 
 The two attentions of a layer, its layer norm and the next attention process one block of pixels at a time
 for several prompts (`decoder_kernels`). Operations on tokens alone are plain numpy here.
@@ -36,7 +36,7 @@ LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
 BLOCK = 64
 """Maximum pixels per block. Its arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
 PROMPTS = 16
-"""Prompts per call. They process each block one after the other while it is in the cache."""
+"""Prompts per call, applied to each block one after the other while it is in the cache."""
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
 
 
@@ -59,7 +59,7 @@ class FirstPrompts(NamedTuple):
     twice_changes: np.ndarray  # twice the difference between the values of its tokens and the last token's
     gram: np.ndarray  # products of these differences after the output projection (`doubled_below`)
     last: np.ndarray  # values of the last token
-    square: np.ndarray  # squared length of the constant that last token and bias add to every pixel
+    square: np.ndarray  # squared length of the constant that the last token and the bias add to every pixel
     linear: np.ndarray  # twice the products of that constant with the differences
     queries: np.ndarray  # of the attention of tokens to pixels
     low: np.ndarray  # products of `queries` with the keys of the factors
@@ -220,9 +220,9 @@ class FactoredDecoder:
         )
 
     def image(self, features: Mapping[str, np.ndarray]) -> ImageTerms:
-        """Compute the terms that all prompts share from an encoder's outputs by name, float32.
+        """Compute the terms shared by all prompts from an encoder's outputs (float32, by name).
 
-        A ModelError is raised if the image side cannot be cut into blocks.
+        A ModelError is raised if the image side cannot be divided into blocks.
         """
         sides = _run(self._image_side, features, np.zeros((1, 2)))
         x, with_positions = (wide(side.reshape(side.shape[-2:]).T) for side in sides)  # (channels, pixels)
@@ -231,7 +231,7 @@ class FactoredDecoder:
         assert side is not None
         pixels = min(BLOCK, x.shape[1])
         if x.shape[1] % pixels or pixels % WIDTH:
-            raise ModelError(f"the decoder cannot be factored: an image of {side.shape[2:]} features")
+            raise ModelError(f"the decoder cannot be factored for image features of shape {side.shape[2:]}")
         read0, read1, read2 = self._reads
         update0, update1 = self._updates
         xc = centred(x, 0)

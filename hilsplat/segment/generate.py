@@ -41,22 +41,22 @@ from hilsplat.segment.suppression import (
 from hilsplat.settings import MasksSettings
 
 LOOSE = 0.1
-"""Masks below this predicted IoU or stability, or below a lower threshold of the settings, are not cached."""
+"""Masks below this predicted IoU or stability (or the settings' threshold, if lower) are not cached."""
 BAND_PX = 3
 """Logits within this many low-resolution pixels of a mask's edge are kept (see `Candidates`)."""
 REPEAT_IOU = 0.95
 """A preview mask repeats a better one if the IoU of their boxes exceeds this (`distinct_prompts`)."""
 REPEAT_SLACK = 0.05
-"""Amount by which a repeated mask's preview stability, counted on few pixels, may exceed the better one's."""
+"""Amount by which a repeated mask's preview stability (from few pixels) may exceed the better mask's."""
 CROP_OVERLAP = 512 / 1500
 """Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
 CROP_EDGE_PX = 20
-"""A mask counts as cut by its crop if its box is this close to an edge that isn't the image's (SAM)."""
+"""A mask counts as truncated if its box is this close to a crop edge that isn't an image edge (SAM)."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """K masks as decoded, before any threshold that a user may change.
+    """K decoded masks, before any user-defined threshold is applied.
 
     A mask's logits are kept in a window around it, in steps of `sam.LOGIT_STEP` (unrounded for the official
     generator). Logits with no edge within `BAND_PX` are set to +-127, so that windows compress well. This
@@ -69,7 +69,7 @@ class Candidates:
     window_xyxy: Int32[np.ndarray, "K 4"]  # low-resolution px, end exclusive
     low_hw: Int32[np.ndarray, " 2"]  # size of the decoder's masks
     head: UInt8[np.ndarray, " K"]  # row of `HEADS`
-    predicted_iou: Float32[np.ndarray, " K"]  # exceeds 1 for the most certain masks of a released SAM
+    predicted_iou: Float32[np.ndarray, " K"]  # exceeds 1 for the most certain masks of released SAMs
     stability: Float32[np.ndarray, " K"]  # `sam.read_logits` or `sam.full_stability`
     crop: UInt8[np.ndarray, " K"]  # row of the view's crop boxes
 
@@ -141,7 +141,7 @@ def floors(thresholds: Thresholds) -> tuple[float, float]:
 
 
 def needs_full_size(settings: MasksSettings) -> bool:
-    """Return whether stability is counted at the view's size."""
+    """Return whether stability is computed at the view's size."""
     return settings.stability == "full" or settings.generator == "official"
 
 
@@ -153,7 +153,7 @@ def decode_candidates(
 ) -> Candidates:
     """Decode masks at grid points of the image and its crops, skipping repeats (`distinct_prompts`).
 
-    `points` (x, y, px), at least one, replace the grid on the whole image; crops keep the grid.
+    `points` (x, y, px; at least one) replace the grid of the whole image; crops keep the grid.
     """
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
@@ -173,10 +173,10 @@ def decode_candidates(
 
 
 def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
-    """Yield the prompts of each decoder call, and how many of them count.
+    """Yield the prompts of each decoder call, and how many of them are not padding.
 
-    The last prompt is repeated to fill the last call: some networks have a fixed batch size, and with a
-    constant size the results don't depend on how the prompts are split into calls.
+    The last prompt is repeated to fill the last call: some networks have a fixed batch size, and a
+    constant size makes the results independent of how the prompts are split into calls.
     """
     total = len(next(iter(prompts.values())))
     for start in range(0, total, batch):
@@ -185,7 +185,7 @@ def calls(prompts: Prompts, batch: int) -> Iterator[tuple[Prompts, int]]:
 
 
 def uses_preview(model: SamModel, settings: MasksSettings) -> bool:
-    """Return whether to skip repeated prompts: the model has previews, and repeated masks are suppressed."""
+    """Return whether to skip repeated prompts (needs a model with previews, and suppression of repeats)."""
     may_repeat = settings.generator == "official" or settings.box_nms_iou >= REPEAT_IOU
     return model.previews and not may_repeat
 
@@ -196,7 +196,7 @@ def distinct_prompts(
     """Preview prompts and drop each one whose masks all repeat better masks of the same head.
 
     Masks are compared by their boxes in the preview, which has every second or fourth row and column of the
-    decoder's masks (`suppression.distinct_boxes`), before any threshold that a user may change. Of 1000
+    decoder's masks (`suppression.distinct_boxes`), before any user-defined threshold is applied. Of 1000
     prompts, 200 to 300 remain; at least one is kept.
     """
     iou_floor, stability_floor = floors(model.thresholds(settings))
@@ -268,14 +268,14 @@ def masks_from_candidates(
 ) -> HierarchicalMasks:
     """Threshold and upscale candidates, remove small holes and islands, and suppress repeats.
 
-    Suppression compares boxes in a crop, boxes across crops, boxes of changed masks, and masks.
+    Suppression compares, in order: boxes within a crop, boxes across crops, boxes of changed masks, pixels.
 
     The result is in `content_order`; a level may be empty.
     """
     thresholds = model.thresholds(settings)
     official = settings.generator == "official"
     boxes, layer_of = crop_boxes(size_hw, settings.crop_layers)
-    # smaller crops show more detail (SAM): `official` prefers a smaller area, ours a deeper layer
+    # smaller crops show more detail (SAM): `official` prefers smaller crops, ours those of deeper layers
     preferred = 1 / np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) if official else layer_of
     enough = (candidates.predicted_iou > thresholds.predicted_iou_min) | (thresholds.predicted_iou_min == 0)
     enough &= candidates.stability >= thresholds.stability_min
@@ -320,7 +320,7 @@ def _upscale(
     level: Level,
     official: bool,
 ) -> HierarchicalMasks:
-    """Upscale candidates to masks of the view, without empty ones and those cut by the crop's edge."""
+    """Upscale candidates to masks of the view, without empty or truncated masks (`cut_by_crop`)."""
     low_h, low_w = candidates.low_hw.tolist()
     runs, offsets = upscaled_runs(
         candidates.logits,
@@ -345,7 +345,7 @@ def _upscale(
 def clean_masks(
     masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Fill holes and drop islands below `min_area_px` (8-connected), and drop masks below it.
+    """Fill holes and drop islands below `min_area_px` (8-connected), and drop smaller masks.
 
     The largest island of a mask is always kept. With `keep_small`, masks below `min_area_px` are kept and
     count as changed (SAM). Returns the remaining masks, and which of them were changed.

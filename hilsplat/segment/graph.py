@@ -1,8 +1,8 @@
 """Masks without a model: OpenCV's graph segmentation, merged into three nested scales.
 
-It is for photographs without SAM weights and has no notion of objects: its levels are coarse, middle and
-fine regions of even colour, and its scores measure the contrast to the surroundings. A region that is the
-same at two scales appears at both levels.
+It needs no SAM weights and has no notion of objects: its levels are coarse, medium and fine regions of
+uniform colour, and its scores measure the contrast with the surroundings. A region that is the same at two
+scales appears at both levels.
 """
 
 import heapq
@@ -16,20 +16,20 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks, runs_of_labels
 
 WORK_SIDE_PX = 640
-"""Longer side at which images are segmented; finer texture is not a part of an object."""
+"""Longer side at which images are segmented; finer texture doesn't separate parts of objects."""
 BASE_SCALE = 80.0
 """Scale `k` of the base segmentation (Felzenszwalb and Huttenlocher), in its colour units."""
 CONTRAST = 6.0
-"""Colour difference (CIELAB) from all neighbours that keeps a region of exactly a level's least size
-separate; larger regions need less, in inverse proportion to their width."""
+"""Minimum colour difference (CIELAB) from all neighbours at which a region of exactly a level's minimum size
+stays separate; for larger regions, the difference is inversely proportional to their width."""
 THIN_PX = 4.0
-"""A region narrower than this (at working size) is a seam that blur leaves along a strong edge."""
+"""A region narrower than this (at working size) is treated as a seam caused by blur along a strong edge."""
 THIN_HURRY = 0.01
 """Factor on the cost of merging a seam: seams merge first, into the more similar side."""
 LIGHTNESS = 0.6
 """Weight of lightness relative to a* and b*: shading changes lightness within an object."""
 CLEAR_EDGE = 40.0
-"""Colour difference across a border from which the predicted IoU is 1."""
+"""Colour difference across a border at and above which the predicted IoU is 1."""
 
 
 def segment_graph(
@@ -37,19 +37,19 @@ def segment_graph(
 ) -> HierarchicalMasks:
     """Segment a photograph into regions at three nested scales.
 
-    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, the cheapest first. A merge
+    A fine segmentation (`cv2.ximgproc.segmentation`) is merged pair by pair, cheapest first. A merge
     across a colour difference D costs D times the width of the smaller region, `min(sqrt(A), 4 A / P)` with
     its area A and perimeter P. Small or thin regions thus join their most similar neighbour, and large ones
-    stay separate even if they differ less. A level of least size s (a share of the image side) is the state
+    stay separate even if they differ less. A level of minimum size s (a share of the image side) is the state
     in which every remaining merge costs at least `CONTRAST * s * sqrt(image area)`.
 
-    The result has a mask for each region (of at least `min_area_px`) and level. `predicted_iou` is the mean
+    The result contains one mask per level and region of at least `min_area_px`. `predicted_iou` is the mean
     colour difference along the region's border over `CLEAR_EDGE`, clipped to 1. `stability` is the share of
     scales over which the region persists unchanged, on a logarithmic axis from the level's own scale to the
     one where all regions are merged.
 
     Args:
-        scales: least size at whole, part, subpart; none exceeds the one before.
+        scales: minimum sizes of wholes, parts and subparts, in non-increasing order.
     """
     height, width = image.shape[:2]
     small = resize_to_fit(image, WORK_SIDE_PX)
@@ -80,14 +80,14 @@ region, numbered after the base regions in the order of merges."""
 
 
 def to_lab(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Smooth texture of a pixel or two, and convert to CIELAB with lightness scaled by `LIGHTNESS`."""
+    """Smooth texture one or two pixels wide, and convert to CIELAB with lightness scaled by `LIGHTNESS`."""
     smooth = cv2.bilateralFilter(image, d=7, sigmaColor=20, sigmaSpace=3)
     lab = cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
     return lab * np.array([LIGHTNESS, 1, 1], dtype=np.float32)
 
 
 def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.ndarray, "H W"]:
-    """Segment finely, with labels 0..n-1; regions have at least a quarter of the least area at `finest`."""
+    """Segment finely, with labels 0..n-1; regions have at least a quarter of the minimum area at `finest`."""
     least_px = max(4, round((finest**2) * image.shape[0] * image.shape[1] / 4))
     graph = cv2.ximgproc.segmentation.createGraphSegmentation(sigma=0.5, k=BASE_SCALE, min_size=least_px)
     labels = graph.processImage(np.ascontiguousarray(image[..., ::-1]))
@@ -97,7 +97,7 @@ def base_regions(image: UInt8[np.ndarray, "H W 3"], finest: float) -> Int32[np.n
 def steps_along(axis: int, labels: Int32[np.ndarray, "H W"], lab: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the labels of each pair of adjacent pixels along an axis, and the colour difference there.
 
-    The difference spans one pixel more on each side: edges in photographs are wider than one pixel.
+    The difference spans one more pixel on each side, because edges in photographs are wider than one pixel.
     """
     length = labels.shape[axis]
     first, second = np.arange(length - 1), np.arange(1, length)
@@ -109,7 +109,7 @@ def steps_along(axis: int, labels: Int32[np.ndarray, "H W"], lab: np.ndarray) ->
 def neighbours(
     labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """Return the sum of colour differences across each border of two regions, and its length, px."""
+    """Return the summed colour difference across each border between two regions, and its length, px."""
     pairs, contrasts = [], []
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)
@@ -135,11 +135,11 @@ def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"])
 
 
 def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> list[Merge]:
-    """Merge the cheapest pair until one region is left; on equal costs, the lower numbers first.
+    """Merge the cheapest pair until one region is left; on a tie, the pair with the lower numbers.
 
-    The colour difference of a pair is the mean of two differences: between their mean colours, and across
-    their border beyond their own texture. The cost is halved if the smaller region is enclosed by
-    the larger one, and nearly zero if it is a seam (`THIN_PX`).
+    The colour difference of a pair is the mean of two differences: between the regions' mean colours, and
+    across their border (minus their mean texture, at least 0). The cost is halved if the larger region
+    encloses the smaller one, and nearly zero if it is a seam (`THIN_PX`).
     """
     flat = labels.reshape(-1)
     area = np.bincount(flat).astype(np.float64).tolist()
@@ -209,7 +209,7 @@ def cut(
         dies[[a, b]] = price
         if price < threshold:
             owner[[a, b]] = num_base + step
-    # an owner has a higher number than its region, so going down resolves all chains
+    # an owner has a higher number than its region, so the descending order resolves all chains
     for region in range(len(owner) - 1, -1, -1):
         owner[region] = owner[owner[region]]
     roots, new = np.unique(owner[labels], return_inverse=True)

@@ -1,4 +1,4 @@
-"""Compiled loops over run lengths of masks (`masks.encode_runs`): no loop needs an image per mask.
+"""Compiled loops over run lengths of masks (`masks.encode_runs`): no loop decodes masks to images.
 
 Loops are sequential, so results do not depend on the number of threads.
 """
@@ -209,7 +209,7 @@ def cleaned_runs(runs, offsets, width, min_area):
         value = np.empty(most, np.bool_)
         segments = 0
         at = np.int64(0)
-        for place in range(len(mine)):  # cut runs at the ends of rows
+        for place in range(len(mine)):  # split runs at the ends of rows
             end = at + mine[place]
             while at < end:
                 line = at // width

@@ -61,7 +61,7 @@ def edge_windows(steps, rows, boxes, reach):
 
     Args:
         steps: int8 or float32 (K, h, w).
-        rows: masks to take; none is empty.
+        rows: masks to extract; none is empty.
         boxes: box (xyxy) of the positive pixels of every mask.
         reach: distance from a change of sign within which pixels keep their value; all others become
             127 or -127. The window is the box with this margin, clipped to the image.

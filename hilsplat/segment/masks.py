@@ -50,7 +50,7 @@ def runs_of_labels(
 ) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M_and_1"]]:
     """Encode the regions of a label map, one mask per chosen label; each must occur in the map.
 
-    The result equals `encode_runs` of `labels == label` for each label, but takes one pass.
+    The result equals `encode_runs` of `labels == label` for each label, but needs only one pass.
     """
     flat = labels.reshape(-1)
     borders = np.concatenate(([0], np.flatnonzero(flat[1:] != flat[:-1]) + 1, [flat.size]))
@@ -69,7 +69,7 @@ def runs_of_labels(
 def join_rows(parts: Sequence[Any], ragged: str, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Concatenate the rows of several tables (at least one), field by field.
 
-    The field `ragged` has a variable number of values per row, at `offsets`; those in `names` have one entry.
+    The field `ragged` has several values per row, delimited by `offsets`; fields in `names` have one.
     """
     starts = np.cumsum([0, *(len(getattr(part, ragged)) for part in parts)])
     offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
@@ -88,7 +88,7 @@ class HierarchicalMasks:
     runs: UInt32[np.ndarray, " R"]  # run lengths of all masks (`encode_runs`)
     offsets: Int64[np.ndarray, " M_and_1"]  # start of each mask's runs, and the end of the last ones
     level: UInt8[np.ndarray, " M"]  # `Level` of each mask
-    predicted_iou: Float32[np.ndarray, " M"]  # as the segmenter predicts; SAM's may slightly exceed 1
+    predicted_iou: Float32[np.ndarray, " M"]  # as predicted by the segmenter; SAM's may slightly exceed 1
     stability: Float32[np.ndarray, " M"]  # stability under a changed threshold, in [0, 1]
     area_px: Int64[np.ndarray, " M"]
     box_xyxy: Int32[np.ndarray, "M 4"]  # px, end exclusive
@@ -117,11 +117,11 @@ class HierarchicalMasks:
         stability: Float32[np.ndarray, " M"],
         size_hw: tuple[int, int],
     ) -> "HierarchicalMasks":
-        """Build masks of given levels, or of one level; raise an EmptyMaskError if a mask has no pixel."""
+        """Build masks of given levels, or of one level; raise an EmptyMaskError if a mask is empty."""
         area_px, boxes = areas_and_boxes(runs, offsets, size_hw[1])
         if not area_px.all():
             raise EmptyMaskError(
-                f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} have no pixel",
+                f"masks {np.flatnonzero(area_px == 0).tolist()} of {len(area_px)} contain no pixels",
                 fix="drop empty masks before packing",
             )
         levels = np.full(len(area_px), level, np.uint8)
@@ -143,7 +143,7 @@ class HierarchicalMasks:
         return window_of_runs(runs, self.size_hw[1], box_xyxy)
 
     def overlaps_px(self) -> Int64[np.ndarray, "M M"]:
-        """Return the exact number of pixels that each pair of masks shares."""
+        """Return the exact number of pixels shared by each pair of masks."""
         return shared_pixels(self.runs, self.offsets, self.box_xyxy, *self.size_hw)
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "HierarchicalMasks":
@@ -178,9 +178,9 @@ class HierarchicalMasks:
         return np.flatnonzero(self.level == int(level))
 
     def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
-        """Return the row of the mask that each pixel shows, -1 for none, of one level or of all (None).
+        """Return the row of the mask visible at each pixel (-1: none), for one level or all levels (None).
 
-        Large masks are painted first, so small ones stay visible; of two equal ones, the lower row wins.
+        Large masks are painted first, so small ones stay visible. At equal area, the lower row wins.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
         rows = np.arange(len(self)) if level is None else self.rows_of(level)

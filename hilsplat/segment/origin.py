@@ -12,9 +12,9 @@ def masks_label(masks_folder: Path) -> str:
 
 
 def label_of_index(index: dict[str, Any]) -> str:
-    """Return the label in the index of masks, else the name of the model or, without one, the segmenter.
+    """Return the label in the masks' index, or else the name of the model or, without one, the segmenter.
 
-    The label of masks made from true labels names their faults.
+    The label of masks made from ground-truth labels lists their simulated faults.
     """
     if "label" in index:
         return str(index["label"])
@@ -22,5 +22,5 @@ def label_of_index(index: dict[str, Any]) -> str:
 
 
 def made_from_truth(masks: str) -> bool:
-    """Return whether masks with this label were made from true labels: a diagnostic, not a result."""
+    """Return whether masks with this label were made from ground-truth labels (for diagnosis only)."""
     return masks.startswith("truth-perturbed")

@@ -74,8 +74,8 @@ def tree_picture(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the largest coverage trees of a view: roots at the left, children to the right.
 
-    A mask is shown as its crop, dimmed outside and framed in its colour in `masks_picture`. Trees that don't
-    fit into `max_leaves` rows are omitted.
+    Each mask is shown as a crop, dimmed outside the mask and framed in its `masks_picture` colour. Trees that
+    don't fit into `max_leaves` rows are omitted.
     """
     children: dict[int, list[int]] = {}
     for row, above in enumerate(parent.tolist()):

@@ -1,7 +1,7 @@
 """Segment Anything in onnxruntime: three masks per point prompt on an image.
 
-Resizing of images and restoring of masks follow SamProcessor of the transformers library, whose ONNX
-exports are read. The rounding of logits (`read_logits`) is ours.
+The models are ONNX exports of the transformers library, and images and masks are resized as by its
+SamProcessor. The rounding of logits (`read_logits`) is ours.
 """
 
 import logging
@@ -37,8 +37,8 @@ logger = logging.getLogger(__name__)
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the decoder's three outputs, in their order: fine to coarse."""
 LOGIT_STEP = 1 / 8
-"""Logits are rounded to this step and clipped to +-127 steps, so that a view's candidates take a few MB of
-cache. Borders move by less than 0.01 low-resolution pixels where the logit changes by 5 per pixel, as is
+"""Logits are rounded to this step and clipped to +-127 steps, so that a view's candidates take a few MB in
+the cache. Borders move by less than 0.01 low-resolution pixels where the logit changes by 5 per pixel, as is
 typical for SAM."""
 
 
@@ -62,7 +62,7 @@ class Encoded:
 
 
 Prompts = Mapping[str, np.ndarray]
-"""Prompts of an image, arrays with one row per prompt: `points` (x, y, px of the image) or, for previewed
+"""Prompts of an image, as arrays with one row per prompt: `points` (x, y, px of the image) or, for previewed
 prompts, the arrays that the factored decoder keeps."""
 
 
@@ -77,8 +77,8 @@ class Thresholds:
 
 
 REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, points_per_batch=8)
-"""LangSplat's thresholds for a released SAM. A ViT-B call takes 60 MB per prompt, and calls of more than 8
-prompts are no faster per prompt."""
+"""LangSplat's thresholds for the released SAM models. A ViT-B call takes 60 MB per prompt, and calls of
+more than 8 prompts are no faster per prompt."""
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
 """Prompts on which the factored decoder is compared with the network, and the largest difference allowed."""
 OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
@@ -87,7 +87,7 @@ OWN = "mask_generation"  # key of `config.json` under which a model specifies it
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
     """Return the height and width whose longer side is `longest_edge`, halves rounded up as in SamProcessor.
 
-    Departs: neither becomes 0 for very thin images.
+    Departs: neither side becomes 0 for very thin images.
     """
     scale = longest_edge / max(original_hw)
     return max(1, int(original_hw[0] * scale + 0.5)), max(1, int(original_hw[1] * scale + 0.5))
@@ -184,7 +184,7 @@ class SamModel:
             vision.get("image_size", 1024) // vision.get("patch_size", 16),
         )
         if graph is None:
-            logger.info("the encoder of %s runs as exported, in more memory", self.model.folder)
+            logger.info("the encoder of %s runs as exported, which takes more memory", self.model.folder)
         return graph
 
     def _factor(self) -> FactoredDecoder | None:
@@ -199,7 +199,7 @@ class SamModel:
             logger.info("%s: %s", on_runtime, error)
             return None
         if difference > AGREEMENT:
-            logger.warning("%s, slower: factored, it differs by %.2g", on_runtime, difference)
+            logger.warning("%s, slower: the factored decoder differs by %.2g", on_runtime, difference)
             return None
         return factored
 
@@ -270,7 +270,7 @@ class SamModel:
     def preview(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 low_h low_w"], Prompts]:
-        """Decode prompts at a lower resolution, if `previews`; `finish` takes the third result."""
+        """Decode prompts at a lower resolution, if `previews`; pass the third result to `finish`."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, kept = self.factored.decode(encoded.terms, points, fine=False)
@@ -340,7 +340,7 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
         if name.startswith("image_"):
             shape = [decoder.fixed_axis(name, axis) for axis in (1, 2, 3)]
             if None in shape:
-                raise ModelError(f"{decoder.path.name} declares no shape of {name}")
+                raise ModelError(f"{decoder.path.name} declares no shape for input {name}")
             features[name] = rng.standard_normal((1, *shape), np.float32)  # type: ignore[arg-type]
     points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
     iou, logits = ask_network(decoder, features, points[:, None])
@@ -428,10 +428,10 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return each pixel's first low-resolution pixel along one axis, and the weights of it and the next ones.
+    """Return each pixel's first low-resolution pixel along one axis, and the weights of it and later ones.
 
-    They combine SamProcessor's steps: bilinear from `low` to the padded input, cropped to the resized image,
-    bilinear to the original size.
+    The weights combine SamProcessor's steps: bilinear from `low` to the padded input, cropping to the resized
+    image, bilinear to the original size.
     """
     weights = _bilinear(low, padded)[:resized]
     if resized != original:

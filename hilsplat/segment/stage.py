@@ -52,12 +52,12 @@ def run_masks(
 
     Args:
         out: folder to write: `<view>.npz` (`HierarchicalMasks`) and `index.json` (`digests.index_entry`).
-        cache: folder of the view cache. For SAM it contains the decoder's candidates and the masks, so other
-            thresholds don't rerun the networks, and other levels need no computation.
+        cache: folder of the view cache. For SAM it contains the decoder's candidates and the masks, so
+            changing thresholds doesn't rerun the networks, and changing levels needs no computation.
         threads: views processed in parallel if they fit into memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None: all free memory.
         key_views: views to segment; None: every training view.
-        prompts: returns the points (x, y, px) at which SAM is prompted in a view; None: the settings' grid.
+        prompts: function that returns a view's prompt points for SAM (x, y, px); None: the settings' grid.
         finished: output of this stage whose views are reused as they are.
     """
     scene = Scene.load(scene_folder)
@@ -110,7 +110,7 @@ def run_masks(
 
 
 def at_levels(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
-    """Return the masks with the segmenter's levels or, depending on the settings, the tree's."""
+    """Return the masks with the segmenter's levels or the tree's, depending on the settings."""
     if settings.levels == "head":
         return masks
     return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)

@@ -39,8 +39,8 @@ def suppress_boxes(
 ) -> Int64[np.ndarray, " k"]:
     """Return the rows of boxes kept by SAM's greedy suppression, ascending.
 
-    The best box is kept and drops every other whose IoU with it exceeds `iou_max`; then the best of
-    the rest, and so on. Boxes are ranked by `first`, if given, then by score, larger area, the box's
+    The best box is kept and drops every other box whose IoU with it exceeds `iou_max`; this is repeated for
+    the remaining boxes. Boxes are ranked by `first`, if given, then by score, larger area, the box's
     coordinates and row.
     """
     area = np.prod(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], axis=1, dtype=np.int64)
@@ -72,9 +72,10 @@ def distinct_boxes(
 ) -> Int64[np.ndarray, " k"]:
     """Return the rows kept by a suppression that is valid for any thresholds, the best first.
 
-    The box with the highest score (on a tie, the lower row) is kept and drops every other whose IoU with it
-    exceeds `iou_max` and whose stability is at most `slack` above its own; then the best of the rest, and so
-    on. Except for the slack, a box that passes a threshold is dropped only by a box that also passes it.
+    The box with the highest score (on a tie, the lower row) is kept and drops every other box whose IoU with
+    it exceeds `iou_max` and whose stability is at most `slack` above its own; this is repeated for the
+    remaining boxes. Except for the slack, a box that passes a threshold is dropped only by a box that also
+    passes it.
     """
     order = np.argsort(-score, kind="stable")
     return order[_greedy(boxes_xyxy[order], iou_max, stability[order], slack)]
@@ -114,10 +115,10 @@ def keep_best_masks(
 
     With I shared pixels and areas a, row j is dropped if any of these holds:
     - its score is not above `score_min`, unless that is 0;
-    - a row of better score (on a tie, a lower row) has an IoU with it above `iou_max`;
+    - a row with a better score (on a tie, a lower row) has an IoU with it above `iou_max`;
     - it is inside a row i: `I / a_j >= 0.85`, `I / a_i < 0.5` and
       `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
-      contained mask whichever score is higher (masks then nest between levels only), and
+      contained mask regardless of its score (masks then nest between levels only), and
       `inner = 0` drops none (masks also nest within levels).
     As in LangSplat, dropped rows still drop others, so the result doesn't depend on the order of visits.
     """

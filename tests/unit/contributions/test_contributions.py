@@ -309,5 +309,5 @@ def test_masks_of_another_size_are_refused(two_boxes):
 def test_masks_that_their_index_does_not_record_are_refused(two_boxes_contributions):
     world, _ = two_boxes_contributions
     reverse_masks(world, "001.png", record=False)
-    with pytest.raises(MisalignedArtifactError, match=r"001\.png\.npz contains other masks"):
+    with pytest.raises(MisalignedArtifactError, match=r"001\.png\.npz contains different masks"):
         build_contributions(world)

@@ -231,7 +231,7 @@ def with_shuffled_rows(masks: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [(with_another_view, r"7\.png"), (with_shuffled_rows, r"contains other masks \(view 0\.png\)")],
+    [(with_another_view, r"7\.png"), (with_shuffled_rows, r"contains different masks \(view 0\.png\)")],
 )
 def test_masks_of_another_scene_or_index_are_refused(red_scene, colour_clip, tmp_path, change, words):
     scene, masks = red_scene

@@ -362,7 +362,7 @@ def test_parts_of_masks_in_another_order_are_refused(boxes_with_latents, stale):
 def test_the_literal_trainer_and_baselines_refuse_masks_in_another_order(flat_boxes):
     world, *own = flat_boxes
     reverse_masks(world, "001.png")
-    with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
+    with pytest.raises(MisalignedArtifactError, match=r"contains different masks \(view 001\.png\)"):
         solved_field(flat_boxes, "literal", LITERAL)
-    with pytest.raises(MisalignedArtifactError, match=r"contains other masks \(view 001\.png\)"):
+    with pytest.raises(MisalignedArtifactError, match=r"contains different masks \(view 001\.png\)"):
         MethodInputs(world.scene, world.ply, world.masks, *own).view_labels("001.png")

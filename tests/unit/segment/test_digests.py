@@ -38,16 +38,16 @@ def test_a_digest_depends_on_order_size_pixels_levels_and_scores(tmp_path):
 def test_masks_that_differ_from_the_recorded_digest_are_refused(tmp_path):
     two_masks().take(np.array([1, 0])).save(tmp_path / "v.npz")
     write_index(tmp_path, {"v": index_entry(two_masks())})
-    with pytest.raises(MisalignedArtifactError, match=r"v\.npz contains other masks \(view v\)"):
+    with pytest.raises(MisalignedArtifactError, match=r"v\.npz contains different masks \(view v\)"):
         load_masks(tmp_path, "v", digests_in(tmp_path))
-    with pytest.raises(MisalignedArtifactError, match=r"expected +no masks of this view"):
+    with pytest.raises(MisalignedArtifactError, match=r"expected +no masks for this view"):
         load_masks(tmp_path, "v", {})
 
 
 @pytest.mark.parametrize("entry", [{}, {"masks_sha256": 3}, [], None, 7])
 def test_an_index_without_digests_is_refused(tmp_path, entry):
     write_index(tmp_path, {"v": entry})
-    with pytest.raises(ArtifactError, match=r"is of another version(.|\n)*found +none of view v"):
+    with pytest.raises(ArtifactError, match=r"another version of hilsplat(.|\n)*found +none for view v"):
         digests_in(tmp_path)
 
 
@@ -58,7 +58,7 @@ def test_the_error_names_the_view_that_differs_in_either_artifact(tmp_path, rows
     write_index(tmp_path / "clip", {**same, **more})
     write_index(tmp_path / "masks", {**same, "v": index_entry(two_masks())})
     for one, other in (("clip", "masks"), ("masks", "clip")):
-        words = rf"{one} and .*{other} belong to different masks \(view v\)"
+        words = rf"{one} and .*{other} refer to different masks \(view v\)"
         with pytest.raises(MisalignedArtifactError, match=words):
             require_same_masks(tmp_path / one, tmp_path / other)
     require_same_masks(tmp_path / "clip", tmp_path / "clip")
