@@ -23,7 +23,7 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SIGLIP_TOKENS = 64
-"""Text length of a SigLIP if its configuration does not specify one."""
+"""Text length of a SigLIP model whose configuration does not specify one."""
 MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # of model folders in `models/`
 
 
@@ -31,7 +31,7 @@ class ClipModel:
     """A loaded CLIP model.
 
     Args:
-        threads: number of batches of crops embedded at once; results do not depend on it.
+        threads: number of crop batches embedded in parallel; results do not depend on it.
         template: prompt template, in which each text replaces `{}`.
     """
 
@@ -57,7 +57,7 @@ class ClipModel:
         except Exception as error:  # the tokenizers package raises bare Exception
             raise ModelError(f"{path} cannot be read: {error}", fix=WHOLE_COPY) from error
         if not self.tokenizer.get_vocab_size(with_added_tokens=False):
-            raise ModelError(f"{path} contains no word", fix=WHOLE_COPY)
+            raise ModelError(f"{path} contains no words", fix=WHOLE_COPY)
         fixed = self.text.fixed_axis(self.ids, 1)
         text_config = model.config.get("text_config", {})
         self.siglip = model.layout == "siglip"
@@ -87,7 +87,7 @@ class ClipModel:
 
     @property
     def crops_per_call(self) -> int | None:
-        """Crops per call of the vision network if it fixes them; open_clip's exports take one."""
+        """Fixed number of crops per call of the vision network, if any; it is 1 in open_clip's exports."""
         return self.vision.fixed_axis(self.pixels, 0)
 
     def use_int8(self, network: Network) -> None:
@@ -95,7 +95,7 @@ class ClipModel:
         self.__dict__["vision"], self.precision = network, "int8"
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
-        """Return the padding token of the tokenizer, else of its configuration, else of the model's."""
+        """Return the padding token in the tokenizer, else in its configuration, else in the model's."""
         named = (self.tokenizer.padding or {}).get("pad_id")
         beside = self.model.tokenizer.with_name("tokenizer_config.json")
         if named is None and beside.is_file():
@@ -119,13 +119,13 @@ class ClipModel:
         return self.text.fixed_axis(self.words, 1) or self.embed_texts(["object"]).shape[1]
 
     def require_width(self, numbers: int, what: str) -> None:
-        """Raise a MisalignedArtifactError unless an artifact was made for vectors of this CLIP's width."""
+        """Raise a MisalignedArtifactError unless an artifact's vectors have this model's width."""
         if self.width != numbers:
             raise MisalignedArtifactError(
-                f"{what} does not belong to the CLIP in {self.model.folder}",
-                expected=f"vectors of {self.width} numbers, as from this CLIP",
+                f"{what} does not match the CLIP model in {self.model.folder}",
+                expected=f"vectors of {self.width} numbers, as from this model",
                 found=f"{numbers} numbers",
-                fix="use the CLIP it was made with (clip.model), or rerun the clip stage and those after it",
+                fix="set clip.model to the model it was made with, or rerun the clip stage and later stages",
             )
 
     def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
@@ -176,7 +176,7 @@ class ClipModel:
     def embed_texts(self, texts: list[str]) -> Float32[np.ndarray, "T C"]:
         """Return the unit vectors of texts, each inserted into the template; vectors are cached.
 
-        Texts are embedded one by one, so a vector never depends on other queries. A text without a token
+        Texts are embedded one by one, so a vector never depends on other queries. A text without tokens
         raises a ModelError.
         """
         for text in texts:
@@ -185,7 +185,7 @@ class ClipModel:
         return np.stack([self._known_texts[text] for text in texts])
 
     def unknown_words(self, text: str) -> list[str]:
-        """Return the words of a text that are not in the vocabulary; none with a tokenizer of word pieces."""
+        """Return the words of a text that are not in the vocabulary; empty for word-piece tokenizers."""
         unknown = self.tokenizer.token_to_id(getattr(self.tokenizer.model, "unk_token", None) or "")
         encoding = self.tokenizer.encode(text)
         places = zip(encoding.ids, encoding.offsets, strict=True)
@@ -194,13 +194,13 @@ class ClipModel:
 
     def _embed_text(self, text: str) -> Float32[np.ndarray, " C"]:
         if not text.strip() or not sum(self.tokenizer.encode(text).attention_mask):
-            raise ModelError(f"text {text!r} has no token", fix="give each query at least one word")
+            raise ModelError(f"text {text!r} contains no tokens", fix="use at least one word in each query")
         sentence = self.template.replace("{}", text)
         if self.siglip:  # trained on lower-case texts
             sentence = sentence.lower()
         encoding = self.tokenizer.encode(sentence)
         if encoding.overflowing:
-            logger.warning("text cut off after %d tokens: %r", self.max_tokens, text)
+            logger.warning("text truncated after %d tokens: %r", self.max_tokens, text)
         mask = np.array([encoding.attention_mask], dtype=np.int64)
         ids = np.array([encoding.ids], dtype=np.int64)
         (vector,) = self.text(**{self.ids: ids, "attention_mask": mask})
@@ -214,14 +214,14 @@ def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
 
 
 def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> ClipModel:
-    """Open the CLIP that embedded the masks of a clip artifact, wherever its folder is now.
+    """Open the CLIP model that embedded the masks of a clip artifact, even if its folder was moved.
 
     The model is identified by its digest. The search covers the recorded path and every folder in `models/`,
     each relative to the working directory, to the parent folders of the artifact (such as the project of the
     results) and to the installation, and the user's models. The vision network is opened on first use.
 
     Raises:
-        ModelError: no CLIP found has the digest of the one that embedded the masks.
+        ModelError: no CLIP model was found with the digest of the one that embedded the masks.
     """
     index = read_full_index(clip_folder, "model", "model_sha256")
     recorded, expected = Path(index["model"]), index["model_sha256"]
@@ -237,15 +237,15 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         try:
             model = open_model_folder(folder, "clip", variant=variant)
         except ModelError:
-            continue  # a SAM, or an incomplete copy
+            continue  # a SAM model, or an incomplete copy
         if model.digest == expected:
             return ClipModel(model, threads, template)
         seen[place] = model.digest
     raise ModelError(
-        f"the CLIP that embedded the masks in {clip_folder} was not found",
+        f"the CLIP model that embedded the masks in {clip_folder} was not found",
         expected=f"a model folder with digest {expected[:12]}; it was {recorded}",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
-        or f"no CLIP at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
+        or f"no CLIP model at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
         fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "
-        "with the CLIP you have",
+        "with a CLIP model that you have",
     )

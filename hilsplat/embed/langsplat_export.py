@@ -18,9 +18,9 @@ from hilsplat.splat.coordinates import write_source_ply
 def maps_of(
     masks: HierarchicalMasks,
 ) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
-    """Return LangSplat's four maps of a view, and the mask of each row of its vectors.
+    """Return LangSplat's four maps of a view, and the mask that each row of its vectors describes.
 
-    The map of mixed levels contains all masks, painted from large to small.
+    The mixed-level map contains all masks, painted from large to small.
     """
     maps, rows = [], []
     count = 0
@@ -36,7 +36,7 @@ def maps_of(
 def export_langsplat(scene: Scene, masks: Path, clip: Path, gaussians: Path, out: Path) -> None:
     """Export a scene as LangSplat's input: images, `sparse/0`, `language_features/` and `point_cloud.ply`.
 
-    `masks` are those of its training views; `out` is replaced if it exists.
+    `masks` contains the training views' masks; `out` is replaced if it exists.
 
     Raises:
         MisalignedArtifactError: the CLIP vectors were computed from other masks.

@@ -1,10 +1,10 @@
 """Import of LangSplat's masks and vectors (the `language_features/` of its preprocessing).
 
-An image `a.jpg` has two plain arrays:
+Each image, such as `a.jpg`, has two plain arrays:
     a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 for none;
     a_f.npy  float32 (N, C): a CLIP vector per mask.
-The four maps are default, s, m, l: all heads mixed, then from fine to coarse. Rows are numbered across all
-four maps. File names are truncated at their first dot.
+The four maps are default, s, m, l: all heads mixed, then each head from fine to coarse. Rows are numbered
+across all four maps. File names are truncated at their first dot.
 """
 
 import logging
@@ -27,12 +27,12 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Relative difference between the aspect ratios of maps and view that is attributed to rounding."""
+"""Maximum relative difference between aspect ratios of maps and view that is attributed to rounding."""
 LEAST_SHARE = 0.5
 """Share of the training views that must have files; with fewer, the files are likely from another scene."""
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
-"""Number of masks embedded again as a check, and the minimum median cosine of their vectors. The same CLIP
-reaches 0.99; another one of the same width about 0."""
+"""Number of masks embedded again as a check, and the minimum median cosine similarity of their vectors. The
+same CLIP model reaches 0.99; a different model of the same width, about 0."""
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the four maps, in order; the first map mixes all levels."""
 
@@ -46,7 +46,7 @@ def stems_of(views: list[str]) -> dict[str, str]:
     """Return the stem of each view, or raise an ArtifactError if two views have the same one."""
     stems = {view: stem_of(view) for view in views}
     if twins := [view for view in views if list(stems.values()).count(stems[view]) > 1]:
-        shared = f"these views would share LangSplat's files: {', '.join(twins[:4])}"
+        shared = f"these views would use the same LangSplat files: {', '.join(twins[:4])}"
         raise ArtifactError(shared, fix="rename the images so that their names differ before the first dot")
     return stems
 
@@ -56,13 +56,13 @@ def read_view(
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The map of mixed levels is ignored. Where masks of one level overlap, the files contain only the one
-    painted last. They contain no scores, so predicted IoU and stability are set to 1. Maps of another size
-    with the same aspect ratio, such as LangSplat's 1080 rows, are read at the nearest pixel.
+    The mixed-level map is ignored. Where masks of one level overlap, the files contain only the one
+    painted last. They contain no scores, so predicted IoU and stability are set to 1. Maps of a different
+    size but equal aspect ratio, such as LangSplat's 1080 rows, are resampled to the nearest pixel.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or not as described above.
-        MisalignedArtifactError: the maps have another aspect ratio.
+        MisalignedArtifactError: the maps' aspect ratio differs from the view's.
     """
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
     maps, vectors = read_npy(maps_path), read_npy(vectors_path)
@@ -78,10 +78,10 @@ def read_view(
     labels = np.where(np.isfinite(maps), maps, -2).astype(np.int64)
     if (labels != maps).any() or labels.min() < -1 or labels.max() >= len(vectors):
         raise ArtifactError(
-            f"{maps_path} does not belong to {vectors_path.name}",
+            f"{maps_path} does not match {vectors_path.name}",
             expected=f"row numbers from -1 (none) to {len(vectors) - 1}",
-            found=f"numbers from {maps.min():g} to {maps.max():g}",
-            fix="use two files from the same run of the preprocessing",
+            found=f"row numbers from {maps.min():g} to {maps.max():g}",
+            fix="use two files from the same preprocessing run",
         )
     height, width = labels.shape[1:]
     if (height, width) != size_hw:
@@ -90,7 +90,7 @@ def read_view(
                 f"{maps_path} and view {view} differ in shape",
                 expected=f"the shape of {size_hw} (height, width)",
                 found=f"{(height, width)}",
-                fix="make both from the same image; poses that undistort an image change its shape",
+                fix="create the map from the view's image; undistortion changes an image's shape",
             )
         rows = ((np.arange(size_hw[0]) + 0.5) * height / size_hw[0]).astype(int)
         columns = ((np.arange(size_hw[1]) + 0.5) * width / size_hw[1]).astype(int)
@@ -112,7 +112,7 @@ def read_view(
 
 
 def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]]:
-    """Read the training views that have files; raise an ArtifactError if fewer than half have."""
+    """Read the training views that have files; raise an ArtifactError if fewer than half do."""
     maps = {view: f"{stem}_s.npy" for view, stem in stems_of(train_views(scene)).items()}
     views = [view for view, name in maps.items() if (folder / name).is_file()]
     missing = [name for view, name in maps.items() if view not in views]
@@ -147,7 +147,7 @@ def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
 def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
     """Write LangSplat's vectors in the format of the clip stage: `<view>.npy`, with rows as in `read_masks`.
 
-    A MisalignedArtifactError is raised if `settings.model`, which embeds the texts, didn't compute them.
+    A MisalignedArtifactError is raised unless `settings.model`, which embeds the texts, computed them.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
@@ -177,7 +177,7 @@ def _require_model(
 ) -> None:
     """Embed some masks of a view again, as LangSplat does, and compare the vectors.
 
-    Comparing widths alone would not distinguish all CLIPs.
+    Comparing only widths would not distinguish all CLIP models.
     """
     view = max(found, key=lambda view: len(found[view][0]))
     masks, vectors = found[view]
@@ -185,12 +185,12 @@ def _require_model(
     rows = np.arange(len(masks))[:: max(1, len(masks) // CHECKED_MASKS)]
     own = model.embed_masks(scene.image(view), masks, ClipSettings(crop="langsplat"), rows).astype(np.float32)
     cosine = float(np.median((own * vectors[rows].astype(np.float32)).sum(axis=1))) if len(rows) else 1.0
-    logger.info("the CLIP in %s agrees with %s: median cosine %.3f", model.model.folder, files, cosine)
+    logger.info("the CLIP model in %s agrees with %s: median cosine %.3f", model.model.folder, files, cosine)
     if cosine < LEAST_COSINE:
         raise MisalignedArtifactError(
-            f"the vectors in {files} were not computed by the CLIP in {model.model.folder}",
+            f"the vectors in {files} were not computed by the CLIP model in {model.model.folder}",
             expected=f"a median cosine of at least {LEAST_COSINE} with its own vectors of the same masks",
             found=f"{cosine:.3f} for {len(rows)} masks of {view}",
-            fix="set clip.model to the CLIP that made them; LangSplat's is clip-vit-b-16-laion2b: "
+            fix="set clip.model to the model that computed them; LangSplat's is clip-vit-b-16-laion2b: "
             "hilsplat models get clip-vit-b-16-laion2b",
         )

@@ -18,7 +18,7 @@ from hilsplat.segment.sam import SamModel
 CACHE = Path("results/.cache")
 """Folder for measured timings, and for int8 networks if the models are read-only."""
 LARGEST_PROVIDER_DIFFERENCE = 0.02
-"""Largest relative difference attributed to rounding, such as that of TF32 products on CUDA."""
+"""Maximum relative difference attributed to rounding, such as TF32 products on CUDA."""
 Seconds = dict[str, float]
 """Timings. SAM: per "image", and per prompt for "masks" and the optional "preview". CLIP: per "crop"."""
 
@@ -61,7 +61,7 @@ def check_model(folder: Path, variant: str = "") -> str:
 
 
 def provider_disagreement(folder: Path) -> str | None:
-    """Describe how the image network differs between providers on a random image; None if it agrees."""
+    """Describe how the image network's output differs between providers on a random image, or return None."""
     model = open_model_folder(folder)
     providers = execution_providers()
     if len(providers) < 2:
@@ -77,12 +77,12 @@ def provider_disagreement(folder: Path) -> str | None:
         pairs = zip(reference, found, strict=True)
         apart = max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(a)), 1e-12) for a, b in pairs)
         if not apart <= LARGEST_PROVIDER_DIFFERENCE:
-            return f"{provider} differs from the CPU by {apart:.2g} of the output's norm"
+            return f"{provider} differs from the CPU by {apart:.2g} times the output's norm"
     return None
 
 
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
-    """Return the timings of a model, from an earlier measurement in `cache` if there is one.
+    """Return the timings of a model, from an earlier measurement in `cache` if available.
 
     `precision` is "fp32", or "auto" or "int8" for int8 where possible.
     """
@@ -114,7 +114,7 @@ def _measure(model: SamModel | ClipModel, precision: str) -> Seconds:
 
 
 def _second_call(call: Callable[..., Any], *given: object) -> tuple[Any, float]:
-    """Return the result of a second call and its seconds. The first call compiles and fills caches."""
+    """Return the result and duration (s) of a second call; the first call compiles and fills caches."""
     call(*given)
     start = time.perf_counter()
     return call(*given), time.perf_counter() - start

@@ -58,11 +58,11 @@ def run_clip(
 
     Args:
         semantic_tree_folder: output of the semantic tree stage, with crop ranks; None to embed every mask.
-        out: folder to write: `<view>.npy`, float16 (M, C) unit vectors with rows as the masks, zero for masks
+        out: folder to write: `<view>.npy`, float16 (M, C) unit vectors in the masks' order, zero for masks
             that were not selected, and `index.json` with C and the model.
         cache: folder of the view cache. Entries accumulate: a run that selects other masks embeds only masks
             that no earlier run embedded.
-        threads: views embedded at once, if they fit into the memory; the result does not depend on it.
+        threads: views embedded in parallel, if they fit into memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None for all free memory.
 
     Raises:
@@ -75,7 +75,7 @@ def run_clip(
     training = scene.views("train")
     if unknown := sorted(set(views) - set(training)):
         raise MisalignedArtifactError(
-            f"masks in {masks_folder} do not belong to the training views of {scene.name}",
+            f"masks in {masks_folder} do not match the training views of {scene.name}",
             expected=f"only masks of its {len(training)} training views",
             found=", ".join(unknown[:5]),
             fix=RERUN_MASKS,
@@ -107,7 +107,7 @@ def run_clip(
         )
         if masks.size_hw != scene.cameras[view].size_hw:
             raise MisalignedArtifactError(
-                f"masks of view {view} of {scene.name} do not fit its camera",
+                f"masks of view {view} of {scene.name} do not match its camera's size",
                 expected=f"{scene.cameras[view].size_hw} (height, width)",
                 found=f"{masks.size_hw}",
                 fix=RERUN_MASKS,
@@ -198,7 +198,7 @@ def _choose_precision(
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:
     """Return the rows of each view's masks that are among a node's `per_node` best crops by rank.
 
-    If there are none, all masks are returned.
+    If no mask is ranked, all masks are returned.
     """
     rank = read_npz(sealed(semantic_tree_folder, "tree.npz"), "crop_rank")["crop_rank"]
     is_chosen = (rank >= 0) & (rank < per_node)

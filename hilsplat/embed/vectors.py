@@ -1,4 +1,4 @@
-"""Reading of the masks' CLIP vectors."""
+"""Read the masks' CLIP vectors."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.segment.digests import require_same_masks
 
 UNIT_TOLERANCE = 2e-3
-"""Largest deviation of a vector's length from 1; vectors are stored as float16."""
+"""Maximum deviation of a vector's length from 1; vectors are stored as float16."""
 
 
 def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:
     """Read the CLIP vectors of all masks, in the row order of `folder`; zero for masks without a vector.
 
     Raises:
-        ArtifactError: a file is missing or damaged, or its vectors differ in width or are not of length 1.
+        ArtifactError: a file is missing or damaged, or its vectors differ in width or do not have length 1.
         MisalignedArtifactError: the vectors were computed from other masks.
     """
     views = require_same_masks(clip_folder, folder)
@@ -47,6 +47,6 @@ def require_every_vector(vectors: Shaped[np.ndarray, "M C"], clip_folder: Path, 
     if without := int((~vectors.any(axis=1)).sum()):
         raise ArtifactError(
             f"{without} of {len(vectors)} masks have no CLIP vector in {clip_folder}; {purpose} needs all",
-            fix="set clip.crops: masks, and rerun the clip stage; or take the vectors of a variant with "
+            fix="set clip.crops: masks, and rerun the clip stage; or use the vectors of a variant with "
             "autoencoder.targets: mask",
         )

@@ -1,4 +1,4 @@
-"""Coordinates of Gaussians: similarity transforms, and import and export in the coordinates of a source."""
+"""Coordinates of Gaussians: similarity transforms, and import and export in a source's coordinates."""
 
 import logging
 from pathlib import Path
@@ -19,9 +19,9 @@ from hilsplat.splat.ply import load_ply, save_ply
 logger = logging.getLogger(__name__)
 
 AXES = "right-handed; cameras in OpenCV axes (x right, y down, z forward)"
-FIX = "export it again as an uncompressed 3DGS PLY, or correct column gaussians of the scene sheet"
+FIX = "export it again as an uncompressed 3DGS PLY, or correct the gaussians column of the scene sheet"
 TOLERANCE = 1e-5
-"""Largest deviation of a matrix from a scaled rotation, relative to the scale."""
+"""Maximum deviation of a matrix from a scaled rotation, relative to the scale."""
 
 
 def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.ndarray, "3 3"], np.ndarray]:
@@ -37,8 +37,8 @@ def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.n
     rotation = linear / scale if scale > 0 else np.zeros((3, 3))
     if not are_rotations(rotation, TOLERANCE) or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise HilsplatError(
-            "a transform of coordinates is not a similarity",
-            expected="a 4 x 4 matrix of scale times rotation, with a translation and the last row 0 0 0 1",
+            "a coordinate transform is not a similarity",
+            expected="a 4 x 4 matrix: scale times rotation, a translation, and the last row 0 0 0 1",
             found=str(matrix.tolist()),
         )
     return scale, rotation, matrix[:3, 3]
@@ -105,10 +105,10 @@ def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np
 
 
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
-    """Write the transform between a PLY's coordinates, which are the scene's, and those of its source.
+    """Write the transform between a PLY's coordinates (the scene's) and those of its source.
 
-    The JSON file beside the PLY applies to no other PLY, so it contains the digest. Coordinates of our own
-    structure from motion are not recorded elsewhere.
+    The JSON file beside the PLY applies to no other PLY, so it contains the PLY's digest. The coordinates
+    used by our own structure from motion are recorded only here.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
@@ -135,7 +135,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the transform of a PLY of this package to its source's coordinates, or None without a JSON file.
+    """Return the transform from a PLY of this package to its source's coordinates; None without a JSON file.
 
     Raises:
         ArtifactError: if the JSON file belongs to another PLY, or its transform cannot be used.
@@ -148,10 +148,10 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
         return None
     if content.get("ply_sha256") != (found := sha256_of_file(ply)):
         raise ArtifactError(
-            f"{path} belongs to another PLY than {ply.name}",
+            f"{path} belongs to a PLY other than {ply.name}",
             expected=f"sha256 {content.get('ply_sha256')}",
             found=f"sha256 {found}",
-            fix="put it beside the PLY that it was written for, or remove it if the PLY is in the "
+            fix="move it next to the PLY that it was written for, or remove it if the PLY is in the "
             "coordinates of the scene's source",
         )
     matrix = np.array(content["source_from_scene"], dtype=np.float64)
@@ -177,7 +177,7 @@ def import_gaussians(
     """
     gaussians = load_ply(ply, fix=FIX)
     if len(gaussians) == 0:
-        raise ArtifactError(f"{ply} does not hold any Gaussians", fix=FIX)
+        raise ArtifactError(f"{ply} contains no Gaussians", fix=FIX)
     lengths = np.linalg.norm(gaussians.quats.astype(np.float64), axis=1)
     if (zero := int((lengths < 1e-12).sum())) > 0:
         raise ArtifactError(

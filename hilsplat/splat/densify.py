@@ -25,22 +25,22 @@ from hilsplat.splat.optimise import Adam
 from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 
 SMALL = 0.01
-"""Gaussians whose largest axis exceeds this, in units of the extent, are split; others are cloned (3DGS)."""
+"""Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""
 SPLIT_FACTOR = 1.6
-"""Factor by which the halves of a split Gaussian are smaller (3DGS: 0.8 x 2)."""
+"""Divisor of the scales of a split Gaussian's halves (3DGS: 0.8 x 2)."""
 HUGE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
 opacity reset; here walls of rooms are flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
 
 MAX_TOGETHER = 51
-"""Maximum number of Gaussians that share one place (the paper's code); more would change little."""
+"""Maximum number of coincident Gaussians (the paper's code); more would change little."""
 MAX_OPACITY = 1 - 1e-6
-"""Largest opacity; opacity 1 has no logit."""
+"""Maximum opacity; opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
 """Rate at which noise decreases with opacity (paper: k = 100): at opacity 0.1 its factor is e^-9.5."""
 LEAST_GATE = 1e-6
-"""Noise with a smaller factor is skipped."""
+"""Noise whose factor is smaller than this is skipped."""
 
 
 @compiled
@@ -82,7 +82,7 @@ def densify(
     extent: float,
     generator: np.random.Generator,
 ) -> None:
-    """Clone small and split large Gaussians with large screen gradients, the largest first, up to the cap."""
+    """Clone small and split large Gaussians with large screen gradients, largest first, up to the cap."""
     mean = gradients.mean()
     selected = np.flatnonzero(mean > settings.densify_gradient)
     room = max(settings.max_gaussians - len(adam), 0)
@@ -119,7 +119,7 @@ def reset_opacities(adam: Adam) -> None:
 
 
 def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]) -> np.ndarray:
-    """Return the opacity at which `number` coincident Gaussians cover as much as one of `opacity`.
+    """Return the opacity at which `number` coincident Gaussians cover as much as one with `opacity`.
 
     1 - (1 - new)^number = old (paper, Eq. 9).
     """
@@ -129,14 +129,14 @@ def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N
 def scale_factor(
     opacity: Float[np.ndarray, " N"], shared: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]
 ) -> Float[np.ndarray, " N"]:
-    """Return the factor on the scales of Gaussians that share a place; it preserves their profile's integral.
+    """Return the factor on the scales of coincident Gaussians that preserves their profile's integral.
 
-    n Gaussians of opacity o and deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. Its
+    n Gaussians of opacity o and standard deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. Its
     integral is sqrt(2 pi) s times the sum over k = 1..n of C(n, k) (-1)^(k-1) o^k / sqrt(k); one
     Gaussian of opacity `opacity` and deviation 1 has sqrt(2 pi) opacity. (Paper, Eq. 9, whose double
     sum is this one, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
 
-    `shared` is `shared_opacity(opacity, number)` of the original Gaussian; 1 to MAX_TOGETHER share the place.
+    `shared` is `shared_opacity(opacity, number)` of the original Gaussian; 1 to MAX_TOGETHER coincide.
     """
     k = np.arange(1, MAX_TOGETHER + 1)
     signs = np.where(k % 2 == 1, 1.0, -1.0) / np.sqrt(k)
@@ -150,7 +150,7 @@ def scale_factor(
 def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
     """Add noise to rows begin..end: weight x gate x covariance x normal, in units of the extent.
 
-    The gate is 1/2 at the opacity threshold of the dead, and 0 for opaque Gaussians (paper, Eq. 8).
+    The gate is 1/2 at the opacity threshold of dead Gaussians, and 0 for opaque ones (paper, Eq. 8).
     """
     turn, local = np.empty((3, 3)), np.empty(3)
     for row in range(begin, end):
@@ -190,8 +190,8 @@ def add_noise(
 
     The step is noise weight x rate of the means x gate x covariance x normal numbers, limited to the extent.
     The paper assumes scenes of extent 1; here the covariance is in units of the extent, so that the result
-    does not depend on the scene's unit. `rate_of_means` is in units of the extent, too. The result has the
-    same bytes for any number of threads.
+    does not depend on the scene's unit. `rate_of_means` is also in units of the extent. The result is
+    byte-identical for any number of threads.
     """
     p = adam.parameters
     normal = generator.standard_normal(p["means"].shape, dtype=np.float32)
@@ -216,8 +216,8 @@ def add_regularisers(adam: Adam, gradients: Gradients, settings: GaussiansSettin
 def relocate_and_grow(adam: Adam, settings: GaussiansSettings, generator: np.random.Generator) -> None:
     """Move dead Gaussians onto live ones, then add copies of live ones up to the cap.
 
-    Places are drawn with a probability proportional to their opacity. The Gaussians that then share a place
-    together cover what the original one covered.
+    Live Gaussians are drawn with a probability proportional to their opacity. A drawn Gaussian and its copies
+    together cover what the original covered.
     """
     opacity = opacities(adam)
     dead = opacity <= settings.min_opacity
@@ -245,9 +245,9 @@ def _share(
     settings: GaussiansSettings,
     generator: np.random.Generator,
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
-    """Draw rows with replacement and a probability proportional to `weights`, and return copies of them.
+    """Draw rows with replacement, with probabilities proportional to `weights`, and return copies.
 
-    The drawn rows themselves are reduced to their share of the place, like the copies.
+    The drawn rows are reduced to their share of the original coverage, like the copies.
     """
     p, edges = adam.parameters, np.cumsum(weights)
     source = np.searchsorted(edges, generator.uniform(0, edges[-1], number), side="right")

@@ -52,9 +52,9 @@ CURVE_EVERY = 20
 MIN_SIDE_PX = 64
 """Images are not shrunk below this shorter side."""
 MAX_SHOWN = 8
-"""Maximum number of views on the sheet of test views."""
+"""Maximum number of views on the contact sheet of test views."""
 SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
-"""Entries of the report that the index repeats."""
+"""Report entries that are copied to the index."""
 ERROR_GAIN = 4
 """Factor by which displayed errors are magnified."""
 TABLES = ("parameters", "first", "second")
@@ -68,7 +68,7 @@ class FitState:
     Attributes:
         gradients: screen gradients since the last densification.
         generator: source of view order, splits and random backgrounds.
-        order: indices of the remaining views of this round.
+        order: indices of the remaining views in this epoch.
         step: completed steps.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians).
     """
@@ -97,7 +97,7 @@ class FitState:
 
     @staticmethod
     def load(path: Path, key: str) -> "FitState | None":
-        """Read the checkpoint of this fit; None if it is missing, damaged or of another fit."""
+        """Read the checkpoint of this fit; None if it is missing, damaged or from another fit."""
         if not path.is_file():
             return None
         try:
@@ -106,7 +106,7 @@ class FitState:
             logger.warning("ignoring the checkpoint, the fit starts over: %s", error)
             return None
         if arrays["key"].item() != key:
-            logger.info("checkpoint %s belongs to other inputs; the fit starts over", path)
+            logger.info("checkpoint %s was written for different inputs; the fit starts over", path)
             return None
         parameters, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
         generator = np.random.default_rng()
@@ -163,14 +163,14 @@ def fit_step(
 
 
 def steps_of(settings: GaussiansSettings, num_views: int) -> int:
-    """Return the steps of a fit; fits to few views overfit sooner, so they take fewer steps."""
+    """Return the number of steps of a fit; fits to few views overfit sooner, so they take fewer steps."""
     return min(settings.iterations, settings.steps_per_view * num_views)
 
 
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
     """Return the scale of the training images after a share of the iterations, from coarse to fine.
 
-    Coarse images are cheaper, and their wide gradients move Gaussians into place from further away.
+    Coarse images are cheaper, and their wider gradients move Gaussians over larger distances.
     `side_px` is the shorter side of the images at full size.
     """
     scale = 0.25 if progress < settings.quarter_until else 0.5 if progress < settings.half_until else 1.0
@@ -210,7 +210,7 @@ def fit_gaussians(
 ) -> tuple[Gaussians, Float64[np.ndarray, "S 4"]]:
     """Fit Gaussians to the training views of a scene.
 
-    The result has the same bytes for any number of threads, and for a fit that was interrupted and resumed.
+    The result is byte-identical for any number of threads, even if the fit was interrupted and resumed.
 
     Args:
         seed: determines the view order, splits, relocations, noise and random points.
@@ -227,7 +227,7 @@ def fit_gaussians(
     """
     views = load_views(scene, "train", settings.image_scale)
     if not views:
-        raise SceneError(f"{scene.name} has no training view", fix="hold out fewer views (poses.test_every)")
+        raise SceneError(f"{scene.name} has no training views", fix="hold out fewer views (poses.test_every)")
     settings = settings.model_copy(update={"iterations": steps_of(settings, len(views))})
     cameras = [view.camera for view in views]
     extent = camera_extent(cameras)
@@ -268,7 +268,7 @@ def write_report(
     settings: GaussiansSettings,
     threads: int,
 ) -> dict[str, Any]:
-    """Write the report folder and return the content of report.json.
+    """Write the report folder and return the contents of report.json.
 
     The training views are scored if the scene has no held-out views. `curve` is that of `fit_gaussians`; None
     for imported Gaussians.

@@ -1,4 +1,4 @@
-"""Smooth camera paths around a scene or through given cameras; films and contact sheets of renders."""
+"""Smooth camera paths around a scene or through given cameras; videos and contact sheets of renders."""
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -22,21 +22,21 @@ SHEET_FRAMES = 12
 MAX_STOPS = 80
 """Maximum number of cameras that the path visits; if there are more, it visits every n-th."""
 SMOOTHING = 1 / 40
-"""Width of the smoothing as a share of the tour: it removes the shake of hand-held photographs."""
+"""Width of the smoothing as a share of the tour; smoothing removes the shake of hand-held cameras."""
 
 MAX_SIDE_PX = 320
 """Longer side of a picture on a contact sheet."""
 GAP_PX = 4
 
 OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0"}
-"""Macroblock-tree rate control is off: its bytes differ between runs, even on one thread (PyAV 18.1)."""
+"""Macroblock-tree rate control is off: its output differs between runs, even on one thread (PyAV 18.1)."""
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a closed tour of the given ones, which is short in position and direction.
+    """Return cameras along a closed tour of the given cameras that is short in position and direction.
 
-    Its speed is constant. Position, viewing direction and up are smoothed along it. Lens and image size are
-    those of the first camera. A single camera is repeated.
+    The speed is constant. Position, viewing direction and up vector are smoothed along the tour. Lens and
+    image size are those of the first camera. A single camera is repeated.
     """
     stops = cameras[:: -(-len(cameras) // MAX_STOPS)]
     centres = np.stack([camera.centre for camera in stops])
@@ -57,10 +57,10 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
 
 
 def open_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a smooth curve through two or more given ones, in their order.
+    """Return cameras along a smooth curve through two or more given cameras, in order.
 
     Position and lens follow a monotone cubic, so that the path does not overshoot; the direction rotates at
-    a constant rate between neighbours. The image size is that of the first camera.
+    a constant rate between consecutive cameras. The image size is that of the first camera.
     """
     centres = np.stack([camera.centre for camera in cameras])
     turns = Rotation.from_matrix([camera.cam_from_world[:3, :3] for camera in cameras])
@@ -121,7 +121,7 @@ def write_flyaround(
 ) -> None:
     """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 
-    Frames are rendered on threads while others are encoded; the bytes do not depend on their number.
+    Frames are rendered on threads while others are encoded; the bytes do not depend on the number of threads.
     """
     shown: list[UInt8[np.ndarray, "H W 3"]] = []
     path = closed_path(cameras, FRAMES)
@@ -138,10 +138,10 @@ def write_flyaround(
 
 
 def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
-    """Encode one or more frames of one size as MP4; equal frames give equal bytes with the same PyAV.
+    """Encode one or more equally sized frames as MP4; with one PyAV version, equal frames give equal bytes.
 
     An odd last row or column is cropped: yuv420p needs even sides. Frames are consumed one by one, so that a
-    long film needs little memory. `path` is in a temporary folder, or a file of an atomic writer.
+    long video needs little memory. `path` is in a temporary folder, or a file of an atomic writer.
     """
     frames = iter(frames)
     first = next(frames)
@@ -152,7 +152,7 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
         stream.codec_context.flags |= av.codec.context.Flags.bitexact
         for frame in chain([first], frames):
             even = np.ascontiguousarray(frame[:height, :width])
-            # the encoder's own conversion occasionally gives other bytes
+            # the encoder's own conversion is not always byte-identical
             picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
             film.mux(stream.encode(picture))
         film.mux(stream.encode())

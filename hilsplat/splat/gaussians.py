@@ -46,7 +46,7 @@ class Gaussians:
 
 
 FIELDS = tuple(field.name for field in fields(Gaussians))
-"""Field names of the parameters."""
+"""Names of the parameter fields."""
 
 BITS = 21
 """Bits per coordinate; three coordinates use 63 of a key's 64 bits."""
@@ -56,8 +56,8 @@ def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
     """Return the rows of points in the order of a Z-shaped curve (Morton 1966) through their box.
 
     Loops over Gaussians and their neighbours, such as G of the language field, then mostly hit the
-    processor's cache. The box excludes the outermost hundredth on each side: otherwise a few Gaussians
-    far away would put all others into one cell. Rows of one cell keep their relative order.
+    processor's cache. The box excludes the outermost hundredth on each side: otherwise a few distant
+    Gaussians would cause all others to share one cell. Rows in one cell keep their relative order.
     """
     if not len(means):
         return np.zeros(0, np.int64)

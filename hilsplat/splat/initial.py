@@ -1,4 +1,4 @@
-"""Start of a fit: the training views at the size at which they are fitted, and the initial Gaussians."""
+"""Inputs of a fit: the training views, scaled to the fit's resolution, and the initial Gaussians."""
 
 import logging
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ logger = logging.getLogger(__name__)
 SH_0 = 0.28209479177387814
 FIRST_OPACITY = 0.1  # 3DGS
 MIN_POINTS = 200
-"""With fewer sparse points than this, random points in front of cameras are added."""
+"""If there are fewer sparse points than this, random points in front of cameras are added."""
 ADDED_POINTS = 2_000
-"""Number of random points added to too few sparse points."""
+"""Number of random points added if there are too few sparse points."""
 RANDOM_POINTS = 10_000
 """Number of random points if `gaussians.initial` is "random"."""
 
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One view at the size at which it is fitted."""
+    """One view, scaled to the fit's resolution."""
 
     name: str
     camera: Camera
@@ -58,11 +58,11 @@ def camera_extent(cameras: list[Camera]) -> float:
 def first_gaussians(
     scene: Scene, cameras: list[Camera], settings: GaussiansSettings, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return round Gaussians at the sparse points, as wide as the mean distance to the 3 nearest (3DGS).
+    """Return round Gaussians at the sparse points; width: mean distance to the 3 nearest points (3DGS).
 
     If there are fewer than MIN_POINTS sparse points, random grey points in front of random cameras are added.
     If `settings.initial` is "random", random points replace all sparse points. If it is "frozen", every
-    sparse point becomes one Gaussian, regardless of their number.
+    sparse point becomes one Gaussian, regardless of the number of points.
 
     Raises:
         SceneError: if points to be frozen are missing or not finite.
@@ -72,10 +72,10 @@ def first_gaussians(
     is_random, is_frozen = settings.initial == "random", settings.initial == "frozen"
     if is_frozen and not (len(xyz) and finite.all()):
         raise SceneError(
-            f"the points of {scene.name} cannot each become a Gaussian (gaussians.initial: frozen)",
+            f"the points of {scene.name} cannot be used as Gaussians (gaussians.initial: frozen)",
             expected="at least one point, all finite",
             found=f"{len(xyz)} points, {int((~finite).sum())} not finite",
-            fix="name the points as ply_file_path in transforms.json, or set gaussians.initial to points",
+            fix="specify the points as ply_file_path in transforms.json, or set gaussians.initial to points",
         )
     xyz, rgb = xyz[finite], rgb[finite]
     known = xyz
@@ -110,7 +110,7 @@ def first_gaussians(
 def _random_points(
     cameras: list[Camera], known: np.ndarray, number: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Sample points in front of random cameras, at depths of known points, or else of the cameras' extent."""
+    """Sample points in front of random cameras, at depths of known points or else of the cameras' extent."""
     extent = camera_extent(cameras)
     depths = []
     for camera in cameras:

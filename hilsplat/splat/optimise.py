@@ -1,4 +1,4 @@
-"""Fused Adam for the parameters of the Gaussians, with the step sizes of 3DGS."""
+"""Fused Adam for the Gaussians' parameters, with the step sizes of 3DGS."""
 
 from dataclasses import dataclass
 from typing import no_type_check
@@ -28,7 +28,7 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
 def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
     """Take an Adam step for chunks begin..end of 16 numbers, in place.
 
-    `rates` (divided by 1 - beta1^t) is cyclic: chunk k uses those at 16 k and beyond. `root_of_rest2` is
+    `rates` (divided by 1 - beta1^t) is cyclic: chunk k uses the rates from index 16 k. `root_of_rest2` is
     sqrt(1 - beta2^t).
     """
     beta1, rest1 = lanes(np.float32(BETA1)), lanes(np.float32(1.0 - BETA1))

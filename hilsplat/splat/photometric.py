@@ -1,6 +1,6 @@
 """Photometric loss of a rendered view, L1 and D-SSIM in one pass with its gradient; PSNR and SSIM.
 
-SSIM is that of 3DGS: an 11x11 Gaussian window of sigma 1.5 px, applied as two 11-tap passes to each
+SSIM is computed as in 3DGS: an 11x11 Gaussian window of sigma 1.5 px, applied as two 11-tap passes to each
 channel, with zeros beyond the border and the constants 0.01^2 and 0.03^2 for values in [0, 1].
 """
 
@@ -155,7 +155,7 @@ def photometric_loss(
 ) -> tuple[float, Float32[np.ndarray, "H W 3"]]:
     """Return L = (1 - w) mean |image - target| + w (1 - SSIM), and dL/dimage (3DGS, Eq. 7: w = 0.2).
 
-    Images are RGB in [0, 1]. The result has the same bytes for any number of threads.
+    Images are RGB in [0, 1]. The result is byte-identical for any number of threads.
     """
     height, width, _ = image.shape
     num = 3 * width

@@ -11,7 +11,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 
 HEADER_BYTES = 2**14
-"""Bytes that are searched for the number of vertices."""
+"""Number of bytes that are searched for the vertex count."""
 
 
 def _names(num_bases: int) -> list[str]:
@@ -50,7 +50,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def vertex_count(path: Path) -> int | None:
-    """Return the number of Gaussians in a PLY's header, or None if unreadable, which readers report."""
+    """Return the number of Gaussians in a PLY's header; None if unreadable (readers report the error)."""
     try:
         with Path(path).open("rb") as stream:
             header = stream.read(HEADER_BYTES)
@@ -63,8 +63,8 @@ def vertex_count(path: Path) -> int | None:
 def load_ply(path: Path, fix: str = "") -> Gaussians:
     """Read a 3DGS PLY of this or another package; the number of f_rest columns determines the degree.
 
-    The file may be binary or ASCII, with properties in any order and of any number type. Normals and
-    properties not in 3DGS (colours, labels) are ignored. `fix` is for errors; "": how to rerun the stage.
+    The file may be binary or ASCII, with properties in any order and of any numeric type. Normals and
+    properties not in 3DGS (colours, labels) are ignored. `fix` is the errors' fix; "": rerun the stage.
 
     Raises:
         ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers.
@@ -111,7 +111,7 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
         finite &= values.all(axis=tuple(range(1, values.ndim)))
     if not finite.all():
         raise ArtifactError(
-            f"{path}: {int((~finite).sum())} of {len(gaussians)} Gaussians hold a number that is not finite",
+            f"{path}: {int((~finite).sum())} of {len(gaussians)} Gaussians contain a non-finite number",
             fix=fix,
         )
     return gaussians

@@ -1,7 +1,7 @@
 """Write Gaussians as SPZ, the compressed format of Niantic Labs (version 2), which many viewers read.
 
 A gzip stream of a 16-byte header and six columns: positions in 24-bit fixed point, then opacity, colour,
-log scales, rotation and harmonics in one byte each, in axes x right, y up, z backwards. The format fixes
+log scales, rotation and harmonics in one byte each, with axes x right, y up, z backwards. The format fixes
 the quantisation of all but positions and harmonics. A render of a synthetic scene of degree 2 has a PSNR of
 43 dB against the original at 17 bytes per Gaussian.
 """
@@ -22,7 +22,7 @@ STEPS_PER_SPREAD = 8192
 """Minimum number of position steps in the Gaussians' median distance from their centre."""
 LARGEST_STEP = 2**23 - 1
 HARMONIC_STEP = 8
-"""Step of harmonics in 1/128 (5 bits). The usual 4 bits beyond degree 1 lose 2 dB and save 1 byte."""
+"""Step size of harmonics in 1/128 (5 bits). The usual 4 bits beyond degree 1 lose 2 dB and save 1 byte."""
 COLOUR_SCALE = 0.15
 GZIP_LEVEL = 6
 

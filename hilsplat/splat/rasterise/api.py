@@ -39,17 +39,17 @@ def render(
     threads: int = 1,
     device: Device = "cpu",
 ) -> Rendering:
-    """Render a view by the conventions of gsplat (docs/rasteriser.md); `draw` also computes gradients.
+    """Render a view with the conventions of gsplat (docs/rasteriser.md); `draw` also computes gradients.
 
     Args:
         features: additional channels to blend in the same pass; any number.
         sh_degree: degree of spherical harmonics to use; default: that of the Gaussians.
-        threads: CPU threads; the result has the same bytes for any number.
+        threads: CPU threads; the result is byte-identical for any number.
         device: backend; see `device.choose_device`.
 
     Raises:
-        HilsplatError: if parameters are not finite, quaternions are zero, or features have another number
-            of rows.
+        HilsplatError: if parameters are not finite, quaternions are zero, or the number of feature
+            rows differs from the number of Gaussians.
     """
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= min(gaussians.sh_degree, 3):
@@ -71,14 +71,14 @@ def draw(
     threads: int,
     device: Device,
 ) -> Drawn:
-    """Draw image and alpha of a view without background, and compute gradients on demand.
+    """Draw the image and alpha of a view without background, and compute gradients on demand.
 
-    Gaussians behind the camera get zero gradient. Gradients are first-order only and do not reach the
+    Gaussians behind the camera get zero gradient. Gradients are first-order and are not computed for the
     camera. Arguments and errors are those of `render`.
     """
     if features is not None and len(features) != len(gaussians):
         raise HilsplatError(
-            "features do not fit the Gaussians",
+            "features do not match the Gaussians",
             expected=f"{len(gaussians)} rows",
             found=f"{len(features)} rows",
         )

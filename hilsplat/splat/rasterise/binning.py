@@ -16,10 +16,10 @@ BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 """Centre of the first pixel of each 4x4 block, relative to the tile's corner."""
 REACH_SLACK = (1e-2, 1e-6)
-"""A block is skipped if the exponent misses the cut by more than this: absolute, and relative to the
-squared terms of the exponent (float32 has 6e-8)."""
+"""A block is skipped if the exponent is below the cut by more than this: an absolute slack, and one relative
+to the squared terms of the exponent (float32 rounding: 6e-8)."""
 AHEAD = 16
-"""Number of list entries by which rows are prefetched ahead."""
+"""Number of list entries by which row prefetching is ahead."""
 MAX_ENTRIES = 2**21
 """Maximum number of tile list entries in memory: 8 MiB, and 72 MiB of gradients for 3 channels."""
 
@@ -37,7 +37,7 @@ class Tiles:
     touches it, front to back, in at most tile_start[t + 1] - tile_start[t] entries.
 
     Attributes:
-        order: rows of the drawn Gaussians, front to back; equal depths in row order.
+        order: rows of the drawn Gaussians, front to back; ties in row order.
         tile_start: number of entries of all preceding tiles.
     """
 
@@ -123,7 +123,7 @@ def _least(a, b, c, u, v):
 def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
     """Return the bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
 
-    The least exponent over a block is at the mean, if the block contains it. Otherwise it is on an edge
+    The minimum exponent over a block is at the mean, if the block contains it. Otherwise it is on an edge
     that faces the mean: where the slope along the edge is zero (along_x v and along_y u from the mean), or at
     the nearer corner.
     """

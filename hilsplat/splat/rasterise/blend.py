@@ -11,7 +11,7 @@ the forward's. It keeps one number per pixel, R = sum over channels of (contribu
 Gaussians) x (gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each list entry has
 its own slot for the sums, so the result does not depend on the distribution of tiles over threads.
 
-Alpha is one more channel, of colour 1: the image's alpha is the sum of the weights.
+Alpha is an additional channel with colour 1: the image's alpha is the sum of the weights.
 
 Arguments shared by the kernels: tiles begin..end of a row-major grid with `tiles_x` per row; the list
 of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geometry as written by
@@ -46,11 +46,11 @@ from hilsplat.splat.rasterise.binning import AHEAD, BLOCK_X, BLOCK_Y, TILE
 from hilsplat.splat.rasterise.project import MIN_ALPHA, MOMENTS
 
 MAX_ALPHA = 0.999
-"""A Gaussian's alpha at a pixel is clipped here, and passes no gradient beyond (gsplat: 0.999)."""
+"""Maximum alpha of a Gaussian at a pixel; clipped alphas pass no gradient (gsplat: 0.999)."""
 MIN_TRANSMITTANCE = 1e-4
-"""Blending stops at a pixel before the Gaussian that would leave less light than this (3DGS, gsplat)."""
+"""Blending stops at a pixel before the Gaussian that would reduce transmittance below this (3DGS, gsplat)."""
 CHUNK = 128
-"""List entries per contiguous copy: with their lists, 40 kB for 3 channels."""
+"""Number of list entries copied at once: with their lists, 40 kB for 3 channels."""
 _CUT = np.float32(np.log2(MIN_ALPHA))
 _TOP = np.float32(MAX_ALPHA)
 _STOP = np.float32(MIN_TRANSMITTANCE)
@@ -109,7 +109,7 @@ def gather(first, count, x0, y0, gaussian, geometry, records):
 @compiled(inline="always")
 @no_type_check
 def _exponent(records, at, px, py):
-    """Return distances of a copied Gaussian to pixel centres, and log2 of its unclipped alpha there."""
+    """Return the offsets of a copied Gaussian from pixel centres, and log2 of its unclipped alpha there."""
     dx, dy = load_same(records, at) - px, load_same(records, at + 1) - py
     slope = load_same(records, at + 3) * dy
     peak = load_same(records, at + 5) - load_same(records, at + 4) * dy * dy

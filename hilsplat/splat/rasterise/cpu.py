@@ -1,7 +1,7 @@
 """CPU backend: multi-threaded projection, tile lists and blending on plain arrays.
 
-Threads process ranges of Gaussians or tiles; nothing is summed across threads, so every result has the
-same bytes for any number of threads.
+Threads process ranges of Gaussians or tiles; nothing is summed across threads, so every result is
+byte-identical for any number of threads.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, pro
 from hilsplat.splat.rasterise.weights import count_weights, write_weights
 
 RANGES_PER_THREAD = 4
-"""Ranges of work per thread, which balances the load."""
+"""Number of work ranges per thread; several ranges balance the load."""
 
 
 @cache
@@ -43,7 +43,7 @@ def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *argume
 def over_ranges(
     work: Callable[..., Any], count: int, threads: int, *arguments: Any, first: int = 0
 ) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for ranges that cover `count` numbers from `first`, on threads."""
+    """Call `work(begin, end, *arguments)` for ranges that cover `count` items from `first`, on threads."""
     pieces = min(count, RANGES_PER_THREAD * threads) if threads > 1 and count > 1 else 1
     edges = first + np.linspace(0, count, pieces + 1).astype(int)
     return over_edges(work, edges.tolist(), threads, *arguments)
@@ -59,7 +59,7 @@ class Projected:
         geometry: see `project.GEOMETRY`.
         box: pixel box of each Gaussian; last < first if it is not drawn.
         colours: RGB in this view.
-        only_band: the filled lists, if one band contains them all and they were filled before.
+        only_band: the filled lists, if one band contains all of them and was already filled.
     """
 
     camera: Float64[np.ndarray, " 25"]
@@ -108,7 +108,7 @@ def refuse_broken(broken: int, total: int) -> None:
         raise HilsplatError(
             f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
             expected="finite means, log_scales, quats, opacity_logits and sh",
-            fix="drop these Gaussians, or run the gaussians stage again",
+            fix="drop these Gaussians, or rerun the gaussians stage",
         )
 
 

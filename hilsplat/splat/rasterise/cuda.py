@@ -26,7 +26,7 @@ DEVICE = "cuda"
 TILE = 16
 """Side of a gsplat tile, px."""
 EVERYTHING = 2**31 - 1
-"""A number beyond the last batch of any tile."""
+"""A number larger than any tile's batch index."""
 
 
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -46,7 +46,7 @@ def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
 def blend(
     g: dict[str, Tensor], camera: Camera, channels: Float[Tensor, "N C"]
 ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"], dict[str, Any]]:
-    """Blend channels of Gaussians on the device into premultiplied image, alpha and intermediate results."""
+    """Blend channels of Gaussians on the device; return premultiplied image, alpha and intermediates."""
     import gsplat
 
     height, width = camera.size_hw

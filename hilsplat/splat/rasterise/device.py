@@ -1,4 +1,4 @@
-"""Choice of the rendering backend, our own on the CPU or gsplat on CUDA, and a self-test that both agree."""
+"""Choice of the rendering backend (ours on the CPU, or gsplat on CUDA), and a self-test that both agree."""
 
 import ctypes
 import logging
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 Device = Literal["cpu", "cuda"]
 
 LEAST_AGREEMENT = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
-"""Largest differences that rounding explains. That of gradients is relative, and over all Gaussians."""
+"""Maximum differences attributed to rounding. That of gradients is relative and covers all Gaussians."""
 
 
 @cache
@@ -56,7 +56,7 @@ def _has_driver() -> bool:
 def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting selects on this machine, and log it the first time.
 
-    `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with the CPU.
+    `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test matches the CPU.
     Without gsplat and a driver, or for `cpu`, torch isn't imported (1.3 to 3 s).
 
     Raises:

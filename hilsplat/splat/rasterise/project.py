@@ -35,13 +35,13 @@ from hilsplat.base.rotations import matrix_entries
 from hilsplat.scene.cameras import Camera
 
 NEAR = 0.01
-"""Gaussians with a smaller depth are not drawn, scene units (gsplat: 0.01)."""
+"""Gaussians with a smaller depth (scene units) are not drawn (gsplat: 0.01)."""
 LOW_PASS_PX2 = 0.3
 """Variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
 """A smaller alpha is not drawn (3DGS, gsplat: 1 / 255)."""
 MAX_LOG_SCALE = np.float32(20.0)
-"""Scales are clipped at exp(20), 5e8 scene units, and get no gradient beyond. A Gaussian that wide covers
+"""Scales are clipped at exp(20), 5e8 scene units; clipped scales get no gradient. A Gaussian that wide covers
 any view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers.
 It is float32, since a float64 would make the scales' whole computation float64 and change their last bits."""
 _LEAST_LOG = np.float32(-60.0)

@@ -1,7 +1,7 @@
 """Blending weights of a view as sparse rows, one per pixel, with ascending columns.
 
 The first pass counts the entries of each row; the second writes them. Pixels, blocks, lanes and arguments are
-those of `blend`.
+as in `blend`.
 """
 
 from typing import no_type_check
@@ -110,7 +110,7 @@ def write_weights(
                 for lane in range(LANES if done else 0):
                     pixel = block * LANES + lane
                     at = pixel * room + size_of[pixel]
-                    for n in range(done):  # branch-free, since a branch would be unpredictable
+                    for n in range(done):  # branch-free, because a branch would be unpredictable
                         weight = by_lane[n * LANES + lane]
                         held_columns[at], held_weights[at] = rows[n], weight
                         at += np.int64((weight > _ZERO) & (weight >= least))

@@ -109,11 +109,11 @@ def test_long_texts_are_truncated_with_a_warning(colour_clip, caplog):
     (colour_clip / "config.json").write_text(json.dumps(config))
     vectors = ClipModel.load(colour_clip).embed_texts(["mug mug mug mug handle"])
     np.testing.assert_allclose(vectors, [[1, 0, 0]])
-    assert "cut off after 4 tokens" in caplog.text
+    assert "truncated after 4 tokens" in caplog.text
 
 
 def test_a_text_without_a_word_is_refused(colour_clip):
-    with pytest.raises(ModelError, match="text '' has no token"):
+    with pytest.raises(ModelError, match="text '' contains no tokens"):
         ClipModel.load(colour_clip).embed_texts([""])
 
 

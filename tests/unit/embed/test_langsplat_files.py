@@ -110,9 +110,9 @@ def test_maps_of_another_size_are_resized_and_of_another_shape_refused(ours, tmp
     ("maps", "vectors", "words"),
     [
         (np.zeros((3, 6, 8)), np.zeros((1, 5)), "is not a LangSplat map"),
-        (np.full((4, 6, 8), 7.0), np.zeros((7, 5)), "does not belong to a_f.npy"),
-        (np.full((4, 6, 8), 0.5), np.zeros((7, 5)), "does not belong to a_f.npy"),
-        (np.full((4, 6, 8), np.nan), np.zeros((7, 5)), "does not belong to a_f.npy"),
+        (np.full((4, 6, 8), 7.0), np.zeros((7, 5)), "does not match a_f.npy"),
+        (np.full((4, 6, 8), 0.5), np.zeros((7, 5)), "does not match a_f.npy"),
+        (np.full((4, 6, 8), np.nan), np.zeros((7, 5)), "does not match a_f.npy"),
         (np.zeros((4, 6, 8)), np.full((1, 5), np.inf), "is not an array of vectors"),
         (np.zeros((4, 6, 8)), np.zeros(5), "is not an array of vectors"),
         (np.array([{"a": 1}], dtype=object), np.zeros((1, 5)), "cannot be read"),
@@ -185,8 +185,8 @@ def test_vectors_of_the_same_clip_are_accepted(embedded, scene, tmp_path):
 @pytest.mark.parametrize(
     ("width", "words"),
     [
-        (100, r"a_f.npy does not belong to the CLIP in"),
-        (None, r"were not computed by the CLIP in(.|\n)*laion2b"),
+        (100, r"a_f.npy does not match the CLIP model in"),
+        (None, r"were not computed by the CLIP model in(.|\n)*laion2b"),
     ],
 )
 def test_vectors_of_another_clip_are_refused(embedded, scene, tmp_path, width, words):

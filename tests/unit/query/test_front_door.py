@@ -105,7 +105,7 @@ def test_another_clip_is_refused(desk, elsewhere):
     described = elsewhere / "copy/models/colours/preprocessor_config.json"
     described.write_text(described.read_text().replace('"image_std": [1, 1, 1]', '"image_std": [2, 1, 1]'))
     recorded = json.loads((desk / SCENE / "default/clip/index.json").read_text())
-    with pytest.raises(ModelError, match="the CLIP that embedded the masks in") as caught:
+    with pytest.raises(ModelError, match="the CLIP model that embedded the masks in") as caught:
         hilsplat.open(Path("copy") / SCENE)
     message = str(caught.value)
     assert recorded["model_sha256"][:12] in message
@@ -118,7 +118,7 @@ def test_a_missing_clip_is_reported_with_the_searched_folders(desk, elsewhere, m
     monkeypatch.setattr("hilsplat.embed.clip.INSTALLED", elsewhere)
     shutil.copytree(desk / SCENE, elsewhere / "desk")
     (elsewhere / "models").mkdir()
-    with pytest.raises(ModelError, match=rf"no CLIP at models/colours or in {elsewhere}/models"):
+    with pytest.raises(ModelError, match=rf"no CLIP model at models/colours or in {elsewhere}/models"):
         hilsplat.open("desk")
 
 

@@ -294,10 +294,10 @@ def changed(columns: dict, value: float, *names: str) -> dict:
         (lambda c: {k: v for k, v in c.items() if k != "rot_3"}, "without rot_3"),
         (lambda c: {**c, "f_rest_0": c["x"], "f_rest_1": c["x"]}, "2 f_rest columns"),
         (lambda c: {**c, **{f"f_rest_{k}": c["x"] for k in range(72)}}, "72 f_rest columns"),
-        (lambda c: changed(c, -np.inf, "scale_1"), "1 of 3 Gaussians hold a number that is not finite"),
+        (lambda c: changed(c, -np.inf, "scale_1"), "1 of 3 Gaussians contain a non-finite number"),
         (lambda c: changed(c, 0, "rot_0", "rot_1", "rot_2", "rot_3"), "no rotation"),
         (lambda c: {"packed_position": c["x"].astype(np.uint32)}, "compressed"),
-        (lambda c: {k: v[:0] for k, v in c.items()}, "does not hold any Gaussians"),
+        (lambda c: {k: v[:0] for k, v in c.items()}, "contains no Gaussians"),
     ],
 )
 def test_an_unusable_ply_is_named(turned_scene, source_ply, tmp_path, change, message):
