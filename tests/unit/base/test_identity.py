@@ -174,7 +174,7 @@ def test_both_branches_that_bind_a_name_count(tmp_path):
         (
             "hilsplat.a:g",
             "from hilsplat import a\n\ndef g():\n    a.x()\n",
-            r"uses 'x' of hilsplat\.a, which",
+            r"uses 'x' from hilsplat\.a, which",
         ),
         ("hilsplat.a:g", "from hilsplat.a import *\n\ndef g():\n    x()\n", r"a star import of hilsplat\.a"),
     ],
