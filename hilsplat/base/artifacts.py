@@ -469,7 +469,7 @@ def output_lock(output: Path) -> Iterator[None]:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ArtifactError(
-                f"another process is writing {output}", fix="wait until it ends, or end it, then run again"
+                f"another process is writing {output}", fix="wait until it ends, or stop it, then run again"
             ) from error
         stream.truncate(0)
         stream.write("unfinished\n")

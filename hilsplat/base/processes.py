@@ -82,7 +82,7 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
 
     A locked file in it tells `remove_leftovers` that the writer is alive: the system releases the lock when
     the writer ends, even if it is killed. Process ids have no meaning in other containers and after a reboot.
-    The folder itself is not locked, because NFS locks only files.
+    The folder itself is not locked, because NFS can lock only files.
     """
     is_locked = False
     while not is_locked:

@@ -107,7 +107,7 @@ def evaluate_files(
 def table(
     name: Annotated[str, typer.Argument(help="table: hierarchy, lerf, ablation, ... (docs/tables.md)")],
     published: PathIn,
-    out: Annotated[Path, typer.Option(help="CSV to write, with .md, .tex and .html beside it")],
+    out: Annotated[Path, typer.Option(help="CSV to write, with .md, .tex and .html files beside it")],
     scores: Annotated[list[Path] | None, typer.Argument(help="scores.csv of each scene and variant")] = None,
     labels: Annotated[str, typer.Option(help="JSON: variant -> its name in the table")] = "{}",
     absent: Annotated[list[str] | None, typer.Option(help="what was not measured, and why")] = None,

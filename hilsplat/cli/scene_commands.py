@@ -8,7 +8,7 @@ import typer
 
 from hilsplat.cli.stage import app
 
-POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute; default: those in the folder"
+POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute poses; default: those found"
 
 
 @app.command()
@@ -54,7 +54,7 @@ def new(
     frames: Annotated[int, typer.Option(min=3, max=1000, help="maximum number of video frames")] = 60,
     poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     gaussians: Annotated[
-        Path | None, typer.Option(help="3DGS PLY; none: fit; default: the output of 3DGS in the folder")
+        Path | None, typer.Option(help="3DGS PLY; none: fit Gaussians; default: 3DGS output in the folder")
     ] = None,
     features: Annotated[
         Path | None, typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: those found")

@@ -48,7 +48,7 @@ def examine() -> Iterator[Finding]:
         try:
             yield from check()
         except Exception as error:  # a broken installation can raise anything
-            yield Finding(check.__name__, "fault", f"{type(error).__name__}: {error}", "read the message")
+            yield Finding(check.__name__, "fault", f"{type(error).__name__}: {error}", "see the message")
 
 
 def python() -> Iterator[Finding]:

@@ -132,7 +132,7 @@ class JobResources:
         return needed
 
     def gpus(self, section: str) -> Callable[[Job], int]:
-        """Return the function for the resource `gpu`: 1 for `device: cuda` and for onnxruntime-gpu."""
+        """Return the function for the resource `gpu`: 1 for `device: cuda` or onnxruntime-gpu, else 0."""
 
         def needed(wildcards: Any) -> int:
             settings = getattr(self.plan.stages(wildcards), section)

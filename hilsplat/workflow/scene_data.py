@@ -116,7 +116,7 @@ class SceneData:
         return readers_of([self.source_name(job)])
 
     def existing_gaussians(self, job: Job) -> list[str]:
-        """Return the input: a PLY that replaces the fit, and files about its coordinates; usually empty."""
+        """Return the input of gaussians: a PLY that replaces the fit, and its coordinate files, if any."""
         ply = self.row(job).gaussians
         if ply is None:
             return []
