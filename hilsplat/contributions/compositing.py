@@ -1,4 +1,4 @@
-"""Normalised compositing weights of a view, and the latents that they render at its pixels."""
+"""Normalised compositing weights of a view, and latents rendered with them at its pixels."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -9,17 +9,17 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import LANES, WIDTH, lanes, load, store
 
 MIN_ALPHA = 0.5
-"""Pixels with a smaller alpha are ignored, since their features would be extrapolated."""
+"""Pixels with a smaller alpha are ignored, because their features would be extrapolated."""
 
 MIN_LATENT_SHARE = 0.5
-"""A pixel has a latent at a level if more than this share of its weight is of Gaussians with a latent."""
+"""A pixel has a latent at a level if Gaussians with a latent have more than this share of its weight."""
 
 
 def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
     """Divide the weights of each pixel by their sum, the accumulated alpha; the memory is overwritten.
 
     The weights then sum to 1, so that a rendered feature is an average of features; pixels with an alpha
-    below `MIN_ALPHA` become empty rows. Weights that the rasteriser dropped as too small are not in the sum.
+    below `MIN_ALPHA` become empty rows. The sum excludes weights that the rasteriser dropped as too small.
     """
     weights.sort_indices()
     kept = _normalise(weights.indptr, weights.indices, weights.data, MIN_ALPHA)
@@ -60,10 +60,10 @@ def _add_columns(indices, data, out):
 def rendered_latents(
     weights: sp.csr_matrix, features: Float32[np.ndarray, "N 3 D"]
 ) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-    """Return, per level, the pixels that mostly show Gaussians with a latent, and their rendered latents.
+    """Return, per level, the pixels dominated by Gaussians with a latent, and their rendered latents.
 
-    Gaussians without a latent have zeros, which a code would decode like any latent. They are omitted, and
-    the normalised weights of the others are divided by their sum. The bytes equal those of sparse products.
+    Gaussians without a latent contain zeros, which a code would decode like any latent. They are omitted, and
+    the remaining normalised weights are divided by their sum. The bytes equal those of sparse products.
     """
     rows = weights.indptr, weights.indices, weights.data
     shares = np.zeros((weights.shape[0], features.shape[1]), np.float32)

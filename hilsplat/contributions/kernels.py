@@ -8,7 +8,7 @@ from numba.extending import intrinsic
 from hilsplat.base.compiled import compiled
 
 SUMS = 4
-"""Numbers that are summed together: three sums, and the number of products added, 0 for a new pair."""
+"""Numbers per pair that are summed together: three sums, and the number of products added (0: new pair)."""
 
 
 @compiled
@@ -22,8 +22,8 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
         indptr, indices, data: W; pixels without weights are ignored.
 
     Returns:
-        pixel counts (masks x 2): painted ones and those in the half; row sizes, columns, and sums over the
-        raw mask, its painted pixels and their half (entries x 3, float64, summed in the order of the pixels).
+        pixel counts (masks x 2): painted pixels and those in the half; row sizes, columns, and sums over the
+        raw mask, its painted pixels and their half (entries x 3, float64, summed in pixel order).
     """
     sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
     counts = np.zeros((last - first, 2), np.int64)

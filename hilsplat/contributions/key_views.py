@@ -1,4 +1,4 @@
-"""Key views: training views that together show most of the scene and are segmented first."""
+"""Key views: training views that are segmented first and together show most of the scene."""
 
 import math
 from pathlib import Path
@@ -39,13 +39,13 @@ def run_key_masks(
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
-    """Choose a share of the training views (rounded up) by the Gaussians that each one adds; in camera order.
+    """Choose a share of the training views (rounded up) by the Gaussians that each adds; in camera order.
 
-    A Gaussian counts with its mean visible mass, halved by each chosen view that shows it, so that the views
-    cover the scene before they repeat. The result does not depend on `threads`.
+    A Gaussian is weighted by its mean visible mass, halved by each chosen view that shows it, so that views
+    of uncovered regions are preferred. The result does not depend on `threads`.
 
     Raises:
-        SceneError: if there is no training view.
+        SceneError: if there are no training views.
     """
     names, gaussians = train_views(scene), load_ply(gaussians_ply)
 
@@ -63,7 +63,7 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
 
 
 def most_covering(seen: Bool[np.ndarray, "V N"], worth: Float64[np.ndarray, " N"], number: int) -> list[int]:
-    """Choose rows greedily by the worth of the columns that they see, the first on a tie.
+    """Choose rows greedily by the total worth of their visible columns; the first row wins ties.
 
     Each chosen row halves the worth of its columns. The result is in the order of selection.
     """

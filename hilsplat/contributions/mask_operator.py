@@ -1,7 +1,7 @@
 """Mask means as a linear map of the field, its adjoint, and averages of latents over masks.
 
-Rows of a multiple of sixteen float32 channels take the loops `_wide_means` and `_wide_spread`, which give the
-bytes of the plain loops.
+Rows with a multiple of sixteen float32 channels use the loops `_wide_means` and `_wide_spread`, whose results
+are bit-identical to those of the plain loops.
 """
 
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from hilsplat.base.lanes import WIDTH, lanes, load, store
 from hilsplat.contributions.compositing import plus
 
 MEDIAN_SOFTENING = 1e-4
-"""Minimum distance of a latent to the median, which avoids division by zero."""
+"""Minimum distance between a latent and the median, to avoid division by zero."""
 
 BLOCK = 2**15
 """Gaussians per pass of a wide product with A, so that their features stay in the processor's cache."""
 
 SPREAD_PARTS = 4
-"""Ranges of Gaussians per thread, which balance the load: masks show some Gaussians more often."""
+"""Number of Gaussian ranges per thread; several balance the load (masks show some Gaussians more often)."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,9 @@ def lifted_average(
     pixels: Float32[np.ndarray, " M"],
     latents: Float32[np.ndarray, "M D"],
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Average the latents of the pixels that show each Gaussian, weighted by its share of them; 0 if none do.
+    """Average the latents of the pixels that show each Gaussian, weighted by its share; 0 without any.
 
-    This takes one sparse product and is within about a tenth of the regression's optimum.
+    This needs only one sparse product and is within about 10 % of the regression's optimum.
     """
     sums = masks.spread(pixels[:, None] * latents)
     return np.where(mass[:, :, None] > 0, sums / np.maximum(mass, 1e-12)[:, :, None], np.float32(0))
@@ -110,8 +110,8 @@ def lifted_median(
     """Compute the geometric median of the same latents and weights, to which LangSplat's L1 loss converges.
 
     Masks that merge or miss objects shift an average much more than a median. Each Weiszfeld iteration,
-    one pass over A, averages with the weights divided by the distance to the latest estimate; 15 give about
-    three correct digits. Gaussians that no mask shows keep `start`, the lifted average.
+    one pass over A, averages with the weights divided by the distance to the latest estimate; 15 iterations
+    give about three correct digits. Gaussians that no mask shows keep `start`, the lifted average.
     """
     features = np.array(start, np.float32, order="C")
     for _ in range(steps):
@@ -183,7 +183,7 @@ def _wide_spread(begin, end, indptr, indices, data, level_index, values, width, 
 
 @compiled
 def _columns_below(limit, begin, end, indices):
-    """Return the end of the columns below `limit` in a row, begin..end of `indices`, which are sorted."""
+    """Return the end of the columns below `limit` in a row (begin..end of the sorted `indices`)."""
     while begin < end and indices[begin] < limit:
         begin += 1
     return begin

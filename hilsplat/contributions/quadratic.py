@@ -1,6 +1,6 @@
 """The quadratic form of frozen geometry: G_l = sum over views of W' diag(valid_l) W.
 
-W contains the compositing weights of all pixels that have a mask at some level. G is stored once for all
+W contains the compositing weights of all pixels that have a mask at any level. G is stored once for all
 levels, as an upper triangle with three values per pair of Gaussians. If W has fewer non-zeros, it is stored
 and streamed instead. Both give the same products.
 """
@@ -19,8 +19,8 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import padded, plus
 
 PRODUCT_PARTS = 4
-"""A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that the
-bytes don't depend on the threads; each part stores the sums of its rows and of those below."""
+"""A product with G is summed in this many parts with equal numbers of pairs. The number is fixed so that
+results don't depend on the number of threads; each part stores the sums of its rows and those below."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Gram:
         return np.ascontiguousarray(total[:, :, :channels])
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
-        """Return the sum over levels of tr F'GF, in float64 except for G F, whose roundings cancel."""
+        """Return the sum over levels of tr F'GF, in float64 except for G F, whose rounding errors cancel."""
         return float(np.multiply(features, self.product(features), dtype=np.float64).sum())
 
     def save(self, folder: Path) -> None:

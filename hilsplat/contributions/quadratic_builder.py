@@ -1,4 +1,4 @@
-"""Sum the quadratic form of frozen geometry part by part, in bounded memory, and choose G or W."""
+"""Sum the quadratic form of frozen geometry part by part in bounded memory; choose G or W."""
 
 import logging
 import shutil
@@ -29,22 +29,22 @@ logger = logging.getLogger(__name__)
 
 BLOCKS = 64
 """G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. Blocks
-whose Gaussians a part does not show are skipped, which a Morton order makes frequent."""
+without Gaussians visible in a part are skipped; Morton order makes such blocks frequent."""
 
 MERGE_AT = 8
-"""Late pairs of a block are merged with its rows once they exceed one in this many."""
+"""Late pairs of a block are merged with its rows once they exceed 1 in this many pairs."""
 
 CHUNK_WEIGHTS = 2**25
-"""Non-zeros of W collected before they are added to G; collecting and adding takes 0.6 GiB."""
+"""Non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""
 
 LARGE_PART = 2**23
-"""Parts with this many non-zeros are added to G directly: collecting would copy them for little gain."""
+"""Parts with this many non-zeros are added to G directly: copying them would gain little."""
 
 MAX_WEIGHTS = 2**28
-"""Non-zeros of all views' W up to which it is held in memory, 2 GiB."""
+"""Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
 
 CLEARLY_MORE = 2
-"""W is dropped once it has this many times the non-zeros of G: W grows linearly with the views, G less."""
+"""W is dropped once it has this many times the non-zeros of G: W grows linearly with the views, G slower."""
 
 CHECKPOINT_SECONDS = 300.0
 """Seconds between checkpoints of a long pass; short passes write none."""
@@ -53,7 +53,7 @@ ROWS = ("indptr", "indices", "values")
 
 
 class _Rows:
-    """Some rows of G, in reused memory: first writes to new pages take time and memory."""
+    """Some rows of G, in reused memory: the first writes to new pages take time and memory."""
 
     def __init__(self, rows: int) -> None:
         self.indptr = np.zeros(rows + 1, np.int64)
@@ -88,15 +88,15 @@ class _Rows:
 class _Block:
     """Rows of G, with the few pairs that were added late kept separately.
 
-    A part shows a tenth of the Gaussians of a large scene. Sums of known pairs are updated in place, and only
-    the late pairs are rewritten, until there are enough of them to merge.
+    A part shows about 10 % of the Gaussians of a large scene. Sums of known pairs are updated in place, and
+    only the late pairs are rewritten, until there are enough to merge.
     """
 
     def __init__(self, rows: int) -> None:
         self.rows, self.late = _Rows(rows), _Rows(rows)
 
     def replace_late(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
-        """Replace the late pairs, and merge them if they are many."""
+        """Replace the late pairs, and merge them if there are many."""
         self.late.replace(indptr, indices, values)
         if MERGE_AT * self.late.nonzeros > self.rows.nonzeros:
             self.merged()
@@ -112,7 +112,7 @@ class _Block:
 class GramBuilder:
     """Sum of G over parts of W, such as one view after another; its memory grows only with G.
 
-    Entries are summed in float64 in the order of the pixels, so the bytes depend neither on the division of
+    Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
     pixels into parts nor on the number of threads.
     """
 
@@ -153,9 +153,9 @@ class GramBuilder:
             list(pool.map(grow, range(len(self._blocks))))
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return each Gaussian's weights in W: start of its list, and lists of pixels and places.
+        """Return each Gaussian's weights in W: the start of its list, and lists of pixels and places.
 
-        The columns of the upper triangle begin at such a place in the pixel's row of W. The lists are reused
+        A place is where the upper triangle's columns begin in the pixel's row of W. The lists are reused
         for the next part, because allocating memory takes longer than filling it.
         """
         dtype = np.int32 if weights.nnz < 2**31 else np.int64
@@ -167,7 +167,7 @@ class GramBuilder:
         return begins, self._pixels, self._places
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return everything summed so far as arrays."""
+        """Return all sums so far as arrays."""
         return {
             f"{name}_{number}": array
             for number, block in enumerate(self._blocks)
@@ -180,7 +180,7 @@ class GramBuilder:
             block.rows.replace(*(state[f"{name}_{number}"] for name in ROWS))
 
     def finish(self) -> Gram:
-        """Return G of everything added, and empty the builder."""
+        """Return G of all added parts, and empty the builder."""
         indptr = np.zeros(self._ranges[-1][1] + 1, np.int64)
         indices = np.empty(self.nonzeros, np.int32)
         values = np.empty((len(indices), len(LEVELS)), np.float32)
@@ -200,7 +200,7 @@ class _Waiting:
 
     def __init__(self, num_gaussians: int) -> None:
         self._num_gaussians = num_gaussians
-        room = CHUNK_WEIGHTS + LARGE_PART  # parts are smaller than the latter, and added beyond the former
+        room = CHUNK_WEIGHTS + LARGE_PART  # parts are smaller than LARGE_PART; CHUNK_WEIGHTS triggers adding
         self._indices, self._data = np.empty(room, np.int32), np.empty(room, np.float32)
         self._clear()
 
@@ -233,7 +233,7 @@ class _Waiting:
 
 
 class QuadraticBuilder:
-    """Builder of G or W, part by part; it keeps whichever has fewer non-zeros.
+    """Builder of G or W, part by part; the matrix with fewer non-zeros is kept.
 
     A product reads each non-zero of either equally often. W is dropped and G is kept as soon as W has more
     than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far. `keep` is "auto", or
@@ -273,7 +273,7 @@ class QuadraticBuilder:
             gram.add(self._waiting.take())
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return everything added so far as arrays."""
+        """Return all parts added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
             out |= self._gram.state()
@@ -287,7 +287,7 @@ class QuadraticBuilder:
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Continue from `state`; the result has the same bytes as without interruption."""
+        """Continue from `state`; the result is byte-identical to that of an uninterrupted pass."""
         self.weights_nonzeros, self._keeps_weights = int(state["nonzeros"][0]), bool(state["nonzeros"][1])
         if self._gram is not None:
             self._gram.restore(state)
@@ -300,7 +300,7 @@ class QuadraticBuilder:
             (self._parts if name == "parts" else self._waiting).append(part)
 
     def finish(self) -> Quadratic:
-        """Return G or W of everything added."""
+        """Return G or W of all added parts."""
         if self._gram is None:
             return stack_weights(self._parts)
         self._add_waiting(self._gram)
@@ -319,7 +319,7 @@ class QuadraticCheckpoint:
         self._last = time.monotonic()
 
     def resume(self, builder: QuadraticBuilder) -> int:
-        """Restore the builder, and return the number of views it then contains, 0 without a checkpoint.
+        """Restore the builder, and return the number of views it contains (0 without a checkpoint).
 
         An incomplete checkpoint, for example after the cache was pruned, is deleted.
         """

@@ -15,7 +15,7 @@ from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 
 HEADER_BYTES = 128
-"""Size of the header of our .npy files; empty arrays have nothing else and cannot be mapped."""
+"""Header size of our .npy files; files of empty arrays contain nothing else and cannot be mapped."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Contributions:
         mask: row among the masks of the view.
         area_px: pixels of the raw mask.
         pixels: number n of pixels that show the mask and are covered by Gaussians.
-        half_pixels: number of those that are in the random half.
+        half_pixels: number of those pixels that are in the random half.
     """
 
     folder: Path
@@ -77,7 +77,7 @@ class Contributions:
         return read_npy(sealed(self.folder, "centres.npy"))
 
     def quadratic(self, threads: int = 1) -> Quadratic:
-        """Memory-map G or W, whichever the stage kept; products with W use one thread.
+        """Memory-map G or W, depending on which the stage kept; products with W use one thread.
 
         Raises:
             ArtifactError: if the folder contains neither.
@@ -90,7 +90,7 @@ class Contributions:
             indptr, indices, data, columns, valid = (self._mapped(f"W/{name}") for name in names)
             shape = (len(indptr) - 1, int(columns[0]))
             return StackedWeights(sp.csr_matrix((data, indices, indptr), shape=shape, copy=False), valid)
-        raise ArtifactError(f"{self.folder} holds neither G nor W", fix="run the contributions stage again")
+        raise ArtifactError(f"{self.folder} contains neither G nor W", fix="rerun the contributions stage")
 
     def _mapped(self, name: str) -> np.ndarray:
         """Memory-map an array from its file, read-only; a missing or changed file raises ArtifactError."""
@@ -103,7 +103,7 @@ class Contributions:
         """Read the rows of a finished contributions folder.
 
         Raises:
-            ArtifactError: if it is missing, damaged or of another version.
+            ArtifactError: if it is missing, damaged or from another version.
         """
         folder, names = Path(folder), ("num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_full_index(folder, *names)

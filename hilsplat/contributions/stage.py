@@ -9,7 +9,7 @@ into one label map per level, with indicator B and areas n, the stage computes
 - S = D W with the raw, overlapping masks D: the visible weight of each Gaussian in each mask,
 - mass: the visible weight of each Gaussian in each view.
 
-The losses of the language field and the semantic tree need nothing else from the images.
+The language field's losses and the semantic tree need no other data from the images.
 """
 
 import hashlib
@@ -58,7 +58,7 @@ WEIGHTS_PER_PIXEL = 40
 """Weights per pixel of a typical scene."""
 
 MAX_WEIGHTS_TOGETHER = 2**25
-"""Views with more weights are prepared one at a time; each takes 256 MiB, and up to four are waiting."""
+"""Views with more weights are prepared one at a time; each needs 256 MiB, and up to four may be waiting."""
 
 
 def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
@@ -67,7 +67,7 @@ def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
 
 
 def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
-    """Return B: one row per mask, with ones at those of the given pixels that show it (float64)."""
+    """Return B: one row per mask, with ones at the given pixels that show the mask (float64)."""
     pixel, level = np.nonzero((labels >= 0) & pixels[:, None])
     ones = np.ones(len(pixel))
     return sp.csr_matrix((ones, (labels[pixel, level], pixel)), shape=(num_masks, len(labels)))
@@ -84,7 +84,7 @@ def view_contributions(
 ) -> dict[str, np.ndarray]:
     """Return all matrices of one view except W as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
-    The view's name seeds the random halves; `weights` are normalised. Threads don't change the result.
+    The view's name seeds the random halves; `weights` are normalised. The result is independent of threads.
     """
     total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
     shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
@@ -114,7 +114,7 @@ def view_contributions(
 
 
 def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
-    """Return the rows of W with Gaussians and a mask at some level, stored in the memory of `weights`."""
+    """Return the rows of W with Gaussians and a mask at any level, in the memory of `weights`."""
     sizes = np.diff(weights.indptr)
     valid = (labels >= 0) & (sizes > 0)[:, None]
     rows = np.flatnonzero(valid.any(axis=1))
@@ -126,7 +126,7 @@ def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> S
 
 
 class ArrayStream:
-    """A .npy file written row by row, so that the stage never holds all of its output."""
+    """A .npy file written row by row, so that the stage never keeps all of its output in memory."""
 
     def __init__(self, path: Path, dtype: type, row_shape: tuple[int, ...] = ()) -> None:
         self._dtype, self._row_shape, self._rows = np.dtype(dtype), row_shape, 0
@@ -170,7 +170,7 @@ def run_contributions(
     One or two views are prepared while rows of previous views are written and added to G. Memory contains
     them, the sum of G so far, and the weights waiting to be added to it (`quadratic_builder`). After an
     interruption, a rerun reads the matrices of finished views from the cache, and G as of at most
-    `CHECKPOINT_SECONDS` (and one view) earlier; it rasterises W again for the views not in that G.
+    `CHECKPOINT_SECONDS` (and one view) earlier; it rasterises W again for views missing from that G.
 
     Raises:
         MisalignedArtifactError: if masks and images differ in size, or the masks of a view differ from those
@@ -201,7 +201,7 @@ def run_contributions(
         )
         for camera in cameras
     ]
-    # half of the work has one thread, but W takes memory
+    # half of the work uses one thread, but W takes memory
     most_px = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
     fits = most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER
     together = min(2, max(1, threads)) if fits else 1
@@ -229,10 +229,10 @@ def run_contributions(
             masks = load_masks(masks_folder, camera.name, digests)
             if masks.size_hw != camera.size_hw:
                 raise MisalignedArtifactError(
-                    f"masks of view {camera.name} do not fit its camera",
+                    f"masks of view {camera.name} do not match its camera's size",
                     expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
                     found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                    fix="run the masks stage again",
+                    fix="rerun the masks stage",
                 )
 
             @cache_calls
@@ -271,8 +271,8 @@ def run_contributions(
         num_masks = sum(len(part) for part in rows["view"])
         if not num_masks:
             raise ArtifactError(
-                f"no train view of {scene.name} has a mask",
-                fix="loosen masks.predicted_iou_min or masks.stability_min, then run the masks stage again",
+                f"no training view of {scene.name} has masks",
+                fix="loosen masks.predicted_iou_min or masks.stability_min, then rerun the masks stage",
             )
         np.save(folder / "means.npy", gaussians.means)
         np.save(folder / "centres.npy", np.stack([camera.centre for camera in cameras]))

@@ -72,7 +72,7 @@ def node_boxes(
 ) -> tuple[Float32[np.ndarray, "T 3"], Float32[np.ndarray, "T 2 3"], Float32[np.ndarray, "T 5 3"]]:
     """Return each node's centroid, axis-aligned box and oriented box.
 
-    Visible mass weights centroids and axes. Each node must have a member (`nodes.renumbered_without_empty`).
+    Centroids and axes are weighted by visible mass. No node may be empty (`nodes.renumbered_without_empty`).
     """
     centroid = np.zeros((len(level), 3), np.float32)
     box = np.zeros((len(level), 2, 3), np.float32)

@@ -1,9 +1,9 @@
 """The semantic tree stage: links the masks of all views by the Gaussians they share.
 
 Masks of one level in different views are linked by how well they agree on the Gaussians that both views see.
-Clusters of masks become nodes, each Gaussian joins its best node, and small stray pieces leave it. A coarser
-node that holds most of a finer one becomes its parent. None of this needs CLIP: the tree only scores the
-crops that show each node. The clip stage embeds the best, and their average is the node's vector.
+Clusters of masks become nodes, each Gaussian is assigned to its best node, and small stray pieces are
+removed. A coarser node that contains most of a finer one becomes its parent. None of this needs CLIP: the
+tree only scores each node's crops. The clip stage embeds the best; their average is the node's vector.
 """
 
 import logging
@@ -46,7 +46,7 @@ APART_DEG = 30.0
 """Directions at least this far apart do not lower each other's score."""
 
 LEAST_NEW = 0.1
-"""Share of its score that a crop keeps if a higher-ranked crop has the same direction."""
+"""Share of a crop's score that remains if a higher-ranked crop has the same direction."""
 
 RANKED = 32
 """Number of crops ranked per node."""
@@ -67,15 +67,15 @@ def crop_ranks(
 ) -> Int32[np.ndarray, " M"]:
     """Rank the masks of each node by score, reduced for directions close to those already ranked.
 
-    At equal scores, crops from different sides describe a thing better (docs/experiments.md).
+    At equal scores, crops from different sides describe an object better (docs/experiments.md).
 
     Args:
         node: node that each mask shows, -1 for none.
-        score: how well its crop shows the node.
+        score: how well each mask's crop shows the node.
         directions: unit vectors from nodes to cameras.
 
     Returns:
-        rank of each mask among those of its node, 0 for the best; -1 without a node or beyond `RANKED`.
+        rank of each mask within its node, 0 for the best; -1 without a node or beyond `RANKED`.
     """
     rank = np.full(len(node), NONE, np.int32)
     order = np.argsort(node, kind="stable")
@@ -105,7 +105,7 @@ def build_tree(
     Args:
         threads: the result does not depend on it.
         join_wholes: join wholes from nodes that touch in 3D, for segmenters that detect only colour regions.
-        nodes_of: finds the nodes of a level; None links masks.
+        nodes_of: function that finds the nodes of a level; None: nodes are linked masks.
     """
     S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
     view = contributions.view
@@ -155,10 +155,10 @@ def build_tree(
     np.add.at(view_area, (cluster_of_mask[own], view[own]), contributions.area_px[own])
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
     fits, iou = mask_fits(node_of_gaussian, S, mass, view, contributions.level, cluster_of_mask)
-    # Nesting may remove from a node the Gaussians that its masks show; the node still needs a crop.
+    # Nesting may remove the Gaussians that a node's masks show; the node still needs a crop.
     fit = np.where(cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU))
     score = (np.sqrt(contributions.area_px) * fit).astype(np.float32)
-    if join_wholes:  # the mask of a piece has a low IoU with the joined whole, but shows it
+    if join_wholes:  # a piece's mask has a low IoU with the joined whole, but still shows it
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = cluster_of_mask[pieces]
     linked = cluster_of_mask.astype(np.int32)
@@ -195,7 +195,7 @@ def run_semantic_tree(
     threads: int = 1,
     nodes_of: NodesOf | None = None,
 ) -> None:
-    """Write the 3D semantic tree of a scene: `tree.npz`, the readable `tree.json`, `index.json`.
+    """Write the 3D semantic tree of a scene: `tree.npz`, the human-readable `tree.json`, and `index.json`.
 
     `nodes_of` is as in `build_tree`.
 
@@ -216,7 +216,7 @@ def run_semantic_tree(
         counts |= {**per_level, "orphans": sum(orphans.values())}
         if not len(tree):
             logger.warning(
-                "the semantic tree of %s has no node: no group of linked masks spans %d views; "
+                "the semantic tree of %s has no nodes: no group of linked masks spans %d views; "
                 "lower semantic_tree.min_views or semantic_tree.link_threshold",
                 scene,
                 settings.min_views,

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float64, Int32
 from hilsplat.base.compiled import compiled
 
 ROWS_AT_A_TIME = 64
-"""Number of masks in one task of a thread."""
+"""Number of masks per thread task."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Evidence:
     """Agreement of each pair of the M masks of a level on the Gaussians that both views see.
 
     Attributes:
-        intersection: of pairs a < b from different views that share Gaussians.
-        union: of the same pairs, stored in the same order.
-        seen: size of each mask as each of the V views sees it: its full size in its own view, 0 in views
+        intersection: soft intersection of pairs a < b from different views that share Gaussians.
+        union: soft union of the same pairs, in the same order.
+        seen: visible size of each mask in each of the V views: its full size in its own view, 0 in views
             that see too little of it. A pair that is not stored has intersection 0 and union
             `seen[a, view[b]] + seen[b, view[a]]`.
     """
@@ -47,13 +47,13 @@ def mask_evidence(
 
     Let s be the share of a Gaussian's visible weight inside a mask, and w its importance. The intersection of
     a and b is the sum of w s_a s_b. The size of a as seen from the view of b is the sum of w s_a^2 over the
-    Gaussians visible there (Tanimoto). Fitted Gaussians reach across borders and have shares between 0 and 1.
-    With squares, the IoU of a region with itself stays 1; with the sum of w s_a as the size it would shrink
-    (shares of 0.3 give 0.18).
+    Gaussians visible there (Tanimoto). Fitted Gaussians extend across borders and have shares between 0 and
+    1. With squares, the IoU of a region with itself stays 1; with the sum of w s_a as the size, it would be
+    smaller (shares of 0.3 give 0.18).
 
-    Two masks of one view are different things, so they are evidence against a link (intersection 0, union
+    Two masks of one view show different objects, so they are evidence against a link (intersection 0, union:
     both full sizes). Masks that share Gaussians are no evidence if each view sees less than `min_covisible`
-    of the other mask. If masks share none, each counts if the other's view sees at least that share of it.
+    of the other mask. If they share none, each mask counts if the other view sees at least that share of it.
 
     Shares have one row per mask of a level, and are zero if the Gaussian is not visible in the mask's view.
     The result does not depend on the number of threads.
@@ -65,7 +65,7 @@ def mask_evidence(
     columns = sp.csr_matrix((share, shares.indices, shares.indptr), shape=shares.shape, copy=False).tocsc()
     rows, by_column = (shares.indptr, shares.indices), (columns.indptr, columns.indices, columns.data)
     flags = np.ascontiguousarray(visible.T).view(np.uint8)
-    everywhere = np.zeros((num, len(visible)))  # size of each mask as each view sees it
+    everywhere = np.zeros((num, len(visible)))  # size of each mask as seen from each view
     ranges = list(pairwise([*range(0, num, ROWS_AT_A_TIME), num])) or [(0, 0)]
     with ThreadPoolExecutor(max(1, threads)) as pool:
         list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes, flags, everywhere), ranges))

@@ -36,10 +36,10 @@ def readable_nodes(tree: SemanticTree) -> list[dict]:
 def write_tree_ply(gaussians_ply: Path, tree: SemanticTree, out: Path) -> None:
     """Copy a 3DGS PLY and add three properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
 
-    Gaussian viewers ignore them; tools that show scalar fields can colour by them. -1 means no node.
+    Gaussian viewers ignore them; tools that display scalar fields can use them as colours. -1 means no node.
 
     Raises:
-        MisalignedArtifactError: the tree was made for another PLY.
+        MisalignedArtifactError: the tree was computed from another PLY.
     """
     require_same("semantic tree", str(gaussians_ply.parent), gaussians_ply, tree.gaussians_sha256)
     nodes = {f"node_{level.label}": tree.node_of_gaussian[:, level.index] for level in LEVELS}
@@ -53,7 +53,7 @@ def write_selection_ply(
     labels: Int32[np.ndarray, " g"] | None = None,
     names: Sequence[str] = (),
 ) -> None:
-    """Copy some Gaussians of a 3DGS PLY, such as those that answer a query.
+    """Copy some Gaussians of a 3DGS PLY, such as those selected by a query.
 
     Args:
         labels: label of each Gaussian, from 1; written as the property `label`.

@@ -38,7 +38,7 @@ def run_guided_masks(
     Departs: SAM and LangSplat prompt a grid in every view (measured in docs/experiments.md).
 
     Raises:
-        MisalignedArtifactError: the tree was made for other Gaussians.
+        MisalignedArtifactError: the tree was computed from other Gaussians.
     """
     scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
     tree = SemanticTree.load(semantic_tree_folder)
@@ -62,10 +62,10 @@ def run_guided_masks(
 def guided_points(
     labels: dict[Level, Int32[np.ndarray, "H W"]], grid: Float[np.ndarray, "G 2"], min_area_px: int
 ) -> Float[np.ndarray, "P 2"]:
-    """Return a prompt in the middle of each node, and the grid points that no subpart covers; (x, y), px.
+    """Return a prompt in the middle of each node, and the grid points not covered by any subpart; (x, y), px.
 
-    The middle is the pixel farthest from the region's border. `labels` are the nodes that pixels show at each
-    level, -1 for none; `grid` has points of the unit square.
+    The middle is the pixel farthest from the region's border. `labels` contains the node that each pixel
+    shows at each level, -1 for none; `grid` contains points in the unit square.
     """
     found = []
     for node_of_pixel in labels.values():

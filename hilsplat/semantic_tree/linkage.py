@@ -1,7 +1,7 @@
 """Pooled average linkage of the masks of one level across views.
 
-Everything is sparse: only masks that share Gaussians can be joined, and how much two clusters see of each
-other is a sum over the views of their members. The cost grows with the number of pairs that share Gaussians.
+Everything is sparse: only masks that share Gaussians can be joined, and the mutual visibility of two clusters
+is a sum over their members' views. The cost grows with the number of pairs that share Gaussians.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from hilsplat.base.compiled import compiled
 from hilsplat.semantic_tree.evidence import Evidence
 
 ROWS_OF_A_BLOCK = 256
-"""Rows per block; the best score of each block is stored, so that finding the best row reads few scores."""
+"""Rows per block; the best score of each block is stored, so that finding the best row takes few reads."""
 
 
 def pooled_linkage(
@@ -54,7 +54,7 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
     room = 2 * len(indices) + len(indices) // 2 + 1024
     neighbour = np.empty(room, np.int32)
     inter, extra = np.empty(room), np.empty(room)
-    for a in range(num):  # rows in order, so that the neighbours in a run are in order too
+    for a in range(num):  # rows in order, so that each run's neighbours are also in order
         for k in range(indptr[a], indptr[a + 1]):
             b = np.int64(indices[k])
             apart = seen[a, view[b]] + seen[b, view[a]]
@@ -67,7 +67,7 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
 
 @compiled
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to `first` and beyond, and sum neighbours joined since it was written.
+    """Copy a run of neighbours to `first` onwards, and sum neighbours joined since the run was written.
 
     Entries already there, from an earlier run of the cluster, are summed too. Entries that refer to the
     cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
@@ -107,7 +107,7 @@ def _plus_sizes(total, i, j, seen, members, shown, shows):
 
 @compiled
 def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown, shows, place_of):
-    """Return the neighbour with the best pooled IoU in a run by `_merged_run`, -1 for none, and that IoU.
+    """Return the neighbour with the best pooled IoU in a run of `_merged_run` (-1: none), and that IoU.
 
     On a tie, the lowest row is returned. The run's marks in `place_of` are cleared.
     """
@@ -125,7 +125,7 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown
 
 @compiled
 def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Move the runs of living clusters to the front of the pool, or to a larger pool, and update their ends.
+    """Move the runs of existing clusters to the front of the pool or to a larger pool; update their ends.
 
     The new pool has room for `needed` more entries.
     """
@@ -161,7 +161,7 @@ def _set_score(i, value, score, block_best):
 
 @compiled
 def _best_row(score, block_best):
-    """Return the lowest row with the best score, -1 without rows."""
+    """Return the lowest row with the best score, or -1 if there are no rows."""
     block = np.argmax(block_best)
     for row in range(block * ROWS_OF_A_BLOCK, min((block + 1) * ROWS_OF_A_BLOCK, len(score))):
         if score[row] == block_best[block]:
@@ -176,9 +176,9 @@ def _link(start, stop, neighbour, inter, extra, seen, view, threshold, root, wit
     A pool stores the clusters' neighbours, one run per cluster: the neighbour, the sum of intersections
     (`inter`), and the sum of the differences between the unions of stored pairs and `seen` (`extra`, never
     positive, because sizes count the overlap of two masks twice). The union of two clusters is `extra` plus,
-    over views, the size of each as seen there times the number of the other's members there. Neighbours
-    joined since a run was written are summed when it is next read. The run of a merged cluster is written at
-    the end of the pool, which is compacted when full.
+    over views, the size of each cluster in the view times the number of the other cluster's members there.
+    Neighbours joined since a run was written are summed when it is next read. The run of a merged cluster is
+    written at the end of the pool, which is compacted when full.
     """
     num, num_views = seen.shape
     used = stop[-1] if num else 0
@@ -190,9 +190,9 @@ def _link(start, stop, neighbour, inter, extra, seen, view, threshold, root, wit
         shown[i, 0] = view[i]
     alive = np.ones(num, np.bool_)
     best = np.full(num, -1, np.int64)
-    # Number of merges of each cluster, and of its best neighbour when that was found. If the neighbour has
-    # merged since, the score is only an upper bound, because joining never creates a better pair. A bound is
-    # recomputed only when it is the best score.
+    # Number of merges of each cluster, and of its best neighbour when the neighbour was found. If the
+    # neighbour has merged since, the score is only an upper bound, because joining never creates a better
+    # pair. A bound is recomputed only when it is the best score.
     merges, best_merges = np.zeros(num, np.int64), np.full(num, -1, np.int64)
     score = np.full(num, np.inf)
     block_best = np.full(num // ROWS_OF_A_BLOCK + 1, -np.inf)

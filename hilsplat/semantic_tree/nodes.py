@@ -15,22 +15,22 @@ MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
 MIN_COVISIBLE = 0.2
-"""Pairs of masks whose views see less than this share of each other are no evidence."""
+"""Pairs of masks are no evidence if each mask's view sees less than this share of the other mask."""
 
 MIN_MEMBER_SHARE = 0.05
-"""A Gaussian joins its best node if that node holds more than this share of its weight."""
+"""A Gaussian joins its best node if that node contains more than this share of its weight."""
 
 MIN_FIT = 0.25
-"""A mask shows its best-fitting node if their IoU in the mask's view is above this."""
+"""A mask shows its best-fitting node if their IoU in the mask's view exceeds this."""
 
 PRIOR_VIEWS = 3
-"""Views without the node that are added to those that show it, so that one view alone decides little."""
+"""Number of views without the node added to those that show it, to limit a single view's influence."""
 
 NEIGHBOURS = 11
 """Number of nearest Gaussians, itself included, that connect a node."""
 
 STRAY_SHARE = 0.02
-"""A piece of a node with less than this share of the mass of its largest piece leaves the node."""
+"""A piece is removed from its node if its mass is less than this share of the largest piece's mass."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class LevelNodes:
     quality: Float64[np.ndarray, " t"]
 
     def joined(self, into: Int64[np.ndarray, " t"]) -> "LevelNodes":
-        """Merge nodes with the same number in `into`; the quality is the mean over their masks."""
+        """Merge nodes with equal numbers in `into`; the new quality is the mean over their masks."""
         into_or_none = np.append(into, NONE)
         masks = np.bincount(self.of_mask[self.of_mask != NONE], minlength=len(into))
         total = np.bincount(into, masks * self.quality)
@@ -74,8 +74,8 @@ def level_nodes(
 ) -> LevelNodes:
     """Link the masks of one level into nodes and assign Gaussians to them.
 
-    A cluster whose Gaussians go to other clusters, such as a duplicate, could select nothing. A cluster
-    therefore becomes a node only if at least `min_views` masks fit it best.
+    A cluster whose Gaussians all belong to other clusters, such as a duplicate, would select nothing. A
+    cluster therefore becomes a node only if it is the best fit of at least `min_views` masks.
 
     `weights` is S of the masks, `mass` the visible mass of each Gaussian in each view, `importance` its mean
     over the views that see the Gaussian, and `total_mass` its sum (px).
@@ -123,18 +123,18 @@ def gaussian_nodes(
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
     """Assign each Gaussian to the node with the largest product of two shares of its visible weight.
 
-    The first is the share inside the node's masks in all views. The second is the same in the views that have
-    a mask of the node, with `PRIOR_VIEWS` average views added to its denominator. It lets a small thing,
-    segmented in few views, keep its Gaussians beside a large one whose masks sometimes cover it. Masks of one
-    view may overlap, and a node may have several there, so a Gaussian's weight in a view is capped at its
-    visible mass there.
+    The first is the share inside the node's masks in all views. The second is the same share in the views
+    with a mask of the node, with `PRIOR_VIEWS` average views added to its denominator. It lets a small
+    object, segmented in few views, keep its Gaussians next to a large one whose masks sometimes cover it.
+    Masks of one view may overlap, and a node may have several masks there, so a Gaussian's weight in a view
+    is capped at its visible mass there.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
         weights: S of the masks.
         mass: visible mass of each Gaussian in each view, px.
         total_mass: sum of `mass` over views, px.
-        min_share: a Gaussian joins only nodes that hold more than this share of its weight in all views.
+        min_share: a Gaussian joins only nodes that contain more than this share of its weight in all views.
 
     Returns:
         node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.
@@ -154,7 +154,7 @@ def gaussian_nodes(
     per_node.eliminate_zeros()
     column, share = per_node.indices, per_node.data
     in_its_views = np.zeros(per_node.nnz)
-    for node, in_view in zip(pair_node, pair_view, strict=True):  # gathered view by view: mass is large
+    for node, in_view in zip(pair_node, pair_view, strict=True):  # view by view, because mass is large
         row = slice(per_node.indptr[node], per_node.indptr[node + 1])
         in_its_views[row] += mass[in_view].take(column[row])
     one_view = total_mass / np.maximum(np.count_nonzero(mass > MIN_VISIBLE_PX, axis=0), 1)
@@ -170,7 +170,7 @@ def gaussian_nodes(
 
 
 def nearest_gaussians(means: Float[np.ndarray, "N 3"], threads: int) -> Int64[np.ndarray, "N K"]:
-    """Return the `NEIGHBOURS` nearest Gaussians of each, itself included."""
+    """Return the `NEIGHBOURS` nearest Gaussians of each Gaussian, itself included."""
     from scipy.spatial import cKDTree  # lazy: takes 0.2 s, and queries import this module
 
     near = np.arange(1, min(NEIGHBOURS, len(means)) + 1)
@@ -182,7 +182,7 @@ def without_strays(
     nearest: Int64[np.ndarray, "N K"],
     total_mass: Float64[np.ndarray, " N"],
 ) -> Int32[np.ndarray, " N"]:
-    """Return the nodes without their stray pieces: Gaussians behind or beside a thing that its masks cover.
+    """Return the nodes without stray pieces: Gaussians covered by an object's masks but behind or beside it.
 
     Gaussians of one node are connected if one is among the nearest of the other (`nearest_gaussians`).
     """
@@ -204,7 +204,7 @@ def node_parents(
     mass: Float[np.ndarray, " N"],
     min_coverage: float,
 ) -> Int32[np.ndarray, " T"]:
-    """Return each node's parent: the coarser node that holds more than `min_coverage` of its visible mass.
+    """Return each node's parent: the coarser node with more than `min_coverage` of its visible mass.
 
     The next coarser level is searched first, then the one above it, so that a whole may be the direct
     parent of a subpart. Nodes without such a parent are orphans (-1).
@@ -237,7 +237,7 @@ def mask_fits(
     level: UInt8[np.ndarray, " M"],
     linked: Int32[np.ndarray, " M"],
 ) -> tuple[Int32[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
-    """Return the node that each mask shows: the one with the best soft IoU with it, in its view.
+    """Return the node that each mask shows: the one with the best soft IoU in the mask's view.
 
     Args:
         S: weight of each Gaussian in each mask, px.
@@ -245,8 +245,8 @@ def mask_fits(
         linked: node that each mask was linked into, -1 for none.
 
     Returns:
-        best node of the mask's level, -1 if it shares no Gaussian with any; and the IoU with the linked
-        node, 0 for none.
+        best node at the mask's level, -1 if the mask shares no Gaussians with any node; and the IoU with the
+        linked node, 0 for none.
     """
     fits, of_linked = np.full(len(view), NONE, np.int32), np.zeros(len(view))
     for each in LEVELS:
@@ -264,7 +264,7 @@ def level_ious(
     mass: Float32[np.ndarray, "V N"],
     view: Int32[np.ndarray, " m"],
 ) -> sp.csr_matrix:
-    """Return the soft IoU of each mask of a level with each node that it shares Gaussians with, in its view.
+    """Return the soft IoU, in its view, of each mask of a level with each node that it shares Gaussians with.
 
     `weights` is S of the level's masks; `mass` is the visible mass of each Gaussian in each view, px.
     """
@@ -297,8 +297,8 @@ def nest_nodes(
 ) -> Int32[np.ndarray, "N 3"]:
     """Make every child a subset of its parent, so that the tree is nested by construction.
 
-    A Gaussian of a child joins the parent and the parent's parent if no other node holds it at their levels;
-    otherwise it leaves the child. Coarse levels are processed first.
+    A Gaussian of a child is added to the parent and the parent's parent if no other node contains it at their
+    levels; otherwise it is removed from the child. Coarse levels are processed first.
     """
     nested = node_of_gaussian.copy()
     index_of = level.astype(np.int64) - 1
@@ -323,10 +323,10 @@ def nest_nodes(
 def renumbered_without_empty(
     node_of_gaussian: Int32[np.ndarray, "..."], num_nodes: int
 ) -> Int32[np.ndarray, " T1"]:
-    """Return each node's new id, in the old order; NONE for a node without Gaussians, which selects nothing.
+    """Return each node's new id, in the old order; NONE for a node without Gaussians (it selects nothing).
 
     Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost. The
-    result has one more entry than there are nodes: the last is NONE, so that indexing with NONE gives NONE.
+    result has an additional last entry, NONE, so that indexing with NONE returns NONE.
     """
     used = np.unique(node_of_gaussian[node_of_gaussian >= 0])
     renumber = np.full(num_nodes + 1, NONE, np.int32)

@@ -21,23 +21,23 @@ class SemanticTree:
     """T nodes at three levels, coarse to fine.
 
     Attributes:
-        parent: row of the coarser node that holds it, -1 for none.
+        parent: row of the coarser node that contains each node, -1 for none.
         clip: unit CLIP vector of each node; empty (C = 0) in the tree that the stage writes.
-        centroid: mean of its Gaussians' centres weighted by visible mass, scene units.
+        centroid: mean of the Gaussians' centres, weighted by visible mass, scene units.
         box: axis-aligned box, lower and upper corner, scene units.
         oriented_box: centre, three axes and sizes (see `OrientedBox`), scene units.
         quality: pooled IoU of its masks across views, in [0, 1].
-        views: number of views that have masks of it.
+        views: number of views with masks of each node.
         node_of_gaussian: node of each Gaussian at each level, -1 for none.
         membership: share of the Gaussian's visible weight inside its node's masks, in [0, 1]; 0 without
-            a node, and for a Gaussian that joined only because a child of the node holds it.
-        node_of_mask: node of its level that each mask (row of the contributions) fits best; -1 if it shares
-            no Gaussian with any.
+            a node, and for a Gaussian that was added only because a child of the node contains it.
+        node_of_mask: node that each mask (row of the contributions) fits best at its level; -1 if it shares
+            no Gaussians with any node.
         linked_node: node that each mask was linked into, -1 for none.
-        crop_score: how well the crop of each mask shows the node that it was linked into: the square root of
-            its area, times its IoU with the node in its view, px; 0 without a node.
+        crop_score: how well each mask's crop shows the node that the mask was linked into: the square root of
+            its area times its IoU with the node in its view, px; 0 without a node.
         crop_rank: order in which the crops of a node are embedded (`build.crop_ranks`), -1 for none.
-        view_area_px: area of its masks in each view.
+        view_area_px: area of each node's masks in each view.
         gaussians_sha256: digest of the PLY that the tree belongs to.
         cameras_sha256: digest of the scene's cameras.
         min_weight: weights below this are dropped in the contributions and when views are rendered.
@@ -67,14 +67,14 @@ class SemanticTree:
         return len(self.level)
 
     def _require_whole(self, path: Path) -> None:
-        """Raise ArtifactError if a row of a node does not exist, or if a parent is not coarser."""
+        """Raise ArtifactError if an array refers to a missing node, or if a parent is not coarser."""
         most = len(self) - 1
         rows = {"parent": self.parent, "node_of_gaussian": self.node_of_gaussian}
         rows |= {"node_of_mask": self.node_of_mask, "linked_node": self.linked_node}
         for name, values in rows.items():
             if values.size and (values.min() < NONE or values.max() > most):
                 raise ArtifactError(
-                    f"{path}: array {name} names nodes that do not exist",
+                    f"{path}: array {name} refers to nodes that do not exist",
                     expected=f"-1 to {most}",
                     found=f"{values.min()} to {values.max()}",
                     fix=remake(path),
@@ -92,7 +92,7 @@ class SemanticTree:
         return np.flatnonzero(np.isin(self.parent, nodes))
 
     def ancestors(self) -> Int32[np.ndarray, "T 3"]:
-        """Return the node that holds each node at each level: itself at its own level, -1 for none."""
+        """Return the node that contains each node at each level: itself at its own level, -1 for none."""
         found = np.full((len(self), len(LEVELS)), NONE, np.int32)
         rows, above = np.arange(len(self)), np.arange(len(self), dtype=np.int32)
         while len(rows):
@@ -114,10 +114,10 @@ class SemanticTree:
 
     @staticmethod
     def load(folder: Path, clip_folder: Path | None = None) -> "SemanticTree":
-        """Read a finished semantic tree; nodes get vectors from `clip_folder`, the masks' CLIP vectors.
+        """Read a finished semantic tree; node vectors come from the masks' CLIP vectors in `clip_folder`.
 
         Raises:
-            ArtifactError: the tree is missing, damaged or of another version.
+            ArtifactError: the tree is missing, damaged or from another version.
             MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
         """
         folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")

@@ -1,8 +1,8 @@
 """Share of each node in each pixel of a view: the basis of its masks and relevancy maps.
 
 A pixel blends about ten Gaussians, but rarely more than two nodes of a level. Summing its weights by node
-once per view makes each later answer in that view several times cheaper than a product with all weights,
-and needs a fraction of the memory.
+once per view makes each later query in that view several times cheaper than a product with all weights,
+and needs only a fraction of the memory.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class ViewNodes:
 
     Attributes:
         nodes: rows of the semantic tree.
-        shares: share of the pixel that each node makes up; the rest has no node.
+        shares: each node's share of the pixel; the rest has no node.
         covered: whether the Gaussians cover each pixel.
     """
 
@@ -52,7 +52,7 @@ class ViewNodes:
     ) -> Float32[np.ndarray, " P"]:
         """Blend one value per node; Gaussians without a node have the value `without`.
 
-        Uncovered pixels get the lowest value of the covered ones. If `out` is given, the result is in it.
+        Uncovered pixels get the lowest value of the covered ones. The result is written to `out` if given.
         """
         out = np.empty(len(self.covered), np.float32) if out is None else out
         _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)

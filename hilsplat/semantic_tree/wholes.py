@@ -1,8 +1,8 @@
 """Wholes for a segmenter that detects only colour regions: regions that touch in 3D are joined.
 
-In a photograph, a coloured part of a thing borders both the wall behind it and the part beside it. In 3D it
-touches only the latter. Small regions join first, so things are complete before any of their parts is joined
-to the table, the walls or the floor, which are large.
+In a photograph, a coloured part of an object borders both the wall behind it and the part beside it. In 3D it
+touches only that other part. Small regions join first, so objects are complete before any part is joined to
+the table, the walls or the floor, which are large.
 """
 
 import heapq
@@ -15,13 +15,13 @@ from scipy.spatial import cKDTree
 from hilsplat.base.levels import NONE
 
 NEIGHBOURS = 10
-"""Number of nearest Gaussians, itself included, that are searched for neighbours in another region."""
+"""Number of nearest Gaussians (including itself) that are searched for neighbours in another region."""
 
 MIN_MASS_PX = 2.0
-"""A neighbouring Gaussian needs more mass than this, summed over views; lighter ones may float anywhere."""
+"""Minimum mass of a neighbouring Gaussian, summed over views; lighter ones may float anywhere."""
 
 MIN_SHARE = 1e-4
-"""A view shows a region if the region makes up more than this share of it."""
+"""A view shows a region if the region covers more than this share of the view."""
 
 
 def joined_regions(
@@ -31,12 +31,12 @@ def joined_regions(
     mass: Float32[np.ndarray, "V N"],
     most: float,
 ) -> Int64[np.ndarray, " T"]:
-    """Join regions that touch, the cheapest pair first, until every pair costs `most` or more.
+    """Join regions that touch, cheapest pair first, until every pair costs `most` or more.
 
     The cost of a pair is `side(both) * sqrt(touch of the smaller / touch of the pair)`. Side is the square
-    root of a region's mean share of the views that show it. Touch is the number of pairs of neighbouring
+    root of a region's mean area share in the views that show it. Touch is the number of pairs of neighbouring
     Gaussians between a pair of regions, or between a region and all others. Two regions that touch only
-    each other are therefore joined up to a side of `most`, and others up to a smaller one.
+    each other are therefore joined up to a side of `most`, and others up to a smaller side.
 
     Args:
         region_of_gaussian: region of each Gaussian, -1 for none.
@@ -57,7 +57,7 @@ def joined_regions(
 def touching(
     region: Int32[np.ndarray, " n"], num_regions: int, means: Float32[np.ndarray, "n 3"]
 ) -> sp.csr_matrix:
-    """Count the pairs (Gaussian, one of its `NEIGHBOURS` nearest) between each two regions; symmetric."""
+    """Count the pairs (Gaussian, one of its `NEIGHBOURS` nearest) between every two regions; symmetric."""
     near = min(NEIGHBOURS, len(means))  # the nearest is the Gaussian itself
     nearest = cKDTree(means).query(means, k=np.arange(1, near + 1))[1] if near else np.zeros((0, 0), np.int64)
     first, second = np.repeat(region, near), region[nearest.ravel()]
@@ -109,6 +109,6 @@ def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float
 
 
 def _side(share: Float64[np.ndarray, " V"]) -> float:
-    """Return the square root of a region's mean share of the views that show it; 0 if none does."""
+    """Return the square root of a region's mean area share in the views that show it; 0 if none does."""
     shown = share > MIN_SHARE
     return float(np.sqrt(share.sum() / max(shown.sum(), 1)))

@@ -158,7 +158,7 @@ def test_a_rerun_writes_the_same_bytes_and_too_few_views_give_an_empty_tree(tree
     assert sha256_of_path(out) == before
     run_semantic_tree(world.folder / "contributions", world.masks, out, SemanticTreeSettings(min_views=5))
     assert len(SemanticTree.load(out)) == 0
-    assert "has no node" in caplog.text
+    assert "has no nodes" in caplog.text
 
 
 def test_masks_in_another_order_are_refused(tree_of_boxes):
