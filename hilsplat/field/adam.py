@@ -12,11 +12,11 @@ BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
 
 @dataclass
 class Adam:
-    """Adam for one array of parameters, which `step` changes in place."""
+    """Adam for one parameter array, which `step` updates in place."""
 
     values: np.ndarray  # parameters, float32, contiguous
     rate: float  # step size; it may change between steps
-    # number added to the root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS and in
+    # added to the square root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS and in
     # published code of language fields
     eps: float = 1e-15
 
@@ -24,7 +24,7 @@ class Adam:
         self.steps, self._moments = 0, np.zeros((2, self.values.size), np.float32)
 
     def step(self, gradient: np.ndarray) -> None:
-        """Take one step, on a single thread, so that the bytes are always the same."""
+        """Take one step, on a single thread, so that results are always byte-identical."""
         self.steps += 1
         rate = np.float32(self.rate / (1 - BETA1**self.steps))
         scale = np.float32((1 - BETA2**self.steps) ** -0.5)

@@ -1,6 +1,6 @@
 """Stage `autoencoder`: fit the scene's code, a network or PCA, and encode the masks with it.
 
-The network is trained by closed-form gradients on BLAS: its matrices are so small (64 x 128) that torch's
+The network is trained with closed-form gradients and BLAS: its matrices are so small (64 x 128) that torch's
 overhead would take most of a step.
 """
 
@@ -35,7 +35,7 @@ Arrays = dict[str, np.ndarray]
 
 Passed = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Values for the backward pass through a layer: inputs (B, I) of the linear layer, after BatchNorm and ReLU;
-normalised inputs (B, I) of a BatchNorm and their reciprocal deviations (I), both empty if there is none."""
+normalised inputs (B, I) of the BatchNorm and reciprocal standard deviations (I), both empty without it."""
 
 
 def mask_targets(
@@ -44,9 +44,9 @@ def mask_targets(
     """Return the target vector of each mask, and the distinct vectors to train on.
 
     Args:
-        clip: each mask's own vector, or zero if it has none.
+        clip: each mask's own vector, zero if it has none.
         targets: "node": the vector of the node that the mask fits best, or the mean of all nodes for a mask
-            that shares no Gaussian with any; "mask": its own vector, as in the paper, which is also used if
+            that shares no Gaussian with any; "mask": the mask's own vector, as in the paper; also used if
             the tree has no nodes.
     """
     if targets == "node" and len(tree):
@@ -111,8 +111,8 @@ def train_autoencoder(
 ) -> Autoencoder:
     """Train on one scene's unit vectors: Adam with cosine decay, full batches drawn without replacement.
 
-    Equal inputs and seeds give equal bytes on any number of the stage's threads (the command line limits BLAS
-    to one thread). The seed determines the initial weights and the order of vectors.
+    Equal inputs and seeds give equal bytes for any number of stage threads (the command line limits BLAS to
+    one thread). The seed determines the initial weights and the order of vectors.
     """
     twister = torch_generator(seed)
     channels, latent = vectors.shape[1], settings.latent
@@ -140,7 +140,7 @@ def train_autoencoder(
 
 
 def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray, " n"]:
-    """Return the order that `torch.randperm(count)` draws from this generator state."""
+    """Return the order that `torch.randperm(count)` returns for this generator state."""
     order = np.arange(count)
     _swap(order, twister.randint(0, 2**32, max(count - 1, 0), np.uint32))
     return order
@@ -148,7 +148,7 @@ def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray,
 
 @compiled
 def _swap(order, drawn):
-    """Swap each place with itself or a later one, as drawn."""
+    """Swap each element with itself or a later one, as drawn."""
     for place in range(len(drawn)):
         other = place + np.int64(drawn[place]) % (len(order) - place)
         order[place], order[other] = order[other], order[place]
@@ -169,7 +169,7 @@ def loss_gradients(
 ) -> None:
     """Write the gradients of the mean squared error plus `cosine_weight` times the mean of 1 - cosine.
 
-    Inputs and outputs have unit length, so the squared error of a vector is 2 (1 - cosine), over C channels.
+    Inputs and outputs have unit length, so a vector's squared error, summed over C, is 2 (1 - cosine).
 
     Departs: LangSplat computes the cosine along the batch axis, which compares channels, not vectors.
     """
@@ -196,7 +196,7 @@ def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int
 
 
 def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
-    """Return the outputs of layers, with the batch's statistics, and the values for the backward pass."""
+    """Return the layers' outputs, using the batch's statistics, and the values for the backward pass."""
     passed = []
     for layer in layers:
         scaled, spread = values[:0], values[:0, 0]
@@ -214,7 +214,7 @@ def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple
 def _back(
     parameters: Arrays, layers: list[Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
 ) -> np.ndarray:
-    """Compute the gradients of the layers' parameters, and return that of their inputs."""
+    """Compute the gradients of the layers' parameters, and return the gradient of their inputs."""
     for layer, (values, scaled, spread) in zip(layers[::-1], passed[::-1], strict=True):
         np.matmul(slope.T, values, out=gradients[f"{layer.name}.weight"])
         np.sum(slope, axis=0, out=gradients[f"{layer.name}.bias"])
@@ -229,7 +229,7 @@ def _back(
 
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the gradient before `unit` from that after it; the component along the vectors vanishes."""
+    """Return the gradient before `unit` from the one after it; the component along the vectors vanishes."""
     length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
     return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
@@ -258,7 +258,7 @@ def _normalised(values, weight, bias):
 
 @compiled(error_model="numpy")
 def _normalised_back(slope, scaled, spread, weight, of_weight, of_bias):
-    """Turn `slope` of a BatchNorm's outputs into that of its inputs, and write those of weight and bias."""
+    """Convert `slope` from a BatchNorm's outputs to its inputs; write the gradients of weight and bias."""
     rows, columns = slope.shape
     of_weight[:] = 0
     of_bias[:] = 0

@@ -22,7 +22,7 @@ ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 NORM_EPS = 1e-5  # epsilon added to the variances of BatchNorm, as in torch
 
-ROWS = 2 * WIDE_COLUMNS  # rows that pass through the layers together: weights are read from L2 once for all
+ROWS = 2 * WIDE_COLUMNS  # rows that pass through the layers together; weights are read from L2 only once
 
 UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple
 
@@ -30,12 +30,12 @@ _add_products = rows_of_products(UNITS)
 
 
 class LinearCode:
-    """Code e = unit(m + U z) with d principal directions around the mean.
+    """Code e = unit(m + U z) with d principal directions about the mean.
 
     It involves no training and no randomness. Unlike with a network, the code of an average is the average
     of the codes, and a cosine with any vector takes d products, so relevancy needs no decoding. A network,
-    however, can adapt its d numbers nonlinearly to the vectors of the scene. The mean is m, and the basis U,
-    with orthonormal rows.
+    however, can adapt its d numbers nonlinearly to the scene's vectors. m is the mean, and U the basis with
+    orthonormal rows.
     """
 
     def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
@@ -86,10 +86,10 @@ class PackedLayers(NamedTuple):
     """Dense layers with ReLUs between them, in the layout of one compiled loop.
 
     The values stay in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
-    the registers. The order of the sums of a row does not depend on the other rows.
+    the registers. The summation order within a row does not depend on other rows.
     """
 
-    widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then of each layer's outputs
+    widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then number of each layer's outputs
     weights: Float32[np.ndarray, " W"]
     biases: Float32[np.ndarray, " V"]
 
@@ -166,7 +166,7 @@ class Layer(NamedTuple):
 def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
     """Return the layers of encoder and decoder; no layer is wider than the vectors."""
     inner, outer = ([min(width, channels) for width in sizes] for sizes in (ENCODER_WIDTHS, DECODER_WIDTHS))
-    # names have the numbers of torch's nn.Sequential, which counts norms and ReLUs
+    # names use the numbering of torch's nn.Sequential, which counts norms and ReLUs
     encoder = [
         Layer(f"encoder.{3 * k}", f"encoder.{3 * k - 2}" if k else "", k > 0, *sizes)
         for k, sizes in enumerate(pairwise([channels, *inner, latent]))
@@ -227,7 +227,7 @@ class Autoencoder:
 
     @staticmethod
     def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
-        """Draw the weights that torch draws from this generator state; BatchNorm is the identity."""
+        """Draw the same weights as torch from this generator state; BatchNorm is the identity."""
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
             if layer.norm:
@@ -245,7 +245,7 @@ class Autoencoder:
         """Build a trained network from its saved weights.
 
         Raises:
-            ValueError: an array is missing or has another shape.
+            ValueError: an array is missing or has the wrong shape.
         """
         model = Autoencoder.drawn(channels, latent, torch_generator(0))
         for name, values in model.arrays.items():
@@ -275,7 +275,7 @@ def load_code(folder: Path) -> Code:
             return LinearCode(state["mean"], state["basis"])
         return Autoencoder.from_arrays(about["channels"], about["latent"], state)
     except (KeyError, ValueError) as error:
-        raise ArtifactError(f"{path} is of another version: {error}", fix=remake(path)) from error
+        raise ArtifactError(f"{path} is from another version: {error}", fix=remake(path)) from error
 
 
 def autoencoder_file(folder: Path) -> Path:

@@ -1,6 +1,6 @@
 """The contrastive losses L_ins and L_part (paper, Eq. 3 to 5) as functions of the field.
 
-Both depend only on the mask means, so a step takes a sparse product and no rendering.
+Both depend only on the mask means, so a step needs a sparse product but no rendering.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class ViewRelations:
     """Inputs of the contrastive losses for one view."""
 
     rows: Int64[np.ndarray, " m"]  # selected masks of all levels
-    depth: Int64[np.ndarray, "m m"]  # depth of the deepest common ancestor of each pair of them
+    depth: Int64[np.ndarray, "m m"]  # depth of the deepest common ancestor of each pair of masks
     level: Int64[np.ndarray, " m"]  # their levels
     # selected masks of PART and of SUBPART, and the rows of their parents, -1 for none
     parts: tuple[tuple[Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]], ...]
@@ -38,7 +38,7 @@ def view_relations(
     contributions: Contributions,
     parents: dict[str, np.ndarray],  # by view, the row of each mask's parent among the view's masks
     settings: FieldSettings,
-    means: Float32[np.ndarray, "M D"],  # of the lifted features in each mask, to prune similar masks
+    means: Float32[np.ndarray, "M D"],  # mean lifted features of each mask, to prune similar masks
 ) -> list[ViewRelations]:
     """Select the masks of each view for the contrastive losses, largest first."""
     relations = []
@@ -70,11 +70,11 @@ def view_relations(
 def distinct(
     means: Float32[np.ndarray, "m D"], depth: Int64[np.ndarray, "m m"], most_alike: float
 ) -> Int64[np.ndarray, " k"]:
-    """Prune contrastive samples: return rows that aren't similar to an unrelated row kept before them.
+    """Prune contrastive samples: return rows not similar to any unrelated row that was kept before.
 
-    The paper keeps the most distinct samples and gives no numbers. A pair of masks that are unrelated in the
-    tree but similar adds a gradient almost redundant with those of the kept pairs. Rows are in order of
-    preference, `depth` is their `common_ancestor_depth`, and `most_alike` a cosine.
+    The paper keeps the most distinct samples and specifies no numbers. A pair of masks that are similar but
+    unrelated in the tree adds a gradient that is almost redundant with those of the kept pairs. Rows are in
+    order of preference, `depth` is their `common_ancestor_depth`, and `most_alike` is a cosine.
     """
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     alike = (unit @ unit.T > most_alike) & (depth == 0)
@@ -85,7 +85,7 @@ def distinct(
 
 
 def compared(relations: list[ViewRelations]) -> tuple[int, int]:
-    """Return the number of views in the mean of L_ins, and of pairs of view and level in that of L_part."""
+    """Return the number of views averaged in L_ins, and of (view, level) pairs averaged in L_part."""
     instance = sum(len(view.rows) > 1 for view in relations)
     part = sum(
         len(rows) > 1 and bool((parent != NONE).any()) for view in relations for rows, parent in view.parts
@@ -96,7 +96,7 @@ def compared(relations: list[ViewRelations]) -> tuple[int, int]:
 def instance_term(
     means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Compute L_ins of the masks' mean features, averaged over views with at least two, and its gradient."""
+    """Compute L_ins of masks' mean features, averaged over views with two or more masks, and its gradient."""
     losses, gradient = [], np.zeros(means.shape)
     for view in relations:
         if len(view.rows) < 2:
@@ -146,10 +146,10 @@ def part_term(
 class Contrast:
     """The contrastive losses as functions of the field."""
 
-    masks: MaskOperator  # A; `half_masks` is A over a random half of each mask's pixels
-    half_masks: MaskOperator
-    pixels: Float32[np.ndarray, " M"]  # n; `half_pixels` counts those of the halves
-    half_pixels: Float32[np.ndarray, " M"]
+    masks: MaskOperator  # A
+    half_masks: MaskOperator  # A over a random half of each mask's pixels
+    pixels: Float32[np.ndarray, " M"]  # n
+    half_pixels: Float32[np.ndarray, " M"]  # pixels in the halves
     relations: list[ViewRelations]
     settings: FieldSettings
 

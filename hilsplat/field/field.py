@@ -30,7 +30,7 @@ def run_field(
     out: Path,
     settings: FieldSettings,
     threads: int,
-    seed: int = 0,  # of a random start, and of the order of views of `trainer: literal`
+    seed: int = 0,  # for a random start, and for the order of views with `trainer: literal`
     rendered: tuple[Path, Path, Path] | None = None,  # scene, Gaussians and masks for `trainer: literal`
     start: Path | None = None,  # field from which `start: langsplat` begins
 ) -> None:
@@ -49,8 +49,8 @@ def run_field(
     ):
         if (getattr(settings, name) == value) != (given is not None):
             raise SettingsError(
-                f"field.{name} and the options don't fit together",
-                expected=f"{options} with {name}: {value}, and only there",
+                f"field.{name} and the options do not match",
+                expected=f"{options} if and only if {name}: {value}",
             )
     contributions = Contributions.load(contributions_folder)
     scene = read_index(contributions_folder)["scene"]
@@ -64,7 +64,7 @@ def run_field(
             made_from = contributions.gaussians_sha256, code_sha256
             if (begun.gaussians_sha256, begun.autoencoder_sha256) != made_from:
                 raise MisalignedArtifactError(
-                    f"{start} belongs to other Gaussians, or to another code",
+                    f"{start} was computed from other Gaussians or another code",
                     fix="compute both fields from the same Gaussians and autoencoder",
                 )
             first = begun.features
@@ -105,7 +105,7 @@ def field_losses(
     seed: int,
     threads: int,
 ) -> tuple[QuadraticProblem, Contrast]:
-    """Return the losses of a scene's field; `start` and `seed` are those of `QuadraticProblem.of`."""
+    """Return the losses of a scene's field; `start` and `seed` are as in `QuadraticProblem.of`."""
     masks, half_masks = (
         MaskOperator.of(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
     )

@@ -1,10 +1,10 @@
 """Train the field as in the paper: render a view, compute its losses, take an Adam step on the features.
 
-It is slow because it is the reference for the sparse solver (`solver.solve_field`). Both minimise the same
-objective, term by term. Here each step computes every term on the rendered maps of one random view, whose
+It is the slow reference for the sparse solver (`solver.solve_field`). Both minimise the same
+objective, term by term. Here each step computes every term on the rendered maps of one random view; the
 expectation over the views is the solver's objective.
 
-Departs from `train.py` of minghanqin/LangSplat, whose loop it follows: one run trains the three levels on the
+Departs from `train.py` of minghanqin/LangSplat, whose loop it follows: one run trains all three levels on the
 same views; rendered features are divided by alpha, so that losses and queries use the same features; thinly
 covered pixels are ignored; features of Gaussians are not scaled to unit length before they are blended.
 """
@@ -45,16 +45,16 @@ class ViewTargets:
     rows: Int64[np.ndarray, " m"]  # rows of its masks in the contributions
     level: Int64[np.ndarray, " m"]  # level of each mask, 0 to 2
     painted: sp.csr_matrix  # indicator (masks x pixels) of the pixels that show each mask
-    half: sp.csr_matrix  # indicator of those pixels that are in the random half
+    half: sp.csr_matrix  # indicator of the shown pixels that are in the random half
     relations: ViewRelations  # masks compared by L_ins and L_part
 
 
 def view_losses(
     shown: Float64[np.ndarray, "P 3 D"],  # rendered features divided by alpha
     view: ViewTargets,
-    latents: Float32[np.ndarray, "M D"],  # of every mask of the scene
+    latents: Float32[np.ndarray, "M D"],  # latent of every mask of the scene
     settings: FieldSettings,
-    shares: tuple[int, float, int, int],  # views, labelled pixels, and the counts of `compared`, of the scene
+    shares: tuple[int, float, int, int],  # of the scene: views, labelled pixels, counts of `compared`
 ) -> tuple[dict[str, float], Float64[np.ndarray, "P 3 D"]]:
     """Compute all losses on the rendered maps of one view, and the gradient of their weighted sum.
 
@@ -122,7 +122,7 @@ def train_literally(
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
-    """Run Adam from the field's start, one random view per step, each once before any is repeated.
+    """Run Adam from the field's start, one random view per step; views repeat only after all were used.
 
     Returns:
         the features, and a report: every term of the objective before and after, and the loss curve.

@@ -1,7 +1,7 @@
-"""The losses L_ins and L_part (paper, Eq. 3 to 5) of one view in two variants each, with their gradients.
+"""The losses L_ins and L_part (paper, Eq. 3 to 5) of one view, each in two variants, with gradients.
 
-The losses compare a few dozen masks at a time, so their gradients are written in NumPy: torch takes longer to
-start than a solve takes to compute them. The tests compare them with autograd.
+The losses compare a few dozen masks at a time, so their gradients are written in NumPy: importing torch takes
+longer than computing them for a whole solve. The tests compare them with autograd.
 """
 
 import math
@@ -23,7 +23,7 @@ def log_distance_loss(
     """Return the mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
 
     The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from dot products: M x M
-    instead of M x M x D numbers. In float64 the cancellation error is far below the softening. At least two
+    numbers instead of M x M x D. In float64 the cancellation error is far below the softening. At least two
     means are required; `log_wanted` is the natural logarithm of the target distance of each pair.
     """
     rows = len(means)
@@ -45,9 +45,9 @@ def instance_loss_literal(
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """Compute L_ins as printed (Eq. 3): the target distance of two masks is Omega^-|l_i - l_j|.
 
-    This pushes all masks of the same level to distance 1, related or not, which is impossible for more than
-    D + 1 masks. Departs only in the softened distance. `means` has the mean rendered feature of each mask of
-    one view, all levels; Omega is above 1.
+    This pushes all masks of the same level to distance 1, related or not, which is impossible for more than D
+    + 1 masks. Departs only in the softened distance. `means` contains the mean rendered feature of each mask
+    of one view, all levels; Omega exceeds 1.
     """
     return log_distance_loss(means, -np.abs(level[:, None] - level[None]) * math.log(omega))
 
@@ -65,7 +65,7 @@ def instance_loss_tree(
 
 
 def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, "M M"]:
-    """Return the depth of the deepest common ancestor of every pair of masks in one view's coverage tree.
+    """Return the depth of each mask pair's deepest common ancestor in one view's coverage tree.
 
     A mask counts as its own ancestor and roots have depth 1; 0 means that two masks are unrelated. The value
     for a mask and its child is the depth of the mask; for two children of a root it is 1.
@@ -83,8 +83,8 @@ def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, 
         if not len(has):
             break
         is_ancestor[has, current[has]] = 1
-    # Common ancestors of two masks form a chain from the root down, so their number is the depth.
-    # float32 counts exactly, and its products are fast.
+    # Common ancestors of two masks form a chain from the root down, so the number of ancestors is the
+    # depth. float32 counts are exact, and its products are fast.
     chains = is_ancestor.astype(np.float32)
     return (chains @ chains.T).astype(np.int64)
 
@@ -99,13 +99,13 @@ def similarity_without_parent(
     """Compute s_p of Eq. 4: cosine of two mask means after subtracting the anchor's parent mean from both.
 
     Departs: Eq. 4 prints index j twice in the denominator; we use i and j, so that s_p is a cosine. We
-    interpret its parent mean, which has no index, as the anchor's, for positives and negatives alike. The
+    interpret the parent mean in Eq. 4, which has no index, as the anchor's for positives and negatives. The
     parent gets no gradient: parts move relative to their whole, not the whole relative to its parts.
     """
     own = anchors - parent
     square = np.square(own).sum(axis=1, keepdims=True) + SHORTEST**2
     along = own @ others.T - (own * parent).sum(axis=1, keepdims=True)
-    # |other - parent|^2 from dot products: A x B instead of A x B x D numbers
+    # |other - parent|^2 from dot products: A x B numbers instead of A x B x D
     far = np.square(others).sum(axis=1) - 2 * parent @ others.T + np.square(parent).sum(axis=1, keepdims=True)
     softened = np.maximum(far, 0) + SHORTEST**2
     scale = 1 / np.sqrt(square * softened)
@@ -123,18 +123,18 @@ def similarity_without_parent(
 
 
 def part_loss_literal(
-    means: Float[np.ndarray, "M D"],  # of the rendered features in each mask of the level
+    means: Float[np.ndarray, "M D"],  # mean rendered feature of each mask of the level
     parent: Int[np.ndarray, " M"],  # id of each mask's parent, -1 for an orphan
     parent_means: Float[np.ndarray, "M D"],  # any value for orphans
     tau: float,
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Compute L_part of one view and level as printed (Eq. 5): siblings attract, children of others repel.
+    """Compute L_part of one view and level as printed (Eq. 5): siblings attract, other masks repel.
 
     The denominator contains only the negatives, as printed. This pulls siblings together ("bear nose" and
     "bear mouth"), whereas the paper's text says to separate them.
 
-    Departs: we read 1 / (L N_p) as the mean, over anchors with at least one positive and one negative, of
-    the mean over their positives. The caller omits level l = 1, which has no parents; this function omits
+    Departs: we interpret 1 / (L N_p) as the mean, over anchors with at least one positive and one negative,
+    of the mean over their positives. The caller omits level l = 1, which has no parents; this function omits
     orphans. An anchor is not its own positive. Without anchors, the loss is 0.
     """
     similarity, pull_back = similarity_without_parent(means, means, parent_means)
@@ -161,7 +161,7 @@ def part_loss_disentangle(
     parent_means: Float[np.ndarray, "M D"],  # any value for orphans
     tau: float,
 ) -> tuple[float, Float64[np.ndarray, "M D"], Float64[np.ndarray, "M D"]]:
-    """Compute L_part of one view and level as the paper describes it: parts of one object are separated.
+    """Compute L_part of one view and level as in the paper's text: parts of one object are separated.
 
     Departs: the positive of a mask is the other random half of its own pixels; negatives are the other
     halves of all other masks of the level, including siblings; the denominator includes the positive

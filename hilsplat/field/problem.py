@@ -7,9 +7,9 @@ With the rendered map M = W F, the mask means A F, the areas n and the mask late
 - clustering loss L_h (Eq. 2):        tr F'GF - sum n |AF|^2
 - ridge: sum of visible mass x |F - F_lifted|^2
 
-Their sum is one quadratic form, minimised by a few conjugate-gradient steps from the lifted average.
+Their sum is a single quadratic form, minimised by a few conjugate-gradient steps from the lifted average.
 
-Departs: the paper's objective has no term with CLIP, so a constant field minimises it. The language loss is
+Departs: the paper's objective has no CLIP term, so a constant field minimises it. The language loss is
 LangSplat's regression with squared instead of absolute differences, averaged over labelled pixels only.
 """
 
@@ -32,7 +32,7 @@ class QuadraticProblem:
     mass: Float32[np.ndarray, "N 3"]  # G 1, the visible mass of each Gaussian at each level, px
     pixels: Float32[np.ndarray, " M"]  # n
     latents: Float32[np.ndarray, "M D"]  # h
-    lifted: Float32[np.ndarray, "N 3 D"]  # start of the field, to which the ridge pulls
+    lifted: Float32[np.ndarray, "N 3 D"]  # start of the field, towards which the ridge pulls
     weights: tuple[float, float, float]  # of the language loss, the clustering loss and the ridge
 
     @staticmethod
@@ -42,10 +42,10 @@ class QuadraticProblem:
         pixels: Float32[np.ndarray, " M"],
         latents: Float32[np.ndarray, "M D"],
         weights: tuple[float, float, float],
-        start: str | Float32[np.ndarray, "N 3 D"] = "average",  # or "median", "random", features
+        start: str | Float32[np.ndarray, "N 3 D"] = "average",  # or "median", "random", or features
         seed: int = 0,
     ) -> "QuadraticProblem":
-        """Compute the mass and the start of the field, to which the ridge pulls."""
+        """Compute the mass and the start of the field, towards which the ridge pulls."""
         mass = level_mass(quadratic)
         if isinstance(start, np.ndarray):
             lifted = start
@@ -60,13 +60,13 @@ class QuadraticProblem:
 
     @property
     def total_pixels(self) -> float:
-        """Number of labelled pixels of all levels, the divisor that turns sums into means."""
+        """Number of labelled pixels at all levels, the divisor that converts sums to means."""
         return max(float(self.pixels.sum(dtype=np.float64)), 1.0)
 
     def hessian_product(
         self, features: Float32[np.ndarray, "N 3 D"], curved: Float32[np.ndarray, "N 3 D"] | None = None
     ) -> Float32[np.ndarray, "N 3 D"]:
-        """Return half the Hessian of the summed losses times the features; `curved` is G F, if known."""
+        """Return half the Hessian of the summed losses times the features; `curved` is G F, if available."""
         language, clustering, ridge = self.weights
         out = self.quadratic.product(features) if curved is None else curved.copy()
         out *= np.float32(language + clustering)
@@ -88,7 +88,7 @@ class QuadraticProblem:
     def terms(self, features: Float32[np.ndarray, "N 3 D"]) -> dict[str, float]:
         """Return the language loss, L_h and the ridge, unweighted, as means over labelled pixels.
 
-        Both losses are small differences of large sums, so all sums are in float64.
+        Both losses are small differences of large sums, so all sums are computed in float64.
         """
         form = self.quadratic.form(features)
         means = self.masks.means(features.astype(np.float64))
@@ -140,7 +140,7 @@ def _ratio(
 
 # Updates and sums over a whole field in one pass, without temporaries of its size. They are memory-bound:
 # three levels of sixteen numbers for a million Gaussians are 192 MB, and a NumPy expression reads and writes
-# that much for each operator. Sums are taken in float64 in a fixed order.
+# that much for each operator. Sums are computed in float64 in a fixed order.
 
 
 @compiled
@@ -156,7 +156,7 @@ def channel_dots(a, b):
 
 @compiled
 def scaled_squares(scale, a):
-    """Return `channel_dots` of a field and scale (N, 3) times the field."""
+    """Return `channel_dots` of a field and the same field times scale (N, 3)."""
     out = np.zeros(a.shape[1:])
     for n in range(len(a)):
         for level in range(a.shape[1]):

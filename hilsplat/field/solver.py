@@ -1,6 +1,6 @@
-"""Solve the field: lifted average, conjugate gradient, then L-BFGS if contrastive losses have a weight.
+"""Solve the field: lifted average, conjugate gradient, then L-BFGS if any contrastive loss has a weight.
 
-Both solvers stop early, since more steps would fit the noise of mask borders.
+Both solvers stop early, because more steps would fit the noise of mask borders.
 """
 
 from collections.abc import Callable
@@ -25,8 +25,8 @@ def solve_field(
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Return the features, and a report with every loss before and after each phase."""
     weights, total = (settings.weight_instance, settings.weight_part), problem.total_pixels
-    # The steps of L-BFGS take much memory, so its variables are only those that a mask shows. They are scaled
-    # by the root of the mass, which makes the quadratic part nearly isotropic.
+    # L-BFGS needs much memory, so its variables are only the features visible in masks. They are scaled by
+    # the square root of the mass, which makes the quadratic part nearly isotropic.
     shown = np.flatnonzero(problem.mass)
     root = np.sqrt(problem.mass.reshape(-1)[shown])[:, None]
     inverse_root = np.zeros(problem.mass.shape, np.float32)
@@ -74,7 +74,7 @@ def keep_labelled(
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Remove the latents of Gaussians with little of their visible weight in a level's labelled pixels.
 
-    Tables and walls have no part masks. But where a mask border extends onto them by a pixel, their Gaussians
+    Tables and walls have no part masks. But if a mask border extends onto them by a pixel, their Gaussians
     get the mask's full latent and match its queries everywhere: the regression uses only labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
@@ -82,9 +82,9 @@ def keep_labelled(
 
 
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
-    """Minimise by limited-memory BFGS with step halving; every sum is taken in a fixed order.
+    """Minimise by limited-memory BFGS with step halving; every sum is computed in a fixed order.
 
-    The start `point` is overwritten. A step takes one evaluation of value and gradient, plus one per halving;
+    The start `point` is overwritten. A step needs one evaluation of value and gradient, plus one per halving;
     `first_step` is the inverse curvature assumed before the first.
     """
     value, gradient = objective(point)
@@ -106,7 +106,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
         else:
             break
         del direction
-        # reuse the memory of vectors no longer needed: one takes over 100 MiB in a large scene
+        # reuse the memory of vectors no longer needed: each takes over 100 MiB in a large scene
         moved = np.subtract(candidate, point, out=point)
         turned = np.subtract(new_gradient, gradient, out=gradient)
         curvature = dot(moved, turned)

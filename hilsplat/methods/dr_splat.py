@@ -1,15 +1,15 @@
-"""Dr. Splat: averaged vectors of the masks at pixels that a Gaussian dominates, stored as a few bytes.
+"""Dr. Splat: averaged mask vectors from the pixels that a Gaussian dominates, stored as a few bytes.
 
 For every pixel the published code selects the 45 Gaussians with the largest compositing weights, adds each
 weight to (Gaussian, mask), averages the masks' unit CLIP vectors with these sums, scales the average to unit
 length and stores its product-quantised bytes (kaist-ami/Dr-Splat `train.py`). No field is trained.
 
 Departs from the published code:
-    - the product quantiser is trained on the scene's own mask vectors, the published index on general images;
-    - one byte per four elements of a vector (128 bytes for 512); the published index file sets its own;
+    - the product quantiser is trained on the scene's own mask vectors, not on general images;
+    - one byte per four vector elements (128 bytes for 512); the published index file sets its own number;
     - weights of a pixel are divided by its alpha, those below `contributions.min_weight` are dropped, and
       pixels with alpha below `MIN_ALPHA` are ignored;
-    - all three levels instead of one (`--feature_level`);
+    - all three levels are used instead of one (`--feature_level`);
     - for queries, the bytes are decoded and rendered like any field instead of looked up in the index.
 """
 
@@ -26,7 +26,7 @@ from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
-TOP_GAUSSIANS = 45  # heaviest Gaussians of a pixel that take its vector, as in the published code
+TOP_GAUSSIANS = 45  # Gaussians with the largest weights at a pixel, which get its vector, as published
 PART = 4  # elements of a CLIP vector that share a byte
 UNSEEN = 1e-9  # averages shorter than this have no direction
 
@@ -42,7 +42,7 @@ def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
 def register(
     inputs: MethodInputs, vectors: Float32[np.ndarray, "M C"], count: int
 ) -> Float32[np.ndarray, "N 3 C"]:
-    """Return unit averages of unit mask vectors over the pixels that a Gaussian dominates; zero without any.
+    """Return unit averages of unit mask vectors over the pixels each Gaussian dominates; zero without any.
 
     The `count` Gaussians with the largest weights dominate a pixel.
     """
@@ -68,7 +68,7 @@ def codebooks(vectors: Float32[np.ndarray, "B C"], seed: int) -> list[Float32[np
 def quantised(
     vectors: Float32[np.ndarray, "n C"], books: list[Float32[np.ndarray, "_ S"]]
 ) -> Float32[np.ndarray, "n C"]:
-    """Replace each part of the vectors by its nearest entry of the codebook, a byte if that has 256."""
+    """Replace each part of the vectors with its nearest codebook entry (one byte for 256 entries)."""
     nearest = [
         book[vq(part, book, check_finite=False)[0]] for part, book in zip(_parts(vectors), books, strict=True)
     ]

@@ -2,7 +2,7 @@
 
 1. Every Gaussian learns an identity feature for each level by L = L_h + lambda_1 L_ins + lambda_2 L_part
    alone (paper, Sec. III-C), without language.
-2. Gaussians are clustered coarse to fine: wholes by their features at level whole, then parts inside wholes,
+2. Gaussians are clustered coarse to fine: wholes by their whole-level features, then parts inside wholes,
    subparts inside parts. Clusters closer than half the median distance of two masks that share a view and a
    parent are merged.
 3. A cluster's vector is computed from the CLIP vectors of the masks of its level that fit it best, as in
@@ -26,9 +26,9 @@ from hilsplat.semantic_tree.nodes import MIN_FIT, LevelNodes, best_fits, level_i
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 
 CENTRE_OF = 4  # minimum number of Gaussians per centre
-STEPS = 60  # L-BFGS steps of the features
+STEPS = 60  # number of L-BFGS steps
 
-RIDGE = 1e-3  # weight of the pull towards the random start; it keeps unobserved directions from drifting
+RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in unobserved directions
 
 
 def farthest_alike(
@@ -48,9 +48,9 @@ def farthest_alike(
 def nested_clusters(
     features: Float32[np.ndarray, "N 3 D"], farthest: tuple[float, ...], seed: int
 ) -> Int64[np.ndarray, "N 3"]:
-    """Return each Gaussian's cluster per level, -1 where its feature is nan; clusters nest.
+    """Return each Gaussian's cluster per level, -1 where its feature is NaN; clusters are nested.
 
-    A cluster is divided by k-means, whose centres are merged up to an average distance of `farthest`.
+    Clusters are divided by k-means; centres with an average distance of at most `farthest` are merged.
     """
     found = np.full(features.shape[:2], NONE, np.int64)
     around = np.zeros(len(features), np.int64)

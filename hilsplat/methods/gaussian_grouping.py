@@ -10,13 +10,13 @@ The authors' values are in the constants, and `steps` 30,000, `rate` 0.0025 (0.0
 
 Departs:
     - identities come from masks linked by shared Gaussians, as in our tree, not from a video tracker (DEVA),
-      so that a table row shows what codes and classifier add to that;
-    - each of our levels is trained separately; the authors use one set of masks;
-    - pixels without an identity are ignored; the authors assign them a class of their own;
+      so that a table row shows what the codes and classifier add;
+    - each level is trained separately; the authors use one set of masks;
+    - pixels without an identity are ignored; the authors assign them a separate class;
     - geometry is frozen instead of trained together with the codes;
     - fewer steps, on 4096 pixels of a view; classifier and codes share a learning rate;
-    - the KL is computed at every step instead of every fifth, with 1000 samples as there;
-    - text selects by the identities' CLIP vectors, not by Grounding-DINO and SAM in a first view.
+    - the KL is computed at every step instead of every fifth, with 1000 samples as in the original;
+    - text queries use the identities' CLIP vectors, not Grounding-DINO and SAM in a first view.
 """
 
 import numpy as np
@@ -56,7 +56,7 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
 def neighbour_loss(
     logits: Float[Tensor, "s K"], others: Float[Tensor, "s n K"], num_classes: int
 ) -> Float[Tensor, ""]:
-    """Return the mean KL divergence of class probabilities from those of the neighbours, per class."""
+    """Return the mean KL divergence of class probabilities from the neighbours' probabilities, per class."""
     log_p, log_q = log_softmax(logits, -1)[:, None], log_softmax(others, -1)
     return (log_p.exp() * (log_p - log_q)).sum(-1).mean() / num_classes
 
@@ -69,7 +69,7 @@ def identity_of_gaussians(
     settings: MethodSettings,
     seed: int,
 ) -> Int64[np.ndarray, " N"]:
-    """Train codes and classifier of a level, and classify the Gaussians."""
+    """Train the codes and classifier of a level, and classify the Gaussians."""
     num_classes = int(identity.max()) + 1
     draw = torch.Generator().manual_seed(seed)
     codes = (0.1 * torch.randn(contributions.num_gaussians, CHANNELS, generator=draw)).requires_grad_()

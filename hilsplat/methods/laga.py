@@ -1,10 +1,10 @@
-"""LaGa: contrastive features nested by prefix, objects from masks of all views, several descriptors each.
+"""LaGa: contrastive features nested by prefix; objects from all views' masks, with several descriptors each.
 
 1. Every Gaussian learns 32 numbers: wholes use the first 16, parts 24, subparts all. Pixels are attracted to
-   the prototype of their mask and repelled from others. Pixels that share a finer mask must agree in the
-   coarser prefix; pixels that a coarser mask separates must differ in the finer one.
+   the prototype of their mask and repelled from other prototypes. Pixels that share a finer mask must agree
+   in the coarser prefix; pixels that a coarser mask separates must differ in the finer one.
 2. Prototypes of masks over all views are clustered by density: each cluster is an object, and a Gaussian
-   belongs to the nearest.
+   belongs to the nearest object.
 3. The CLIP vectors of an object's masks are clustered; the silhouette chooses the number of descriptors, up
    to 20. A descriptor's weight is its agreement with the object's average.
 
@@ -15,7 +15,7 @@ Departs:
     - an object's descriptors are summed by weight; for each text the authors take the maximum of relevancy
       times weight, but a field here holds one code per Gaussian and level;
     - levels are queried separately; the authors average the three scores and smooth them over neighbours;
-    - density clusters at the authors' radius (DBSCAN*) in place of HDBSCAN with that as the minimum radius;
+    - DBSCAN* clusters at the authors' radius instead of HDBSCAN clusters with it as the minimum radius;
     - one k-means start per number of descriptors instead of ten;
     - painted masks, fewer steps on 2048 pixels of a view; almost equal initial features; prototypes of
       objects from exact mask means; masks below the same share of the image are ignored.
@@ -46,8 +46,8 @@ PREFIX = (16, 24, 32)
 MIN_SHARE = 400 / (988 * 731)  # minimum share of the image in a mask: 400 px of a LERF view
 SAME_IOU = 0.8
 HARD_COSINE = 0.5
-RADIUS = (0.3, 0.2, 0.1)  # radius of density clusters at level whole, part, subpart
-LEAST_MASKS = 5  # minimum number of masks within the radius of a dense mask, at most the number of views
+RADIUS = (0.3, 0.2, 0.1)  # radius of density clusters for wholes, parts, subparts
+LEAST_MASKS = 5  # minimum number of masks within a dense mask's radius, limited to the number of views
 MOST_DESCRIPTORS = 20
 PIXELS = 2048
 
@@ -80,8 +80,8 @@ def nested_loss(
 ) -> Float[Tensor, ""]:
     """Return the contrast of pixels with mask prototypes per prefix, plus a penalty for slice lengths not 1.
 
-    `masks` has the pixels of the masks of whole, part, subpart. Pixels outside a mask are drawn, as many as
-    inside; all hard ones are also used.
+    `masks` contains the pixels of each mask at whole, part and subpart. Outside a mask, all hard pixels are
+    used, and as many random ones as there are pixels inside.
     """
     inside = [torch.from_numpy(each) for each in masks]
     last = len(LEVELS) - 1
@@ -114,7 +114,7 @@ def objects(
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
     """Return the object of each Gaussian and of each mask, -1 for none: a density cluster of prototypes.
 
-    Features and prototypes have unit length; `radius` and `least` are those of `density_clusters`.
+    Features and prototypes have unit length; `radius` and `least` are as in `density_clusters`.
     """
     of_mask = density_clusters(prototypes, radius, least)
     has = of_mask != NONE
@@ -141,8 +141,8 @@ def silhouette(distance: Float[np.ndarray, "n n"], group: Int64[np.ndarray, " n"
 def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[np.ndarray, " n"]:
     """Return the weight of each mask's vector in the sum of its object's weighted descriptors.
 
-    A descriptor is the unit centroid c of a cluster of vectors. Its weight is c.a, with the unit average a of
-    all vectors, so that a scattered cluster has less weight. Vectors are the unit CLIP vectors of one object.
+    A descriptor is the unit centroid c of a cluster of vectors. Its weight is c.a, where a is the unit
+    average of all vectors, so that scattered clusters have less weight. `vectors`: unit vectors, one object.
     """
     group, best = np.zeros(len(vectors), np.int64), -1.0
     distance = cdist(vectors, vectors)

@@ -1,11 +1,11 @@
-"""LangSplat: an independent field per level, L1 between rendered and painted codes, no tree.
+"""LangSplat: an independent field per level, an L1 loss between rendered and painted codes, no tree.
 
-The published code renders a random view per step, each view once before any is repeated, and compares every
+The published code renders one random view per step (each once before any is repeated) and compares every
 labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so rendering is a product with fixed
 compositing weights, which we compute once per view.
 
 Departs from the published code:
-    - fewer steps, and a grid of pixels instead of all (`MethodSettings`);
+    - fewer steps, and a pixel grid instead of all pixels (`MethodSettings`);
     - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, counting
       unlabelled ones as 0, so a view's step has more weight the larger the area of its masks;
     - rendered codes are divided by alpha, as in queries, and pixels with alpha below `MIN_ALPHA` are ignored;
@@ -14,7 +14,7 @@ Departs from the published code:
     - weights below `contributions.min_weight` are dropped.
 
 `hilsplat.field.literal_trainer` (loss `l1`) renders at every step, and averages over all pixels like
-LangSplat. It also trains all levels in one run. It treats alpha and unit length like this module.
+LangSplat. It also trains all levels in one run. It treats alpha and unit length as in this module.
 """
 
 from typing import Any
@@ -104,7 +104,7 @@ def zeros(typingctx):
 
 @intrinsic
 def signs_of_difference(typingctx, a, b, scale):
-    """Return scale where a > b, -scale where a < b, 0 where they are equal; NaN is kept."""
+    """Return scale where a > b, -scale where a < b, 0 where they are equal; NaN is preserved."""
 
     def codegen(context, builder, sig, args):
         apart, up = builder.fsub(args[0], args[1]), _all(builder, args[2])
@@ -116,14 +116,14 @@ def signs_of_difference(typingctx, a, b, scale):
 
 
 def train_level(
-    views: list[LabelledView],  # with labelled pixels at this level, at least one
+    views: list[LabelledView],  # at least one; each has labelled pixels at this level
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train by Adam from zero, one random view per step, each once before any is repeated."""
+    """Train with Adam from zero, one random view per step, each once before any is repeated."""
     channels = latents.shape[1]
     wide = channels + -channels % WIDTH
     features, gradient = np.zeros((2, num_gaussians * wide), np.float32)
@@ -140,16 +140,16 @@ def train_level(
 
 @compiled
 def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
-    """Write the gradient of the mean absolute difference of rendered and painted codes for the features.
+    """Write the features' gradient of the mean absolute difference between rendered and painted codes.
 
     A row of weights is read once for its sum and, while it is in the fastest cache, once for its gradient.
-    Sums are in the order of the products with the matrix and its transpose; there is one thread.
+    Sums have the same order as products with the matrix and its transpose; one thread is used.
 
     Args:
         indptr, indices, data: weights (pixels x Gaussians), CSR.
         labels: row of the code painted at each pixel, -1 for none.
         codes, features, gradient: float32, flat, `wide` numbers per row or Gaussian; `gradient` is written.
-        channels: size of a code; padding after it is 0.
+        channels: size of a code; the padding after it is 0.
         wide: multiple of `WIDTH`.
     """
     gradient[:] = 0

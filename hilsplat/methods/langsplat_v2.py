@@ -6,12 +6,12 @@ maps them to CLIP vectors without an autoencoder. Loss 1 - cosine, Adam, logits 
 (ZhaoYujie2002/LangSplatV2 `train.py`, `scene/gaussian_model.py`, `utils/vq_utils.py`).
 
 Departs from the published code:
-    - fewer and larger steps, and a grid of pixels instead of all (`MethodSettings`);
-    - codebook entries, and so their mixtures, are vectors m + U z of the scene's linear code; d = 64
+    - fewer and larger steps, and a pixel grid instead of all pixels (`MethodSettings`);
+    - codebook entries, and therefore their mixtures, are vectors m + U z of the scene's linear code; d = 64
       reproduces the masks' vectors with a mean cosine of 0.9998 on the development scenes;
     - the loss is averaged over the labelled pixels of the grid, rendered mixtures are divided by alpha,
       thinly covered pixels are ignored and small weights dropped, as in `langsplat`;
-    - k-means on all mask vectors of the level at once instead of mini-batches.
+    - k-means uses all mask vectors of the level at once instead of mini-batches.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ KEPT = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
 def largest_shares(
     logits: Float32[np.ndarray, "N E"], kept: int = KEPT
 ) -> tuple[Int64[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
-    """Return the largest entries of each softmax and their shares, which sum to 1; the first wins ties."""
+    """Return the largest entries of each softmax and their shares, which sum to 1; lower entries win ties."""
     chosen = np.zeros((len(logits), kept), np.int64)
     shares = np.zeros(chosen.shape, np.float32)
     _largest(logits, chosen, shares)
@@ -81,7 +81,7 @@ def step(
 
 
 def train_level(
-    views: list[LabelledView],  # with labelled pixels at this level, at least one
+    views: list[LabelledView],  # at least one; each has labelled pixels at this level
     latents: Float32[np.ndarray, "M D"],
     level: Level,
     num_gaussians: int,

@@ -1,25 +1,25 @@
-"""LEGaussians: a small code and an uncertainty per Gaussian, decoded to an entry of a codebook.
+"""LEGaussians: a small code and an uncertainty per Gaussian, decoded to a codebook entry.
 
 1. The CLIP vectors of the masks are quantised to 128 entries, so every pixel has an index.
 2. Every Gaussian learns 8 numbers and an uncertainty; a small network predicts the entry of each rendered
    pixel (cross-entropy, weighted by 1 - uncertainty, plus -log(1 - uncertainty)).
-3. A network of the position predicts the 8 numbers; they are pulled towards its output, more so where they
-   are uncertain.
+3. A network predicts the 8 numbers from the position; they are pulled towards its output, more strongly if
+   they are uncertain.
 
 Source: Shi et al., Language Embedded 3D Gaussians, CVPR 2024; buaavrcg/LEGaussians `train.py`,
 `scene/index_decoder.py`, `arguments/__init__.py`. The authors' values are in the constants, and `steps`
 30,000, `rate` 0.001 for codes and networks.
 
 Departs:
-    - indices of the masks' CLIP vectors and a codebook by k-means, per level; the authors quantise a pyramid
+    - mask CLIP vectors are indexed with a k-means codebook per level; the authors quantise a pyramid
       of CLIP crops together with DINO, which masks do not have, and train the codebook with balanced loads;
     - geometry is frozen instead of trained together with the codes;
     - fewer steps, on 1024 pixels of a view; almost equal initial codes; networks learn at a fifth of the
       rate; no weight decay (1e-5);
-    - smoothing at every step on 1000 Gaussians with a tenth of its weight, instead of every tenth step on
+    - smoothing at every step on 1000 Gaussians with 10 % of its weight, instead of every tenth step on
       all; positions are scaled to a standard deviation of 1;
-    - each Gaussian takes the entry of its largest logit, which is then rendered; the authors decode rendered
-      codes at each pixel, to the largest or to a softmax mixture.
+    - each Gaussian gets the entry with its largest logit, which is then rendered; the authors decode rendered
+      codes at each pixel to the most probable entry or a softmax mixture.
 """
 
 import itertools
@@ -44,7 +44,7 @@ POSITION_WIDTHS = (128,) * 4
 FIRST_UNCERTAINTY = 0.01
 UNCERTAINTY_RATE = 0.05  # Adam's rate for uncertainties, regardless of the rate of the codes
 NETWORK_RATE = 0.2  # factor of the codes' rate for the networks; the authors use 1
-LEAST_SMOOTHING = 0.1  # smoothing weight of a certain Gaussian; that of an uncertain one is 1
+LEAST_SMOOTHING = 0.1  # smoothing weight of a fully certain Gaussian; it is 1 for a fully uncertain one
 SMOOTHING = 0.1
 SAMPLES = 1000
 PIXELS = 1024

@@ -1,7 +1,7 @@
-"""Stage `method`: compute a language field by a baseline, from the same artifacts as our method.
+"""Stage `method`: compute a language field with a baseline, from the same artifacts as our method.
 
 All other stages (Gaussians, masks, CLIP vectors, the scene's code, queries, protocols, tables) are shared, so
-that rows of a table differ only by method.
+that table rows differ only in the method.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -41,7 +41,7 @@ View = TypeVar("View")
 class MethodInputs:
     """Artifacts of a scene, read on first use."""
 
-    scene_folder: Path  # scene artifact; a method may use only its train views
+    scene_folder: Path  # scene artifact; a method may use only its training views
     gaussians_ply: Path
     masks_folder: Path
     contributions_folder: Path
@@ -50,7 +50,7 @@ class MethodInputs:
 
     @cached_property
     def contributions(self) -> Contributions:
-        """One row per mask of all train views."""
+        """One row per mask of all training views."""
         return Contributions.load(self.contributions_folder)
 
     @cached_property
@@ -87,7 +87,7 @@ class MethodInputs:
         return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
     def linear_code(self, method: str) -> LinearCode:
-        """Return the scene's code, for a method whose training or averages need CLIP vectors themselves.
+        """Return the scene's code, for methods whose training or averages need the CLIP vectors themselves.
 
         Raises:
             SettingsError: the code is a network, whose numbers cannot be averaged like vectors.
@@ -98,7 +98,7 @@ class MethodInputs:
                 f"method {method} needs a linear code",
                 expected="autoencoder.code pca",
                 found="autoencoder.code network",
-                fix="give its variant autoencoder: {code: pca, latent: 64, targets: mask}",
+                fix="set autoencoder: {code: pca, latent: 64, targets: mask} in its variant",
             )
         return code
 
@@ -114,7 +114,7 @@ Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
 
 
 def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: int) -> None:
-    """Compute the field of a scene by a baseline, and write it to `out`, a `field.safetensors`.
+    """Compute the field of a scene with a baseline, and write it to `out`, a `field.safetensors` file.
 
     Raises:
         SettingsError: there is no such method.
@@ -128,7 +128,7 @@ def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: 
             raise ArtifactError(
                 f"method {settings.name} did not return a language field",
                 expected=f"finite features of shape {expected}",
-                found=f"shape {features.shape}, {np.count_nonzero(~np.isfinite(features))} not finite",
+                found=f"shape {features.shape}, {np.count_nonzero(~np.isfinite(features))} non-finite",
                 fix=f"correct hilsplat/methods/{settings.name}.py",
             )
         digest = sha256_of_file(autoencoder_file(inputs.autoencoder_folder))
@@ -157,7 +157,11 @@ class LabelledView:
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Return the labelled pixels of train views that have any, on every `pixel_step`-th row and column."""
+    """Return the labelled pixels of training views with any, on every `pixel_step`-th row and column.
+
+    Raises:
+        ArtifactError: no view has a labelled pixel.
+    """
     found = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):
@@ -171,14 +175,14 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
             found.append(LabelledView(number, rows[number], weights[pixels], labels[pixels], xy))
     if not found:
         raise ArtifactError(
-            f"no train view has a pixel on a grid of {pixel_step} px that a mask labels",
-            fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and run the masks stage again",
+            f"no training view has a labelled pixel on a {pixel_step} px grid",
+            fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and rerun the masks stage",
         )
     return found
 
 
 def in_random_order(views: Sequence[View], random: np.random.Generator) -> Iterator[View]:
-    """Yield views without end, each once before any is repeated."""
+    """Yield views endlessly, each once before any is repeated."""
     while True:
         for number in random.permutation(len(views))[::-1]:
             yield views[number]

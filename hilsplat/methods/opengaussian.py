@@ -1,23 +1,23 @@
-"""OpenGaussian: instance features without language, a codebook of instances, CLIP by association with masks.
+"""OpenGaussian: instance features without language, an instance codebook, CLIP vectors from associated masks.
 
 1. Every Gaussian learns a unit vector of 6 numbers: rendered features are smooth inside a mask, and means of
    a view's masks are kept apart.
-2. A coarse codebook groups Gaussians by feature and position, a fine one divides each group by feature.
+2. A coarse codebook groups Gaussians by feature and position; a fine one divides each group by feature.
 3. A group (an instance) is assigned the CLIP vectors of the masks that fit it best in each view, by IoU times
-   closeness of features. No language is trained.
+   feature closeness. No language features are trained.
 
 Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. The authors' values are in
 the constants, `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
 
 Departs:
-    - each of our levels is processed separately; the authors use one level, the wholes on LERF;
+    - each of our levels is processed separately; the authors use one level (wholes on LERF);
     - fewer steps and a larger rate; a step uses 4096 pixels of a view, and exact means of all its masks;
-    - features are not trained further towards the codebooks (10,000 and 20,000 steps there);
+    - features are not trained further towards the codebooks (published: 10,000 and 20,000 steps);
     - positions are scaled to a standard deviation of 1 in the scene before the weight of 0.5;
     - Gaussians in no mask of the level keep their random features and belong to no instance;
     - Gaussians are never shrunk at random, and pixels with alpha below 0.5, not 0.7, are ignored;
     - the IoU of an instance and a mask uses visible weights instead of the instance rendered alone;
-    - text selects by relevancy, as for all methods, not the best instance and up to ten similar ones.
+    - text queries use relevancy, as for all methods, not the best instance and up to ten similar ones.
 """
 
 import numpy as np
@@ -36,13 +36,13 @@ SMOOTHING = 0.1
 KMEANS_STEPS = 5
 POSITION = 0.5
 LEAST_WEIGHT, HARD_WEIGHT = 0.1, 0.9
-HARD_FROM = 0.5  # share of the steps after which only the closest pairs keep their weight
+HARD_FROM = 0.5  # share of steps after which only the closest pairs keep their weight
 
 
 def smoothing_loss(
     rendered: Float[Tensor, "p D"], means: Float[Tensor, "m D"], label: Int64[Tensor, " p"]
 ) -> Float[Tensor, ""]:
-    """Return the mean distance of pixels to the mean of their mask, averaged over masks with pixels."""
+    """Return the mean distance between pixels and their mask's mean, averaged over masks with pixels."""
     apart = (rendered - means[label]).square().sum(1, keepdim=True)
     distance, counts = segment_means((apart + 1e-12).sqrt(), label, len(means))
     return distance.sum() / (counts > 0).sum().clamp(min=1)
@@ -52,7 +52,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
     """Return the mean of w / (squared distance + 1) over pairs of masks, w = 0.1 + 0.9 rank / (masks - 1).
 
     The other masks are ranked by distance from each mask, from 1 for the farthest to masks - 1 (w = 1) for
-    the closest. After half of the steps, weights below 0.9 become 0.1.
+    the closest mask. After half of the steps, weights below 0.9 become 0.1.
     """
     num = len(means)
     if num < 2:
@@ -69,7 +69,7 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
 def instance_features(
     inputs: MethodInputs, settings: MethodSettings, seed: int
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Return trained instance features of all levels, mapped from unit length to [0, 1]."""
+    """Return trained instance features of all levels: unit vectors mapped to [0, 1]."""
     views, contributions = labelled_views(inputs, settings.pixel_step), inputs.contributions
     num, levels = contributions.num_gaussians, len(LEVELS)
     start = np.random.default_rng(seed).random((num, levels, CHANNELS), dtype=np.float32)

@@ -31,7 +31,7 @@ OURS: str = MethodSettings().name
 
 
 def require_method(name: str) -> None:
-    """Raise a `SettingsError` if a name is neither ours nor a baseline's."""
+    """Raise a `SettingsError` unless a name is that of our method or a baseline."""
     if name != OURS and name not in METHODS:
         raise SettingsError(
             f"method.name: there is no method {name!r}",
@@ -41,12 +41,12 @@ def require_method(name: str) -> None:
 
 
 def method_of(name: str) -> "Fit":
-    """Import a baseline, or raise a `SettingsError` if there is none of this name."""
+    """Import a baseline, or raise a `SettingsError` if there is none with this name."""
     require_method(name)
     if name == OURS:
         raise SettingsError(
             f"method.name: {OURS} is not a baseline",
             expected=f"one of {', '.join(METHODS)}",
-            fix="run the stage `field`, which solves its field",
+            fix="run the `field` stage, which computes its field",
         )
     return METHODS[name]

@@ -1,7 +1,7 @@
-"""SAGA: affinity features of Gaussians that a gate adapts to a scale (GARField's idea in Gaussians).
+"""SAGA: affinity features of Gaussians that a gate adapts to a scale (GARField's idea for Gaussians).
 
 1. Every mask has a 3D scale. Every Gaussian learns 32 numbers, averaged over its neighbours and multiplied by
-   a gate that depends on the scale: two pixels can be one group at a large scale and two at a small one.
+   a gate that depends on the scale: two pixels can form one group at a large scale and two at a small one.
 2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest larger
    mask that contains them is the same.
 3. The gated features at the median scale of each level's masks are clustered; a cluster is assigned the CLIP
@@ -12,8 +12,8 @@ Source: Cen et al., Segment Any 3D Gaussians, AAAI 2025; Jumpat/SegAnyGAussians 
 chungmin99/garfield). The authors' values are in the constants, and `steps` 10,000, `rate` 0.0025.
 
 Departs:
-    - a mask's scale is the spread of its Gaussians, not of unprojected depths;
-    - painted masks, at most three at a pixel; fewer steps, on 256 pixels of a view instead of 1000;
+    - a mask's scale is the spread of its Gaussians, not that of unprojected depths;
+    - painted masks, at most three per pixel; fewer steps, on 256 pixels of a view instead of 1000;
     - almost equal initial features; all 16 neighbours are used at every step;
     - the authors click at a chosen scale or cluster by HDBSCAN, and don't support text: here the scales are
       the levels' medians, 256 k-means centres are merged by average cosine as for OmniSeg3D, and clusters
@@ -35,11 +35,11 @@ from hilsplat.settings import MethodSettings
 
 CHANNELS = 32
 NEIGHBOURS = 16
-SCALES = 8  # random scales per step, besides one below and one above all masks of the view
+SCALES = 8  # random scales per step, plus one below and one above all masks of the view
 PIXELS = 256
 MOST_WEIGHT = 10.0
 EASY_POSITIVE, HARD_NEGATIVE = 0.75, 0.5
-COSINE = 0.95  # minimum average in a cluster; 0.5 does not separate parts from subparts on development scenes
+COSINE = 0.95  # minimum average in a cluster; 0.5 doesn't separate parts and subparts on development scenes
 
 
 def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
@@ -52,7 +52,7 @@ def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
 
 
 def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator) -> Float64[np.ndarray, " s"]:
-    """Draw scales between neighbouring mask scales of a view, one below all and one above all."""
+    """Draw scales between adjacent mask scales of a view, plus one below and one above all of them."""
     ends = np.concatenate([[0.0], np.sort(scales), [2 * scales.max()]])
     between = 1 + random.permutation(len(scales) - 1)[:SCALES]
     chosen = np.concatenate([[0], between, [len(ends) - 2]])
@@ -62,10 +62,10 @@ def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator)
 def together(
     labels: Int32[np.ndarray, "p 3"], scales: Float64[np.ndarray, "p 3"], scale: float
 ) -> Bool[np.ndarray, "p p"]:
-    """Return whether two pixels share a mask up to the scale, or the smallest mask above it.
+    """Return whether two pixels share a mask at or below the scale, or the smallest mask above it.
 
-    `labels` is the mask of each pixel at each level, -1 for none, and `scales` the scales of these masks; no
-    mask has two levels.
+    `labels` is the mask of each pixel at each level (-1: none), and `scales` contains the masks' scales; each
+    mask has only one level.
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
@@ -83,15 +83,14 @@ def pair_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p
 
 def affinity_loss(
     rendered: Float[Tensor, "p 32"],
-    gates: Float[Tensor, "s 32"],
-    same: Bool[np.ndarray, "s p p"],
-    weight: Float32[np.ndarray, "p p"],
+    gates: Float[Tensor, "s 32"],  # of each scale
+    same: Bool[np.ndarray, "s p p"],  # whether two pixels are together at each scale
+    weight: Float32[np.ndarray, "p p"],  # of each pair
     random: np.random.Generator,
 ) -> Float[Tensor, ""]:
-    """Return a loss that raises gated cosines within groups, lowers positive ones across, keeps length 1.
+    """Return a loss that raises gated cosines within groups, lowers positive ones across, and keeps length 1.
 
     Pairs used are those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
-    `same` is whether two pixels are together at each scale.
     """
     gated = unit(rendered[None] * gates[:, None])
     cosine = gated @ gated.transpose(1, 2)

@@ -1,20 +1,20 @@
 """View-consistent hierarchy: features whose ultrametric reproduces the coverage trees of the views.
 
 1. Every Gaussian learns a vector. Pixels are joined to their 10 nearest in the image by edges as long as the
-   distance of their vectors; the ultrametric is the longest edge between two in the minimum spanning tree.
-2. For every mask, a pixel must be closer to others inside than to ones outside but in the mask's parent, by
+   distance of their vectors; the ultrametric is the longest edge on a pair's minimum spanning tree path.
+2. For every mask, a pixel must be closer to pixels inside than to pixels outside but in the mask's parent, by
    dot product and by ultrametric.
-3. Gaussians within a distance of their 16 nearest neighbours are connected; components at three distances
-   nest and form the levels. A component is assigned the CLIP vectors of its best-fitting masks in each view.
+3. Gaussians are connected to those of their 16 nearest neighbours within a distance; nested components at
+   three distances form the levels. A component is assigned its best masks' CLIP vectors in each view.
 
 Source: He et al., View-Consistent Hierarchical 3D Segmentation Using Ultrametric Feature Fields, CVPR 2024;
 hardyho/ultrametric_feature_fields. The authors' values are in the constants, `steps` 20 epochs, `rate` 0.01.
 
 Departs:
-    - vectors of 16 numbers on frozen Gaussians, not a field of 128 (instant-NGP) with its density;
-    - unit length by division, without a penalty of the norm; depth is not smoothed;
+    - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
+    - unit length by division, without a penalty on the norm; depth is not smoothed;
     - parents are those of our coverage tree (0.9 inside), not 0.95 inside and IoU below 0.9;
-    - components of Gaussians, not of voxels of 0.002; Gaussians outside the 200 largest join the nearest one;
+    - components of Gaussians, not of voxels of 0.002; Gaussians outside the 200 largest join the nearest;
     - the authors don't support text.
 """
 
@@ -47,7 +47,7 @@ THRESHOLDS = (0.6, 0.5, 0.45)
 
 @compiled
 def joining_edges(num, edge_a, edge_b, first, second):
-    """Return the edge, in the given order, that joins the two pixels of each pair; -1 if none does."""
+    """Return the edge, in the given order, that joins the two pixels of each pair, or -1."""
     top = np.arange(num)  # union-find over pixels
     node = np.arange(num)  # dendrogram node of the root's component
     up = np.full(num + len(edge_a), -1, np.int64)
@@ -88,7 +88,7 @@ def ultrametric(
     """Return the longest edge between each pair of pixels in the minimum spanning tree; differentiable.
 
     The penalty is added to an edge's length when the tree is chosen, not in the result. The result is 2 for a
-    pair without a path, and 0 from a pixel to itself.
+    pair without a path, and 0 for a pixel and itself.
     """
     num = len(vectors)
     held = vectors.detach().numpy()
@@ -109,7 +109,7 @@ def ultrametric(
 
 
 def neighbouring_pixels(xy: Int64[np.ndarray, "p 2"]) -> Int64[np.ndarray, "2 e"]:
-    """Return the distinct edges from each pixel to its nearest ones in the image."""
+    """Return the distinct edges from each pixel to its nearest pixels in the image."""
     near = nearest(xy, PIXEL_NEIGHBOURS + 1)
     edges = np.stack([np.repeat(np.arange(len(xy)), near.shape[1]), near.ravel()])
     return np.unique(np.sort(edges[:, edges[0] != edges[1]], axis=0), axis=1)
@@ -123,7 +123,7 @@ def triplets(
 ) -> Int64[np.ndarray, "3 k"]:
     """Draw, per mask, `PAIRS` pixels a and b inside, and c outside but in its parent (anywhere, for a root).
 
-    `labels` has the row of the mask at each pixel and level, `parent` that of each mask's parent, or -1.
+    `labels` contains the mask row at each pixel and level, `parent` the row of each mask's parent (-1: none).
     """
     found = []
     for mask in np.unique(labels[labels >= 0]):
@@ -143,7 +143,7 @@ def components(
 ) -> Int64[np.ndarray, "N 3"]:
     """Return the component of each Gaussian at every distance, largest first.
 
-    Gaussians outside the 200 largest components join that of the nearest Gaussian inside them.
+    Gaussians outside the 200 largest components join the component of the nearest Gaussian inside one.
     """
     num = len(means)
     near = nearest(means, NEIGHBOURS + 1)

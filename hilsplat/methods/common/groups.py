@@ -1,4 +1,4 @@
-"""Groups of Gaussians by their features, and the code of a group from the masks that show it."""
+"""Groups of Gaussians with similar features, and each group's code from the masks that show it."""
 
 import warnings
 from collections.abc import Callable
@@ -16,24 +16,24 @@ from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
-ROUNDS = 20  # Lloyd iterations; further ones reduce the error by less than 1 %
+ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
 CENTRES = 256
 KMEANS_ROUNDS = 10
 MIN_SCORE = 0.2
 MIN_VIEWS = 2
-"""Minimum score of a mask and minimum number of views for a cluster's code: OpenGaussian's values for
-ScanNet; its number of views for LERF is 5."""
+"""Minimum mask score and minimum number of views for a cluster's code: OpenGaussian's values for ScanNet;
+its number of views for LERF is 5."""
 
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
-"""Function of pairs of a mask and a group."""
+"""Function of (mask, group) pairs."""
 
 
 def kmeans(
     vectors: Float32[np.ndarray, "n C"], count: int, seed: int, rounds: int = ROUNDS
 ) -> tuple[Float32[np.ndarray, "E C"], Int64[np.ndarray, " n"]]:
-    """Return centroids by k-means from distant starts (k-means++), and each vector's nearest centroid.
+    """Return k-means centroids from distant starts (k-means++), and each vector's nearest centroid.
 
-    If at most `count` vectors are distinct, those are the centroids, and the first one is repeated. In the
+    If at most `count` vectors are distinct, they are the centroids, and the first is repeated. In the
     `rounds` Lloyd iterations, a centroid that loses its last vector keeps its position.
     """
     if not len(vectors):
@@ -49,12 +49,12 @@ def kmeans(
 def _distant_rows(
     data: Float[np.ndarray, "n C"], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "E C"]:
-    """Draw rows by squared distance from previous ones; scipy's own sampling takes E times as long."""
+    """Draw rows by squared distance from previous ones; scipy's sampling takes E times as long."""
     chosen = np.full(count, -1, np.int64)
     square, chances = np.full(len(data), np.inf), np.arange(1.0, len(data) + 1)
     for place in range(count):
         if chances[-1] == 0:
-            break  # every row is a start already
+            break  # every row is already a start
         draw = random.random() * chances[-1]
         chosen[place] = min(int(np.searchsorted(chances, draw, side="right")), len(data) - 1)
         np.minimum(square, np.square(data - data[chosen[place]]).sum(axis=1), out=square)
@@ -74,7 +74,7 @@ def unit_rows(rows: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n D"]:
 
 
 def nearest(points: Shaped[np.ndarray, "n C"], count: int) -> Int64[np.ndarray, "n k"]:
-    """Return each point's `count` nearest points (or all if fewer), itself included, nearest first."""
+    """Return each point's `count` nearest points (all if there are fewer), itself included, nearest first."""
     count = min(count, len(points))
     return cKDTree(points).query(points, count)[1].reshape(len(points), count)
 
@@ -82,7 +82,7 @@ def nearest(points: Shaped[np.ndarray, "n C"], count: int) -> Int64[np.ndarray, 
 def group_means(
     rows: Float[np.ndarray, "n D"], group: Int[np.ndarray, " n"], num: int
 ) -> tuple[Float64[np.ndarray, "T D"], Int64[np.ndarray, " T"]]:
-    """Return the mean of the rows of each of `num` groups, 0 for an empty one, and the number of rows."""
+    """Return the mean of the rows of each of `num` groups (0 if empty), and the number of rows."""
     counts = np.bincount(group, minlength=num)
     sums = np.stack([np.bincount(group, column, num) for column in rows.T], axis=1)
     return sums / np.maximum(counts, 1)[:, None], counts
@@ -102,13 +102,13 @@ def associated_codes(
     rows: Int64[np.ndarray, " m"],  # candidate masks
     closeness: Closeness | None = None,  # factor of the score; its masks are indices into `rows`
 ) -> Float32[np.ndarray, "N D"]:
-    """Return the code of each Gaussian's group: that of its best-fitting mask of every view, averaged.
+    """Return the code of each Gaussian's group, averaged over its best-fitting masks of all views.
 
     Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU uses visible weights instead of a group
     rendered alone, so that hidden Gaussians do not count.
 
     A mask is chosen only if its score is above `MIN_SCORE`. Groups with masks in fewer than `MIN_VIEWS` views
-    get 0; in a scene of one view, one is enough.
+    get 0; in a scene with one view, one is enough.
     """
     contributions = inputs.contributions
     num_groups = int(group.max(initial=NONE)) + 1
@@ -154,7 +154,7 @@ def clusters(
 def merged_centres(
     features: Float32[np.ndarray, "N D"], count: int, distances: tuple[float, ...], seed: int, metric: str
 ) -> Int64[np.ndarray, "N K"]:
-    """Return each row's cluster: k-means centres, merged while their average distance is at most each one."""
+    """Return each row's cluster per distance: k-means centres, merged up to that average distance."""
     _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
     if len(used) < 2:
@@ -173,7 +173,7 @@ def density_clusters(
     """Return each point's cluster, -1 for none: dense points within the radius are connected (DBSCAN*).
 
     A point is dense if at least `least` points, including itself, are within the radius. Clusters are
-    numbered by their first point (Campello et al., PAKDD 2013).
+    numbered in the order of their first points (Campello et al., PAKDD 2013).
     """
     dense = cKDTree(points).query_ball_point(points, radius, return_length=True) >= least
     found = np.full(len(points), NONE, np.int64)

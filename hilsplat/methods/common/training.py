@@ -1,7 +1,7 @@
 """Train features of Gaussians on rendered pixels of masks, with frozen geometry, for grouping methods.
 
 A step renders random labelled pixels of one random view: a product with compositing weights that are computed
-once per view. Losses are written in torch and differentiated by it.
+once per view. Losses are written in torch and differentiated automatically.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from hilsplat.base.progress import track
 from hilsplat.methods.method import LabelledView, in_random_order
 from hilsplat.settings import MethodSettings
 
-PIXELS = 4096  # maximum per step; published: VCH also 4096, OmniSeg3D 32,768, others whole views
+PIXELS = 4096  # maximum per step; published: VCH 4096, OmniSeg3D 32,768, others whole views
 
-START_NOISE = 0.1  # standard deviation of the initial features about their common value
+START_NOISE = 0.1  # standard deviation of initial features about their common value
 
 
 class _Product(torch.autograd.Function):
-    """Product of a constant sparse matrix and features, by scipy: torch's is slower and in beta."""
+    """Product of a constant sparse matrix and features, with scipy: torch's is slower and still in beta."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, matrix: sp.csr_matrix) -> Tensor:
@@ -42,7 +42,7 @@ def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tens
 
 
 def of_seen(matrix: sp.csr_matrix) -> tuple[sp.csr_matrix, Int64[Tensor, " s"]]:
-    """Return the non-empty columns and their indices; a step's pixels show few of the Gaussians."""
+    """Return the non-empty columns and their indices; a step's pixels show only a few Gaussians."""
     columns, place = np.unique(matrix.indices, return_inverse=True)
     parts = matrix.data, place.reshape(-1), matrix.indptr
     small = sp.csr_matrix(parts, shape=(matrix.shape[0], len(columns)))
@@ -57,8 +57,8 @@ def unit(rows: Float[Tensor, "*n D"]) -> Float[Tensor, "*n D"]:
 def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
     """Return trainable initial features that are almost the same for all Gaussians.
 
-    Gaussians with equal features stay together unless a mask separates them; after independent starts, each
-    would keep some of its initial feature.
+    Gaussians with equal features stay together unless a mask separates them; with independent starts, each
+    would retain some of its initial feature.
     """
     draw = torch.Generator().manual_seed(seed)
     start = torch.randn(1, channels, generator=draw)
@@ -66,7 +66,7 @@ def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
 
 
 Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
-"""Loss of the given pixels of a view; the number is the completed share of the steps."""
+"""Loss of the given pixels of a view; the number is the share of completed steps."""
 
 
 def train(
@@ -74,10 +74,10 @@ def train(
     parameters: list[Any],  # tensors, or groups of `torch.optim.Adam`, which may have their own rate
     loss: Loss,
     settings: MethodSettings,
-    seed: int,  # of the order of views and the pixels
+    seed: int,  # for the order of views and the pixels
     pixels: int = PIXELS,  # maximum per step
 ) -> None:
-    """Minimise in place by Adam: each step uses one view, each view once before any is repeated."""
+    """Minimise in place with Adam: each step uses one view; each view is used once before any is repeated."""
     random = np.random.default_rng(seed)
     with one_torch_thread():
         optimiser = torch.optim.Adam(parameters, settings.rate, eps=1e-15)
@@ -93,7 +93,7 @@ def train(
 def segment_means(
     values: Float[Tensor, "p D"], segment: Int64[Tensor, " p"], num: int
 ) -> tuple[Float[Tensor, "m D"], Float[Tensor, " m"]]:
-    """Return the mean of the rows of each segment, 0 for an empty one, and the number of rows."""
+    """Return the mean of the rows of each segment (0 if empty), and the number of rows."""
     counts = torch.bincount(segment, minlength=num).to(values.dtype)
     sums = torch.zeros(num, values.shape[1], dtype=values.dtype).index_add(0, segment, values)
     return sums / counts.clamp(min=1)[:, None], counts

@@ -343,7 +343,7 @@ def test_a_field_resumes_from_another_one(flat_boxes):
 @pytest.mark.parametrize("update", [{"trainer": "literal"}, {"start": "langsplat"}])
 def test_settings_without_their_input_are_refused(boxes_with_latents, update):
     settings = SMALL_MASKS.model_copy(update=update)
-    with pytest.raises(SettingsError, match="don't fit together"):
+    with pytest.raises(SettingsError, match="options do not match"):
         solved_field(boxes_with_latents, "field", settings, rendered=None)
 
 

@@ -51,7 +51,7 @@ def one_view(weights, labels, size_hw):
 
 def test_views_without_labelled_pixels_are_refused():
     inputs = one_view([1, 1], np.full((2, 3), -1, np.int32), (1, 2))
-    with pytest.raises(ArtifactError, match="no train view has a pixel on a grid of 3 px"):
+    with pytest.raises(ArtifactError, match="no training view has a labelled pixel on a 3 px grid"):
         inspect.unwrap(labelled_views)(inputs, 3)
 
 
