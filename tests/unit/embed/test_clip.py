@@ -99,7 +99,7 @@ def test_vectors_of_another_width_are_refused(colour_clip):
     model = ClipModel.load(colour_clip)
     model.require_width(3, "autoencoder a")
     with pytest.raises(
-        MisalignedArtifactError, match=r"autoencoder a does not belong(.|\n)*3 numbers(.|\n)*512"
+        MisalignedArtifactError, match=r"autoencoder a does not match the CLIP(.|\n)*3 numbers(.|\n)*512"
     ):
         model.require_width(512, "autoencoder a")
 
