@@ -97,7 +97,7 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
         ),
         (
             partial(write_disc_sam, heads=4),
-            r"other outputs(.|\n)*expected .*\(any, any, 3\)(.|\n)*'P', 4\]",
+            r"unexpected or missing outputs(.|\n)*expected .*\(any, any, 3\)(.|\n)*'P', 4\]",
         ),
         (as_torch, r"PyTorch weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
         *(
