@@ -33,7 +33,7 @@ Rings = Annotated[list[Ring], Field(max_length=2000)]
 def _plain_text(text: str) -> str:
     plain = " ".join(text.split())
     if not plain or not plain.isprintable():
-        raise ValueError("it needs at least one character, and only printable ones")
+        raise ValueError("it must contain at least one character, and all must be printable")
     return plain
 
 

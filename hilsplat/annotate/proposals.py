@@ -283,8 +283,8 @@ class Clicks:
         right = (masks[:, rows, columns] == inside).sum(axis=1)
         fits = iou
         if box:
-            x, y, width, height = np.array([cv2.boundingRect(mask.astype(np.uint8)) for mask in masks]).T
-            boxes = np.stack([x, y, x + width, y + height], axis=1)
+            found = np.array([cv2.boundingRect(mask.astype(np.uint8)) for mask in masks])
+            boxes = np.concatenate([found[:, :2], found[:, :2] + found[:, 2:]], axis=1)
             fits = iou * box_iou(boxes, corners[None] + (0, 0, 1, 1))[:, 0]
         kept: dict[int, Level] = {}  # the coarsest level among masks that count as the same
         for row in np.lexsort((-fits, -right)).tolist():

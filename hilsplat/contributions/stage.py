@@ -126,7 +126,10 @@ def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> S
 
 
 class ArrayStream:
-    """A .npy file written row by row, so that the stage never keeps all of its output in memory."""
+    """A .npy file written row by row, so that the stage never keeps all of its output in memory.
+
+    `row_shape` is the shape of one row: () for an array of numbers.
+    """
 
     def __init__(self, path: Path, dtype: type, row_shape: tuple[int, ...] = ()) -> None:
         self._dtype, self._row_shape, self._rows = np.dtype(dtype), row_shape, 0

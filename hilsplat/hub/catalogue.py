@@ -55,7 +55,11 @@ class ModelRequest:
             raise DownloadError(problem, fix="write owner/name") from error
         if name.count("/") != 1:
             known = ", ".join(release.name for release in RELEASES)
-            raise DownloadError(f"unknown model {name!r}", expected=f"{known}, or owner/name on the hub")
+            raise DownloadError(
+                f"unknown model {name!r}",
+                expected=f"{known}, or owner/name on the hub",
+                fix="choose one from `hilsplat models list`, or write owner/name",
+            )
         return ModelRequest(f"{name.split('/')[1]}{ending}", name, None)
 
 
@@ -191,8 +195,8 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             plain = [*layout.described, *(path for path in layout.beside if path in listing.files)]
             files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
             # external weights keep the names under which the networks refer to them
-            endings = tuple(f"{network}{mark}data" for network in files for mark in "_.")
-            weights = [path for path in listing.files if path.startswith(endings)]
+            prefixes = tuple(f"{network}{mark}data" for network in files for mark in "_.")
+            weights = [path for path in listing.files if path.startswith(prefixes)]
             return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)
     weights = [name for name in WEIGHTS if name in listing.files][:1]
     if variant or not weights:

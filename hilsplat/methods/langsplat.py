@@ -72,9 +72,11 @@ def _all(builder: Any, scalar: Any) -> Any:
 @intrinsic
 def load(typingctx, array, index):
     """Return four consecutive numbers of a flat float32 array."""
-    return QUAD(array, types.intp), lambda context, builder, sig, args: builder.load(
-        _pointer(context, builder, sig.args[0], *args), align=4
-    )
+
+    def codegen(context, builder, sig, args):
+        return builder.load(_pointer(context, builder, sig.args[0], *args), align=4)
+
+    return QUAD(array, types.intp), codegen
 
 
 @intrinsic
@@ -91,9 +93,11 @@ def store(typingctx, array, index, value):
 @intrinsic
 def plus(typingctx, total, scale, row):
     """Return total + scale * row; each product is rounded before the addition."""
-    return QUAD(QUAD, types.float32, QUAD), lambda context, builder, sig, args: builder.fadd(
-        args[0], builder.fmul(_all(builder, args[1]), args[2])
-    )
+
+    def codegen(context, builder, sig, args):
+        return builder.fadd(args[0], builder.fmul(_all(builder, args[1]), args[2]))
+
+    return QUAD(QUAD, types.float32, QUAD), codegen
 
 
 @intrinsic

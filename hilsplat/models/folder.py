@@ -72,10 +72,10 @@ def open_model_folder(
         ModelError: the folder or some of its files are missing, or it contains another kind of model.
     """
     folder = model_path(folder)
-    fix = f", or {fix}" if fix else ""
+    alternative = f", or {fix}" if fix else ""
     if not folder.is_dir():
-        raise ModelError(f"model folder {folder} is missing", fix=OTHER_FOLDER + fix)
-    name, config = _layout_of(folder, kind, OTHER_FOLDER + fix)
+        raise ModelError(f"model folder {folder} is missing", fix=OTHER_FOLDER + alternative)
+    name, config = _layout_of(folder, kind, OTHER_FOLDER + alternative)
     layout = LAYOUTS[name]
     ending = f"_{variant}.onnx" if variant else ".onnx"
     networks, missing = {}, []
@@ -88,7 +88,7 @@ def open_model_folder(
             missing.append(f"{spec.places[-1]}{ending}")
     missing += [file for file in layout.described if not (folder / file).is_file()]
     if missing:
-        raise _incomplete(folder, name, missing, variant, fix)
+        raise _incomplete(folder, name, missing, variant, alternative)
     preprocessing = _preprocessing_of(folder / layout.preprocessing)
     weights = [path for network in networks.values() for path in external_weights(network, folder)]
     described = [folder / file for file in (*layout.described, *layout.beside) if (folder / file).is_file()]
@@ -120,7 +120,7 @@ def _layout_of(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str,
     return name, config
 
 
-def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: str) -> ModelError:
+def _incomplete(folder: Path, name: str, missing: list[str], variant: str, alternative: str) -> ModelError:
     """Return the error for a folder that lacks files: what was found instead, and how to fix it."""
     layout = LAYOUTS[name]
     found = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
@@ -142,7 +142,7 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, fix: 
         f"model folder {folder} lacks {', '.join(missing)}",
         expected=", ".join(expected),
         found=", ".join(found[:20]),
-        fix=remedy + fix,
+        fix=remedy + alternative,
     )
 
 

@@ -41,9 +41,10 @@ def may_be_int8(model: ModelFolder) -> bool:
 
 def considers_int8(precision: str, model: ModelFolder) -> bool:
     """Return whether to compare int8 with float32; log a warning if int8 is required but unavailable."""
-    if precision == "int8" and not may_be_int8(model):
+    possible = may_be_int8(model)
+    if precision == "int8" and not possible:
         logger.warning("%s runs in float32: int8 needs a pretrained model on a CPU", model.folder)
-    return precision != "fp32" and may_be_int8(model)
+    return possible and precision != "fp32"
 
 
 def int8_network(

@@ -14,9 +14,7 @@ class NetworkSpec:
     inputs: Mapping[str, Axes]  # required inputs
     outputs: Mapping[str, Axes]  # required outputs; others are ignored
     optional: tuple[str, ...] = ()  # inputs that are passed if the network has them
-    places: tuple[
-        str, ...
-    ] = ()  # possible paths without `.onnx` in the folder; the first that exists is used
+    places: tuple[str, ...] = ()  # paths in the folder, without `.onnx`; the first that exists is used
     synonyms: Mapping[str, str] = field(default_factory=dict)  # output -> alternative name in some exports
 
 

@@ -140,8 +140,12 @@ class Network:
 
 def _fits(shape: Sequence[Any], axes: Axes) -> bool:
     """Return whether a declared shape, which may be empty or contain names, is compatible with these axes."""
-    fixed = [(length, axis) for length, axis in zip(shape, axes, strict=False) if isinstance(length, int)]
-    return not shape or (len(shape) == len(axes) and all(axis in (None, length) for length, axis in fixed))
+    if not shape:
+        return True
+    return len(shape) == len(axes) and all(
+        axis is None or not isinstance(length, int) or axis == length
+        for length, axis in zip(shape, axes, strict=True)
+    )
 
 
 def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:

@@ -185,7 +185,7 @@ def whole_clip(folder: Path) -> Path | None:
 
 
 def split_clip(folder: Path) -> list[Path]:
-    """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP model's `model.onnx`, which they replace.
+    """Write `vision_model.onnx` and `text_model.onnx` beside a CLIP model's `model.onnx`, which is kept.
 
     A network above 2 GiB has its weights in a separate file (`model.onnx_data`), to which both halves refer.
 

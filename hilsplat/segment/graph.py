@@ -1,4 +1,4 @@
-"""Masks without a model: OpenCV's graph segmentation, merged into three nested scales.
+"""Masks without a model: OpenCV's graph segmentation, merged into three scales, nested by construction.
 
 It needs no SAM weights and has no notion of objects: its levels are coarse, medium and fine regions of
 uniform colour, and its scores measure the contrast with the surroundings. A region that is the same at two

@@ -210,7 +210,7 @@ class HierarchicalMasks:
         size = arrays.pop("size_hw")
         is_size = size.shape == (2,) and size.dtype.kind in "iu"
         if not is_size or size.min() < 1 or size.max() > MAX_SIDE_PX:
-            raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px")
+            raise _damaged(path, "size_hw", f"two sides from 1 to {MAX_SIDE_PX} px", str(size.tolist()))
         masks = made(HierarchicalMasks, arrays, {"size_hw": tuple(size.tolist())}, path, LIMITS)
         masks._require_whole(path)
         return masks
@@ -219,12 +219,14 @@ class HierarchicalMasks:
         """Check that offsets, runs, areas and boxes agree."""
         lengths, ends = np.diff(self.offsets), self.offsets[[0, -1]].tolist() if len(self.offsets) else []
         if len(self.offsets) != len(self) + 1 or ends != [0, len(self.runs)] or (lengths <= 0).any():
-            raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}")
+            found = f"{len(self.offsets)} from {ends}, the smallest step {lengths.min(initial=0)}"
+            raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}", found)
         height, width = self.size_hw
         if len(self):
             pixels = np.add.reduceat(self.runs.astype(np.int64), self.offsets[:-1])
             if (pixels != height * width).any():
-                raise _damaged(path, "runs", f"{height * width} pixels per mask")
+                found = f"{pixels[pixels != height * width][0]} in one"
+                raise _damaged(path, "runs", f"{height * width} pixels per mask", found)
         area_px, boxes = areas_and_boxes(self.runs, self.offsets, width)
         if not (area_px > 0).all() or not np.array_equal(area_px, self.area_px):
             raise _damaged(path, "area_px", "the areas of the masks")
@@ -232,8 +234,9 @@ class HierarchicalMasks:
             raise _damaged(path, "box_xyxy", "the boxes of the masks")
 
 
-def _damaged(path: Path, name: str, expected: str) -> ArtifactError:
-    return ArtifactError(f"{path}: array {name} cannot be right", expected=expected, fix=remake(path))
+def _damaged(path: Path, name: str, expected: str, found: str | None = None) -> ArtifactError:
+    problem = f"{path}: array {name} cannot be right"
+    return ArtifactError(problem, expected=expected, found=found, fix=remake(path))
 
 
 def region_ious(

@@ -107,9 +107,7 @@ class SamModel:
     own: Thresholds = REAL_SAM
     stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
     previewer: Network | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
-    factored: FactoredDecoder | None = (
-        None  # the equivalent, much faster decoder, if the graph can be factored
-    )
+    factored: FactoredDecoder | None = None  # the much faster decoder, if the graph can be factored
     as_exported: bool = True  # encoder or decoder run as exported, which takes more memory
 
     def __init__(self, model: ModelFolder) -> None:
@@ -428,7 +426,9 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return each pixel's first low-resolution pixel along one axis, and the weights of it and later ones.
+    """Return the first low-resolution pixel that contributes to each pixel, and its and later ones' weights.
+
+    Both are along one axis.
 
     The weights combine SamProcessor's steps: bilinear from `low` to the padded input, cropping to the resized
     image, bilinear to the original size.

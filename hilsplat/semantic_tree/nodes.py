@@ -178,9 +178,9 @@ def nearest_gaussians(means: Float[np.ndarray, "N 3"], threads: int) -> Int64[np
 
 
 def without_strays(
-    node_of_gaussian: Int32[np.ndarray, " N"],
+    node_of_gaussian: Int32[np.ndarray, " N"],  # -1 for none
     nearest: Int64[np.ndarray, "N K"],
-    total_mass: Float64[np.ndarray, " N"],
+    total_mass: Float64[np.ndarray, " N"],  # visible weight over all views, px
 ) -> Int32[np.ndarray, " N"]:
     """Return the nodes without stray pieces: Gaussians covered by an object's masks but behind or beside it.
 

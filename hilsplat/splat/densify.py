@@ -7,7 +7,8 @@ length averaged over the steps in which the Gaussian was drawn.
 
 3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024; `strategy: mcmc`) moves transparent (dead) Gaussians
 onto opaque ones, increases the number by a fixed share up to the cap, and lets noise move transparent
-Gaussians. Two regularisers make unneeded Gaussians transparent and small. "Paper" below is that paper.
+Gaussians. Two regularisers make unneeded Gaussians transparent and small.
+"Paper" below means Kheradmand et al.
 """
 
 from dataclasses import dataclass
@@ -182,7 +183,7 @@ def add_noise(
     adam: Adam,
     settings: GaussiansSettings,
     rate_of_means: float,
-    extent: float,
+    extent: float,  # radius of the cameras, scene units
     generator: np.random.Generator,
     threads: int = 1,
 ) -> None:

@@ -68,14 +68,16 @@ class FileChanges:
         Raises:
             StaleSceneError: a part was rewritten before or during the read.
         """
-        for is_after in (False, True):
-            if changed := sorted(path.name for path in self.changed() if not parts or path in parts):
-                raise StaleSceneError(
-                    f"{', '.join(changed)} of {scene} changed on the disk since the page was loaded",
-                    fix="reload the page",
-                )
-            if not is_after:
-                yield
+        self._require_unchanged(scene, parts)
+        yield
+        self._require_unchanged(scene, parts)
+
+    def _require_unchanged(self, scene: str, parts: tuple[Path, ...]) -> None:
+        if changed := sorted(path.name for path in self.changed() if not parts or path in parts):
+            raise StaleSceneError(
+                f"{', '.join(changed)} of {scene} changed on the disk since the page was loaded",
+                fix="reload the page",
+            )
 
 
 def _state(path: Path) -> State:

@@ -1,4 +1,4 @@
-"""A notebook with the viewer in a frame: to the browser another site, so the frame gets no cookie."""
+"""The viewer in a frame of a notebook. For the browser these are two sites, so the frame gets no cookie."""
 
 import threading
 from functools import partial

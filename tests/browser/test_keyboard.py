@@ -40,12 +40,17 @@ def walk(page, desk, tmp_path) -> None:
     tab_to(page, "#answers button")
     press(page, "Enter", "u")  # the handle is chosen, then the mug that it is part of
     press(page, "n")
-    page.keyboard.type("Souvenir")
+    page.keyboard.type("Souvenir <b")
     press(page, "Enter")
-    page.get_by_text("Named “Souvenir”").wait_for()
+    page.get_by_text("Named “Souvenir <b”").wait_for()
     mug = page.locator("#overlay path.chosen").get_attribute("data-node")
     (names,) = read_json(desk / "names.json")["trees"].values()
-    assert names == {mug: "Souvenir"}
+    assert names == {mug: "Souvenir <b"}
+    tab_to(page, "#text")
+    press(page, "Control+a")
+    page.keyboard.type("souvenir <B")
+    press(page, "Enter")
+    page.locator("#answers").get_by_text("Souvenir <b").wait_for()  # as text, not as markup
     tab_to(page, "#save summary")
     press(page, "Enter")
     tab_to(page, "[data-save=boxes]")
@@ -53,6 +58,9 @@ def walk(page, desk, tmp_path) -> None:
         press(page, "Enter")
     started.value.save_as(tmp_path / "boxes.json")
     assert read_json(tmp_path / "boxes.json")
+    tab_to(page, "#answers button")
+    press(page, "Enter", "n", "Control+a", "Delete", "Enter")
+    page.get_by_text("The name is taken away.").wait_for()
 
 
 def test_naming_drawing_and_saving_in_the_annotator(opened, desk, tmp_path):

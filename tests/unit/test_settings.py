@@ -11,6 +11,8 @@ from snakemake.utils import update_config
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.configuration import SECTIONS, config_schema, knob_table, parse_run, parse_section, read_config
+from hilsplat.methods.registry import METHODS, OURS
+from hilsplat.settings import MethodSettings
 
 
 def load(project: Path, name: str) -> dict:
@@ -160,3 +162,8 @@ def test_the_paper_configuration_holds_the_papers_numbers(project: Path) -> None
 def test_a_single_name_is_read_as_a_list() -> None:
     run = parse_run({"only": "desk", "groups": "photos"})
     assert (run.only, run.groups) == (("desk",), ("photos",))
+
+
+def test_only_our_solver_and_plain_averages_are_independent_of_the_seed() -> None:
+    fixed = {name for name in (OURS, *METHODS) if not MethodSettings(name=name).is_random}
+    assert fixed == {"hilsplat", "lifted", "occam"}

@@ -1,4 +1,4 @@
-// Requests to the server. Each has the state of the scene that this page was loaded with; the server refuses any other.
+// Requests to the server. Each names the state of the scene that this page was loaded with; the server refuses any other state.
 
 import { $ } from "./elements.js";
 import { get, send } from "./http.js";

@@ -138,7 +138,7 @@ class Band:
 
     begin: int
     end: int
-    lists: tuple[Any, ...]  # base, tiles_x, tile_start, tile_end, gaussian, reach
+    lists: tuple[Any, ...]  # base, tiles_x, tile_start, tile_end, gaussian, reach (a bit per block)
 
     def over_tiles(self, work: Callable[..., Any], threads: int, *arguments: Any) -> None:
         """Call `work(begin, end, *lists, *arguments)` over ranges that cover the band's tiles, on threads."""

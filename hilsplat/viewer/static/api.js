@@ -5,9 +5,9 @@ import { get, send, streamed } from "./http.js";
 export const offline = false;
 export const texts = [], kept = [], first = "", opening = "";   // what an exported page can answer, and where its camera begins
 
-// Each request has the state of the scene that this page was loaded with; the server refuses any other.
+// Each request names the state of the scene that this page was loaded with; the server refuses any other state.
 let state = "";
-// In a notebook, the page is a frame in another site and gets no cookie, so its address has the token. Paths are
+// In a notebook, the page is a frame on another site and gets no cookie, so its address contains the token. Paths are
 // relative, because a proxy may serve the page under any path.
 const token = new URLSearchParams(location.search).has("embedded") ? new URLSearchParams(location.search).get("token") : "";
 const at = (path, of = `of=${state}`) => `${path}?${of}${token ? `&token=${token}` : ""}`;

@@ -17,7 +17,7 @@ async function answered(query) {
   for (const pane of panes) query.answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
 }
 
-// The colour of the fewest kept queries.
+// The colour that the fewest kept queries use.
 function freeColour() {
   const used = KEPT.map((_, k) => page.kept.filter((query) => query.colour === k).length);
   return used.indexOf(Math.min(...used));
@@ -32,7 +32,7 @@ export async function keep(asked) {
   return true;
 }
 
-// Kept queries in the address, or of an exported page.
+// Kept queries from the address or from an exported page.
 export async function keepFromStart() {
   const kept = api.offline ? api.kept : start.getAll("keep").map((text) => { try { return JSON.parse(text); } catch { return null; } });
   for (const asked of kept) if (asked?.text) await keep(asked);

@@ -1,4 +1,4 @@
-// Start of the page: load the scene, choose a painter for this browser, and load the present variants.
+// Start of the page: load the scene, choose a painter for this browser, and load the variants that exist.
 
 import * as api from "./api.js";
 import { Camera } from "./camera.js";

@@ -1,4 +1,4 @@
-// Server painter: JPEG frames from hilsplat's rasteriser, if WebGL is in software or missing.
+// Server painter: JPEG frames from hilsplat's rasteriser, if WebGL runs in software or is missing.
 
 import * as api from "./api.js";
 import { latest } from "./latest.js";

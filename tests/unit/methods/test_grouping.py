@@ -80,13 +80,16 @@ def test_a_step_uses_distinct_pixels_of_a_view(most, expected):
     xy = np.stack([np.arange(5)] * 2, axis=1)
     view = LabelledView(0, np.arange(1), matrix, np.zeros((5, 3), np.int32), xy)
     feature, seen = torch.zeros(5, 1, requires_grad=True), []
+    shares = []
 
     def loss(view, random, done):
         seen.append(view.xy[:, 0].tolist())
+        shares.append(done)
         return product(view.weights, feature).sum()
 
     settings = MethodSettings(name="saga", steps=20)
-    train([view], [{"params": [feature], "lr": 0.1}], loss, settings, 0, most)
+    train([view], [feature], loss, settings, 0, most)
+    assert shares == [step / 20 for step in range(20)]
     assert {len(set(pixels)) for pixels in seen} == {len(pixels) for pixels in seen} == {expected}
     assert {pixel for pixels in seen for pixel in pixels} == set(range(5))
 
