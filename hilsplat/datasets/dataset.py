@@ -14,7 +14,7 @@ class SceneReport:
     """Result of checking one scene.
 
     Attributes:
-        facts: what was read, in words and numbers: {"labelled views": 4, "texts": 21}.
+        facts: what was read, such as {"labelled views": 4, "texts": 21}.
         warnings: one sentence for each item that was reinterpreted or could not be used.
     """
 
@@ -29,7 +29,7 @@ class Dataset:
     Attributes:
         name: key in the registry, and data set in rows and paths.
         title: name as written in papers.
-        labels: "images" if their pixels are labelled, "points" if the points of a mesh or a scan are.
+        labels: "images" if image pixels are labelled, "points" if points of a mesh or scan are.
         folder: the data set's folder below `data_root`; all other paths are relative to it.
         scenes: scenes in the paper's tables.
         terms: obligations of the user under the licence, in one sentence.
@@ -37,7 +37,7 @@ class Dataset:
         required: paths that a scene needs.
         open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
         open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
-        protocols: protocols that score it (`evaluate.protocols.cards`), besides those of any labelled image.
+        protocols: protocols that score it (`evaluate.protocols.cards`), besides those for any labelled image.
         label_places: glob patterns of a scene's files that only evaluation reads.
     """
 
@@ -111,18 +111,18 @@ class Dataset:
                 f"scene {scene} of {self.title} is incomplete in {root}",
                 expected=f"also {', '.join(missing)}",
                 found=", ".join(here) or listing(root),
-                fix="unpack the whole archive again, or correct the name of the scene",
+                fix="unpack the whole archive again, or correct the scene name",
             )
 
     def _has_begun(self, root: Path) -> bool:
-        """Return whether a folder contains a required path of a known scene; any scene if none is known."""
+        """Return whether a folder has a required path of a known scene or, if none is known, any scene."""
         if not self.scenes:
             return bool(self.found(root))
         return any(
             _at(root, place).exists()
             for scene in self.scenes
             for place in self.required(scene)
-            if not place.startswith("..")  # paths outside the folder are no evidence
+            if not place.startswith("..")  # paths outside the folder do not count
         )
 
 
@@ -132,7 +132,7 @@ def _at(root: Path, place: str) -> Path:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Return the subfolders by name; none if the folder is missing."""
+    """Return the subfolders, sorted by name; empty if the folder is missing."""
     return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
 Found = TypeVar("Found")
 
 ROUNDING_PX = 1.0
-"""A label counts as a scaled copy of its image if their sides differ by rounding only."""
+"""A label counts as a scaled copy of its image if, after scaling, their sides differ by at most this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class LabelledRegion:
         boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
         level: None if the data set has no levels.
         path: texts from the whole down to this region; just its text without levels.
-        any_grey: reads all non-black pixels, for protocols that use those as truth; None if as `pixels`.
+        any_grey: reads all non-black pixels, the ground truth of some protocols; None if equal to `pixels`.
     """
 
     text: str
@@ -59,7 +59,7 @@ class LabelledRegion:
     ) -> Bool[np.ndarray, "H W"]:
         """Return the region at the label's size, or resized by nearest neighbour.
 
-        It takes the old pixel under each new pixel's corner, as public evaluators do (OpenCV's nearest).
+        Each new pixel takes the value at its top-left corner, as in public evaluators (OpenCV's nearest).
         """
         mask = self.any_grey() if any_grey and self.any_grey else self.pixels()
         if size_hw is None or mask.shape == tuple(size_hw):
@@ -67,10 +67,10 @@ class LabelledRegion:
         return cv2.resize(mask.astype(np.uint8), size_hw[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
     def boxes(self, size_hw: tuple[int, int] | None = None) -> Int[np.ndarray, "B 4"]:
-        """Return boxes with borders included; the region's own extent if none is annotated.
+        """Return the boxes, borders included; the region's own extent if no box is annotated.
 
-        At another size, each side is scaled and rounded to the pixel that contains it. A region with neither
-        pixels nor annotated boxes has none.
+        For another size, each side is scaled and rounded to the pixel that contains it. A region with neither
+        pixels nor annotated boxes has no boxes.
         """
         boxes = self.boxes_xyxy
         if boxes is None:
@@ -115,13 +115,13 @@ class LabelledScene:
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> None:
-        """Raise SceneError, with a list, if labelled views have no pose."""
+        """Raise SceneError, listing the labelled views without a pose, if there are any."""
         missing = [view for view in self.views if view not in names]
         if missing:
             shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
             raise SceneError(
                 f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
-                expected=f"all {len(self.views)} labelled views among the posed ones",
+                expected=f"a pose for each of the {len(self.views)} labelled views",
                 found=f"{len(names)} posed views, {', '.join(shown)}",
                 fix="use the poses that come with the data set, or register those images",
             )
@@ -136,7 +136,7 @@ class LabelledScene:
             if not region.mask().any()
         ]
         if empty:
-            warnings.append(f"regions without a pixel: {'; '.join(empty)}")
+            warnings.append(f"regions without pixels: {'; '.join(empty)}")
         facts: dict[str, object] = {
             "images": len(self.images),
             "labelled views": len(self.views),
@@ -154,7 +154,7 @@ class LabelledScene:
 
 
 def images_by_view(folder: Path) -> dict[str, Path]:
-    """Return the images of a folder by view, sorted by stem; raise SceneError if none, or two of one stem."""
+    """Return a folder's images by view, sorted by stem; raise SceneError if it has none or a stem repeats."""
     files = list_images(folder) if folder.is_dir() else []
     if not files:
         raise SceneError(
@@ -169,7 +169,7 @@ def images_by_view(folder: Path) -> dict[str, Path]:
             raise SceneError(
                 f"two images in {folder} differ only in their suffix",
                 found=f"{images[view].name}, {path.name}",
-                fix="remove one of them: labels are matched by the name without suffix",
+                fix="remove one of them: labels are matched by file name without the suffix",
             )
         images[view] = path
     return images
@@ -193,7 +193,7 @@ def mask_region(
     Args:
         foreground: lowest grey value of the region.
         share: as in `check_label_size`.
-        least_grey: lowest value for protocols that use any grey as truth, if that differs.
+        least_grey: lowest value for protocols whose ground truth is any grey, if it differs.
     """
     size_hw = image_size_hw(path)
     warnings += check_label_size(f"mask {path}", size_hw, image_hw, share)
@@ -203,7 +203,7 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels of a grey mask file with values of at least `least`; raise ImageError if damaged."""
+    """Return which pixels of a grey mask file are at least `least`; raise ImageError if it is damaged."""
     return _read("mask", path, lambda image: np.asarray(image.convert("L")) >= least)
 
 
@@ -222,9 +222,10 @@ def _read(kind: str, path: Path, read: Callable[[Image.Image], Found]) -> Found:
 def check_label_size(
     where: str, label_hw: tuple[int, int], image_hw: tuple[int, int], share: float = 0.0
 ) -> list[str]:
-    """Compare the size of a label, described by `where`, with that of its image; report if it is resized.
+    """Compare a label's size with its image's; return a sentence, starting with `where`, if it is resized.
 
-    `share` is the tolerated height difference at equal widths, beyond rounding, as a share of the height.
+    `share` is the height difference that is tolerated at equal widths, as a share of the height; rounding
+    is always tolerated.
 
     Raises:
         SceneError: one is not a scaled copy of the other.
@@ -251,16 +252,16 @@ def require_images(labelled: Iterable[str], images: Mapping[str, Path]) -> None:
     if orphans:
         raise SceneError(
             f"labelled views have no image: {', '.join(orphans)}",
-            expected=f"images of that name in {next(iter(images.values())).parent}",
+            expected=f"images with these names in {next(iter(images.values())).parent}",
             found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
-            fix="unpack the images again; those of another release are numbered differently",
+            fix="unpack the images again; other releases number them differently",
         )
 
 
 def unlisted_texts(found: Iterable[str], published: Collection[str]) -> list[str]:
     """Return a sentence naming texts that a non-empty published list lacks, if any."""
     new = sorted(set(found) - set(published))
-    return [f"texts that the published list lacks: {', '.join(new)}"] if published and new else []
+    return [f"texts missing from the published list: {', '.join(new)}"] if published and new else []
 
 
 def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> list[str]:
@@ -273,7 +274,7 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
     """Return the posed views of a scene folder by view name, sorted by stem.
 
     Raises:
-        SceneError: the folder has no poses, they cannot be read, or their lenses are distorted, so that
+        SceneError: the folder has no poses, they cannot be read, or the lenses have distortion, so that
             labels of undistorted images would not fit.
     """
     from hilsplat.scene.importers.known_views import read_source
@@ -289,10 +290,10 @@ def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:
     bent = sorted({view.camera.model.name for view in views if not view.camera.is_undistorted()})
     if bent:
         raise SceneError(
-            f"the cameras of {known.files[0]} are distorted",
-            expected="PINHOLE or SIMPLE_PINHOLE, the model of the undistorted images",
+            f"the cameras in {known.files[0]} have lens distortion",
+            expected="PINHOLE or SIMPLE_PINHOLE, as for undistorted images",
             found=", ".join(bent),
-            fix="take the model of the undistorted images, or undistort images and labels",
+            fix="use the COLMAP model of the undistorted images, or undistort images and labels",
         )
     by_stem = {Path(view.name).stem: view for view in views}
     return {view_name(stem): by_stem[stem] for stem in sorted(by_stem)}

@@ -21,5 +21,5 @@ PROMPTS: dict[str, dict[str, list[str]]] = _LISTS["prompts"]
 """Prompts by data set and scene, sorted."""
 
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
-"""Number of (frame, category) pairs of LERF-OVS, derived: the smallest counts for which all published
-localization figures are whole fractions."""
+"""Number of (frame, category) pairs of LERF-OVS, derived: the smallest counts for which whole numbers of hits
+give all published localization figures."""

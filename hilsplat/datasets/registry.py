@@ -1,6 +1,6 @@
 """The supported data sets by name, and the output of `hilsplat datasets`.
 
-A reader's module describes its data set in a constant (see `dataset.Dataset`); one line here adds it.
+A reader's module describes its data set in a constant (see `dataset.Dataset`); one line here registers it.
 """
 
 from collections.abc import Collection, Sequence
@@ -33,7 +33,7 @@ DATASETS: Plugins[Dataset] = Plugins(
 
 
 def readers_of(labels: Collection[str]) -> tuple[str, ...]:
-    """Return the places of the readers for labels such as "lerf_ovs/figurines" (see `base.plugins`)."""
+    """Return the import paths of the readers for labels such as "lerf_ovs/figurines" (`base.plugins`)."""
     names = {name.partition("/")[0] for name in labels}
     return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
 
@@ -46,7 +46,7 @@ def open_labelled(name: str, data_root: Path) -> "LabelledScene":
     dataset = dataset_of(name.partition("/")[0])
     if dataset.labels != "images":
         raise SceneError(
-            f"{name!r} names no scene with labels on images",
+            f"{name!r} is not a scene with labelled images",
             expected="<data set>/<scene>, such as lerf_ovs/figurines",
             found=f"a data set with labels on {dataset.labels}",
             fix=LISTED,
@@ -61,7 +61,7 @@ def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
     dataset = dataset_of(dataset_name)
     if not scene:
         expected = "<data set>/<scene>, such as scannet/scene0000_00"
-        raise SceneError(f"{name!r} names no scene", expected=expected, fix=LISTED)
+        raise SceneError(f"{name!r} does not contain a scene name", expected=expected, fix=LISTED)
     return dataset.open(dataset.locate(data_root), scene)
 
 

@@ -12,7 +12,7 @@ from hilsplat.datasets.registry import DATASETS, dataset_of, open_labels
 from hilsplat.scene.sheet import DATA_PREFIX
 
 LABELS_ON = {"lerf_ovs": "hi_lerf", "3d_ovs": "hi_3dovs"}
-"""Data set -> another one that also labels its images, with levels."""
+"""Data set -> the data set that also labels its images, with levels."""
 
 LEVELLED = tuple(LABELS_ON.values())
 
@@ -43,7 +43,7 @@ def absence(source: str, data_root: str) -> str | None:
 
 
 def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) -> list[str]:
-    """Return scenes on disk that are in no row's source, for data sets without a list of scenes (Waymo).
+    """Return scenes on disk that no row has as its source, for data sets without a list of scenes (Waymo).
 
     Such a data set has the name of its group; `data_root` is empty if not set.
     """
@@ -58,9 +58,9 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Return labels to score a row's scene (`dataset/scene`) against, as `data set/scene`, its own first.
+    """Return the labels, as `data set/scene`, that score a row's scene (`dataset/scene`), its own first.
 
-    Without `data_root`, the working folder may contain own annotations.
+    Without `data_root`, your own annotations may be in the working folder.
     """
     drawn = (Path(data_root).expanduser() / "annotated" / row).glob("*.json")
     own = (f"annotated/{row}",) if any(drawn) else ()
@@ -81,7 +81,7 @@ def _folder(dataset: Dataset, data_root: str) -> Path:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Return the files of `data set/scene` that only evaluation reads, sorted; edits rerun nothing else."""
+    """Return the files of `data set/scene`, sorted, that only evaluation reads; edits rerun only that."""
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
     root = _folder(dataset, data_root)
@@ -90,7 +90,7 @@ def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
 
 
 def image_files(source: str, data_root: str) -> tuple[Path, ...]:
-    """Return the files listed by the data set that contain images and poses of an exported scene."""
+    """Return the data set's files that contain images and poses of an exported scene."""
     place = published(source)
     assert place is not None, source
     name, scene = place
@@ -113,7 +113,7 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     """Write images and poses of `data set/scene` to a folder for `poses`; return the number of images.
 
     The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (optionally
-    frozen) positions of Gaussians. Lidar points aren't, because the sky and distant objects have none.
+    frozen) positions of Gaussians. Lidar points are not, because the sky and distant objects have none.
 
     Raises:
         SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.
@@ -125,7 +125,7 @@ def export_images(name: str, data_root: Path, out: Path) -> int:
     if not isinstance(scene, PointScene):
         raise SceneError(
             f"{name} needs no export: its images are already in a folder",
-            fix="name the folder as source in the scene sheet",
+            fix="enter the folder as the source in the scene sheet",
         )
     meshes = [points for points in scene.truth.values() if points.faces is not None]
     write_posed_images(out, scene.images, meshes[0].xyz if meshes else None)

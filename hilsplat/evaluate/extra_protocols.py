@@ -19,7 +19,8 @@ STAND_INS: Mapping[str, tuple[str, ...]] = {
     ),
     "street": ("waymo/segmentation",),
 }
-"""Kind of synthetic scene -> protocols that it substitutes for, besides LERF-OVS and the level protocols."""
+"""Kind of synthetic scene -> protocols of the benchmarks that it substitutes for, besides LERF-OVS and the
+level protocols."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,12 @@ class Extra:
 
     @staticmethod
     def of_world(kind: str) -> "Extra":
-        """Return the protocols of a synthetic scene; none for kind "", a SceneError for an unknown kind."""
+        """Return the protocols of a synthetic scene, none for kind ""; raise SceneError for unknown kinds."""
         if kind and kind not in STAND_INS:
             raise SceneError(
                 f"unknown kind of synthetic scene: {kind!r}",
                 expected=f"one of {', '.join(STAND_INS)}",
-                fix="correct the kind, or leave it out",
+                fix="correct the kind, or omit it",
             )
         return Extra.of(STAND_INS.get(kind, ()), Level.WHOLE)
 

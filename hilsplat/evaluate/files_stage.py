@@ -65,15 +65,15 @@ def run_evaluate_files(
 
     Masks without a level are scored under the text protocols, masks with levels under
     `hierarchy/level-given`, point labels under the point protocols for which there is a file. A text without
-    a mask counts as 0, except under the protocol that omits it.
+    a mask counts as 0, except under the protocol that omits such texts.
 
     Args:
         out: `scores.csv`; `instances.npz` is written beside it.
         method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
-        truth: alternatively, the truth folder of a synthetic scene, with its posed `scene` (which defines the
+        truth: alternatively, the ground truth of a synthetic scene, with its posed `scene` (which defines the
             test views), `kind` as in `run_evaluate`, and data set and name for the rows.
-        min_region_px: smaller true regions of a synthetic scene are not scored; None for the default setting.
+        min_region_px: smaller regions of a synthetic scene are not scored; None for the default setting.
 
     Raises:
         ArtifactError: a view has no predictions, or a file cannot be read.
@@ -82,7 +82,7 @@ def run_evaluate_files(
     """
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
         raise SettingsError(
-            "it is unclear what to score against",
+            "predictions must be scored against exactly one set of labels",
             expected="--labels of a data set, or --truth and --scene of a synthetic scene",
         )
     with stage_log("evaluate-files", str(predictions)) as counts:
@@ -126,7 +126,7 @@ def run_evaluate_files(
 def _mask_rows(
     predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], extra: Extra
 ) -> Iterator[tuple[str, Measured]]:
-    """Yield the rows of all views; all are read before scoring, so that a missing one is reported at once."""
+    """Yield the rows of all views, whose files are read first, so that a missing one is reported at once."""
     found = {view: read_view_masks(predictions, view) for view in views}
     truths = {view: load() for view, load in views.items()}
     levels = {level for masks in found.values() for level, _ in masks}
@@ -159,20 +159,20 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
                 f"{where}: the labels have no text {text!r}" + (f" at level {level}" if level else ""),
                 expected=f"one of {', '.join(known)}",
                 found=text,
-                fix=f"rename it {near[0]!r}" if near else "remove it, or correct its name",
+                fix=f"rename it to {near[0]!r}" if near else "remove it, or correct its name",
             )
         shape = next((query.truth.shape for query in (*truth.categories, *truth.absent)), mask.shape)
         if mask.shape != shape:
             raise MisalignedArtifactError(
-                f"{where}: the mask has another size than the labels",
+                f"{where}: the mask and the labels differ in size",
                 expected=f"{shape[0]} x {shape[1]} (height x width)",
                 found=f"{mask.shape[0]} x {mask.shape[1]}",
-                fix="resize the prediction to the labels by the nearest pixel",
+                fix="resize the prediction to the size of the labels by nearest neighbour",
             )
 
 
 def _flat_rows(masks: Masks, truth: ViewTruth, extra: Extra) -> Iterator[Measured]:
-    """Yield rows of masks without a level, for all texts under LERF's protocols, then the data set's own."""
+    """Yield rows of masks without a level, under LERF's protocols for all texts, then the data set's own."""
     for query in truth.categories:
         for card in (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN):
             yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
@@ -251,7 +251,7 @@ def _point_rows(
         own, shared = (predictions / f"{each}.txt" for each in (card.classes, labelling))
         path = own if own.is_file() else shared
         if not path.is_file():
-            logger.info("%s: not scored, neither %s nor %s exists", card.name, own.name, shared.name)
+            logger.info("%s: not scored: neither %s nor %s exists", card.name, own.name, shared.name)
             continue
         predicted = classes.labels(read_point_classes(path, len(points)))
         yield from measure_points(card, METHOD, points.labels(classes), predicted, classes, "files")
@@ -260,7 +260,7 @@ def _point_rows(
         raise ArtifactError(
             f"{predictions} has no point labels",
             expected=" or ".join(f"{each}.txt" for each in _files_of(extra.points)),
-            fix="write one class id per point and line",
+            fix="write one class id per line, one line per point",
         )
 
 
@@ -278,7 +278,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
     place, packed = Path(folder) / stem, Path(folder) / f"{stem}.npz"
     if packed.is_file() and place.is_dir():
         raise ArtifactError(
-            f"view {stem} has predictions twice",
+            f"view {stem} has two sets of predictions",
             expected=f"{packed.name} or {place.name}/",
             found="both",
             fix="remove one of them",
@@ -289,7 +289,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
         raise ArtifactError(
             f"view {stem} has no predictions",
             expected=f"{place}/<text>.png, or {packed.name}",
-            fix="write them, or an empty folder if nothing was found",
+            fix="write them, or create an empty folder if nothing was found",
         )
     masks = {}
     for path in sorted(place.rglob("*.png")):
@@ -328,7 +328,7 @@ def read_point_instances(
 ) -> tuple[Bool[np.ndarray, "M P"], Int64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
     """Read masks, class ids and confidences in ScanNet's format: lines of mask file, class id and confidence.
 
-    A mask file, relative to the folder of `path`, has one integer per point, not 0 in the instance.
+    A mask file, relative to the folder of `path`, has one integer per point, non-zero inside the instance.
 
     Raises:
         ArtifactError: a file is missing or malformed.
@@ -381,7 +381,7 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
     mask = array > FOREGROUND
     if not mask.any() and array.any():
         raise ArtifactError(
-            f"mask {where} has values, but none is foreground",
+            f"mask {where} has non-zero values, but none is foreground",
             expected=f"0 and 255: values above {FOREGROUND} are foreground",
             found=f"values up to {array.max()}",
             fix="multiply the mask by 255, or store it as bool in a .npz",

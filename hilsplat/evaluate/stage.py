@@ -37,7 +37,7 @@ TIMED_TEXTS = 3
 
 
 Annotations = LabelledScene | PointScene | Path
-"""Labels of a published data set, or the truth folder of a synthetic scene."""
+"""Labels of a published data set, or the ground-truth folder of a synthetic scene."""
 
 
 def run_evaluate(
@@ -58,12 +58,12 @@ def run_evaluate(
 
     With the labels of a published data set, every labelled view is scored, even if it was used for training,
     because most benchmarks train on all views. `times.csv` (seconds per query) and `instances.npz` are
-    written beside `scores.csv`, which holds only the header without truth and labels.
+    written beside `scores.csv`, which contains only the header if there are neither truth nor labels.
 
     Args:
         parts: the finished scene; its test views were held out from all earlier stages.
-        dataset: data set in every row, as are `scene` and `variant`.
-        truth: truth folder of a synthetic scene.
+        dataset: data set in every row, like `scene` and `variant`.
+        truth: ground-truth folder of a synthetic scene.
         kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Extra.of_world`).
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
@@ -125,7 +125,7 @@ def run_evaluate(
 def known_truths(
     known: Annotations, posed: Scene, settings: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """Return the true regions by view; empty for labels on points."""
+    """Return the ground-truth regions by view; empty for labels on points."""
     if isinstance(known, PointScene):
         return {}
     if isinstance(known, LabelledScene):
@@ -159,7 +159,7 @@ def point_rows(
         error = camera_error(true, found, transform)
         if error > MAX_CAMERA_ERROR_M:
             logger.warning(
-                "%s: cameras are %.2f m from the true ones (median); labelled points miss the Gaussians",
+                "%s: cameras are %.2f m from the ground truth (median); point scores are meaningless",
                 answers.scene.name,
                 error,
             )

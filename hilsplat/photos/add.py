@@ -155,16 +155,16 @@ def add_scene(
     """Append your own photographs to the sheet as scene `photos/<name>`; a missing sheet is created.
 
     A folder is used in place: the sheet refers to it, with a relative path if it is inside the project.
-    Frames of a video and the contents of an archive are written to `photos/<name>/` in the project. Of the
+    Frames of a video and the contents of an archive are written to `photos/<name>/` in the project. For the
     last four arguments, None uses what is found in the folder, and `NO_POSES` ("none") ignores it.
 
     Args:
         photos: folder of photographs or of videos, a video, or a zip archive of photographs.
-        frames: maximum number of frames taken from videos.
-        poses: a COLMAP model or transforms file; instead of it, structure from motion.
-        gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates; instead
-            of it, a fit.
-        features: LangSplat's folder of masks and vectors; instead of it, SAM and CLIP.
+        frames: maximum number of frames extracted from videos.
+        poses: a COLMAP model or transforms file, used instead of structure from motion.
+        gaussians: a 3DGS PLY in the coordinates of the poses or in nerfstudio's training coordinates, used
+            instead of a fit.
+        features: LangSplat's folder of masks and vectors, used instead of SAM and CLIP.
         labels: folder of label files of LERF-OVS or `hilsplat annotate`, used only for evaluation and copied
             to `annotated/photos/<name>/` in the project.
 
@@ -175,7 +175,7 @@ def add_scene(
     sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
     if problem := name_problem(name):
         raise SceneError(
-            f"{name!r} cannot be the name of a scene",
+            f"{name!r} is not a valid scene name",
             expected=NAME_RULE,
             found=problem,
             fix="choose another name, such as my-desk_2",
@@ -236,7 +236,7 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
     notes = [f"poses: {', '.join(map(str, known.files)) if known else 'structure from motion'}"]
     notes += [f"{what}: {path}" for what, path in extra.items() if what != "poses"]
     if (ply := extra.get("gaussians")) and (dataparser := dataparser_of(ply, folder)):
-        notes.append(f"coordinates of the Gaussians: nerfstudio's, by {dataparser}")
+        notes.append(f"coordinates of the Gaussians: nerfstudio's, from {dataparser}")
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
         notes.append(f"not read, because a pickle can run code: {', '.join(skipped)}")
     return notes
@@ -268,7 +268,7 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
             f"{report.folder} has too few photographs",
             expected=f"at least {MIN_PHOTOS} (20 or more are better)",
             found="; ".join(found),
-            fix="add photographs of the same scene; of a video, film longer and walk around it",
+            fix="add photographs of the same scene, or record a longer video while walking around it",
         )
 
 
@@ -281,7 +281,7 @@ def _append(sheet: Path, name: str, photos: Path, extra: dict[str, Path]) -> Non
     }
     for place in places.values():
         if not place.isprintable() or place.startswith("world:"):
-            problem = f"the path {place!r} cannot be written in the scene sheet"
+            problem = f"the path {place!r} cannot be written to the scene sheet"
             raise SceneError(problem, fix="rename the folder")
     values = {"dataset": PHOTOS, "scene": name, "group": PHOTOS, "unit": "arbitrary", **places}
     if sheet.exists():

@@ -1,4 +1,4 @@
-"""Checks of a set of photographs for likely problems, before time is spent on it.
+"""Checks of a set of photographs for likely problems, before it is processed.
 
 Thresholds were chosen on three sets of real photographs that all register, on blurred, darkened and
 over-exposed copies of them, and on pictures of a camera that only rotates (values: docs/scene.md).
@@ -25,7 +25,7 @@ photographs blurred by a Gaussian of 4 px (of 800) 0.58 to 0.77."""
 REBLUR_PX = 11
 
 DARK_LEVEL = 64
-"""A photograph is dark if 95 % of its pixels are below this level; a lit object on black is not."""
+"""A photograph is dark if 95 % of its pixels are below this level; a lit object on black is not dark."""
 
 WHITE_LEVEL = 250
 WHITE_SHARE = 0.5
@@ -83,7 +83,7 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
     dark = [photo.name for photo in photos if np.percentile(photo.grey, 95) < DARK_LEVEL]
     white = [photo.name for photo in photos if (photo.grey >= WHITE_LEVEL).mean() > WHITE_SHARE]
     for names, advice in (
-        (blurred, "blurred: leave them out, or take them again with more light, a still hand and in focus"),
+        (blurred, "blurred: leave them out, or retake them with more light, a steady hand and correct focus"),
         (dark, "too dark: take them again with more light"),
         (white, "more than half white: take them again with less exposure, unless the background is white"),
     ):
@@ -140,7 +140,7 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     if turned >= MIN_TURN_PAIRS and turned > 2 * moved:
         doubts.append(
             f"the camera seems to turn in place: a rotation explains {turned} of the {turned + moved} "
-            "pairs of neighbours that could be compared; depth needs different places: walk around the "
+            "pairs of neighbours that could be compared; depth requires different positions: walk around the "
             "scene, or step aside between photographs"
         )
     return doubts

@@ -37,7 +37,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
     """Yield the source folder of photographs itself, or `target`, made from videos or an archive.
 
     The source is a folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most
-    `frames` frames are taken from videos. If the block ends with an error, a folder that was made is removed.
+    `frames` frames are taken from videos. If the block raises an error, the converted folder is removed.
 
     Raises:
         SceneError: the source cannot be used, or the target exists and was made from other files.
@@ -45,7 +45,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
     source = Path(source)
     if not source.exists():
         raise SceneError(
-            f"{source} is missing", fix="give a folder of photographs, a video, or a zip of photographs"
+            f"{source} is missing", fix="pass a folder of photographs, a video, or a zip of photographs"
         )
     make: Callable[[Path], list[str]]
     if videos := _videos_of(source):
@@ -70,9 +70,9 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
 
     else:
         raise SceneError(
-            f"{source} is a file of an unknown kind",
+            f"{source} is a file of an unsupported kind",
             expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
-            fix="give the folder that holds the photographs",
+            fix="pass the folder that contains the photographs",
         )
     files = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in videos or [source]]
     mark = {"files": files, "frames": frames}
@@ -81,7 +81,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
             notes = make(folder)
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} already exists, from the same files"]  # an earlier run was killed later
+        notes = [f"{target} already exists, from the same files"]  # an earlier run was killed afterwards
     else:
         fix = "choose another name for the scene, or move that folder away"
         raise SceneError(f"{target} already exists", fix=fix)
@@ -128,12 +128,12 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
         raise SceneError(
             f"archive {archive} cannot be unpacked: {error}",
             found=f"a file of {archive.stat().st_size} bytes" if archive.is_file() else "no file",
-            fix="copy it again, or unpack it yourself and give the folder",
+            fix="copy it again, or unpack it yourself and pass the folder",
         ) from error
 
 
 def _is_wanted(name: PurePosixPath) -> bool:
-    """Return whether an entry is an image or may contain poses; files that operating systems add are not."""
+    """Return whether an entry is an image or may contain poses, and was not added by an operating system."""
     if any(part.startswith(".") or part == "__MACOSX" for part in name.parts):
         return False
     return name.suffix.lower() in IMAGE_SUFFIXES | POSE_SUFFIXES or name.name == "metadata"
@@ -141,7 +141,7 @@ def _is_wanted(name: PurePosixPath) -> bool:
 
 def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
     """Refuse an archive that is too large or could write outside the folder."""
-    fix = "unpack it yourself with a program that you trust, look at it, and give the folder"
+    fix = "unpack it yourself with a program that you trust, inspect the files, and pass the folder"
     total_gib = sum(entry.file_size for entry in entries) / 2**30
     if len(entries) > MAX_FILES or total_gib > MAX_TOTAL_GIB:
         raise SceneError(
@@ -154,13 +154,13 @@ def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
     for entry in entries:
         name = PurePosixPath(entry.filename)
         if name.is_absolute() or ".." in name.parts or "\\" in entry.filename:
-            problem = "leads out of the archive's folder"
+            problem = "is outside the archive's folder"
         elif stat.S_ISLNK(entry.external_attr >> 16):
             problem = "is a link"
         elif entry.flag_bits & 1:
             problem = "is encrypted"
         elif str(name) in names:
-            problem = "is there twice"
+            problem = "occurs twice"
         else:
             names.add(str(name))
             continue

@@ -27,7 +27,7 @@ CANDIDATES_PER_FRAME = 4
 
 MIN_STEP = 0.01
 """Displacement between two frames, as a share of the diagonal, below which they count as the same: about 0.7
-degrees of a phone's 70. The noise of a static camera is below 0.001."""
+of a phone's 70 degrees. The noise of a static camera is below 0.001."""
 
 GREY_SIDE_PX = 480
 SHARPNESS_SIDE_PX = 960
@@ -146,7 +146,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     except (av.error.FFmpegError, OSError) as error:
         raise SceneError(
             f"video {video} cannot be read: {error.strerror or error}",
-            expected="an intact file with a video stream; an .mp4 or .mov that was cut has lost its index",
+            expected="an intact file with a video stream; a truncated .mp4 or .mov has lost its index",
             found=f"a file of {video.stat().st_size} bytes" if video.is_file() else "no file",
             fix="copy it again from the camera, or convert it to H.264 in an .mp4",
         ) from error
@@ -155,7 +155,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
             raise SceneError(
                 f"{video} has no video stream",
                 found=", ".join(stream.type for stream in container.streams) or "no stream",
-                fix="give the file of the video",
+                fix="pass the video file",
             )
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
@@ -163,7 +163,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
 
 
 def _stated_seconds(container: InputContainer, stream: VideoStream) -> float | None:
-    """Return the duration according to the file; None if it is missing, as in recordings by browsers."""
+    """Return the duration according to the file; None if it is missing, as in browser recordings."""
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     return container.duration / av.time_base if container.duration is not None else None
@@ -246,8 +246,8 @@ def _write_frames(video: Path, name_of_frame: dict[int, str], folder: Path) -> N
                 break
     if missing:
         raise SceneError(
-            f"video {video} decoded differently the second time: {len(missing)} frames are gone",
-            fix="check that the file is not being written, and try again",
+            f"video {video} decoded differently the second time: {len(missing)} frames are missing",
+            fix="check that no program is writing to the file, and try again",
         )
 
 
@@ -259,8 +259,8 @@ def upright(pixels: UInt8[np.ndarray, "H W 3"], rotation_deg: int) -> UInt8[np.n
 def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
     """Select the sharpest candidate of each of at most `count` equal sections of the camera path.
 
-    Of two selected frames less than `MIN_STEP` apart, only the sharper one is kept. This also removes the
-    jitter of a hand at rest, whose path has length although the camera stays in place.
+    Of two selected frames less than `MIN_STEP` apart, only the sharper one is kept. This also removes hand
+    jitter, which adds path length although the camera stays in place.
     """
     kept: list[Frame] = []
     if not candidates:
@@ -305,7 +305,7 @@ def _step(one: Frame, other: Frame) -> float:
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for steep edges.
 
-    It can compare pictures of the same place only, because it depends on the content.
+    It can only compare pictures of the same place, because it depends on the content.
     """
     return float(cv2.Laplacian(grey, cv2.CV_32F, ksize=3).var())
 
@@ -313,9 +313,9 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
 def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"]) -> float:
     """Return the upper quartile of corner displacements between two pictures, as a share of the diagonal.
 
-    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that miss their start by a
-    pixel are ignored. Unlike the median, the upper quartile captures an object on a turntable before a static
-    background. The result is 0 for pictures with too few corners, and `LOST` if too few can be tracked.
+    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that return a pixel or more
+    off are ignored. Unlike the median, the upper quartile captures an object on a turntable in front of a
+    static background. The result is 0 for pictures with too few corners, `LOST` if too few can be tracked.
     """
     corners = cv2.goodFeaturesToTrack(one, NUM_CORNERS, qualityLevel=0.01, minDistance=7)
     if corners is None or len(corners) < MIN_FOLLOWED:

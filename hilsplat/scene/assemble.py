@@ -22,7 +22,7 @@ MIN_VIEWS_FOR_TEST = 8
 """Number of views below which none is held out, because the fit needs all of them."""
 
 MIN_LEVELNESS_GAP = 3.0
-"""The cameras' x axes determine up if it fits them this many times better than the next best direction."""
+"""The cameras' x axes determine up if the best direction fits them this many times better than the next."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ def undistort(view: PosedView, folder: Path) -> PosedView:
 def up_direction(cam_from_source: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, " 3"]:
     """Estimate the up direction from cameras that were mostly held level.
 
-    The x axes of level cameras are horizontal, whatever their tilt, so up is the direction most orthogonal to
-    all of them. If the x axes are nearly parallel (the camera only moved sideways), that direction is
+    The x axes of level cameras are horizontal at any tilt, so up is the direction most orthogonal to all of
+    them. If the x axes are nearly parallel (the camera only moved sideways), that direction is
     ambiguous, and the mean of the cameras' own up axes is used.
     """
     right, up_of_camera = cam_from_source[:, 0, :3], -cam_from_source[:, 1, :3]
@@ -126,7 +126,7 @@ def move_cameras(
 def split_views(names: Sequence[str], test_every: int) -> dict[str, str]:
     """Hold out every `test_every`-th view by sorted name, starting with the first (3DGS: index % 8 == 0).
 
-    No view is held out if `test_every` is 0 or 1 (1 would leave no training view), or of fewer than 8 views.
+    No view is held out if `test_every` is 0 or 1 (1 would leave no training view) or for fewer than 8 views.
     """
     ordered = sorted(names)
     holds_out = test_every > 1 and len(ordered) >= MIN_VIEWS_FOR_TEST
@@ -155,7 +155,7 @@ def write_scene(
         unit: "metre" keeps the source's scale; for any other unit, the scale is normalised.
         report: registration report; this function adds split, size and focal length per view.
         turn: rotate the scene so that +z is up.
-        lost: picture of the photographs that were not registered, appended to the plot of the cameras.
+        lost: picture of the unregistered photographs, appended to the plot of the cameras.
     """
     views = sorted(views, key=lambda view: view.view)
     source_poses = np.stack([view.cam_from_source for view in views])

@@ -85,7 +85,7 @@ class Cameras:
         """Read `cameras.npz`.
 
         Raises:
-            ArtifactError: the file is missing or damaged, or its content is not valid for cameras.
+            ArtifactError: the file is missing or damaged, or does not contain valid cameras.
         """
         arrays = read_npz(path, "names", "cam_from_world", "K", "size_hw")
         numbers = {name: array for name, array in arrays.items() if name != "names"}
@@ -93,7 +93,7 @@ class Cameras:
         names, poses, K = arrays["names"], arrays["cam_from_world"], arrays["K"]
         are_rigid = are_rotations(poses[:, :3, :3], RIGID_TOLERANCE)
         if names.dtype.kind != "U" or names.shape != (len(poses),) or len(set(names.tolist())) != len(names):
-            fault = f"{len(names)} names of {len(poses)} cameras, each another"
+            fault = f"a distinct name for each of {len(poses)} cameras ({len(names)} names found)"
         elif not are_rigid.all() or (poses[:, 3] != (0, 0, 0, 1)).any():
             fault = "rigid poses"
         elif not (K[:, [0, 1], [0, 1]] > 0).all() or (K[:, 2] != (0, 0, 1)).any():
@@ -101,5 +101,5 @@ class Cameras:
         else:
             fault = ""
         if fault:
-            raise ArtifactError(f"{path} does not hold cameras", expected=fault, fix=remake(path))
+            raise ArtifactError(f"{path} does not contain valid cameras", expected=fault, fix=remake(path))
         return Cameras(tuple(str(name) for name in names), poses, K, arrays["size_hw"])

@@ -19,10 +19,10 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 EXHAUSTIVE_UP_TO = 200
-"""With matcher = "auto", every pair is tried up to this many views; above, only neighbours by name."""
+"""Maximum number of views for which the matcher "auto" tries every pair, not only neighbours by name."""
 
 SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
-"""Distances, in the order of names, at which sequential matching tries views."""
+"""Distances, in name order, between the views that sequential matching pairs."""
 
 MIN_INLIERS = 12
 """Minimum number of verified matches per pair (reference block, for renders and photographs; COLMAP: 15)."""
@@ -34,7 +34,7 @@ MAX_TRIALS = 1000
 """Maximum RANSAC trials per pair (COLMAP: 10000); pairs without common content use all of them."""
 
 WORK_COMPRESSION = 1
-"""zlib level of work images: it saves a third of the time of level 6, and COLMAP reads them only once."""
+"""zlib level of work images: it is a third faster than level 6, and COLMAP reads the images only once."""
 
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF unit of the focal plane resolution -> mm (default: inch)."""
@@ -116,7 +116,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
 
 
 def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[WorkImage]]:
-    """Group the views that share intrinsics: by size and EXIF focal length ("auto"), all ("yes") or none."""
+    """Group views with shared intrinsics: by size and EXIF focal length ("auto"), all ("yes") or none."""
     if single_camera == "no":
         return [[image] for image in images]
     groups: dict[object, list[WorkImage]] = {}
@@ -227,7 +227,7 @@ def verified_matches(database: Path) -> dict[str, dict[str, int]]:
 def count_matches(database: Path) -> dict[str, dict[str, int]]:
     """Return entries of the registration report for every view: features, and verified matches with others.
 
-    Views count as matched from `MIN_INLIERS` verified matches.
+    Two views count as matched if they have at least `MIN_INLIERS` verified matches.
     """
     shared = verified_matches(database)
     counts = {}

@@ -36,7 +36,7 @@ class SceneParts:
     masks: Path
 
     def as_inputs(self) -> dict[str, Path]:
-        """Return the existing parts by name, in the form of a provenance record's inputs."""
+        """Return the existing parts by name, in the format of a provenance record's inputs."""
         named = {part.name: getattr(self, part.name) for part in fields(self)}
         return {name: path for name, path in named.items() if path is not None}
 
@@ -54,7 +54,7 @@ class FinishedScene:
         """Find the parts of a variant, all within the scene's folder.
 
         Inputs are read from provenance; without it, an input is expected beside the artifact made from it. A
-        variant without a field was scored with that of another variant, recorded in the provenance of its
+        variant without a field was scored with another variant's field, recorded in the provenance of its
         scores. During a run, the variant's own CLIP vectors are sufficient, and `default` falls back to those
         of the key views, with a warning.
 
@@ -74,7 +74,7 @@ class FinishedScene:
             raise ArtifactError(
                 f"{folder} has no variant {variant!r}",
                 expected=f"one of {', '.join(finished)}",
-                fix="name it under ablation_variants and run the workflow",
+                fix="list it under ablation_variants and run the workflow",
             )
         field = folder / variant / "field.safetensors"
         if not field.exists():
@@ -106,7 +106,7 @@ class FinishedScene:
         return self.parts.clip.parent / "names"
 
     def evaluate_settings(self) -> EvaluateSettings:
-        """Return the settings of queries of the run that made the scene, from the provenance of its scores.
+        """Return the query settings of the run that made the scene, from the provenance of its scores.
 
         A scene without labels has no scores, but its panel was drawn with the same settings.
         """
@@ -119,7 +119,7 @@ class FinishedScene:
         else:
             found = {}
             logger.warning(
-                "%s: no scores and no panel record the settings of queries; using the default settings",
+                "%s: neither scores nor a panel record the query settings; using the default settings",
                 self.folder,
             )
         known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
@@ -173,7 +173,7 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse a file with another digest than the one that an artifact was made for."""
+    """Refuse a file whose digest differs from the one that an artifact was made for."""
     require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
 
 

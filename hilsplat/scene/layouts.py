@@ -23,7 +23,7 @@ POSES_BOUNDS = "poses_bounds.npy"
 """Pose file of LLFF."""
 
 NO_POSES = Path("none")
-"""Value instead of a path, which means that poses in the folder are ignored."""
+"""Value used instead of a path to ignore the poses in the folder."""
 
 DATAPARSER = "dataparser_transforms.json"
 """File in which nerfstudio records its training coordinates."""
@@ -44,7 +44,7 @@ def read_json_object(path: Path, fix: str) -> dict[str, Any]:
 
 
 def trained_gaussians(folder: Path) -> Path | None:
-    """Return the PLY that 3DGS or nerfstudio trained in a folder, the one with the most steps, or None."""
+    """Return the PLY with the most training steps that 3DGS or nerfstudio wrote to a folder, or None."""
     starts = ("output/*/", "output/", "")
     patterns = [f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts]
     found = [path for pattern in patterns for path in Path(folder).glob(pattern)]
@@ -67,7 +67,7 @@ def dataparser_of(ply: Path, source: Path) -> Path | None:
 
 
 def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
-    """Return the transforms file with a folder's poses; None if a COLMAP model has them, or nothing does."""
+    """Return the transforms file with a folder's poses; None if they are in a COLMAP model or missing."""
     if named is not None and named.suffix == ".json":
         return named
     folder = named or folder
@@ -129,7 +129,7 @@ class KnownPoses:
 
 
 def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | None:
-    """Search for poses of COLMAP, transforms files, LLFF, Polycam and Record3D, in this order; None if none.
+    """Find poses of COLMAP, transforms files, LLFF, Polycam or Record3D, in this order, or return None.
 
     If `named` is a COLMAP model, a transforms file, or a folder with either, it is used instead of the poses
     in `folder`; `NO_POSES` ignores all poses.
@@ -176,7 +176,7 @@ def _named_poses(folder: Path, named: Path) -> KnownPoses:
         raise SceneError(
             f"{named} has no poses for {folder}",
             expected="a COLMAP model, a transforms.json, or a folder with either",
-            fix="correct the path, or leave it out to use what is beside the images",
+            fix="correct the path, or omit it to use the poses beside the images",
         )
     return KnownPoses(folder, found.kind, found.files)
 

@@ -20,10 +20,10 @@ from hilsplat.base.compiled import compiled
 from hilsplat.scene.colmap import pycolmap
 
 MAX_ANGLE = 0.7
-"""Largest angle between matching descriptors, radians (as in COLMAP)."""
+"""Maximum angle between matching descriptors, radians (as in COLMAP)."""
 
 MAX_RATIO = 0.8
-"""Largest ratio of the angles to the nearest and the second nearest descriptor (as in COLMAP)."""
+"""Maximum ratio of the angles to the nearest and the second-nearest descriptor (as in COLMAP)."""
 
 MIN_MATCHES = 15
 """Number of matches below which a pair counts as unmatched (as in COLMAP)."""
@@ -70,7 +70,7 @@ def match_pairs(
 ) -> None:
     """Match pairs of views, verify the matches, and write both to COLMAP's database.
 
-    `partners` has, for each view in the order of names, the rows of the later views to match with. The result
+    `partners` lists, for each view in name order, the rows of the later views to match it with. The result
     does not depend on `threads`.
     """
     with pycolmap.Database.open(database) as opened, ThreadPoolExecutor(threads) as pool:

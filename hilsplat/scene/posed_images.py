@@ -86,7 +86,7 @@ def write_posed_images(
         raise SceneError(
             f"posed images cannot be written to {folder}",
             expected="at least one image, each with a unique name",
-            found=f"{len(images)} images, twice: {', '.join(twice) or 'none'}",
+            found=f"{len(images)} images, duplicate names: {', '.join(twice) or 'none'}",
         )
     with atomic_folder(folder) as temporary:
         (temporary / "images").mkdir()

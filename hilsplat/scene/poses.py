@@ -42,14 +42,14 @@ LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
 
 WEAK_POINTS_PER_VIEW = 13
-"""Minimum points per registered view in good runs on renders; useless runs had 4 to 18."""
+"""Minimum points per registered view in good runs on renders; unusable runs had 4 to 18."""
 
 
 NEIGHBOURS = 3
-"""Number of registered photographs reported for each lost one."""
+"""Number of registered photographs reported for each unregistered one."""
 
 MAX_ROWS = 12
-"""Maximum number of lost photographs in the picture; registration.json lists all of them."""
+"""Maximum number of unregistered photographs in the picture; registration.json lists all of them."""
 
 THUMBNAIL_PX = 400
 
@@ -122,14 +122,14 @@ def _reconstruct(
             f"{images} of {name} has too few images to find camera poses",
             expected=f"at least {MIN_PHOTOS} overlapping photographs (20 or more are better)",
             found=f"{len(sources)}",
-            fix="add photographs of the same scene, neighbours less than about 10 degrees apart",
+            fix="add photographs of the same scene, with neighbours less than about 10 degrees apart",
         )
     camera_model = settings.camera_model
     if camera_model == "auto":
         camera_model = "simple_pinhole" if is_render else "simple_radial"
     work_images = prepare_images(sources, work / "images", settings.max_side_px)
     database = work / "features.db"
-    logger.info("%s: features of %d images, and matches", name, len(work_images))
+    logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
     matcher = in_own_process(
         find_matches, database, work / "images", work_images, camera_model, settings, seed, threads
     )
@@ -150,7 +150,7 @@ def _reconstruct(
     except RegistrationError as error:
         if has_lost:
             shutil.copyfile(picture, kept)
-            error.add_line("picture", f"{kept} shows the lost photographs and where they belong")
+            error.add_line("picture", f"{kept} shows the unregistered photographs and where they belong")
         raise
     assert model is not None
     views = []
@@ -290,8 +290,8 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
     lost = [entry for entry in report["views"].values() if not entry["registered"]]
     listing = "".join(f"\n            {entry['file']}: {entry['why_not']}" for entry in lost)
     advice = (
-        "add sharp photographs of textured surfaces between the lost ones and the others (neighbours less "
-        "than about 10 degrees apart), or remove the lost ones from the folder"
+        "add sharp photographs of textured surfaces between the unregistered ones and the others (neighbours "
+        "less than about 10 degrees apart), or remove the unregistered ones from the folder"
     )
     if not report["models"]:
         raise RegistrationError(
@@ -324,7 +324,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
 
 
 def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
-    """Add `belongs_near` to lost views of a report: the registered ones that share most verified matches."""
+    """Add `belongs_near` to a report's unregistered views: the registered views with most shared matches."""
     shared = verified_matches(database)
     for view, entry in views.items():
         if entry["registered"]:
@@ -335,7 +335,7 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
-    """Draw each lost photograph in a row with its registered neighbours; return False if there is none."""
+    """Draw a row for each unregistered photograph with its registered neighbours; return False if none."""
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
         return False

@@ -94,7 +94,7 @@ def read_sheet(
 ) -> list[SceneRow]:
     """Read and check the scene sheet: tab-separated, with one header line and `#` for comment lines.
 
-    The columns `gaussians`, `features` and `poses` may be omitted, also at the end of a single row; an empty
+    The columns `gaussians`, `features` and `poses` may be omitted, even at the end of a single row; an empty
     cell or "-" has the same meaning.
 
     Args:
@@ -124,7 +124,7 @@ def read_sheet(
                 f"{path}, line {line}: wrong number of columns",
                 expected=f"{len(header)} columns, separated by tabs ({' '.join(header)})",
                 found=f"{len(cells)}: {text!r}",
-                fix="separate the columns with one tab each; only optional ones at the end may be missing",
+                fix="separate columns with one tab; only optional columns at the end may be missing",
             )
         row = _row(path, line, dict(zip(header, cells, strict=True)), checked_groups, data_root)
         # Names that differ only in case would share a folder on some file systems.
@@ -162,7 +162,7 @@ def choose_scenes(
         found = found or [row.name for row in rows if name in (row.scene, row.name)]
         if not found:
             raise SceneError(
-                f"only names {name!r}, but no scene has that name",
+                f"the setting only contains {name!r}, but no scene has that name",
                 expected=", ".join(row.name for row in in_groups or rows),
                 fix="correct the name, or add a row to the scene sheet",
             )
@@ -175,9 +175,9 @@ def content_lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise SceneError(f"scene sheet {path} is missing", fix="write one, or correct its path") from error
+        raise SceneError(f"scene sheet {path} is missing", fix="create it, or correct its path") from error
     except IsADirectoryError as error:
-        raise SceneError(f"scene sheet {path} is a folder", fix="give the path of a file") from error
+        raise SceneError(f"scene sheet {path} is a folder", fix="pass the path of a file") from error
     except UnicodeDecodeError as error:
         fix = "save it as tab-separated text in UTF-8"
         raise SceneError(f"scene sheet {path} is not UTF-8 text", fix=fix) from error
@@ -200,7 +200,7 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
             f"{path}, line {line}: the header cannot be used",
             expected=f"the columns {' '.join(COLUMNS)}, separated by tabs; also {' '.join(OPTIONAL_COLUMNS)}",
             found="; ".join(problems),
-            fix="correct the header line; spaces or commas do not separate columns",
+            fix="correct the header line, and separate columns with tabs, not spaces or commas",
         )
 
 
@@ -217,7 +217,7 @@ def _row(
     for column in ("dataset", "scene"):
         if problem := name_problem(cells[column]):
             fix = "choose another name, such as my-desk_2"
-            bad = f"{cells[column]!r} cannot be a name"
+            bad = f"{cells[column]!r} is not a valid name"
             raise fault(column, bad, expected=NAME_RULE, found=problem, fix=fix)
     for column, allowed in (("group", GROUPS), ("unit", UNITS)):
         if cells[column] not in allowed:
@@ -226,7 +226,7 @@ def _row(
     source, folder = cells["source"], None
     is_checked = checked_groups is None or cells["group"] in checked_groups
     if not source:
-        raise fault("source", "it is empty", fix="give world:<kind>:<seed>, or a folder of images")
+        raise fault("source", "it is empty", fix="enter world:<kind>:<seed>, or a folder of images")
     if source.startswith("world:"):
         if not WORLD_SOURCE.fullmatch(source):
             expected = "world:<kind>:<seed>, as in world:tabletop:201"
@@ -253,12 +253,12 @@ def _row(
         raise fault(
             "gaussians",
             f"{cells['gaussians']!r} is relative to data_root, which is not set",
-            fix="set data_root, or give a path relative to the project folder",
+            fix="set data_root, or enter a path relative to the project folder",
         )
     if features is not None and not any(features.glob("*_s.npy")):
         raise fault(
             "features",
-            f"folder {features} holds no masks of LangSplat",
+            f"folder {features} contains no LangSplat masks",
             expected="<image>_s.npy and <image>_f.npy for each image",
             fix='correct the path, or write "-" to have the masks computed',
         )
@@ -300,7 +300,7 @@ def _check_source(where: str, folder: Path) -> None:
         )
     if not list_images(photo_folder(folder)) and not has_known_poses(folder):
         kinds = Counter(file.suffix.lower() or "no suffix" for file in folder.iterdir() if file.is_file())
-        found = ", ".join(f"{count} files {kind}" for kind, count in sorted(kinds.items()))
+        found = ", ".join(f"{count} files ({kind})" for kind, count in sorted(kinds.items()))
         below = sorted(sub.name for sub in folder.iterdir() if sub.is_dir() and list_images(sub))
         if below and not found:
             found = f"folders with images below it: {', '.join(below[:5])}"

@@ -14,7 +14,7 @@ def view_name(stem: str) -> str:
 
 
 LONGEST_NAME = 200
-"""Maximum bytes of a photograph's name: later files append to it, and file systems allow 255 bytes."""
+"""Maximum bytes in a photograph's name: later file names append to it, and file systems allow 255 bytes."""
 
 
 def view_names(sources: Sequence[Path]) -> list[str]:
@@ -29,7 +29,7 @@ def view_names(sources: Sequence[Path]) -> list[str]:
     for source in sources:
         name, num_bytes = source.name, len(os.fsencode(source.name))
         if "{" in name or "}" in name or not name.isprintable():  # braces are wildcards in Snakemake
-            problem = f"the name of photograph {str(source)!r} has a brace or an unprintable character"
+            problem = f"the name of photograph {str(source)!r} contains a brace or an unprintable character"
             raise SceneError(problem, fix="rename it")
         if num_bytes > LONGEST_NAME:
             limit, problem = f"at most {LONGEST_NAME} bytes", f"the name of photograph {source} is too long"

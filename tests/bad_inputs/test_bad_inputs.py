@@ -243,7 +243,7 @@ ROWS = {
         with_photographs("big.png", png_of(20_000, 20_000)), NEW, "big.png", "400000000 pixels"
     ),
     "poses that are a list": row(
-        with_photographs("transforms.json", "[]"), POSES, "transforms.json has no list `frames`"
+        with_photographs("transforms.json", "[]"), POSES, "transforms.json has no `frames` list"
     ),
     "frames that are numbers": row(
         with_photographs("transforms.json", '{"frames": [1, 2, 3]}'), POSES, "transforms.json, frame 0"
@@ -264,7 +264,7 @@ ROWS = {
     "labels of 10^9 px": row(
         write("label.json", '{"info": {"height": 1000000000, "width": 1000000000}, "objects": []}'),
         lambda: read_isat(Path("label.json")),
-        "label.json does not give the size",
+        "label.json does not state the size",
         "at most 20000",
         "1000000000",
     ),

@@ -9,7 +9,7 @@ from jaxtyping import Int, Int32
 
 @dataclass(frozen=True)
 class ClassSet:
-    """K classes in a fixed order: label k of a prediction is row k - 1 here, 0 means none.
+    """K classes in a fixed order: label k of a prediction is row k - 1 here; 0 means no class.
 
     Attributes:
         name: such as `scannet-19`.
@@ -27,7 +27,7 @@ class ClassSet:
     def of(
         name: str, source: str, query_of: Mapping[int, str], ids: Iterable[int] | None = None
     ) -> "ClassSet":
-        """Return the classes with the given ids, or all, from the data set's table of queries by id."""
+        """Return the set of classes with the given ids (default: all), from a data set's queries by id."""
         chosen = tuple(query_of if ids is None else ids)
         return ClassSet(name, source, chosen, tuple(query_of[label] for label in chosen))
 
@@ -35,7 +35,7 @@ class ClassSet:
         return len(self.ids)
 
     def labels(self, file_labels: Int[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-        """Map the data set's labels of points to 1 .. K; 0 if the set lacks the class."""
+        """Map the data set's point labels to 1 .. K; 0 for classes that the set lacks."""
         order = np.argsort(self.ids)
         known = np.asarray(self.ids)[order]
         place = np.minimum(np.searchsorted(known, file_labels), len(known) - 1)

@@ -19,7 +19,7 @@ NYU40: dict[int, str] = dict(enumerate(words_of(_NAMES), start=1))
 OPENGAUSSIAN_SCENES: tuple[str, ...] = tuple(
     f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)
 )
-"""The ten scans of OpenGaussian's table. All but the last are in the train split."""
+"""The ten scans of OpenGaussian's table. All but the last are in the training split."""
 
 BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
 """Classes of ScanNet's own benchmark."""

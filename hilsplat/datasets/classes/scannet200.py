@@ -1,8 +1,7 @@
 """The 200 classes of ScanNet200: 66 head, 68 common, 66 tail.
 
-Source: ScanNet/ScanNet `BenchmarkScripts/ScanNet200`, in benchmark order, which is that of the ids. Ids are
-those of the `id` column of `scannetv2-labels.combined.tsv`; they run up to 1191 and are shared by several raw
-categories.
+Source: ScanNet/ScanNet `BenchmarkScripts/ScanNet200`, in the benchmark's order (by id). Ids, up to 1191, are
+those in the `id` column of `scannetv2-labels.combined.tsv`; several raw categories may share one.
 """
 
 from hilsplat.datasets.classes.class_set import ClassSet, words_of

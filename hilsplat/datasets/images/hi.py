@@ -1,7 +1,7 @@
 """Labels at three levels: Hi-LERF and Hi-3DOVS, on images of LERF-OVS and 3D-OVS, and your own scenes.
 
-The paper publishes frames and levels but neither labels nor a format. Our format is LERF-OVS's label file
-with three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
+The paper publishes frames and levels but neither labels nor a format. We use LERF-OVS's label format with
+three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
 id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes it
 for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
 
@@ -32,13 +32,13 @@ from hilsplat.datasets.labelled import (
 from hilsplat.datasets.published import FRAMES
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
-"""Folder with the images of each data set, next to its own."""
+"""Data set -> folder with its images, next to the data set's own folder."""
 
 PROPOSED = "proposed"
 """`origin` of an object that a program proposed; it is ignored until the user accepts it."""
 
 OUTSIDE_SHARE = 0.01
-"""Tolerated share of a child outside its parent, because borders are rasterised."""
+"""Share of a child that may be outside its parent, because borders are rasterised."""
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
@@ -51,7 +51,7 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
     files = label_files(root / "label" / scene)
     for view, path in files.items():
         if view not in images:
-            warnings.append(f"label file {path} has no image in {source / 'images'}: left out")
+            warnings.append(f"label file {path} has no image in {source / 'images'}: skipped")
             continue
         labels = read_isat(path)
         warnings += labels.warnings
@@ -65,8 +65,8 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
 def open_annotated(root: Path, scene: str) -> LabelledScene:
     """Read your annotations of a scene, such as "photos/desk": one region per drawn or accepted object.
 
-    Files whose objects have no level are read like LERF-OVS: one region per text. The photographs are the
-    scene's own undistorted ones; evaluation compares the labels' size with the scene's cameras.
+    Files whose objects have no level are read like those of LERF-OVS: one region per text. The photographs
+    are the scene's own undistorted ones; evaluation compares the labels' size with the scene's cameras.
     """
     ANNOTATED.require(root, scene)
     warnings: list[str] = []
@@ -83,7 +83,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
     """Return one region per object of a file, except for unaccepted proposals; extend `warnings`."""
     waiting = [thing for thing in labels.objects if thing.keys.get("origin") == PROPOSED]
     if waiting:
-        warnings.append(f"{labels.path.name}: proposals not accepted, left out: {len(waiting)}")
+        warnings.append(f"{labels.path.name}: unaccepted proposals, ignored: {len(waiting)}")
         accepted = tuple(thing for thing in labels.objects if thing not in waiting)
         labels = replace(labels, objects=accepted)
     objects = by_id(labels)
@@ -117,7 +117,7 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
                 f"{where}: id cannot be used",
                 expected="a whole number, unique in the file",
                 found=repr(number),
-                fix="number the objects of the file",
+                fix="number the objects in the file",
             )
         if type(level) is not int or level not in list(Level):
             raise SceneError(
@@ -138,7 +138,7 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
 def parents_of(
     labels: IsatFile, objects: Mapping[int, IsatObject], warnings: list[str]
 ) -> dict[int, int | None]:
-    """Return the parent id of every object; None if it has none or names an invalid one."""
+    """Return the parent id of every object; None for objects without a valid parent."""
     parents: dict[int, int | None] = {}
     for number, thing in objects.items():
         parent, level = thing.keys.get("parent"), thing.keys["level"]
@@ -150,7 +150,7 @@ def parents_of(
             warnings.append(f"{where}: its parent {parent!r} does not exist")
         elif objects[parent].keys["level"] != level - 1:
             found = objects[parent].keys["level"]
-            warnings.append(f"{where}, level {level}: its parent {parent} is of level {found}")
+            warnings.append(f"{where}, level {level}: its parent {parent} has level {found}")
         else:
             parents[number] = parent
     return parents
@@ -201,7 +201,7 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         layout=f"""{name}/
   label/<scene>/{frame}.json ...      our format (docs/datasets.md)
 {images}/
-  <scene>/images, sparse              as of that data set""",
+  <scene>/images, sparse              as in that data set""",
         required=lambda scene: (f"label/{scene}", f"../{images}/{scene}/images"),
         open=partial(open_hi, name),
         label_places=lambda scene: (f"label/{scene}/*.json",),

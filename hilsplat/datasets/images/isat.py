@@ -18,7 +18,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.polygons import fill_polygons
 
 LARGEST_SIDE_PX = 20_000
-"""Limit on the size stated in a label file; regions are drawn at it, so a wrong one could exhaust memory."""
+"""Limit on the image size stated in a label file; drawing regions at a wrong size could exhaust memory."""
 
 SLACK_PX = 1.0
 """Distance by which vertices may be outside the image, and boxes may differ from their polygons, without a
@@ -75,13 +75,13 @@ def read_isat(path: Path) -> IsatFile:
 
 
 def parse_isat(path: Path, content: Any) -> IsatFile:
-    """Check the content of a label file, as `read_isat`; `path` is used in messages only."""
+    """Check the content of a label file, like `read_isat`; `path` is used only in messages."""
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise SceneError(
-            f"label file {path} has no list `objects`",
+            f"label file {path} has no `objects` list",
             expected="an ISAT file: info, objects",
             found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
-            fix="labels of other tools (labelme, COCO) must be converted",
+            fix="convert labels from other tools (labelme, COCO)",
         )
     info: Any = content.get("info")
     if not isinstance(info, dict):
@@ -89,7 +89,7 @@ def parse_isat(path: Path, content: Any) -> IsatFile:
     size_hw = height, width = info.get("height"), info.get("width")
     if not all(isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX for side in size_hw):
         raise SceneError(
-            f"label file {path} does not give the size of its image",
+            f"label file {path} does not state the size of its image",
             expected=f"info.width and info.height, px, at most {LARGEST_SIDE_PX}",
             found=f"height {height!r}, width {width!r}",
             fix="export the labels again",
@@ -97,7 +97,7 @@ def parse_isat(path: Path, content: Any) -> IsatFile:
     warnings: list[str] = []
     name = info.get("name")
     if isinstance(name, str) and name and Path(name).stem != path.stem:
-        warnings.append(f"{path.name} names {name} as its image; used for {path.stem}")
+        warnings.append(f"{path.name} names {name} as its image, but is used for {path.stem}")
     objects = tuple(
         _read_object(f"{path}, object {number}", entry, size_hw, warnings)
         for number, entry in enumerate(content["objects"])
@@ -111,7 +111,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
     category = entry.get("category")
     if not isinstance(category, str) or not category.strip():
         raise SceneError(
-            f"{where} has no category", found=repr(category), fix="set the query for it as category"
+            f"{where} has no category", found=repr(category), fix="set its category to the query"
         )
     where = f"{where} ({category})"
     if not isinstance(entry.get("iscrowd", 0), int):  # 0 in some files, false in others
@@ -127,10 +127,10 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
                 f"{where}: a polygon is outside the image",
                 expected=f"x below {width}, y below {height}",
                 found=f"x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}",
-                fix="use labels and images of one size and release",
+                fix="use labels and images of the same size and release",
             )
         if len(polygon) < 3:
-            warnings.append(f"{where}: a polygon has {len(polygon)} vertices; taken as a line")
+            warnings.append(f"{where}: a polygon has {len(polygon)} vertices; treated as a line")
     points = np.concatenate(polygons)
     reach = float(max((-points).max(), (points - [width, height]).max()))
     if reach > SLACK_PX:
@@ -139,7 +139,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
 
 
 def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
-    """Return the polygons, given one or a list of polygons of [x, y] pairs."""
+    """Return the polygons, given one polygon or a list of polygons, each a list of [x, y] pairs."""
     try:
         nested = isinstance(value[0][0], list)
         polygons = tuple(np.array(points, dtype=np.float64) for points in (value if nested else [value]))
@@ -159,7 +159,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
 def _box(
     where: str, value: Any, points: Float[np.ndarray, "P 2"], warnings: list[str]
 ) -> Int64[np.ndarray, " 4"]:
-    """Return the whole pixels of the box [x1, y1, x2, y2]; of the polygon's extent if there is none."""
+    """Return the whole pixels inside the box [x1, y1, x2, y2]; without a box, inside the polygon's extent."""
     extent = np.concatenate([points.min(axis=0), points.max(axis=0)])
     try:
         box = extent if value is None else np.array(value, dtype=np.float64)
@@ -177,7 +177,7 @@ def _box(
                 f"{where}: bbox is not [x1, y1, x2, y2]",
                 expected=f"{extent.tolist()}, the polygon's extent",
                 found=f"{box.tolist()}, as if it were [x, y, width, height]",
-                fix="convert the boxes, or remove bbox: the polygon's extent then takes its place",
+                fix="convert the boxes, or remove bbox to use the polygon's extent",
             )
         warnings.append(f"{where}: bbox {box.tolist()} differs from the polygon's extent {extent.tolist()}")
     # Evaluation tests x1 <= x <= x2 for whole numbers x, so rounding inwards changes no result.

@@ -48,9 +48,9 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
         image_hw = image_size_hw(images[view])
         regions = []
         for path in sorted(place.glob("*.png")):
-            if "." in path.stem:  # at which the published evaluation would cut it
+            if "." in path.stem:  # the published evaluation truncates names at a dot
                 raise SceneError(
-                    f"mask {path} cannot be named after its prompt",
+                    f"the file name of mask {path} has a dot before the suffix",
                     expected="a prompt without a dot",
                     found=path.stem,
                     fix="rename the file",
@@ -89,7 +89,7 @@ def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
             f"the folders of {folder} do not match the test views",
             expected=f"0 to {len(test) - 1}, for {', '.join(test[:10])}{', ...' if len(test) > 10 else ''}",
             found=", ".join([place.name for _, place in numbers] + strange) or "no folder",
-            fix="unpack test_mask, images_train and sparse again: they belong together",
+            fix="unpack test_mask, images_train and sparse again, from the same release",
         )
     return {view: place for view, (_, place) in zip(test, numbers, strict=True)}
 

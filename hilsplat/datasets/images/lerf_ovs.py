@@ -58,7 +58,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     warnings += unlisted_texts(read.prompts, PROMPTS["lerf_ovs"].get(scene, ()))
     if set(views) == set(listed) and read.num_pairs != PAIRS[scene]:
         warnings.append(
-            f"{read.num_pairs} pairs of frame and category, published figures imply {PAIRS[scene]}"
+            f"{read.num_pairs} (frame, category) pairs, but the published figures imply {PAIRS[scene]}"
         )
     return replace(read, warnings=tuple(warnings))
 

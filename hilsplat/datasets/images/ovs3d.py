@@ -2,7 +2,7 @@
 
 `segmentations/classes.txt` names the classes; the class index is the position in the **sorted** list. Each
 test view is a folder with one mask per class. Only the value 255 is foreground, except under protocols with
-truth `any grey`. A missing part, mask or image, or an unusable classes.txt, raises SceneError.
+ground truth `any grey`. A missing part, mask or image, or an unusable classes.txt, raises SceneError.
 """
 
 from pathlib import Path
@@ -81,8 +81,8 @@ def read_classes(path: Path) -> tuple[str, ...]:
     if not prompts or twice:
         raise SceneError(
             f"{path} cannot be used",
-            expected="one class per line, each once",
-            found=f"twice: {', '.join(twice)}" if twice else "no class",
+            expected="one class per line, without duplicates",
+            found=f"duplicates: {', '.join(twice)}" if twice else "no class",
             fix="unpack segmentations again",
         )
     return tuple(prompts)
@@ -96,13 +96,13 @@ def _regions(
     extra = sorted(set(files) - set(prompts))
     if missing:
         raise SceneError(
-            f"{place} lacks the masks of: {', '.join(missing)}",
+            f"{place} has no masks for: {', '.join(missing)}",
             expected="one <class>.png for every line of classes.txt",
-            found=f"classes that classes.txt lacks: {', '.join(extra)}" if extra else f"{len(files)} masks",
-            fix="spell classes.txt and the files alike, or unpack segmentations again",
+            found=f"classes not in classes.txt: {', '.join(extra)}" if extra else f"{len(files)} masks",
+            fix="use the same spelling in classes.txt and the file names, or unpack segmentations again",
         )
     if extra:
-        warnings.append(f"{place.name}: masks of unknown classes are not read: {', '.join(extra)}")
+        warnings.append(f"{place.name}: masks of unknown classes are ignored: {', '.join(extra)}")
     return tuple(
         mask_region(files[prompt], FOREGROUND, image_hw, warnings, SHAPE_TOLERANCE, least_grey=1)
         for prompt in prompts

@@ -18,7 +18,7 @@ def fill_polygons(
     import cv2
 
     canvas = np.zeros(size_hw, dtype=np.uint8)
-    for polygon in polygons:  # one call for all would leave out pixels that two polygons share
+    for polygon in polygons:  # a single call would omit pixels that two polygons share
         cv2.fillPoly(canvas, [np.asarray(polygon).astype(np.int32)], 1)
     return canvas.astype(bool)
 

@@ -21,19 +21,19 @@ LABELLINGS: dict[str, tuple[ClassSet, ...]] = {
     "replica": (REPLICA_51, REPLICA_48),
     "waymo": (WAYMO_22,),
 }
-"""Meaning of the class ids in a data set's files -> class sets evaluated on them."""
+"""Labelling (meaning of the class ids in a data set's files) -> class sets evaluated on it."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledPoints:
-    """P points with their true classes, in the frame of the scene's cameras.
+    """P points with their ground-truth classes, in the frame of the scene's cameras.
 
     Attributes:
         xyz: positions, metres.
         class_id: class number in the data set's files; 0 if undefined.
-        instance_id: from 1; 0 for none. Not comparable between files.
+        instance_id: instance number from 1, unrelated between files; 0 for none.
         labelling: meaning of `class_id`, a key of `LABELLINGS`.
-        faces: corners of triangles, rows of `xyz`; None if the points are not a mesh.
+        faces: corners of triangles, as rows of `xyz`; None if the points are not a mesh.
         visible: whether the point is visible to a camera; None if unknown.
     """
 
@@ -80,7 +80,7 @@ class PointScene:
     warnings: tuple[str, ...] = ()
 
     def report(self) -> SceneReport:
-        """Report what was read, in words and numbers, and what was not."""
+        """Report what was read, and warn about what was skipped."""
         facts: dict[str, object] = {"posed images": len(self.images)}
         for labelling, points in self.truth.items():
             facts[f"{labelling} points"] = len(points)

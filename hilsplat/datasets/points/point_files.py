@@ -46,7 +46,7 @@ def read_numbers(path: Path, columns: int) -> np.ndarray:
             row = []
         if len(row) != columns:
             raise SceneError(
-                f"{path}, line {number}: cannot be read",
+                f"{path}, line {number} cannot be read",
                 expected=f"{columns} numbers",
                 found=line[:80],
                 fix=UNPACK_AGAIN,
@@ -86,10 +86,10 @@ def ply_column(path: Path, content: PlyData, element: str, name: str) -> np.ndar
     data = content[element].data
     if name not in data.dtype.names:
         raise SceneError(
-            f"{path} has no property {name} of its {element} element",
+            f"the {element} element of {path} has no property {name}",
             expected=name,
             found=", ".join(data.dtype.names),
-            fix="take the file that carries labels, as the data set distributes it",
+            fix="use the labelled file that the data set distributes",
         )
     return np.asarray(data[name])
 
@@ -123,7 +123,7 @@ def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]
             raise SceneError(
                 f"{path} is not named like a frame",
                 expected=f"{prefix}<number>{path.suffix}",
-                fix="keep other images out of this folder",
+                fix="move other images out of this folder",
             )
         numbered.append((int(stem), path))
     return sorted(numbered)

@@ -7,7 +7,7 @@ All readers raise SceneError if a file is missing, damaged, or doesn't match the
 | images | `results/frame000000.jpg` | `rgb/rgb_0.png` |
 | depth | `results/depth000000.png`, metres x 6553.5 | `depth/depth_0.png`, millimetres |
 | poses | `traj.txt` | `traj_w_c.txt` |
-| lens | `cam_params.json` beside the sequence, else 600 of 1200 px | focal length half the width |
+| focal length | in `cam_params.json` beside the sequence, else half the width (600 px) | half the width |
 
 Poses are camera-to-world in OpenCV axes, 16 numbers per line.
 """
@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 
 
 LAYOUTS = (("traj.txt", "results", "frame"), ("traj_w_c.txt", "rgb", "rgb_"))
-"""Pose file, image folder and prefix of image names: of NICE-SLAM, and of Semantic-NeRF and vMAP."""
+"""Pose file, image folder and image name prefix of NICE-SLAM, and of Semantic-NeRF and vMAP."""
 
 
 def layout_of(folder: Path) -> tuple[str, str, str]:
@@ -94,7 +94,7 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
         missing = f", the first without a line is frame {beyond[0]}" if beyond else ""
         raise SceneError(
             f"{path} does not match the images in {folder / image_folder}",
-            expected="one line per frame, or more",
+            expected="at least one line per frame",
             found=f"{len(poses)} lines, {len(frames)} images{missing}",
             fix=UNPACK_AGAIN,
         )
@@ -114,7 +114,7 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
 
 
 def sequence_folder(root: Path, scene: str) -> Path:
-    """Return a rendered sequence: `room0` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`."""
+    """Return a sequence's folder: `room0` (NICE-SLAM), `room_0/imap/00` (vMAP) or `room_0/Sequence_1`."""
     places = (scene.replace("_", ""), f"{scene}/imap/00", f"{scene}/Sequence_1")
     for place in places:
         if (root / place).is_dir():
@@ -150,10 +150,10 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
     strange = sorted(set(classes[classes > 0].tolist()) - set(NAMES))
     if other or strange:
         raise SceneError(
-            f"{path} has classes that Replica does not",
-            expected=f"the {len(NAMES)} of the release, such as {NAMES[1]} (1)",
+            f"{path} has classes that are not in Replica",
+            expected=f"the {len(NAMES)} classes of the release, such as {NAMES[1]} (1)",
             found=", ".join([*other[:5], *(f"class id {number}" for number in strange[:5])]),
-            fix="take the file of the original release",
+            fix="use the file of the original release",
         )
     return np.maximum(classes, 0)
 
@@ -191,10 +191,10 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
     of_face = ply_column(path, mesh, "face", "object_id").astype(np.int64)
     if of_face.size and (of_face.min() < 0 or of_face.max() >= len(classes)):
         raise SceneError(
-            f"{path} and info_semantic.json do not belong together",
+            f"{path} and info_semantic.json do not match",
             expected=f"object ids 0 to {len(classes) - 1}",
             found=f"{of_face.min()} to {of_face.max()}",
-            fix="take both files from the same scene",
+            fix="use both files of the same scene",
         )
     xyz = ply_places(path, mesh)
     owner = object_of_vertices(quads, of_face, len(xyz))
@@ -212,15 +212,15 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
         raise SceneError(f"{path} does not contain whole numbers: {error}", fix=UNPACK_AGAIN) from error
     if len(labels) != num_vertices:
         raise SceneError(
-            f"{path} does not label the vertices of its mesh",
+            f"{path} does not match the vertices of its mesh",
             expected=f"{num_vertices} lines",
             found=f"{len(labels)}",
-            fix="take the mesh and the labels of the same scene and release",
+            fix="use the mesh and the labels of the same scene and release",
         )
     unknown = Counter(labels[~np.isin(labels, [*NAMES, 0, -1, -2])].tolist())
     if unknown:
         raise SceneError(
-            f"{path} has classes that Replica does not",
+            f"{path} has classes that are not in Replica",
             expected=f"1 to {max(NAMES)}, 0, -1 or -2",
             found=", ".join(f"{number} ({count} lines)" for number, count in sorted(unknown.items())[:5]),
             fix="use semantic_labels_<scene>.txt, not instance_labels_<scene>.txt",
@@ -246,17 +246,17 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
         values = read_numbers(instances, 1)[:, 0].astype(np.int32)
         if len(values) != len(xyz):
             raise SceneError(
-                f"{instances} does not label the vertices of {mesh_path}",
+                f"{instances} does not match the vertices of {mesh_path}",
                 expected=f"{len(xyz)} lines",
                 found=len(values),
-                fix="take the files of the same scene",
+                fix="use files of the same scene",
             )
         instance = np.where(values >= INSTANCES_PER_CLASS, values, 0).astype(np.int32)
     return LabelledPoints(xyz, class_id, instance, "replica", faces)
 
 
 def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
-    """Read a scene, such as "room_0": every n-th frame, and the labels of the release or else of OpenNeRF."""
+    """Read a scene, such as "room_0": every n-th frame, and the release's labels or else OpenNeRF's."""
     habitat, short = root / scene / "habitat", scene.replace("_", "")
     text = root / f"semantic_labels_{short}.txt"
     if habitat.is_dir():

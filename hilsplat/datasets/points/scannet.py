@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 SAME_PLACE_M = 1e-4
-"""Tolerance between vertices of the labelled and the plain mesh, for printed or rounded copies."""
+"""Tolerance between vertices of the labelled and the unlabelled mesh, because some copies are rounded."""
 
 
 def scan_folder(root: Path, scan: str) -> Path:
@@ -59,7 +59,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 
 
 def read_label_table(path: Path) -> dict[str, int]:
-    """Return the id of each raw category in `scannetv2-labels.combined.tsv`, 0 if not one of the 200."""
+    """Return the id of each raw category in `scannetv2-labels.combined.tsv`; 0 if it isn't one of the 200."""
     require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
     found = {}
     with path.open(encoding="utf-8", newline="") as stream:
@@ -67,7 +67,7 @@ def read_label_table(path: Path) -> dict[str, int]:
         needed = {"id", "raw_category"}
         if not needed <= set(rows.fieldnames or ()):
             raise SceneError(
-                f"{path} is not the table of ScanNet's labels",
+                f"{path} is not ScanNet's label table",
                 expected="tab-separated columns id, raw_category",
                 found=", ".join(rows.fieldnames or ())[:120] or "an empty file",
                 fix="download the latest table of the release again",
@@ -106,13 +106,13 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     """Return posed colour images by frame number, skipping frames that tracking lost.
 
     ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
-    640), so half a pixel is added to the centre of K.
+    640), so half a pixel is added to the principal point in K.
 
     Every n-th frame is used, counting lost ones. Also return a sentence for each item that was skipped.
     """
     if not (folder / "color").is_dir():
         raise SceneError(
-            f"{folder} has no folder color/",
+            f"{folder} has no color/ folder",
             expected="color/, pose/ and intrinsic/ exported from the .sens file",
             found=listing(folder),
             fix="export the frames with ScanNet's SensReader",
@@ -139,7 +139,7 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     if not images:
         raise SceneError(
             f"no frame of {scan} can be used",
-            expected="images in color/ with a finite matrix each in pose/",
+            expected="images in color/, each with a finite matrix in pose/",
             found=f"{len(frames)} images; {len(without)} without a pose, {len(lost)} lost by tracking",
             fix="export poses and images again",
         )
@@ -147,14 +147,14 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     if lost:
         warnings.append(f"{len(lost)} frames were lost by tracking (infinite poses) and are skipped")
     if without:
-        warnings.append(f"{len(without)} images have no file in pose/ and are skipped, first {without[0]}")
+        warnings.append(f"{len(without)} images (first: {without[0]}) have no file in pose/ and are skipped")
     return tuple(images), tuple(warnings)
 
 
 def read_truth(
     folder: Path, scan: str, table: dict[str, int]
 ) -> tuple[dict[str, LabelledPoints], tuple[str, ...]]:
-    """Return labels of the evaluated mesh's vertices, in NYU40 and ScanNet200 ids, with instances.
+    """Return the labels of the evaluated mesh's vertices: NYU40 ids, ScanNet200 ids and instances.
 
     NYU40 ids are those of `.labels.ply`; ScanNet200 ids and instances (objectId + 1) come from the
     aggregation. A vertex in two groups belongs to the later one, as in the official exporter.
@@ -167,20 +167,20 @@ def read_truth(
     same = ply_places(label_path, labelled)
     if len(nyu40) != len(xyz) or not np.allclose(same, xyz, atol=SAME_PLACE_M):
         raise SceneError(
-            f"{label_path.name} does not belong to {mesh_path.name} of {scan}",
+            f"{label_path.name} does not match {mesh_path.name} of {scan}",
             expected=f"the same {len(xyz)} vertices in the same order",
             found=f"{len(nyu40)} vertices" if len(nyu40) != len(xyz) else "vertices in other positions",
-            fix="take both files from the same release",
+            fix="use both files from the same release",
         )
     if nyu40.size and nyu40.max() > 40:
         raise SceneError(
-            f"{label_path} does not hold NYU40 labels", expected="0 to 40", found=int(nyu40.max())
+            f"{label_path} does not contain NYU40 labels", expected="0 to 40", found=int(nyu40.max())
         )
     fine, instance, unknown = _from_aggregation(folder, scan, table, len(xyz))
     warnings = []
     if unknown:
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(unknown.items()))
-        warnings.append(f"categories that {LABEL_TABLE} lacks have no ScanNet200 class: {listed}")
+        warnings.append(f"categories missing from {LABEL_TABLE} have no ScanNet200 class: {listed}")
     points = LabelledPoints(xyz, nyu40, instance, "nyu40", faces)
     truth = {"nyu40": points, "scannet200": replace(points, class_id=fine, labelling="scannet200")}
     return truth, tuple(warnings)
@@ -194,10 +194,10 @@ def _from_aggregation(
     segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
     if segments.shape != (num_points,) or segments.dtype.kind != "i":
         raise SceneError(
-            f"{segments_path} does not belong to the mesh of {scan}",
-            expected=f"a whole number for each of {num_points} vertices",
+            f"{segments_path} does not match the mesh of {scan}",
+            expected=f"an integer for each of {num_points} vertices",
             found=f"{segments.size} values of type {segments.dtype}",
-            fix="take the file of the decimated mesh (vh_clean_2)",
+            fix="use the file of the decimated mesh (vh_clean_2)",
         )
     path = folder / f"{scan}.aggregation.json"
     fine, instance = np.zeros((2, num_points), dtype=np.int32)
@@ -208,7 +208,7 @@ def _from_aggregation(
             members = np.asarray(group["segments"], dtype=np.int64)
         except (KeyError, TypeError, ValueError) as error:
             raise SceneError(
-                f"{path}, group {row}: cannot be read: {error!r}",
+                f"{path}, group {row} cannot be read: {error!r}",
                 expected="objectId, label and a list of segments",
                 fix=UNPACK_AGAIN,
             ) from error
@@ -216,7 +216,7 @@ def _from_aggregation(
         if not rows.any():
             raise SceneError(
                 f"{path}, group {row} ({category}): none of its segments is in {segments_path.name}",
-                fix="take the aggregation of the decimated mesh, not that of the full one",
+                fix="use the aggregation of the decimated mesh, not that of the full mesh",
             )
         if category not in table:
             unknown[category] += 1

@@ -3,9 +3,9 @@
 This is our own format for benchmarks like Hi-LERF, whose format is unpublished. A folder contains
 
     annotations.json          nodes (the tree) and the ids of the nodes annotated in each view
-    labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is none
+    labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is no node
 
-Only `evaluate` may read it, besides the diagnostic segmenter (`truth_masks`).
+Only `evaluate` and the diagnostic segmenter (`truth_masks`) may read it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -26,13 +26,13 @@ FORMAT = "hilsplat-hierarchy-1"
 
 @dataclass(frozen=True)
 class AnnotatedNode:
-    """One true object, part or subpart of a scene.
+    """One annotated object, part or subpart of a scene.
 
     Attributes:
         id: row in the list of nodes.
         level: 1 whole, 2 part, 3 subpart.
         parent: id of the node one level up, -1 for a whole.
-        text: the query that it answers. Nodes with the same text have their masks merged.
+        text: its query. The masks of nodes with the same text are merged.
         synonyms: alternative texts.
     """
 

@@ -26,7 +26,7 @@ REPLICA_NAMES = {
     "tv stand": "tv-stand",
     "mug": "cup",
 }
-"""Classes of the world -> names in the data set, if different. Classes that it lacks are undefined there."""
+"""World class -> its name in the data set, if different. Classes that the data set lacks are undefined."""
 
 WAYMO_CLASSES: dict[str, str] = {
     "car": "car",
@@ -49,15 +49,15 @@ WAYMO_CLASSES: dict[str, str] = {
     "traffic sign pole": "pole",
     "traffic light pole": "pole",
 }
-"""Text of a whole or part of a street -> Waymo class name; a part's class overrides its whole's. Fences are
-undefined: Waymo has no class for them."""
+"""Text of a whole or part of a street -> Waymo class name; a part's class overrides that of its whole. Fences
+are undefined: Waymo has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 """Classes with separate instances."""
 
 
 def scannet_ids(text: str) -> tuple[int, int]:
-    """Return the ScanNet200 id (0 for none) and NYU40 id of a class of the world."""
+    """Return the ScanNet200 id (0 for none) and NYU40 id of a world class."""
     name = SCANNET200_NAMES.get(text, text)
     fine = dict(zip(scannet200.SCANNET200.texts, scannet200.SCANNET200.ids, strict=True))
     broad = {query: number for number, query in scannet.NYU40.items()}
@@ -65,13 +65,13 @@ def scannet_ids(text: str) -> tuple[int, int]:
 
 
 def replica_id(text: str) -> int:
-    """Return Replica's class id of a class of the world, 0 for none."""
+    """Return Replica's class id of a world class, 0 for none."""
     name = REPLICA_NAMES.get(text, text)
     return {query: number for number, query in replica.NAMES.items()}.get(name, 0)
 
 
 def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> Int32[np.ndarray, "P 2"]:
-    """Return instance and Waymo class of points, from their nodes (whole, part, subpart)."""
+    """Return the instance and Waymo class of each point, from its nodes (whole, part, subpart)."""
     number = dict(zip(waymo.WAYMO_22.texts, waymo.WAYMO_22.ids, strict=True))
     of_node = np.array([number.get(WAYMO_CLASSES.get(text, ""), 0) for text in texts] + [0])
     whole, part = of_node[node_ids[:, 0]], of_node[node_ids[:, 1]]
@@ -81,10 +81,10 @@ def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> In
 
 
 def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
-    """Return points with classes by labelling, in the frame of the world's true cameras, metres.
+    """Return points with classes by labelling, in metres, in the frame of the world's ground-truth cameras.
 
-    A room has mesh vertices visible to a camera, because a scanner wouldn't capture the others, labelled as
-    nyu40, scannet200 and replica. A street has the returns of its lidar, labelled as waymo.
+    For a room, these are the mesh vertices visible to a camera (a scanner would miss the others), labelled as
+    nyu40, scannet200 and replica; for a street, its lidar returns, labelled as waymo.
 
     Raises:
         SceneError: the world is of a different kind.
@@ -97,7 +97,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
         return {"waymo": LabelledPoints(scan["points"].astype(np.float64), classes, instance, "waymo")}
     if kind != "room":
         raise SceneError(
-            f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="leave it out"
+            f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="omit them"
         )
     path = world / "truth" / "mesh.ply"
     mesh = read_ply(path, 3)

@@ -173,8 +173,8 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
             sizes.add(part.projection.shape[:2])
         if len(sizes) > 1 or len(frame.inclinations) != part.image.shape[0]:
             raise SceneError(
-                f"{where}: ranges, labels, poses and projections do not belong together",
-                expected="images of one size and an inclination per row",
+                f"{where}: ranges, labels, poses and projections do not match",
+                expected="images of the same size, and one inclination per row",
                 found=f"{sorted(sizes)}, {len(frame.inclinations)} inclinations",
                 fix="download all components of the segment from the same release",
             )
@@ -202,7 +202,7 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
-    """Concatenate points, of at least one frame or return; visibility is kept if every part has it."""
+    """Concatenate the points of frames or returns, at least one; visibility is kept if every part has it."""
     seen = [part.visible for part in parts if part.visible is not None]
     return LabelledPoints(
         np.concatenate([part.xyz for part in parts]),

@@ -48,7 +48,7 @@ def read_component(
 ) -> list[dict[str, Any]]:
     """Return the rows of a component in file order: lists as arrays, other values unchanged.
 
-    If `only` gives a required value by column, other rows are not decoded.
+    `only` maps columns to required values; rows with other values are not decoded.
     """
     import pyarrow as pa
     import pyarrow.parquet as parquet
@@ -131,14 +131,14 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
 def _range_images(
     split: Path, segment: str, time: int, tag: str, component: str, depth: int, returns: int = 2
 ) -> list[np.ndarray | None]:
-    """Return the images (H x W x depth) of the top lidar's returns at a time stamp; None for a null."""
+    """Return the images (H x W x depth) of the top lidar's returns at a time stamp; None for null values."""
     names = [f"[{component}].range_image_return{number}" for number in range(1, returns + 1)]
     columns = [f"{name}.{part}" for name in names for part in ("values", "shape")]
     rows = read_component(split, tag, segment, columns, {FRAME: time, LASER: TOP})
     if len(rows) != 1:
         raise SceneError(
             f"component {tag} of segment {segment} does not match lidar_segmentation",
-            expected=f"one row of the top lidar at {time}",
+            expected=f"one row for the top lidar at {time}",
             found=f"{len(rows)}",
             fix="download all components of the segment from the same release",
         )

@@ -1,7 +1,8 @@
 """Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
 
-Release 2.0.1 (parquet) or 1.4.3 (TFRecord), which contain the same data. Coordinates are relative to the
-vehicle at the segment's first frame: file positions are kilometres from the origin, too far for float32.
+Reads release 2.0.1 (parquet) or 1.4.3 (TFRecord), which contain the same data. Coordinates are relative to
+the vehicle at the segment's first frame, because positions in the files are too large for float32
+(kilometres).
 """
 
 import logging
@@ -45,9 +46,9 @@ def find_record(root: Path, segment: str) -> Path | None:
 
 
 def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
-    """Read a segment: all labelled frames of the top lidar with both returns, images of every n-th frame.
+    """Read a segment: labelled frames of the top lidar with both returns, and images of every n-th frame.
 
-    A segment is named by its context, such as 10023947602400723454_1120_000_1140_000.
+    A segment is named after its context, such as 10023947602400723454_1120_000_1140_000.
 
     Raises:
         SceneError: the segment is missing or damaged, or has no labelled frame.
@@ -67,12 +68,12 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
         release = "1"
     else:
         found = listing(root)
-        fix = "download all components of the segment, or its .tfrecord; testing has no labels"
+        fix = "download all components of the segment, or its .tfrecord; the testing split has no labels"
         if wrong := sorted(root.glob(f"*/*/*/{segment}.parquet")):
             found, fix = f"{wrong[0]}, one level too deep", f"move {wrong[0].parents[1]} to {root}"
         raise SceneError(
             f"segment {segment} is not in {root}",
-            expected=f"<split>/{LABELS}/{segment}.parquet, split one of {', '.join(SPLITS)}",
+            expected=f"<split>/{LABELS}/{segment}.parquet, where <split> is {' or '.join(SPLITS)}",
             found=found,
             fix=fix,
         )
@@ -81,7 +82,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     if not points:
         raise SceneError(
             f"segment {segment} has no frame with labels of the top lidar",
-            fix="use a segment of the 3D semantic segmentation; release 1.3.2 or later has them",
+            fix="use a segment with 3D semantic segmentation labels, from release 1.3.2 or later",
         )
     images = tuple(shot_image(shot, segment_from_world) for shot in shots)
     truth = joined_points(points)
@@ -91,9 +92,9 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     )  # fmt: skip
     warnings = []
     if any(image.distortion[4] for image in images):
-        warnings.append("the lenses have a k3, which poses cannot import: undistort the images first")
+        warnings.append("the lenses have a k3 coefficient, which poses cannot import: undistort the images")
     if truth.visible is None:
-        warnings.append("lidar_camera_projection is missing: it is not known which points a camera sees")
+        warnings.append("lidar_camera_projection is missing: the points visible to a camera are unknown")
     return PointScene(segment, images, {"waymo": truth}, tuple(warnings))
 
 
@@ -111,7 +112,7 @@ class Segments(Dataset):
         return tuple(sorted(found))
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
-        """Return the missing paths of a segment; none if it is a file of release 1."""
+        """Return the missing paths of a segment; empty if the segment is a file of release 1."""
         if find_record(root, scene) is not None:
             return ()
         split = find_parquet(root, scene)

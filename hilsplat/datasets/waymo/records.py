@@ -1,7 +1,7 @@
 """Waymo v1 (1.4.3): TFRecord files of Frame messages, read without TensorFlow.
 
 protobuf decodes the messages; this module reads the records around them, because the package `tfrecord` would
-add two dependencies and allocate as much memory as a damaged length states. All readers raise SceneError if
+add two dependencies and, given a damaged length, allocate that much memory. All readers raise SceneError if
 the file is missing, damaged or truncated.
 """
 
@@ -46,7 +46,7 @@ CameraImage: required int32 name 1, required bytes image 2, required Transform p
 Frame: required Context context 1, required int64 timestamp_micros 2, required Transform pose 3, \
     repeated CameraImage images 4, repeated Laser lasers 5
 """
-"""Fields used of waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers; fields that
+"""Fields used from waymo-research/waymo-open-dataset `dataset.proto`, with its names and numbers; fields that
 are always present are marked required."""
 
 
@@ -78,7 +78,7 @@ def matrix(compressed: bytes, dtype: type) -> np.ndarray:
     """Decode a zlib-compressed MatrixInt32 or MatrixFloat.
 
     Raises:
-        DecodeError, zlib.error, ValueError: the data is damaged, or the shape does not fit the values.
+        DecodeError, zlib.error, ValueError: the data is damaged, or the shape does not match the values.
     """
     kind = MESSAGES["MatrixInt32" if dtype is np.int32 else "MatrixFloat"]
     found = kind.FromString(zlib.decompress(compressed))
@@ -97,7 +97,7 @@ def records(path: Path) -> Iterator[bytes]:
             left -= 12 + length + 4
             if left < 0:
                 raise SceneError(
-                    f"{path}: record {number} is damaged or cut off",
+                    f"{path}: record {number} is damaged or truncated",
                     expected="a TFRecord file",
                     found=f"a file of {path.stat().st_size} bytes",
                     fix=UNPACK_AGAIN,
@@ -173,7 +173,7 @@ def _named(messages: Iterable[Any], name: int) -> Any:
     for message in messages:
         if message.name == name:
             return message
-    raise ValueError(f"it has no data of sensor {name}")
+    raise ValueError(f"it has no data from sensor {name}")
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:

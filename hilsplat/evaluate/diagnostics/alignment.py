@@ -10,7 +10,7 @@ MIN_SHARED = 3
 
 
 def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]:
-    """Return the similarity that maps true coordinates to the scene's, from the cameras shared by name.
+    """Return the similarity that maps ground-truth to scene coordinates, from the cameras shared by name.
 
     The rotation is the mean of those between the cameras' orientations (orthogonal Procrustes), so that it is
     determined even for cameras on a straight line; scale and offset are least squares over the centres.
@@ -21,10 +21,10 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
     shared = [name for name in found.names if name in set(true.names)]
     if len(shared) < MIN_SHARED:
         raise MisalignedArtifactError(
-            "the true cameras and the scene's belong to different images",
+            "the ground-truth cameras and the scene's cameras belong to different images",
             expected=f"at least {MIN_SHARED} shared names",
             found=f"{len(shared)}",
-            fix="evaluate the scene with its own truth folder",
+            fix="evaluate the scene with its own ground-truth folder",
         )
     turns = sum(found[name].cam_from_world[:3, :3].T @ true[name].cam_from_world[:3, :3] for name in shared)
     left, _, right = np.linalg.svd(turns)
@@ -37,7 +37,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
     scale = (turned * (there - there_mean)).sum() / spread if spread > 0 else 0.0
     if scale <= 0:
         raise MisalignedArtifactError(
-            "no similarity maps the true cameras to the scene's",
+            "no similarity maps the ground-truth cameras to the scene's",
             expected="camera centres with the same arrangement",
             found="centres in one place, or mirrored",
             fix="check registration.png; the poses have probably failed",
@@ -49,7 +49,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
 
 
 def camera_error(true: Cameras, found: Cameras, scene_from_true: Float64[np.ndarray, "4 4"]) -> float:
-    """Return the median distance of estimated camera centres from the true ones, true units."""
+    """Return the median distance of estimated camera centres from the ground truth, in its units."""
     turned, offset = scene_from_true[:3, :3], scene_from_true[:3, 3]
     shared = [name for name in found.names if name in set(true.names)]
     apart = [np.linalg.norm(turned @ true[name].centre + offset - found[name].centre) for name in shared]

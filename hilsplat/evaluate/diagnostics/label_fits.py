@@ -1,4 +1,4 @@
-"""Best IoU of any mask or node with annotated regions, by level: the upper limit for a perfect query."""
+"""Best IoU of any mask or node with annotated regions, by level: the upper limit for any query."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -99,10 +99,10 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
 def run_label_fits(
     folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
 ) -> str:
-    """Write and return a table: masks in views that have some, nodes in all annotated views.
+    """Write and return a table: masks in annotated views with masks, nodes in all annotated views.
 
     The scene folder has `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`. The labels
-    have levels, such as "annotated/photos/desk".
+    must have levels, such as "annotated/photos/desk".
 
     Raises:
         SceneError: the labels cannot be read, or do not fit the scene.

@@ -1,4 +1,4 @@
-"""Fit of a synthetic scene's masks to the true regions: a diagnostic that is in no table."""
+"""Fit of a synthetic scene's masks to the ground-truth regions: a diagnostic that appears in no table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from hilsplat.segment.origin import masks_label
 from hilsplat.segment.pictures import paint_level
 
 LEAST_PX = 100
-"""Smaller true regions are not scored."""
+"""Smaller ground-truth regions are not scored."""
 FIT_IOU = 0.5
 COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
 COLOURS = "RdYlGn"
@@ -31,7 +31,7 @@ COLOURS = "RdYlGn"
 
 @dataclass(frozen=True)
 class ViewFit:
-    """Masks of one level of one view against the true regions of that level."""
+    """Masks of one level of one view against the ground-truth regions of that level."""
 
     ids: Int64[np.ndarray, " r"]  # true nodes with a region of at least `LEAST_PX`
     best: Float32[np.ndarray, " r"]  # IoU of the best mask of each, 0 if there is no mask
@@ -40,7 +40,7 @@ class ViewFit:
 
 
 def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
-    """Compare masks with the true regions, level by level.
+    """Compare masks with the ground-truth regions, level by level.
 
     Raises:
         MisalignedArtifactError: masks and labels differ in size.
@@ -65,7 +65,7 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
 
 
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
-    """Write a table of all views and a picture of a median view and the worst one; return a Markdown table.
+    """Write a table of all views and a picture of the median and the worst view; return a Markdown table.
 
     The PDF and the table as CSV are written beside the PNG.
     """
@@ -115,7 +115,7 @@ def draw_fits(
     fits: Mapping[str, dict[Level, ViewFit]],
     views: list[str],
 ) -> Figure:
-    """Draw two rows per view: its masks by level, and below the true regions coloured by their best IoU."""
+    """Draw two rows per view: masks by level, then ground-truth regions coloured by their best IoU."""
     tall, wide = max(1, 2 * len(views)), 1 + len(LEVELS)
     example = scene.cameras[views[0]].size_hw if views else (1, 1)
     height_in = 3.1 * example[0] / example[1] + 0.3
@@ -153,7 +153,7 @@ def draw_fits(
 
 
 def paint_fits(image: np.ndarray, labels: np.ndarray, fit: ViewFit) -> np.ndarray:
-    """Colour outlined true regions by the IoU of the best mask; unscored regions stay grey."""
+    """Colour outlined ground-truth regions by the IoU of the best mask; unscored regions stay grey."""
     painted = 0.5 * grey(image)
     for node, value in zip(fit.ids, fit.best, strict=True):
         colour = np.array(colormaps[COLOURS](float(value))[:3]) * 255

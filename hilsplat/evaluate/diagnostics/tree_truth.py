@@ -30,12 +30,12 @@ class TreeMeasure:
     """Results for one level of a tree."""
 
     nodes: int
-    true_nodes: int  # those that have any Gaussian
+    true_nodes: int  # ground-truth nodes that have any Gaussian
     precision: float  # share of nodes matched one to one with a true node at IoU 0.5
     recall: float  # share of true nodes matched
     mean_iou: float  # mean over true nodes of the matched node's IoU, 0 if unmatched
-    purity: float  # share of the nodes' mass that belongs to each one's main true node
-    parent_accuracy: float  # of matches with a true parent: share whose parent's main true node is it; or nan
+    purity: float  # share of the nodes' mass that belongs to each node's main true node
+    parent_accuracy: float  # share of matches whose parent mainly covers the true parent; nan if none has one
     view_consistency: float  # mean pooled IoU of the nodes' masks across views
     pairs: tuple[tuple[int, int], ...] = ()  # each matched node with its true node
 
@@ -43,7 +43,7 @@ class TreeMeasure:
 def measure_tree(
     tree: SemanticTree, votes: Float[np.ndarray, "N t"], truth: HierarchyAnnotations
 ) -> dict[Level, TreeMeasure]:
-    """Compare nodes with true nodes.
+    """Compare the tree's nodes with ground-truth ("true") nodes.
 
     At each level a Gaussian belongs to the true node with most of its visible weight, and is weighted by its
     total weight in labelled pixels. `votes` is the visible weight of each Gaussian in each true node, by id.

@@ -36,8 +36,8 @@ def measure_world_consistency(
     """Yield the rows of `world/view-consistency`: each annotated view and its nearest neighbour.
 
     The IoU is that of the answers in both views, over shared surface points; `n` is the number of points in
-    the union, and texts without an answer are omitted. Nothing is yielded without the true mesh (labels of a
-    photographed scene). `answered` has the stored answers by view (`views.measure_view`).
+    the union, and texts without an answer are omitted. Nothing is yielded without a ground-truth mesh (as for
+    photographed scenes). `answered` contains the stored answers by view (`views.measure_view`).
     """
     if not (truth / "mesh.ply").is_file():
         return

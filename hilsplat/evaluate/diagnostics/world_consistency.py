@@ -1,4 +1,4 @@
-"""View consistency of masks on a synthetic scene: is a surface point in the same mask in two views?"""
+"""View consistency of masks on a synthetic scene: whether surface points share masks in both of two views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from hilsplat.segment.origin import masks_label
 from hilsplat.world.mesh import TrueMesh
 
 TRUTH = "true regions"
-"""Row name of the labels, an upper limit for any masks: label borders are off by up to a pixel."""
+"""Row name of the labels, an upper limit for any masks (below 1: label borders are off by up to a pixel)."""
 
 COLUMNS = (
     *("scene", "masks", "level", "view_pairs", "masks_compared"),
@@ -62,7 +62,7 @@ class Agreement:
     the Rand index); 0 is perfect. If most pairs are in different masks in both views, it is always small."""
 
     joined_disagreement: float
-    """The same among pairs in the same mask in at least one view (a Jaccard distance); nan without any."""
+    """The same share among pairs in the same mask in at least one view (a Jaccard distance); nan if none."""
 
 
 def shared_points(
@@ -130,7 +130,7 @@ def pair_disagreement(
     """Return the shares of pairs of points that are in the same mask in one view and not in the other.
 
     The first is the share among all pairs of points, the second among those in the same mask in at least one
-    view; nan if there is no such pair. Labels are -1 for points in no mask, which share theirs with no other.
+    view; nan if there is no such pair. Points in no mask have label -1 and differ from all other points.
     All pairs are counted, via the contingency table of the labels.
     """
     rows = np.unique(labels_a, return_inverse=True)[1]
@@ -206,11 +206,11 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     """Measure how consistently masks of neighbouring views divide the same surface; return a Markdown table.
 
     Each view is compared with its `count` nearest views. The CSV has a row per level for the masks and for
-    the true regions.
+    the ground-truth regions.
 
     Raises:
         ArtifactError: fewer than two views have masks.
-        MisalignedArtifactError: masks and true cameras differ in size.
+        MisalignedArtifactError: masks and ground-truth cameras differ in size.
     """
     index = read_index(masks_folder)
     views = list(index["views"])
@@ -231,7 +231,7 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         expected = cameras[view].size_hw
         if masks.size_hw != expected:
             raise MisalignedArtifactError(
-                f"masks of view {view} do not fit its true camera",
+                f"masks of view {view} do not fit its ground-truth camera",
                 expected=f"{expected[0]} x {expected[1]} (height x width)",
                 found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
                 fix="run poses without shrinking the images (poses.max_side_px), then masks again",

@@ -27,7 +27,7 @@ from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 WIDTH_IN = 13.0
 MOST_COLUMNS = 8
-"""With more methods than this, each is a row instead of a column in the figure of queries."""
+"""Maximum number of methods drawn as columns in the figure of queries; more are drawn as rows."""
 VIEWS = 4
 """Number of views in the figure of one query."""
 
@@ -71,7 +71,7 @@ def run_comparison(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the three figures of a scene as PNG and PDF, from its true regions or else from given queries.
+    """Draw the three figures of a scene as PNG and PDF, from ground-truth regions or else given queries.
 
     Args:
         folder: `results/<dataset>/<scene>`, finished under every variant.
@@ -79,7 +79,7 @@ def run_comparison(
             its tree and its field, others for their field.
         names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
-        evaluate: settings for true regions and for converting maps to masks.
+        evaluate: settings for ground-truth regions and for converting maps to masks.
         labels: labels of a published data set instead of `truth`, such as "lerf_ovs/figurines".
 
     Raises:
@@ -87,7 +87,7 @@ def run_comparison(
     """
     if not variants:
         raise SettingsError(
-            "there are no variants to compare", expected="at least one", fix="name them in main_variants"
+            "there are no variants to compare", expected="at least one", fix="list them in main_variants"
         )
     scenes = open_variants(folder, variants, threads)
     scene = scenes[variants[0]].scene
@@ -123,7 +123,7 @@ def over_views(
 ) -> list[Shown]:
     """Return one query in several views: the first part or subpart in `rows`, else the first query.
 
-    Views with a known truth come first, in order; then others, evenly spaced over the scene.
+    Views with known ground truth come first, in order; then others, evenly spaced over the scene.
     """
     if not rows:
         return []

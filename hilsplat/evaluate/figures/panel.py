@@ -48,7 +48,7 @@ class Shown:
     path: tuple[str, ...]  # texts from the whole down; without annotations, those of the query
     level: Level | None  # of the annotation, if any
     view: str
-    truth: Bool[np.ndarray, "H W"] | None  # true region; None if unknown
+    truth: Bool[np.ndarray, "H W"] | None  # ground-truth region; None if unknown
 
     def hits(self, answers: LanguageScene, *, by_path: bool = False) -> NodeHits:
         """Return the tree's answer to the text alone, or to the whole path.
@@ -76,7 +76,7 @@ def run_figures(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the panel from true regions or else from queries; copy the pictures of poses and fit beside it.
+    """Draw the panel from ground-truth regions or else queries; copy pictures of poses and fit beside it.
 
     Args:
         fit: report folder of the fit; None copies nothing.
@@ -98,7 +98,7 @@ def run_figures(
 def truths_of(
     scene: Scene, truth: Path | None, labels: str, data_root: Path, evaluate: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
-    """Return the true regions in the views of a scene; empty if it has neither annotations nor labels."""
+    """Return the ground-truth regions in a scene's views; empty if it has no annotations or labels."""
     if labels:
         return labelled_truths(open_labelled(labels, data_root), scene)
     return annotated_truths(truth, scene, evaluate.min_region_px) if truth is not None else {}
@@ -187,10 +187,10 @@ def draw_queries(
     evaluate: EvaluateSettings,
     columns: int,
 ) -> None:
-    """Draw one row per query: truth, answers of tree and field, field relevancy at three levels.
+    """Draw one row per query: ground truth, answers of tree and field, field relevancy at three levels.
 
-    Titles contain the IoU with the truth and the highest relevancy; the level of the answer is framed. A
-    ring marks the field's localization point.
+    Titles contain the IoU with the ground truth and the highest relevancy; the level of the answer is framed.
+    A ring marks the field's localization point.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)

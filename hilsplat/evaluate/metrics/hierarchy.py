@@ -27,8 +27,8 @@ def children_consistency(family: Family, reading: Reading) -> list[float]:
     """Return one term per child of a parent.
 
     `containment`: area(p and c) / area(c), the paper's wording; 1 for perfect nesting.
-    `literal`: area(p and c) / area(p), the printed symbols with l = 1 the whole.
-    `anchored`: area(c and true p) / area(c), which doesn't reward predicting the whole image.
+    `literal`: area(p and c) / area(p), the printed formula, with l = 1 for wholes.
+    `anchored`: area(c and annotated p) / area(c), which doesn't reward predicting the whole image.
     An empty denominator (no prediction) gives 0.
     """
     anchor = family.true_parent if reading == "anchored" else family.parent
@@ -44,8 +44,8 @@ def hierarchical_consistency(
 ) -> float:
     """Return the HC of one view (paper, Sec. IV, Eq. 7), averaged over children, parents and levels in turn.
 
-    Every parent has the same weight, whatever its number of children. A scene's value is the mean over its
-    views with at least one parent; then scenes are averaged.
+    Every parent has the same weight, regardless of its number of children. A scene's value is the mean over
+    its views with at least one parent; then scenes are averaged.
 
     Departs: the printed normaliser uses N_l outside the sum over l, where it is undefined; here it is the
     mean over the parents of each level, then over the L - 1 transitions. A transition without parents

@@ -31,7 +31,7 @@ class InstanceMatches:
     overlap_index: Int64[np.ndarray, " E"]  # threshold of each entry, 0 .. T - 1
     confidence: Float64[np.ndarray, " E"]
     is_match: Bool[np.ndarray, " E"]  # otherwise the entry is a false positive
-    misses: Int64[np.ndarray, "K T"]  # number of unmatched true instances
+    misses: Int64[np.ndarray, "K T"]  # number of unmatched ground-truth instances
     has_truth: Bool[np.ndarray, " K"]  # whether the scan has a sufficiently large instance of the class
 
 
@@ -43,12 +43,12 @@ def match_instances(
     class_ids: Sequence[int],
     min_points: int = MIN_POINTS,
 ) -> InstanceMatches:
-    """Match the predictions of one scan to its true instances, per class and threshold.
+    """Match the predictions of one scan to its ground-truth instances, per class and threshold.
 
     Instances are visited in order. Each unused prediction of the class that overlaps an instance by more
-    than the threshold matches it. If there are several, the most confident remains the match and each other
-    one is a false positive with the lower confidence. Only the first match of an instance marks its
-    prediction as used. A prediction without sufficient overlap with any true instance is a false positive,
+    than the threshold matches it. If there are several, the most confident remains the match and the others
+    are false positives with their own confidences. Only the first match of an instance marks its prediction
+    as used. A prediction without sufficient overlap with any ground-truth instance is a false positive,
     unless the share of its points in void or in instances that are too small exceeds the threshold.
 
     Args:
@@ -153,7 +153,7 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
 def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "K T"]:
     """Return the average precision per class and threshold over all scans.
 
-    nan for a class without a true instance in any scan; 0 if it has instances but no prediction.
+    It is nan for classes without ground-truth instances, and 0 for those with instances but no prediction.
     """
     result = np.full_like(scans[0].misses, np.nan, dtype=np.float64)
     misses = np.sum([scan.misses for scan in scans], axis=0)
@@ -172,17 +172,17 @@ def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "
 
 
 def ap(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean over the nine thresholds 0.50 .. 0.90 and the classes with true instances."""
+    """Return the mean over the nine thresholds 0.50 .. 0.90 and the classes with ground-truth instances."""
     return _mean_of(precisions[:, :-1])
 
 
 def ap50(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean over the classes with true instances, at an IoU above 0.5."""
+    """Return the mean over the classes with ground-truth instances, at an IoU above 0.5."""
     return _mean_of(precisions[:, :1])
 
 
 def ap25(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean over the classes with true instances, at an IoU above 0.25."""
+    """Return the mean over the classes with ground-truth instances, at an IoU above 0.25."""
     return _mean_of(precisions[:, -1:])
 
 

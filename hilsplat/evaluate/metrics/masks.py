@@ -1,4 +1,4 @@
-"""Metrics of masks against true regions, and of localization: is the most relevant point on the object?"""
+"""Metrics of masks against ground-truth regions, and of localization (peaks of maps on the object)."""
 
 import math
 
@@ -46,10 +46,10 @@ def boundary_iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H
 
 
 def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
-    """Return the largest IoU of any threshold on the score map: a diagnostic that uses the truth.
+    """Return the largest IoU of any threshold on the score map: a diagnostic that uses the ground truth.
 
-    It is exact: lowering the threshold between two scores of true pixels only adds false ones, so testing the
-    scores of true pixels is sufficient.
+    The result is exact: lowering the threshold between two scores of ground-truth pixels adds only false
+    positives, so testing those scores is sufficient.
     """
     inside, outside = np.sort(score[truth]), np.sort(score[~truth])
     cuts = np.unique(inside)
@@ -67,7 +67,7 @@ def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K 
     """Return one mask per class, the pixels where its cosine is largest (Kunhao-Liu/3D-OVS `renderer.py`).
 
     The first class wins ties; a pixel whose values are all -inf has no class. The IoU of a class absent from
-    prediction and truth is 0 (the default of scikit-learn, used by that code).
+    prediction and ground truth is 0 (scikit-learn's default, used by that code).
     """
     winner = similarity.argmax(axis=0)
     answered = similarity.max(axis=0) > -np.inf
@@ -75,9 +75,9 @@ def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K 
 
 
 def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray, "K H W"]) -> float:
-    """Return the share of pixels whose classes are exactly the true ones.
+    """Return the share of pixels whose predicted classes exactly match the ground truth.
 
-    A pixel with two true classes or none is never correct, because the prediction has one.
+    A pixel with two ground-truth classes or none is never correct, because the prediction has one class.
     """
     return float((prediction == truth).all(axis=0).mean())
 
@@ -87,7 +87,7 @@ def peak_points(
 ) -> tuple[Int[np.ndarray, "P 2"], Level]:
     """Return all pixels (x, y) with the maximum of a filtered map, and the level of the map.
 
-    Without a level, the one with the largest maximum is used; the finest wins ties, as in LangSplat.
+    If `level` is None, the level with the highest maximum is used; the finest wins ties, as in LangSplat.
     """
     if level is None:
         level = max(LEVELS, key=lambda each: (filtered[each.index].max(), each.index))
@@ -104,7 +104,7 @@ def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B
 
 
 def hits_the_mask(points_xy: Int[np.ndarray, "P 2"], truth: Bool[np.ndarray, "H W"]) -> bool:
-    """Return whether any point is in the true region, which is stricter than the box."""
+    """Return whether any point is in the ground-truth region, which is stricter than the box."""
     return bool(truth[points_xy[:, 1], points_xy[:, 0]].any())
 
 

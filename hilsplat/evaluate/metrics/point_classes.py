@@ -1,7 +1,7 @@
 """Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
 
-Labels are 1 .. K; 0 means none: ignored in the truth, a miss in the prediction. The benchmarks differ in
-which counts are summed first (those of one scene or of all) and in which classes are averaged.
+Labels are 1 .. K; 0 means none, which is ignored in the ground truth and a miss in the prediction. The
+benchmarks differ in which counts are summed first (of one scene or of all) and which classes are averaged.
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 
 @dataclass(frozen=True)
 class ClassCounts:
-    """Points per class, among those with a true label: correct, true (even if predicted 0), predicted."""
+    """Points per class, among labelled ones: correct, labelled (even if predicted 0), and predicted."""
 
     hits: Int64[np.ndarray, " K"]
     truth: Int64[np.ndarray, " K"]
@@ -23,7 +23,7 @@ class ClassCounts:
     def of(
         truth: Int[np.ndarray, " P"], prediction: Int[np.ndarray, " P"], num_classes: int
     ) -> "ClassCounts":
-        """Count points with labels 0 .. K; predictions at points with truth 0 are ignored."""
+        """Count points with labels 0 .. K; predictions at points with ground truth 0 are ignored."""
         known = truth > 0
         truth, prediction = truth[known], prediction[known]
 
@@ -36,7 +36,7 @@ class ClassCounts:
 
     @property
     def union(self) -> Int64[np.ndarray, " K"]:
-        """Points of the class or predicted as such."""
+        """Points labelled or predicted as the class."""
         return self.truth + self.predicted - self.hits
 
 
@@ -48,17 +48,17 @@ def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
 
 
 def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """Return TP / (TP + FP + FN) per class; nan if the class is neither in truth nor prediction."""
+    """Return TP / (TP + FP + FN) per class; nan if it is in neither ground truth nor prediction."""
     return _ratio(counts.hits, counts.union)
 
 
 def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """Return TP / (TP + FN) per class; nan if the truth lacks the class."""
+    """Return TP / (TP + FN) per class; nan if the ground truth lacks the class."""
     return _ratio(counts.hits, counts.truth)
 
 
 def miou_over_present(counts: ClassCounts) -> float:
-    """Return the mean IoU over the classes of the truth, else nan (OpenGaussian, per scene).
+    """Return the mean IoU over the ground-truth classes, nan if there are none (OpenGaussian, per scene).
 
     A wrong prediction of an absent class lowers only the true class's IoU.
     """
@@ -66,12 +66,12 @@ def miou_over_present(counts: ClassCounts) -> float:
 
 
 def macc_over_present(counts: ClassCounts) -> float:
-    """Return the mean accuracy over the classes of the truth, else nan (OpenGaussian, per scene)."""
+    """Return the mean accuracy over the ground-truth classes, nan if none (OpenGaussian, per scene)."""
     return _mean(class_accuracy(counts)[counts.truth > 0])
 
 
 def miou_over_occurring(counts: ClassCounts, among: Bool[np.ndarray, " K"] | None = None) -> float:
-    """Return the mean IoU over the classes of truth or prediction; nan if there is none.
+    """Return the mean IoU over the classes in ground truth or prediction; nan if there are none.
 
     A class that is only predicted counts as 0. Source: ScanNet/ScanNet `evaluate_semantic_label.py`, pooled
     over all scans. `among` selects classes, such as the head, common or tail of ScanNet200.
@@ -86,7 +86,7 @@ def miou_over_all(counts: ClassCounts) -> float:
 
 
 def macc_over_all(counts: ClassCounts) -> float:
-    """Return the mean accuracy over all K classes; a class without truth counts as 0 (OpenNeRF)."""
+    """Return the mean accuracy over all K classes; one without ground truth counts as 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
 
 
@@ -100,7 +100,7 @@ def miou_absent_as_one(counts: ClassCounts) -> float:
 
 
 def frequency_weighted_iou(counts: ClassCounts) -> float:
-    """Return the mean IoU over the classes of the truth, weighted by their points; nan if it has none."""
+    """Return the mean IoU over the ground-truth classes, weighted by their points; nan if there are none."""
     points = counts.truth.sum()
     if not points:
         return float("nan")

@@ -180,7 +180,7 @@ def level_by_mean_in_mask(
     levels: tuple[Level, ...] = LEVELS,
     empty_wins: bool = False,
 ) -> Level:
-    """Return the level with the highest mean relevancy inside its own mask; an empty one is last, or wins."""
+    """Return the level with the highest mean relevancy in its mask; empty ones lose unless `empty_wins`."""
     empty = np.inf if empty_wins else -np.inf
     means = [
         float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else empty

@@ -1,4 +1,4 @@
-"""Answers of a scene in one view, cached, and their rows of scores."""
+"""Answers of a scene in one view, cached, and their score rows."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -112,7 +112,7 @@ def class_map_rows(
 ) -> Iterator[Measured]:
     """Yield the rows of one view under `3d-ovs/argmax`: IoU of each class and pixel accuracy.
 
-    `similarity` is the cosine of each pixel with each text. Texts are sorted, because the first wins ties.
+    `similarity` is the cosine of each pixel with each text. Texts are sorted, as the first one wins ties.
     """
     prediction = masks.argmax_masks(similarity)
     for row, text in enumerate(texts):

@@ -21,7 +21,8 @@ RELEVANCY_SCALE = 10.0
 
 NODE_SELECT = 0.95
 """A node answers a text if its cosine margin is below that of the best node in the view by at most
-1 - NODE_SELECT of the range of margins at its level, or three times that if their cosine is at least 0.9.
+1 - NODE_SELECT of the range of margins at its level, or three times that if the two nodes' cosine is at least
+0.9.
 
 Version 1 of `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` used 0.85 of the range of the
 relevancies themselves. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency`,
@@ -33,7 +34,7 @@ ANCESTORS = 0.2
 `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` added nothing."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
-"""How rows are averaged to a number in a table.
+"""How rows are averaged into a number in a table.
 
 pairs: mean over the (view, query) pairs of a scene, then over scenes.
 classes: mean over the views of a query, then over the queries of a scene, then over scenes.
@@ -55,7 +56,7 @@ class ProtocolCard:
     selection: str  # how a prediction is chosen, threshold and level, in words
     source: str  # origin and departures from it; begins with "none" if there is no public code
     rule: RelevancyRule | None = None  # how relevancy maps become masks, if they do
-    missing: Literal["zero", "left out"] = "zero"  # score of a pair without a prediction; omission inflates
+    missing: Literal["zero", "left out"] = "zero"  # for pairs without a prediction; omission inflates scores
     classes: str = ""  # name of the queried `ClassSet`, if it is fixed
     # `labels`: the region that the data set defines; `any grey`: all non-black pixels of its mask file
     truth: Literal["labels", "any grey"] = "labels"
@@ -88,7 +89,7 @@ GAUSSIAN_GROUPING = "lkeab/gaussian-grouping@c93f24b script/eval_lerf_mask.py"
 ARGMAX = "argmax of the cosine over the classes, no canonical phrases"
 PAPER = "none: Hi-LSplat, implementation details"
 OURS = "none: ours"
-LANGSPLAT_V2 = "LangSplatV2, as its copy xuexutao/Lang_GS has it"
+LANGSPLAT_V2 = "LangSplatV2, as in its copy xuexutao/Lang_GS"
 
 LERF_LANGSPLAT = ProtocolCard(
     "lerf/langsplat",
@@ -106,9 +107,9 @@ TREE_NODES = ProtocolCard(
     5,
     MASK + LOCALIZATION,
     "pairs",
-    "3D nodes that the view shows, at most 0.05 of the range of the level's cosine margins (with a fifth of "
-    "their ancestors' mean) below the best, or 0.15 if the cosine with it is at least 0.9, rendered; level "
-    "chosen by the tree",
+    "3D nodes visible in the view whose cosine margin (plus a fifth of their ancestors' mean) is below the "
+    "best by at most 0.05 of the level's range, or 0.15 if their cosine with the best node is at least 0.9, "
+    "rendered; level chosen by the tree",
     OURS,
 )
 LEVEL_GIVEN = ProtocolCard(
@@ -134,8 +135,8 @@ PATH = ProtocolCard(
     3,
     (*MASK, *LOCALIZATION, *CONSISTENCY),
     "levels",
-    "3D nodes that answer the chain of texts from the whole down, each with its ancestors; those the view "
-    "shows: more text than the paper gives",
+    "3D nodes, visible in the view, that match the chain of texts from the whole down, each with its "
+    "ancestors; uses more text than the paper",
     OURS,
 )
 SCENE_WIDE = ProtocolCard(
@@ -143,18 +144,18 @@ SCENE_WIDE = ProtocolCard(
     2,
     (*MASK, *CONSISTENCY),
     "levels",
-    "as hierarchy/level-given for nodes, but those of the whole scene compete: one answer for all views",
+    "as hierarchy/level-given for nodes, but all nodes of the scene compete: one answer for all views",
     OURS,
 )
 ANNOTATIONS = ProtocolCard(
-    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: what perfect masks score", OURS
+    "hierarchy/annotations", 1, CONSISTENCY, "views", "the annotations: scores of perfect masks", OURS
 )
 VIEW_CONSISTENCY = ProtocolCard(
     "world/view-consistency",
     2,
     ("view_consistency",),
     "levels",
-    "as hierarchy/level-given, in a view and its nearest neighbour; IoU over the surface points both show",
+    "as hierarchy/level-given, in a view and its nearest neighbour; IoU over surface points visible in both",
     f"{OURS}; exact geometry of the synthetic world",
 )
 LERF_OPENGAUSSIAN = ProtocolCard(
@@ -162,7 +163,7 @@ LERF_OPENGAUSSIAN = ProtocolCard(
     1,
     ("iou", "acc_25", "acc_50"),
     "pairs",
-    "Gaussians selected in 3D by cosine, rendered, silhouette above 0.7; another task than lerf/langsplat",
+    "Gaussians selected in 3D by cosine, rendered, silhouette above 0.7; not the task of lerf/langsplat",
     "OpenGaussian",
     public="yanmin-wu/OpenGaussian@b70dcc6 scripts/compute_lerf_iou.py",
 )
@@ -171,8 +172,8 @@ LERF_MASK = ProtocolCard(
     1,
     MASK,
     "classes",
-    "masks as the method gives them, one per prompt",
-    "Gaussian Grouping; departs: a missing prediction counts 0, two empty masks 0 (there NaN)",
+    "the method's own masks, one per prompt",
+    "Gaussian Grouping; departs: a missing prediction and two empty masks (there, NaN) count as 0",
     public=GAUSSIAN_GROUPING,
 )
 LERF_MASK_SKIPPING = ProtocolCard(
@@ -180,8 +181,8 @@ LERF_MASK_SKIPPING = ProtocolCard(
     1,
     MASK,
     "classes",
-    "masks as the method gives them, one per prompt",
-    "Gaussian Grouping, where a missing prediction is skipped; departs: two empty masks count 0 (there NaN)",
+    "the method's own masks, one per prompt",
+    "Gaussian Grouping, skipping missing predictions; departs: two empty masks count as 0 (there, NaN)",
     missing="left out",
     public=GAUSSIAN_GROUPING,
 )
@@ -190,7 +191,7 @@ OVS_NODES = ProtocolCard(
     1,
     MASK,
     "pairs",
-    "as lerf/tree-nodes: a tree answers with nodes, to which no rule for maps belongs",
+    "as lerf/tree-nodes: a tree answers with nodes, to which rules for maps do not apply",
     OURS,
 )
 OVS_ARGMAX = ProtocolCard(
@@ -199,8 +200,8 @@ OVS_ARGMAX = ProtocolCard(
     ("iou", "pixel_accuracy"),
     "pairs",
     f"{ARGMAX} and over the levels, at an eighth of the image's size",
-    "3D-OVS; departs: the highest cosine of three levels (there one); a pixel that none answers is a miss. "
-    "Up to version 2 a text that the view lacks didn't compete",
+    "3D-OVS; departs: the highest cosine of three levels (there, one); a pixel without a cosine is a miss. "
+    "Up to version 2, texts not visible in the view did not compete",
     public="Kunhao-Liu/3D-OVS@80e512c renderer.py:evaluation_segmentation_test",
 )
 INSTANCES = ProtocolCard(
@@ -208,9 +209,9 @@ INSTANCES = ProtocolCard(
     1,
     ("ap", "ap50", "ap25", "ap_head", "ap_common", "ap_tail"),
     "pooled",
-    "predicted instances with class and confidence; fewer than 100 points are left out",
-    "OpenMask3D's copy of ScanNet's script; departs: confidence is the cosine (there 1 for all). Predictions "
-    "match in the order given; that of ScanNet's own script is a dict's, so undefined",
+    "predicted instances with class and confidence; those with fewer than 100 points are ignored",
+    "OpenMask3D's copy of ScanNet's script; departs: confidence is the cosine (there, 1 for all). "
+    "Predictions are matched in the order given; ScanNet's own script uses a dict's order, so undefined",
     classes="scannet200-instances",
     public="OpenMask3D/openmask3d@6488748 openmask3d/evaluation/eval_semantic_instance.py:evaluate_matches",
 )
@@ -222,9 +223,9 @@ OVS_LANGSPLAT_V2 = ProtocolCard(
     MASK,
     "pairs",
     "min-max of the smoothed relevancy above 0.625, 7 x 7 majority; whole or part, by the highest mean in "
-    "its mask, an empty mask first; truth: any non-zero grey; wood wall is united with wood table",
-    f"{LANGSPLAT_V2}, with the threshold of its .sh; departs: a text without a true pixel is not asked. "
-    "Up to version 2 a mask of greys of 1 to 127 alone was none",
+    "its mask, an empty mask first; ground truth: any non-zero grey; wood wall includes wood table's mask",
+    f"{LANGSPLAT_V2}, with its shell script's threshold; departs: a text without ground-truth pixels is not "
+    "queried. Up to version 2, a mask with only greys of 1 to 127 was empty",
     RelevancyRule(
         filter_px=29,
         threshold=0.25,
@@ -278,7 +279,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     _maps(
         "lerf/langsplat-v2",
         LANGSPLAT_V2,
-        "as lerf/langsplat with windows of 29 and 7 px that end at the border",
+        "as lerf/langsplat with windows of 29 and 7 px that are clipped at the border",
         MASK + LOCALIZATION,
         public="xuexutao/Lang_GS@b808dfb eval_lerf.py",
         filter_px=29,
@@ -336,7 +337,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points(
         "scannet200/benchmark",
         "scannet200",
-        "none: ScanNet/ScanNet has classes and splits alone (BenchmarkScripts/ScanNet200); counts as in its "
+        "none: ScanNet/ScanNet has only classes and splits (BenchmarkScripts/ScanNet200); counts as in its "
         "script for 20 classes",
         (*PER_CLASS, "miou_occurring", "miou_head", "miou_common", "miou_tail"),
         "pooled",
@@ -346,8 +347,8 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points(
         "replica/opennerf",
         "replica-51",
-        "OpenNeRF; departs: a class without a true point counts 0 (there NaN if it is predicted, else the "
-        "script stops)",
+        "OpenNeRF; departs: a class without ground-truth points counts as 0 (there, NaN if it is predicted; "
+        "otherwise, the script stops)",
         (*PER_CLASS, "miou_all", "macc_all"),
         "pooled",
         public="opennerf/opennerf@343fa06 scripts/train_eval_replica_semantics.py:get_iou",
@@ -355,15 +356,15 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points(
         "replica/conceptgraphs",
         "replica-51",
-        "ConceptGraphs' means; departs: on mesh vertices, and all 51 names compete (there only the classes "
-        "that the scene has)",
+        "ConceptGraphs' means; departs: scored on mesh vertices, and all 51 names compete (there, only the "
+        "classes in the scene)",
         (*PER_CLASS, "macc_present", "frequency_weighted_iou"),
         public="concept-graphs/concept-graphs@3f97d78 conceptgraph/utils/eval.py:compute_metrics",
     ),
     _points(
         "waymo/segmentation",
         "waymo-22",
-        "Waymo; miou_present leaves out the classes that it counts as 1",
+        "Waymo; miou_present omits the absent classes, which Waymo counts as 1",
         (*PER_CLASS, "miou_absent_as_one", "miou_present"),
         "pooled",
         public="waymo-research/waymo-open-dataset@2a7359b waymo_open_dataset/metrics/segmentation_metrics.cc",

@@ -7,8 +7,8 @@
 | `vote` | a vote of the k nearest within a radius, weighted by opacity; none beyond the radius |
 | `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
 
-The numbers depend on the mode, so every row names it. Among equidistant Gaussians the search tree chooses,
-deterministically for the same input and any number of threads.
+The numbers depend on the mode, so every row names it. The search tree breaks ties between equidistant
+Gaussians, deterministically for the same input and any number of threads.
 """
 
 from dataclasses import dataclass
@@ -156,7 +156,7 @@ def density(
         squared = (np.einsum("pkij,pkj->pki", whiten[index[rows]], offset) ** 2).sum(axis=2)
         log_weight = np.log(opacities[index[rows]].astype(float)) - squared / 2
         log_weight = np.where(np.isfinite(distance[rows]), log_weight, -np.inf)
-        # Subtracting the largest keeps the ratios and never underflows to all zeros.
+        # Subtracting the maximum preserves the ratios and prevents underflow of all weights to zero.
         weight[rows] = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
     return CarriedPoints(f"density of {k}", index, _normalised(weight), np.ones(len(points), dtype=bool))
 
@@ -188,7 +188,7 @@ def _neighbours(
         raise MisalignedArtifactError(
             "no Gaussian is opaque enough to label a point",
             expected=f"an opacity of at least {OPACITY_MIN}",
-            found=f"{len(opacities)} Gaussians below",
+            found=f"{len(opacities)} Gaussians, all below",
             fix="check gaussians.ply; the fit has probably failed",
         )
     from scipy.spatial import cKDTree  # importing takes 0.2 s and is needed only for points

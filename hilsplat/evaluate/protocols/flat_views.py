@@ -57,7 +57,7 @@ class FlatProtocols:
                 mask from the relevancy maps.
             category: the text, merged over levels.
             queries: the text at each level.
-            maps: the method's maps of any text.
+            maps: the method's maps for any text.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
@@ -112,7 +112,7 @@ def argmax_rows(
     Args:
         cosine_of: cosine of texts with pixels (row * width + column) at any number of levels; -inf for none.
         words: departures, for the protocol's name.
-        is_stand_in: whether pixels around the objects have no text; they are not compared.
+        is_stand_in: whether pixels around the objects have no text, in which case they are not compared.
     """
     if not queries:
         return

@@ -59,12 +59,12 @@ def measure_points(
     """Yield the rows of one scene: IoU and accuracy per class, and the scene's means if the card has them.
 
     In a class row, `n` is the number of points in the denominator, so that `pooled_points` can pool scenes.
-    Classes absent from truth and prediction have no row; a scene without truth has no rows. Labels are 1 .. K
-    in the order of `classes`; 0 is ignored in the truth and a miss in the prediction. `carried` names the way
-    in which predictions reached the points.
+    Classes absent from ground truth and prediction have no row; a scene without ground truth has no rows.
+    Labels are 1 .. K in the order of `classes`; 0 is ignored in ground truth and is a miss in the prediction.
+    `carried` names the mode that transferred predictions to the points.
 
     Raises:
-        MisalignedArtifactError: prediction and truth have different numbers of points, or the classes
+        MisalignedArtifactError: prediction and ground truth have different numbers of points, or the classes
             are not the protocol's.
     """
     if card.classes != classes.name:
@@ -161,7 +161,7 @@ def point_classes(
 def node_instances(
     scene: "LanguageScene", carried: CarriedPoints, truth: LabelledPoints, classes: ClassSet
 ) -> instances.InstanceMatches:
-    """Match the nodes at level whole to the truth; a node's best cosine gives class and confidence."""
+    """Match the nodes at level whole to the ground truth; a node's best cosine gives class and confidence."""
     tree = scene.tree
     nodes = tree.nodes_of(LEVEL)
     cosines = tree.clip[nodes].astype(np.float32) @ scene.text_vectors(classes.texts).T
@@ -206,7 +206,7 @@ def measure_scene_points(
 ) -> Iterator[Measured | tuple[str, instances.InstanceMatches]]:
     """Yield the rows of one scene under point protocols, and the instance matches of the tree.
 
-    Labelled points are given by labelling, in metres; `scene_from_points` is a similarity transform.
+    Labelled points are keyed by labelling, in metres; `scene_from_points` is a similarity transform.
     Protocols whose labelling is absent are skipped.
     """
     radius = VOTE_RADIUS_M * float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))

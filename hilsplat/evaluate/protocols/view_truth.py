@@ -1,4 +1,4 @@
-"""The truth of one view: its scored queries and their regions, loaded on demand."""
+"""Ground truth of one view: its scored queries and their regions, loaded on demand."""
 
 import logging
 from collections.abc import Callable, Iterable
@@ -23,7 +23,7 @@ EIGHTH = 8
 """3D-OVS compares masks at an eighth of the image's size."""
 
 SHAPE_TOLERANCE = 0.01
-"""Tolerated relative difference in shape between labels and view: undistortion and shrinking round sides."""
+"""Tolerated relative difference in shape between labels and view, due to rounding in earlier stages."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Query:
     paths: tuple[tuple[str, ...], ...]  # distinct chains of texts that lead to its nodes
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]  # of each annotated node, borders included
-    any_grey: Bool[np.ndarray, "H W"] | None = None  # region for truth `any grey`, if it differs
+    any_grey: Bool[np.ndarray, "H W"] | None = None  # region for ground truth `any grey`, if it differs
     eighth: Bool[np.ndarray, "h w"] | None = None  # at an eighth of the image's size, read from the label
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
-        """Return the true region for protocols with this `truth`, `labels` or `any grey`."""
+        """Return the ground-truth region for protocols with this `truth`, `labels` or `any grey`."""
         return self.any_grey if truth == "any grey" and self.any_grey is not None else self.truth
 
 
@@ -94,7 +94,7 @@ class ViewTruth:
     def of_regions(
         regions: Iterable[LabelledRegion], size_hw: tuple[int, int], image_hw: tuple[int, int] | None = None
     ) -> "ViewTruth":
-        """Return the truth of a view of a published data set, with or without levels.
+        """Return the ground truth of a view of a published data set, with or without levels.
 
         Regions of one text and level are merged, keeping all their boxes. A region with a broken chain of
         parents is queried but belongs to no family.
@@ -191,7 +191,7 @@ def kept_by_pillow(
 
 
 def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str, Callable[[], ViewTruth]]:
-    """Return the true regions in each annotated test view, loaded on demand."""
+    """Return the ground-truth regions in each annotated test view, loaded on demand."""
     annotations = HierarchyAnnotations.load(truth)
     return {
         view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, min_region_px)
@@ -201,7 +201,7 @@ def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str,
 
 
 def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """Return the true regions in each labelled view of a published data set, loaded on demand."""
+    """Return the ground-truth regions in each labelled view of a published data set, loaded on demand."""
     for sentence in labels.warnings:
         logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
     truths: dict[str, Callable[[], ViewTruth]] = {}

@@ -191,11 +191,11 @@ class _ViewAnswers:
         category: Query,
         queries: Sequence[Query],
     ) -> Iterator[Measured]:
-        """Yield the rows of one text by field or tree.
+        """Yield the rows of one text, answered by field or tree.
 
         Args:
-            flat: protocol of texts merged over levels, as `category` is.
-            answer: level, or None if the method chooses it -> mask of the text.
+            flat: protocol for texts merged over levels, like `category`.
+            answer: maps a level, or None if the method chooses it, to the mask of the text.
             queries: the text at each level.
         """
         united, given, auto = (

@@ -35,7 +35,7 @@ COLUMNS_NOTE = (
 
 
 def ablation_table(sources: Sources) -> Table:
-    """Build the paper's ablation: parts of its method enabled one after the other, in its own reading."""
+    """Build the paper's ablation: parts of its method enabled one after the other, in the paper's reading."""
     footnotes = (
         COLUMNS_NOTE,
         "Initial-2D: levels of the 2D masks by the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
@@ -81,7 +81,7 @@ def _sweep(sources: Sources, name: str, setting: str, reported: str, note: str) 
 def component_blocks(
     sources: Sources, methods: tuple[str, ...] = ("field", "tree", "tree-path")
 ) -> list[Block]:
-    """Return one row per variant and method, all protocols of the ablation side by side."""
+    """Return one row per variant and method, with all protocols of the ablation side by side."""
     scores = measured.with_seeds(sources.scores)
     blocks = measured.measured_blocks(
         replace(sources, scores=sources.scores[sources.scores["method"].isin(methods)]),

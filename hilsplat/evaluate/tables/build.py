@@ -66,7 +66,7 @@ TABLES: dict[str, TableKind] = {
 
 
 def published_values(table: str) -> Path:
-    """Return the file with the paper's values for a table; `-seconds` tables share the main table's."""
+    """Return the file with the paper's values for a table; `-seconds` tables share that of the main table."""
     return project_path(f"config/published/{table.removesuffix(SECONDS)}.csv")
 
 

@@ -128,7 +128,7 @@ def quality_blocks(
 
 
 def time_cells(costs: list[Cost]) -> dict[str, Cell]:
-    """Return mean times over scenes and the largest memory."""
+    """Return mean times over scenes and the maximum memory."""
     return {
         "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
         "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),

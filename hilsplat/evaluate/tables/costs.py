@@ -35,26 +35,26 @@ class Job:
     variant: str
     elapsed_s: float  # wall-clock time
     cpu_s: float  # of the job and its children; 0 if the job was too short to be sampled
-    peak_mib: float  # largest resident memory; 0 as above
+    peak_mib: float  # peak resident memory; 0 if the job was too short to be sampled
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of one scene under one variant; shared stages are counted in full. Without a record: nan."""
+    """Cost of one scene under one variant; shared stages are counted in full. Unrecorded values are nan."""
 
     dataset: str
     scene: str
     variant: str
     prepare_s: float  # wall-clock time of masks, trees of the views and CLIP
     train_s: float  # wall-clock time of contributions, semantic tree, autoencoder and field
-    peak_mib: float  # largest resident memory of a training job
+    peak_mib: float  # peak resident memory of the training jobs
     query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
 
 
 def time_queries(
     answers: "LanguageScene", queries: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
 ) -> dict[str, float]:
-    """Return the seconds of one query per method: text, weights of the view, relevancy and mask.
+    """Return the seconds per query of each method: text encoding, view weights, relevancy and mask.
 
     The view's weights and the text's vector are timed once and added, because later queries reuse them.
     `queries` compute the mask of a text, with weights and vectors cached; the median over texts is used.
@@ -108,7 +108,7 @@ def jobs_of(scores: Path) -> dict[str, Job | None]:
     """Return the jobs behind a score file by stage, of whichever variant ran them; None without a record.
 
     The score file's provenance lists the artifacts that `evaluate` read; the field's provenance lists the
-    rest. A stage whose output nothing read is absent, such as trees for a baseline.
+    rest. Stages whose output was not read are absent, such as trees for a baseline.
     """
     places = _inputs(scores)
     if "field" in places:
@@ -138,7 +138,7 @@ def run_efficiency(results: Path, out: Path) -> str:
     """Write a CSV of all jobs below `results`, and a Markdown table of stages beside it, which is returned.
 
     Raises:
-        ArtifactError: there is no benchmark file, one is unreadable, or an output is an unrelated file.
+        ArtifactError: there is no benchmark file, one is unreadable, or an output path has another file.
     """
     files = sorted(Path(results).glob("**/benchmarks/*.jsonl"))
     if not files:

@@ -78,7 +78,7 @@ def shown_rows(block: Block, notes: dict[str, int]) -> Iterator[tuple[list[str],
 
 
 def as_markdown(table: Table) -> str:
-    """Return the table as Markdown. Best bold, second underlined, third in italics."""
+    """Return the table as Markdown: best values bold, second-best underlined, third-best italic."""
     marks = {1: "**{}**", 2: "<u>{}</u>", 3: "*{}*", 0: "{}"}
     notes = table.numbered_notes()
     lines = [f"# {table.title}", ""]
@@ -109,7 +109,7 @@ def latex_text(text: str) -> str:
 
 
 def as_latex(table: Table) -> str:
-    """Return a booktabs table with footnotes below. Best bold, second underlined, third italic."""
+    """Return a booktabs table with footnotes: best values bold, second-best underlined, third-best italic."""
     marks = {1: r"\textbf{%s}", 2: r"\underline{%s}", 3: r"\textit{%s}", 0: "%s"}
     notes = table.numbered_notes()
     lines = [r"% needs \usepackage{booktabs,graphicx}", r"\begin{table*}[t]", r"\centering"]

@@ -75,7 +75,7 @@ def column_of_data(data: str, column: str) -> str | None:
 
 
 def frames_table(sources: Sources, data: str) -> Table:
-    """Build a table of the paper's frames, and of the views queried at levels with their number of texts."""
+    """Build a table of the paper's frames and of the views queried at levels, with the texts per view."""
     texts: dict[tuple[str, str, str], set] = {}
     for row in sources.scores.itertuples():
         if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):

@@ -1,4 +1,4 @@
-"""Averages of scores, in the order that their protocol sets, and blocks of measured rows.
+"""Averages of scores, in the order that their protocol defines, and blocks of measured rows.
 
 Scores are a frame of `scores.csv` (`evaluate.scores.read_scores`). A (view, query) pair without a prediction
 has a row with value 0 unless its protocol omits such pairs.
@@ -43,7 +43,7 @@ STAND_INS = {
 """Synthetic data set -> its description in headings."""
 
 TRUE_MASKS = "diagnostic, true masks: "
-"""Prefix of the method's name in rows whose masks were made from true labels."""
+"""Prefix of the method's name in rows whose masks were made from ground-truth labels."""
 
 
 def measured_blocks(
@@ -217,7 +217,7 @@ def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> 
 
 
 def share_above(rows: "pd.DataFrame", metric: str, threshold: float) -> float:
-    """Return the share of rows above a threshold, such as Acc@0.25, averaged as the values themselves are."""
+    """Return the share of rows above a threshold, such as Acc@0.25, averaged like the values themselves."""
     return table_value(rows.assign(value=(rows["value"] > threshold).astype(float)), metric)
 
 

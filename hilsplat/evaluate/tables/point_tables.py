@@ -1,6 +1,7 @@
 """Tables of labelled points, with bootstrap intervals over scenes and class names.
 
-A room has about twenty names, most entirely right or wrong: one node changes the mean by several points.
+A room has about twenty names, most of them entirely right or wrong, so one node changes the mean by several
+points.
 """
 
 from collections.abc import Mapping
@@ -187,7 +188,7 @@ def bootstrap_mean(
 
     Args:
         hits: correctly predicted points of each class, per scene.
-        union: points of the class or predicted as it; 0 where it doesn't occur.
+        union: points labelled or predicted as the class; 0 where it doesn't occur.
         present: classes included in the mean.
         pooled: whether counts of all scenes are summed first; otherwise scenes are averaged.
     """
@@ -215,7 +216,7 @@ def bootstrap_mean(
 
 
 def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
-    """Return interval, scenes and names of one protocol, method and seed; nothing without class rows."""
+    """Return interval, scenes and names of one protocol, method and seed; empty without class rows."""
     ious = part[part["metric"] == "class_iou"]
     true = part[part["metric"] == "class_accuracy"]
     if ious.empty or true.empty:

@@ -140,7 +140,7 @@ def read_published(path: Path) -> list[dict[str, str]]:
 
 @dataclass(frozen=True)
 class Sources:
-    """All input of the tables."""
+    """All inputs of the tables."""
 
     published: Sequence[Mapping[str, str]]  # the paper's values (`read_published`)
     scores: "pd.DataFrame"

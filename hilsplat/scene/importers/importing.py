@@ -25,7 +25,7 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 ASPECT_TOLERANCE = 0.01
-"""Relative tolerance of an image's aspect ratio: a scaled copy is accepted, another crop is not."""
+"""Relative tolerance of an image's aspect ratio: a scaled copy is accepted, a different crop is not."""
 
 MIN_TRIANGULATED = 100
 """Number of triangulated points below which random points in front of the cameras are used instead."""
@@ -61,14 +61,14 @@ def import_poses(
     missing = sorted(view.name for view in described if view.image is None)
     total, least = len(described), settings.min_registered_share
     if total == 0:
-        raise SceneError(f"{known.files[0]} of {name} does not pose any view", fix="export it again")
+        raise SceneError(f"{known.files[0]} of {name} contains no posed views", fix="export it again")
     if not present or len(present) < least * total:
         listed = ", ".join(missing[:20]) + (f" and {len(missing) - 20} more" if len(missing) > 20 else "")
         raise RegistrationError(
             f"too few posed views of {name} have an image in {known.root}",
             expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
             found=f"{len(present)}; missing: {listed}",
-            fix="put the images where the model names them: in images/ or beside it",
+            fix="put the images where the model expects them: in images/ or beside it",
         )
     named = list(zip(present, files, view_names(files), strict=True))
     views = [
@@ -164,7 +164,7 @@ def _without_border(
 
 
 def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image in the orientation whose shape fits the camera, or as stored if both do."""
+    """Read an image in the orientation whose shape fits the camera, or as stored if both orientations fit."""
     upright = read_image(path)
     candidates = [upright]
     with open_image(path) as image:
@@ -175,7 +175,7 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
         if abs(ratio - 1) <= ASPECT_TOLERANCE:
             return pixels
     raise ImageError(
-        f"image {path} does not have the shape its camera describes",
+        f"image {path} does not have the shape that its camera describes",
         expected=f"{camera.width} x {camera.height} px (width x height), or a scaled copy",
         found=f"{upright.shape[1]} x {upright.shape[0]} px",
         fix="use the images that the poses were computed from",
@@ -211,7 +211,7 @@ def triangulate(
 def random_points(
     views: Sequence[PosedView], seed: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sample random grey points in front of the cameras, to start a fit if triangulation gives too few.
+    """Sample random grey points in front of the cameras, to start a fit if triangulation yields too few.
 
     Each is on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the distance
     from the camera to the point nearest to all optical axes.

@@ -34,7 +34,7 @@ Errors = dict[str, dict[str, Any]]
 AGAIN = "export it again"
 
 FARTHEST = 1e9
-"""Largest coordinate, in the source's units, up to which 32-bit numbers can resolve a scene."""
+"""Maximum coordinate, in the source's units; 32-bit numbers cannot resolve scenes beyond it."""
 
 MAX_VIEWS = 300
 """Maximum number of views of a phone export, sampled evenly, because a recording has many more frames than a
@@ -67,7 +67,7 @@ class KnownView:
 
 
 def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Errors]:
-    """Read the posed views of a folder in any supported format, with points and errors if it has them."""
+    """Read the posed views of a folder in any supported format, with points and errors if available."""
     if known.kind == "colmap":
         return read_colmap(known)
     if known.kind == "transforms":
@@ -88,13 +88,13 @@ def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
             expected = f"finite numbers, a focal length above 0, sides of 1 to {MAX_SIDE_PX} px"
         elif not np.isfinite(pose).all() or not are_rotations(pose[:3, :3], RIGID_TOLERANCE):
             fault, found = "rotation", np.array2string(pose[:3, :3], precision=4).replace("\n", "")
-            expected = "a matrix that neither scales nor mirrors, from a quaternion that is not 0"
+            expected = "a matrix that neither scales nor mirrors, or a quaternion that is not 0"
         elif np.abs(pose[:3, 3]).max() > FARTHEST:
             fault, found, expected = "position", str(pose[:3, 3].tolist()), "coordinates up to 1e9"
         else:
             continue
         raise SceneError(
-            f"the {fault} of {view.name} cannot be that of a camera",
+            f"the {fault} of {view.name} is not valid for a camera",
             expected=expected,
             found=found,
             fix=f"export the poses again: {known.files[0]}",
@@ -143,12 +143,12 @@ def _find_image(root: Path, name: str) -> Path | None:
 
 
 def _check_inside(root: Path, name: str) -> None:
-    """Refuse a name that leads out of the source's folder: downloaded data could otherwise read any file."""
+    """Refuse names of files outside the source's folder, which downloaded data could otherwise access."""
     if Path(name).is_absolute() or Path(os.path.normpath(name)).parts[:1] == ("..",):
         raise SceneError(
             f"the poses in {root} name a file outside it: {name}",
             expected="names below the folder",
-            fix="put the images into the folder, and correct the names in the file with the poses",
+            fix="put the images into the folder, and correct the names in the pose file",
         )
 
 
@@ -163,7 +163,7 @@ def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
         content = read_json_object(file, AGAIN)
         frames = content.get("frames")
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise SceneError(f"{file} has no list `frames` of objects", fix=AGAIN)
+            raise SceneError(f"{file} has no `frames` list of objects", fix=AGAIN)
         for number, frame in enumerate(frames):
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
@@ -220,8 +220,8 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
         )
     if not (focal_x > 0 and focal_y > 0 and 0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise SceneError(
-            f"{where}: focal length and size cannot be those of a photograph",
-            expected=f"more than 0, sides of at most {MAX_SIDE_PX} px",
+            f"{where}: focal length and size are not valid for a photograph",
+            expected=f"a focal length above 0, sides of 1 to {MAX_SIDE_PX} px",
             found=f"{focal_x:g} and {focal_y:g}, {width:g} x {height:g} px",
             fix=AGAIN,
         )
@@ -240,7 +240,7 @@ def _read_ply_points(path: Path) -> Points:
     except (OSError, PlyParseError, KeyError, ValueError) as error:
         raise SceneError(
             f"the points of {path} cannot be read: {error}",
-            fix="put the file there, or remove ply_file_path from the file to have points computed",
+            fix="put the file there, or remove ply_file_path from the transforms file to compute points",
         ) from error
     if {"red", "green", "blue"} <= set(vertex.dtype.names):
         rgb = np.stack([vertex[colour] for colour in ("red", "green", "blue")], axis=1).astype(np.uint8)
@@ -250,7 +250,7 @@ def _read_ply_points(path: Path) -> Points:
 
 
 def read_llff(known: KnownPoses) -> list[KnownView]:
-    """Read the posed views of an LLFF scene; row i of `poses_bounds.npy` is that of the i-th image by name.
+    """Read the posed views of an LLFF scene; row i of `poses_bounds.npy` belongs to the i-th image by name.
 
     The first 15 of its 17 numbers are a 3 x 5 matrix, row by row: rotation columns (down, right, back),
     translation, and the column (height, width, focal). OpenCV's axes are x = right, y = down, z = -back. The
@@ -321,7 +321,7 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
             camera = pycolmap.Camera(model="PINHOLE", params=params, **size)
         except (KeyError, TypeError, ValueError) as error:
             raise SceneError(
-                f"{file} is not a camera of Polycam: {error!r}",
+                f"{file} is not a Polycam camera: {error!r}",
                 expected="fx, fy, cx, cy, width, height and t_00 to t_23",
                 fix="export the raw data again (developer mode)",
             ) from error
@@ -347,7 +347,7 @@ def read_record3d(known: KnownPoses) -> list[KnownView]:
         matrices = np.concatenate([Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:, None]], axis=2)
     except (KeyError, TypeError, ValueError) as error:
         raise SceneError(
-            f"{file} does not contain poses of Record3D: {error!r}",
+            f"{file} does not contain Record3D poses: {error!r}",
             expected="K (9 numbers), w, h, and poses (rows of 7 numbers)",
             fix="export the recording again",
         ) from error

@@ -1,6 +1,6 @@
 """Check that the binary files of a COLMAP model are complete.
 
-pycolmap does not check record counts: a truncated file or wrong count makes it allocate memory endlessly.
+pycolmap does not check record counts: a truncated file or wrong count makes it allocate unlimited memory.
 """
 
 import mmap
@@ -32,7 +32,7 @@ class _Walk:
         """Advance by a number of bytes, and fail beyond the end of the file."""
         self.at += count
         if self.at > len(self.data):
-            raise ValueError("it ends too early")
+            raise ValueError("it is truncated")
 
 
 def _camera(walk: _Walk) -> None:
@@ -47,7 +47,7 @@ def _image(walk: _Walk) -> None:
     walk.skip(4 + POSE_BYTES + 4)
     end = walk.data.find(b"\0", walk.at)
     if end < 0:
-        raise ValueError("a name has no end")
+        raise ValueError("a name is not terminated")
     walk.at = end + 1
     walk.skip(24 * walk.number("Q"))
 
@@ -103,7 +103,7 @@ def _walk(path: Path, record: Callable[[_Walk], None]) -> None:
         walk = _Walk(data)
         count = walk.number("Q")
         if count > len(data):
-            raise ValueError(f"it announces {count} records in {len(data)} bytes")
+            raise ValueError(f"it states {count} records in {len(data)} bytes")
         for number in range(count):
             try:
                 record(walk)

@@ -21,7 +21,7 @@ def source_from_dataparser(dataparser: Path, transforms: Path | None) -> Float64
     `dataparser_transforms.json` maps original coordinates, usually COLMAP's, to training coordinates:
     `x_training = scale * (transform @ [x_original, 1])`. The poses in `transforms.json` are in a third
     coordinate system, which `applied_transform` and `applied_scale` in that file relate to the original one.
-    Without `transforms`, a COLMAP model has the poses.
+    Without `transforms`, the poses are in a COLMAP model.
     """
     content = read_json_object(dataparser, FIX)
     applied, applied_scale = np.eye(4), 1.0
@@ -47,7 +47,7 @@ def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray
     if not usable:
         raise SceneError(
             f"{path}: {key} cannot be used",
-            expected="a 3 x 4 matrix that can be inverted",
+            expected="an invertible 3 x 4 matrix",
             found=repr(content.get(key))[:80],
             fix=FIX,
         )

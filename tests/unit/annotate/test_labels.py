@@ -83,7 +83,7 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     warnings: list[str] = []
     regions = regions_of(read_isat(path), warnings)
     assert [region.path for region in regions] == [("mug",), ("mug", "Henkel „links“")]
-    assert warnings == ["DSC_1.json: proposals not accepted, left out: 1"]
+    assert warnings == ["DSC_1.json: unaccepted proposals, ignored: 1"]
     first = path.read_bytes()
     write_labels(path, "DSC_1.png", SIZE, given[::-1], version)
     assert path.read_bytes() == first  # the order of drawing does not matter

@@ -96,13 +96,13 @@ def refused(world, predictions, tmp_path, error=ArtifactError):
 def test_a_view_without_predictions_or_with_two_is_refused_but_its_folder_may_be_empty(block_world, tmp_path):
     message = refused(block_world, tmp_path, tmp_path)
     assert "view 001 has no predictions" in message
-    assert "or an empty folder" in message
+    assert "or create an empty folder" in message
     (tmp_path / "001").mkdir()
     frame = score(block_world, tmp_path, tmp_path / "scores.csv")  # nothing in any view
     assert len(frame) and not frame["value"].any()
     (tmp_path / "scores.csv").unlink()
     np.savez(tmp_path / "001.npz", bear=np.ones((64, 64), bool))
-    assert "view 001 has predictions twice" in refused(block_world, tmp_path, tmp_path)
+    assert "view 001 has two sets of predictions" in refused(block_world, tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_view_without_predictions_or_with_two_is_refused_but_its_folder_may_be
         (
             "whole/bear",
             np.full((32, 64), 255),
-            "001.png: whole/bear: the mask has another size than the labels\n"
+            "001.png: whole/bear: the mask and the labels differ in size\n"
             "  expected  64 x 64 \\(height x width\\)\n  found     32 x 64",
         ),
         ("baer", np.full((64, 64), 255), "the labels have no text 'baer'\n(.|\n)*rename it 'bear'"),
@@ -126,7 +126,7 @@ def test_masks_that_cannot_be_scored_are_refused(block_world, tmp_path, name, ma
 
 def test_exactly_one_of_labels_and_truth_is_required(tmp_path):
     for given in ({}, {"truth": tmp_path}, {"labels": "lerf_ovs/ramen", "truth": tmp_path}):
-        with pytest.raises(SettingsError, match="what to score against"):
+        with pytest.raises(SettingsError, match="exactly one set of labels"):
             run_evaluate_files(tmp_path, tmp_path / "scores.csv", method="m", **given)
 
 

@@ -274,7 +274,9 @@ def test_a_folder_of_videos_is_one_capture(tmp_path, sheet):
 
 def test_a_static_video_is_refused_and_leaves_no_files(tmp_path, sheet):
     video = write_video(tmp_path / "still.mp4", pan([0] * 20))
-    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*1 different(.|\n)*film longer"):
+    with pytest.raises(
+        SceneError, match=r"too few photographs(.|\n)*1 different(.|\n)*record a longer video"
+    ):
         add_scene(sheet, "desk", video)
     assert not sheet.exists()
     assert not (tmp_path / "project/photos/desk").exists()
@@ -311,7 +313,7 @@ def test_videos_of_live_photos_are_ignored_and_reported(tmp_path, sheet):
 
 def test_other_files_are_refused(tmp_path, sheet):
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(SceneError, match=r"notes\.txt is a file of an unknown kind(.|\n)*a \.zip"):
+    with pytest.raises(SceneError, match=r"notes\.txt is a file of an unsupported kind(.|\n)*a \.zip"):
         add_scene(sheet, "desk", tmp_path / "notes.txt")
 
 
@@ -333,11 +335,11 @@ def link(name):
     return entry
 
 
-OUTSIDE = [(name, "leads out") for name in ("../evil.jpg", "a/../../evil.jpg", "/evil.jpg", "..\\evil.jpg")]
+OUTSIDE = [(name, "is outside") for name in ("../evil.jpg", "a/../../evil.jpg", "/evil.jpg", "..\\evil.jpg")]
 
 
 @pytest.mark.parametrize(
-    ("entry", "problem"), [*OUTSIDE, (link("evil.jpg"), "is a link"), ("0.jpg", "is there twice")]
+    ("entry", "problem"), [*OUTSIDE, (link("evil.jpg"), "is a link"), ("0.jpg", "occurs twice")]
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_archives_that_could_write_elsewhere_are_refused(tmp_path, sheet, entry, problem):

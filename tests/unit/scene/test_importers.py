@@ -286,10 +286,10 @@ def test_an_r3d_archive_is_imported(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{}", r"does not contain poses of Record3D: KeyError\('K'\)"),
+        ("{}", r"does not contain Record3D poses: KeyError\('K'\)"),
         ("[]", "is not a JSON object"),
         ("{", "is not valid JSON"),
-        ('{"K": [1,0,0,0,1,0,0,0,1], "w": 1, "h": 1, "poses": [[0,0,0,0,0,0,0]]}', "poses of Record3D"),
+        ('{"K": [1,0,0,0,1,0,0,0,1], "w": 1, "h": 1, "poses": [[0,0,0,0,0,0,0]]}', "Record3D poses"),
     ],
 )
 def test_unusable_phone_exports_are_refused(tmp_path, content, message):

@@ -45,7 +45,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
     assert chosen("two") == ["a/two"]  # in the groups
     assert chosen("b/two") == ["b/two"]
     assert chosen("three", "a/one") == ["a/one", "a/three"]
-    with pytest.raises(SceneError, match=r"only names 'tow'(.|\n)*a/one, a/two"):
+    with pytest.raises(SceneError, match=r"only contains 'tow'(.|\n)*a/one, a/two"):
         chosen("tow")
 
 
@@ -72,7 +72,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
         ("gaussians", "desk", "is a folder"),
         ("gaussians", "notes.txt", "is not a PLY: it begins with b'hell'"),
         ("gaussians", "data:theirs.ply", "data_root, which is not set"),
-        ("features", "desk", "holds no masks of LangSplat"),
+        ("features", "desk", "contains no LangSplat masks"),
         ("poses", "gone", "gone is missing"),
     ],
 )
@@ -202,7 +202,7 @@ def test_nerfstudios_export_is_found_with_the_record_of_its_coordinates(tmp_path
     sheet = write_sheet(tmp_path)
     report = str(add_scene(sheet, "desk", folder))
     latest = folder / runs[0]
-    assert f"nerfstudio's, by {latest}" in report
+    assert f"nerfstudio's, from {latest}" in report
     (row,) = read_sheet(sheet)
     data = SceneData([row], "", str)
     assert data.existing_gaussians(row) == [str(row.gaussians), str(latest), str(folder / "transforms.json")]

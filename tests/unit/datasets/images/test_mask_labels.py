@@ -138,7 +138,7 @@ def test_a_world_written_as_3d_ovs_is_read_back_equal(true_world, bed):
     assert scene.views["00.png"][0].boxes().tolist() == [[26, 5, 34, 13]]
     assert scene.views["03.png"][0].boxes().shape == (0, 4)
     warnings = scene.report().warnings
-    assert "regions without a pixel: 03.png: Ring" in warnings
+    assert "regions without pixels: 03.png: Ring" in warnings
     assert "published frames without segmentation: 04.png, 10.png, 23.png, 30.png" in warnings
     posed = posed_images(bed, "3D-OVS")
     assert list(posed) == ["00.png", "01.png", "02.png", "03.png"]
@@ -224,7 +224,7 @@ def test_masks_of_another_size_or_an_unknown_class_are_reported(bed):
     bear = scene.views["00.png"][1]
     assert np.argwhere(bear.mask((24, 40))).tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
     assert any("bear.png is 20 x 12 px, its image 40 x 24 px: resized" in line for line in scene.warnings)
-    assert "03: masks of unknown classes are not read: wood" in scene.warnings
+    assert "03: masks of unknown classes are ignored: wood" in scene.warnings
 
 
 MASKS = "segmentations"
@@ -234,12 +234,12 @@ MASKS = "segmentations"
     ("change", "message"),
     [
         (lambda at: (at / MASKS / "classes.txt").write_text("\n \n"), "no class"),
-        (lambda at: (at / MASKS / "classes.txt").write_text("hand\nhand \n"), "twice: hand"),
+        (lambda at: (at / MASKS / "classes.txt").write_text("hand\nhand \n"), "duplicates: hand"),
         (lambda at: write_png(at / "images/00.png", BLACK), "00.jpg, 00.png|00.png, 00.jpg"),
         (lambda at: write_png(at / MASKS / "00/bear.png", BLACK.T.copy()), "bear.png does not fit its image"),
         (
             lambda at: (at / MASKS / "03/bear.png").rename(at / MASKS / "03/Bear.png"),
-            r"lacks the masks of: bear\n.*\n.*classes.txt lacks: Bear",
+            r"has no masks for: bear\n.*\n.*not in classes.txt: Bear",
         ),
         (lambda at: (at / "images/03.jpg").unlink(), r"labelled views have no image: 03\.png"),
     ],

@@ -112,7 +112,7 @@ def test_a_world_written_as_lerf_ovs_is_read_back_equal(true_world, lerf):
         assert np.array_equal(posed.camera.calibration_matrix(), camera.K)
     reported = "; ".join(scene.report().warnings)
     assert "published frames without label: frame_00041.png, frame_00105.png, frame_00152.png" in reported
-    assert "texts that the published list lacks: Ring, bear, head, nose, paw" in reported
+    assert "texts missing from the published list: Ring, bear, head, nose, paw" in reported
 
 
 def test_boxes_keep_the_whole_pixels_inside(tmp_path):
@@ -153,9 +153,9 @@ def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_pa
     ("text", "message"),
     [
         ('{"info": ', "cannot be read"),
-        ("[]", "has no list `objects`"),
-        ('{"shapes": []}', "has no list `objects`"),
-        ('{"info": {}, "objects": []}', "does not give the size"),
+        ("[]", "has no `objects` list"),
+        ('{"shapes": []}', "has no `objects` list"),
+        ('{"info": {}, "objects": []}', "does not state the size"),
     ],
 )
 def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
@@ -216,7 +216,7 @@ def test_a_wrong_count_of_pairs_is_reported_for_whole_published_scenes(tmp_path,
     assert not open_scene(root, "figurines").warnings
     label_file(root / "label" / "figurines", [thing("bag")], name="frame_00041")
     (warning,) = open_scene(root, "figurines").warnings
-    assert warning.startswith("43 pairs of frame and category")
+    assert warning.startswith("43 (frame, category) pairs")
 
 
 # ---- levels and parents ---------------------------------------------------------------------------
@@ -279,7 +279,7 @@ def test_invalid_parents_and_children_outside_their_parent_are_reported(hi):
     reported = "; ".join(scene.warnings)
     assert "frame_00002.json, id 1 (head): its parent 99 does not exist" in reported
     assert "id 2 (paw): its parent [0] does not exist" in reported
-    assert "id 4 (nose), level 3: its parent 0 is of level 1" in reported
+    assert "id 4 (nose), level 3: its parent 0 has level 1" in reported
     assert "id 92 (c): 9.1% of its area is outside its parent 90 (a)" in reported
     assert "id 91" not in reported  # one percent can be due to rasterisation
     paths = {region.text: region.path for region in scene.views["frame_00002.png"]}
@@ -329,7 +329,7 @@ def test_own_annotations_are_found_and_read_without_proposals(annotated):
     path.write_text(json.dumps(content))
     scene = open_labelled("annotated/photos/desk", annotated)
     assert [region.text for region in scene.views["DSC_1.png"]] == ["mug"]
-    assert scene.warnings == ("DSC_1.json: proposals not accepted, left out: 1",)
+    assert scene.warnings == ("DSC_1.json: unaccepted proposals, ignored: 1",)
 
 
 def test_the_annotation_of_the_bedroom_has_ten_objects_whose_children_are_inside_them():

@@ -102,7 +102,9 @@ def test_labels_per_vertex_as_text(tmp_path):
         assert points.class_id.tolist() == [20, 93, 0, 0, 20, 20, 20, 20]
         assert points.instance_id.tolist() == [20001, 93002, 0, 0, 20001, 20001, 20003, 20003]
         assert points.faces.shape[1] == 3
-    with pytest.raises(SceneError, match=r"classes that Replica does not(.|\n)*found     20001 \(3 lines\)"):
+    with pytest.raises(
+        SceneError, match=r"classes that are not in Replica(.|\n)*found     20001 \(3 lines\)"
+    ):
         read_labelled_mesh(tmp_path / "quads.ply", instances)
     labels.write_text("20\n93\n")
     with pytest.raises(SceneError, match=r"expected  8 lines\n  found     2"):
@@ -137,11 +139,11 @@ def sequence_with(folder: Path, poses: str) -> Path:
     [
         (
             lambda at: read_semantic_mesh(make_habitat(at, labels=(-2, 20))),
-            "do not belong together\n  expected  object ids 0 to 1\n  found     1 to 3",
+            "do not match\n  expected  object ids 0 to 1\n  found     1 to 3",
         ),
         (
             lambda at: read_semantic_mesh(make_habitat(at, labels=(-2, 20, 205, 93))),
-            "classes that Replica does not.*found     class id 205",
+            "classes that are not in Replica.*found     class id 205",
         ),
         (
             lambda at: read_semantic_mesh(
@@ -167,7 +169,7 @@ def sequence_with(folder: Path, poses: str) -> Path:
         ),
         (
             lambda at: read_images(sequence_with(at, "1 0 0 0\n")),
-            "line 1: cannot be read\n  expected  16 numbers",
+            "line 1 cannot be read\n  expected  16 numbers",
         ),
         (
             lambda at: open_scene(at, "room_1"),

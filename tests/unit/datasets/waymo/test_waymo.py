@@ -197,7 +197,7 @@ def test_damaged_components_are_answered_by_a_sentence(root):
 
 def test_images_and_classes_that_do_not_fit_are_refused():
     frame = make_frame()
-    with pytest.raises(SceneError, match=r"return 1 of the top lidar at 1000(.|\n)*an inclination per row"):
+    with pytest.raises(SceneError, match=r"return 1 of the top lidar at 1000(.|\n)*one inclination per row"):
         frame_points(replace(frame, inclinations=np.zeros(2)), np.eye(4))
     strange = replace(frame, returns=(one_return([1, 1], [3, 23]),), pixel_pose=frame.pixel_pose[:, :2])
     with pytest.raises(SceneError, match=r"unknown class\n  expected  0 to 22\n  found     3 to 23"):
@@ -289,7 +289,7 @@ def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
     whole, damaged = path.read_bytes(), write_records(tmp_path / "damaged", [b"\x0b"]).read_bytes()
     for content, message in (
         (whole, "no frame with labels of the top lidar"),
-        (whole[:-30], "record 0 is damaged or cut off.*expected  a TFRecord file"),
+        (whole[:-30], "record 0 is damaged or truncated.*expected  a TFRecord file"),
         (b"no record at all", "record 0 is damaged"),
         (damaged, "frame 0 cannot be read: Error parsing message"),
         (b"", "has no frame"),

@@ -30,7 +30,7 @@ def test_nearest_skips_transparent_gaussians():
     assert nearest(points_at(0.9, 100), MEANS, OPAQUE).labels(LABELS).tolist() == [2, 3]
     transparent = np.array([0.9, 0.05, 0.9])
     assert nearest(points_at(0.9, 1.1), MEANS, transparent).labels(LABELS).tolist() == [1, 3]
-    with pytest.raises(MisalignedArtifactError, match=r"3 Gaussians below"):
+    with pytest.raises(MisalignedArtifactError, match=r"3 Gaussians, all below"):
         nearest(points_at(0.0), MEANS, np.full(3, 0.01))
 
 
