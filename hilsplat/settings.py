@@ -172,7 +172,10 @@ class MasksSettings(Section):
         "encoder arithmetic; auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32",
     )
     key_views: float = knob(
-        1.0, "share of the training views to segment; below 1: those that see the most Gaussians", gt=0, le=1
+        1.0,
+        "share of the training views to segment; below 1: views that together see most Gaussians",
+        gt=0,
+        le=1,
     )
     prompts: Literal["grid", "guided"] = knob(
         "grid",

@@ -200,7 +200,8 @@ def _begin_alone(parent: int, stderr: Path) -> None:
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
     """Yield the results of `work` in the order of `items`, computed by up to `threads` threads.
 
-    At most `2 * threads` results are pending. If an item fails, those not yet started are cancelled.
+    At most `2 * threads` results are pending. If an item fails, those not yet started are cancelled. Under a
+    debugger, items are computed in the calling thread.
     """
     if sys.gettrace() is not None:  # debuggers stop only at breakpoints in this thread
         yield from map(work, items)

@@ -87,7 +87,7 @@ def masks(
     memory: Memory = None,
 ) -> None:
     """Segment each training view at three levels."""
-    section, faults = section_of("masks", settings), section_of("perturb", perturb)
+    section = section_of("masks", settings)
     is_diagnostic = section.segmenter == "truth-perturbed"
     if is_diagnostic and truth is None:
         raise HilsplatError(
@@ -102,6 +102,7 @@ def masks(
             fix="omit --truth, or set masks.segmenter to truth-perturbed, a diagnostic",
         )
     if is_diagnostic:
+        faults = section_of("perturb", perturb)
         read, both = {"scene": scene, "truth": truth}, {"masks": section, "perturb": faults}
         with stage("truth_masks", out, settings=both, seed=faults.seed, threads=threads, inputs=read) as run:
             run(scene, truth, out, faults, section.min_area_px, threads)

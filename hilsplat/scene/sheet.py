@@ -229,8 +229,12 @@ def _row(
         raise fault("source", "it is empty", fix="enter world:<kind>:<seed>, or a folder of images")
     if source.startswith("world:"):
         if not WORLD_SOURCE.fullmatch(source):
-            expected = "world:<kind>:<seed>, as in world:tabletop:201"
-            raise fault("source", f"{source!r} is not the name of a synthetic world", expected=expected)
+            raise fault(
+                "source",
+                f"{source!r} is not the name of a synthetic world",
+                expected="world:<kind>:<seed>, as in world:tabletop:201",
+                fix="correct the source",
+            )
     else:
         folder = _resolved(path, source, data_root)
         # The workflow skips and reports missing scenes of a published data set.

@@ -120,11 +120,12 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
     frames = by_number(list_images(folder / "color"))
     K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL
     lost, without, images = [], [], []
-    size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
-    if (folder / f"{scan}.txt").is_file():
-        info = read_scan_info(folder / f"{scan}.txt")
-        if "colorHeight" in info and "colorWidth" in info:
-            size_hw = int(info["colorHeight"]), int(info["colorWidth"])
+    described = folder / f"{scan}.txt"
+    info = read_scan_info(described) if described.is_file() else {}
+    if "colorHeight" in info and "colorWidth" in info:
+        size_hw = int(info["colorHeight"]), int(info["colorWidth"])
+    else:
+        size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
     for number, path in frames[::every]:
         pose = folder / "pose" / f"{number}.txt"
         if not pose.is_file():

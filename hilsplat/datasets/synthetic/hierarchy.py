@@ -98,7 +98,10 @@ class HierarchyAnnotations:
                 found=record.get("format"),
             )
         nodes = tuple(
-            AnnotatedNode(**{**node, "synonyms": tuple(node.get("synonyms", ()))}) for node in record["nodes"]
+            AnnotatedNode(
+                node["id"], node["level"], node["parent"], node["text"], tuple(node.get("synonyms", ()))
+            )
+            for node in record["nodes"]
         )
         views = {view: tuple(ids) for view, ids in record["views"].items()}
         return HierarchyAnnotations(folder, nodes, views)

@@ -79,7 +79,7 @@ def read_component(
             found=f"a file of {path.stat().st_size} bytes",
             fix=UNPACK_AGAIN,
         ) from error
-    return table.to_pandas().to_dict("records")
+    return table.to_pandas(ignore_metadata=True, integer_object_nulls=True).to_dict("records")
 
 
 def vehicle_poses(split: Path, segment: str) -> dict[int, Float[np.ndarray, "4 4"]]:

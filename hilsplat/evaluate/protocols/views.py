@@ -263,8 +263,10 @@ class _ViewAnswers:
             key = path[-1:] if card is cards.LEVEL_AUTO else (path[-1], Level(len(path)))
             return truth.own_part(path, self.masks.get((method, protocol, *key)))
 
-        for method in ("truth", *self.settings.methods):
-            for card in of_methods[method]:
+        for method, of_method in of_methods.items():
+            if method not in ("truth", *self.settings.methods):
+                continue
+            for card in of_method:
                 protocol = label_of(card, method, self.settings)
                 yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
 

@@ -177,11 +177,13 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
     where = f"{file}, frame {number}"
     try:
         name = str(frame["file_path"]).removeprefix("./")
-        matrix = np.array(frame["transform_matrix"], dtype=np.float64)[:3]  # the last row may be missing
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+    except (KeyError, ValueError, TypeError) as error:
         raise SceneError(
             f"{where}: file_path or transform_matrix cannot be used: {error!r}", fix=AGAIN
         ) from error
+    if matrix.shape == (4, 4):
+        matrix = matrix[:3]  # the last row may be omitted
     source_from_cam = rigid_pose(matrix, f"{where} ({name}), transform_matrix") @ OPENGL_TO_OPENCV
     image = _find_image(known.root, name)
     camera = _frame_camera(where, frame, image)

@@ -99,6 +99,13 @@ def test_work_images_are_the_photographs_upright_and_shrunk(tmp_path):
             assert not written.getexif()
 
 
+def test_noise_registers_nowhere_and_every_photograph_has_its_reason(tmp_path):
+    words = r"no camera pose(.|\n)*0\.png: (too few matches|no features)"
+    with pytest.raises(RegistrationError, match=words):
+        pose_photos(write_noise(tmp_path / "photos", 3), tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
 def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_path):
     true_centres, _ = plane_views(tmp_path / "renders")
     renders, first = tmp_path / "renders", tmp_path / "first"
