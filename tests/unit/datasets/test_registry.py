@@ -188,9 +188,7 @@ def test_scenes_with_labelled_points_are_exported_first(root):
 
 
 def test_images_in_a_folder_need_no_export_and_labels_need_a_scene(root, monkeypatch):
-    with pytest.raises(
-        SceneError, match=r"is not a scene with labelled images|does not contain a scene name"
-    ):
+    with pytest.raises(SceneError, match="does not contain a scene name"):
         open_labels("scannet", Path())
     monkeypatch.setattr("hilsplat.datasets.sources.open_labels", lambda *_: object())
     with pytest.raises(SceneError, match="needs no export"):
