@@ -112,7 +112,7 @@ def distort(folder):
         (lambda at: (at / "test_mask/first").mkdir(), "0, 1, first"),
         (train_on_all, r"has no test view\n.*\n.*4 posed images, all of them"),
         (lambda at: (at / "images_train").rename(at / "train"), r"also teatime/images_train\n"),
-        (distort, r"are distorted\n.*PINHOLE or SIMPLE_PINHOLE.*\n.*OPENCV"),
+        (distort, r"have lens distortion\n.*PINHOLE or SIMPLE_PINHOLE.*\n.*OPENCV"),
     ],
 )
 def test_unusable_scenes_of_lerf_mask_are_refused(teatime, change, message):
