@@ -243,10 +243,10 @@ ROWS = {
         with_photographs("big.png", png_of(20_000, 20_000)), NEW, "big.png", "400000000 pixels"
     ),
     "poses that are a list": row(
-        with_photographs("transforms.json", "[]"), POSES, "transforms.json has no `frames` list"
+        with_photographs("transforms.json", "[]"), POSES, "transforms.json is not a JSON object"
     ),
     "frames that are numbers": row(
-        with_photographs("transforms.json", '{"frames": [1, 2, 3]}'), POSES, "transforms.json, frame 0"
+        with_photographs("transforms.json", '{"frames": [1, 2, 3]}'), POSES, "no `frames` list of objects"
     ),
     "LLFF poses that are text": row(
         lambda: [photographs()(), np.save("photos/poses_bounds.npy", np.array([["a"] * 17] * 3))],
