@@ -167,7 +167,7 @@ ROWS = {
         write(MASKS / "index.json", '{"views": []}'), COVERAGE, "index.json"
     ),
     "an index that is a list": row(
-        write(MASKS / "index.json", "[]"), COVERAGE, "index.json is not the index"
+        write(MASKS / "index.json", "[]"), COVERAGE, "index.json is not an artifact index"
     ),
     "an index 100,000 deep": row(write(MASKS / "index.json", DEEP), COVERAGE, "nested too deeply"),
     "Gaussians that are a folder": row(

@@ -336,7 +336,7 @@ def test_a_field_resumes_from_another_one(flat_boxes):
     assert begun.pop("ridge") == 0  # which pulls towards the start
     assert begun == pytest.approx({name: trained[name] for name in begun}, rel=1e-4)
     LanguageField(LanguageField.load(first).features, "other", "code").save(first)
-    with pytest.raises(MisalignedArtifactError, match="other Gaussians, or to another code"):
+    with pytest.raises(MisalignedArtifactError, match="from other Gaussians or another code"):
         solved_field(flat_boxes, "second", onward, start=first)
 
 

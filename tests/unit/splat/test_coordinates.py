@@ -305,4 +305,4 @@ def test_an_unusable_ply_is_named(turned_scene, source_ply, tmp_path, change, me
     with pytest.raises(ArtifactError, match=message) as caught:
         import_gaussians(path, turned_scene)
     assert "broken.ply" in str(caught.value)
-    assert "column gaussians" in str(caught.value)
+    assert "gaussians column" in str(caught.value)

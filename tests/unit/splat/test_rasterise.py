@@ -202,7 +202,7 @@ def test_weights_sum_to_alpha_and_blend_to_features(device):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"features": np.zeros((4, 2), np.float32)}, "features do not fit"),
+        ({"features": np.zeros((4, 2), np.float32)}, "features do not match"),
         ({"sh_degree": 2}, "degree 2"),
     ],
 )
