@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ValidationError, field_validator
 
-import hilsplat.settings as sections
+from hilsplat import settings
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.files import NAME_RULE, name_problem, project_path
 from hilsplat.models.store import AUTO, EMBEDDED, read_model, real_model
-from hilsplat.settings import LARGEST, ClipSettings, MasksSettings, Section, knob
+from hilsplat.settings import LARGEST, Section, knob
 
 CONFIG = Path("config/config.yaml")
 """The project's configuration; files given with `--configfile` override it."""
@@ -26,21 +26,21 @@ LONGEST_SHOWN = 120  # maximum characters of a value in a message
 class StageSettings(Section):
     """All sections by name."""
 
-    world: sections.WorldSettings = sections.WorldSettings()
-    poses: sections.PosesSettings = sections.PosesSettings()
-    gaussians: sections.GaussiansSettings = sections.GaussiansSettings()
-    masks: MasksSettings = MasksSettings()
-    perturb: sections.PerturbSettings = sections.PerturbSettings()
-    coverage_tree: sections.CoverageTreeSettings = sections.CoverageTreeSettings()
-    clip: ClipSettings = ClipSettings()
-    contributions: sections.ContributionsSettings = sections.ContributionsSettings()
-    semantic_tree: sections.SemanticTreeSettings = sections.SemanticTreeSettings()
-    autoencoder: sections.AutoencoderSettings = sections.AutoencoderSettings()
-    field: sections.FieldSettings = sections.FieldSettings()
-    method: sections.MethodSettings = sections.MethodSettings()
-    evaluate: sections.EvaluateSettings = sections.EvaluateSettings()
-    query: sections.QuerySettings = sections.QuerySettings()
-    figures: sections.FiguresSettings = sections.FiguresSettings()
+    world: settings.WorldSettings = settings.WorldSettings()
+    poses: settings.PosesSettings = settings.PosesSettings()
+    gaussians: settings.GaussiansSettings = settings.GaussiansSettings()
+    masks: settings.MasksSettings = settings.MasksSettings()
+    perturb: settings.PerturbSettings = settings.PerturbSettings()
+    coverage_tree: settings.CoverageTreeSettings = settings.CoverageTreeSettings()
+    clip: settings.ClipSettings = settings.ClipSettings()
+    contributions: settings.ContributionsSettings = settings.ContributionsSettings()
+    semantic_tree: settings.SemanticTreeSettings = settings.SemanticTreeSettings()
+    autoencoder: settings.AutoencoderSettings = settings.AutoencoderSettings()
+    field: settings.FieldSettings = settings.FieldSettings()
+    method: settings.MethodSettings = settings.MethodSettings()
+    evaluate: settings.EvaluateSettings = settings.EvaluateSettings()
+    query: settings.QuerySettings = settings.QuerySettings()
+    figures: settings.FiguresSettings = settings.FiguresSettings()
 
     def with_models(self) -> "StageSettings":
         """Return all sections after resolving values that depend on others: models, crops, theta."""
@@ -85,9 +85,9 @@ def with_models(section: Settings) -> Settings:
     pretrained SAM; without one, it selects the graph segmenter. `masks.model: auto` and `clip.model: auto`
     select the best pretrained model, else the embedded one. Other sections are returned unchanged.
     """
-    if isinstance(section, ClipSettings) and section.model == AUTO:
+    if isinstance(section, settings.ClipSettings) and section.model == AUTO:
         return section.model_copy(update={"model": str(real_model("clip") or EMBEDDED["clip"])})
-    if isinstance(section, MasksSettings) and AUTO in (section.segmenter, section.model):
+    if isinstance(section, settings.MasksSettings) and AUTO in (section.segmenter, section.model):
         named = section.model != AUTO
         folder = Path(section.model) if named else real_model("sam") or Path(EMBEDDED["sam"])
         segmenter = section.segmenter
@@ -123,8 +123,10 @@ def _known_keys(model: Any, path: list[str]) -> list[str]:
     return sorted(model.model_fields)
 
 
-VARIANT_SECTIONS: tuple[str, ...] = ("masks", "perturb", "coverage_tree", "clip", "contributions")
-VARIANT_SECTIONS += ("semantic_tree", "autoencoder", "field", "method", "evaluate")
+VARIANT_SECTIONS = (
+    *("masks", "perturb", "coverage_tree", "clip", "contributions"),
+    *("semantic_tree", "autoencoder", "field", "method", "evaluate"),
+)
 """Sections that a variant may override; all variants share the stages before them."""
 
 UPSTREAM: dict[str, tuple[str, ...]] = {
@@ -195,9 +197,11 @@ class RunSettings(StageSettings):
 
     def variant_names(self) -> list[str]:
         """Return the variants in the run's tables, "default" first; with several seeds, each per seed."""
-        names = self.main_variants + self.ablation_variants + self.component_variants
-        names += self.theta_variants + self.omega_variants + self.pruning_variants
-        return [name for first in dict.fromkeys(["default", *names]) for name in self._all_seeds(first)]
+        names = [
+            *("default", *self.main_variants, *self.ablation_variants, *self.component_variants),
+            *(*self.theta_variants, *self.omega_variants, *self.pruning_variants),
+        ]
+        return [name for first in dict.fromkeys(names) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
         """Return the names of a variant per seed: its own, then, if it is random, `<name>.seed1`, ..."""
@@ -267,8 +271,11 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
         raise settings_error(error, "", RunSettings) from error
     for name in dict.fromkeys([*run.variants, *run.groups]):
         if (problem := name_problem(name)) is not None:
-            problem = f"{name!r} cannot be the name of a variant or group: {problem}"
-            raise SettingsError(problem, expected=NAME_RULE, fix="rename it in the configuration")
+            raise SettingsError(
+                f"{name!r} cannot be the name of a variant or group: {problem}",
+                expected=NAME_RULE,
+                fix="rename it in the configuration",
+            )
     for name in run.variants:
         if _parts_of(name)[0] in RESERVED:
             raise SettingsError(

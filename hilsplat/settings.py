@@ -131,7 +131,9 @@ class GaussiansSettings(Section):
     strategy: Literal["default", "mcmc"] = knob(
         "default", "default: clone, split and prune (3DGS); mcmc: relocate, and add noise", origin="3DGS"
     )
-    mcmc_growth: float = knob(0.05, "mcmc: growth per densification", unit="share", ge=0, le=1, origin="MCMC")
+    mcmc_growth: float = knob(
+        0.05, "mcmc: growth per densification, up to max_gaussians", unit="share", ge=0, le=1, origin="MCMC"
+    )
     mcmc_noise: float = knob(5e5, "mcmc: weight of the noise on the means", ge=0, origin="MCMC")
     mcmc_opacity_weight: float = knob(0.01, "mcmc: weight of the mean opacity", ge=0, origin="MCMC")
     mcmc_scale_weight: float = knob(
@@ -249,8 +251,12 @@ class PerturbSettings(Section):
 
     seed: int = knob(0, "seed of the faults; independent of the run's seed", ge=0)
     background: bool = knob(True, "also mask the surroundings (table, floor, walls), as SAM does")
-    boundary_px: float = knob(0.6, "std of the boundary's normal displacement", unit="px", ge=0, le=64)
-    boundary_smooth_px: float = knob(6.0, "boundary length per displacement", unit="px", ge=1, le=256)
+    boundary_px: float = knob(
+        0.6, "standard deviation of the boundary's displacement along its normal", unit="px", ge=0, le=64
+    )
+    boundary_smooth_px: float = knob(
+        6.0, "length along the boundary over which the displacement changes", unit="px", ge=1, le=256
+    )
     merge: float = knob(
         0.02, "probability per node and view of merging with a sibling in contact", ge=0, le=1
     )
@@ -270,7 +276,9 @@ class PerturbSettings(Section):
         0.02, "probability per node, drawn once per scene, of having no mask in most views", ge=0, le=1
     )
     systematic_share: float = knob(0.9, "probability that a systematic fault occurs in a view", ge=0, le=1)
-    score_noise: float = knob(0.05, "standard deviation of predicted IoU and stability", ge=0, le=1)
+    score_noise: float = knob(
+        0.05, "standard deviation of predicted IoU and stability about their true values", ge=0, le=1
+    )
 
 
 class CoverageTreeSettings(Section):
@@ -326,8 +334,8 @@ class ContributionsSettings(Section):
     min_weight: float = knob(1 / 255, "smaller weights of a Gaussian at a pixel are dropped", ge=0, lt=1)
     keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
-        "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer non-"
-        "zeros; none: neither, sufficient for a semantic tree without a field",
+        "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer "
+        "non-zeros; none: neither, sufficient for a semantic tree without a field",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
         "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
@@ -538,12 +546,14 @@ class EvaluateSettings(Section):
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
         ("tree", "tree-path", "field"), "methods that answer; each has its own rows in the tables"
     )
-    view_consistency: bool = knob(True, "score agreement in neighbouring views (synthetic scenes)")
+    view_consistency: bool = knob(
+        True, "score whether answers agree in neighbouring views (synthetic scenes)"
+    )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
-        "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within 10 "
-        "cm; density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or your own"
-        " PLY with one Gaussian per point)",
+        "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within "
+        "10 cm; density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or your own "
+        "PLY with one Gaussian per point)",
         origin="OpenGaussian: frozen",
     )
 

@@ -27,8 +27,11 @@ ZIP64_BYTES = 2**30  # arrays above this size get an archive entry that may exce
 
 INDEX = "index.json"  # written last into a folder artifact: its presence means that the folder is complete
 
-DAMAGE: tuple[type[Exception], ...] = (EOFError, MemoryError, NotImplementedError, OSError, SyntaxError)
-DAMAGE += (TokenError, ValueError, zipfile.BadZipFile, zlib.error, AttributeError)  # last: .npy for .npz
+DAMAGE = (
+    *(EOFError, MemoryError, NotImplementedError, OSError, SyntaxError, TokenError, ValueError),
+    *(zipfile.BadZipFile, zlib.error),
+    AttributeError,  # a .npy file instead of .npz
+)
 """Errors that numpy and zipfile raise on damaged files."""
 
 
@@ -149,10 +152,10 @@ def _exchange(one: Path, other: Path) -> bool:
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
 """Parts of messages from C++ and Rust libraries with their own error types: safetensors, SQLite."""
 
-FULL_BELOW_MIB = 1.0
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
-"""Free space below which errors of C++ libraries, and of libraries that end their process, are attributed to
-a full disk: COLMAP does not report full disks."""
+"""Errors of C++ libraries, and of libraries that end their process."""
+FULL_BELOW_MIB = 1.0
+"""Free space below which they are attributed to a full disk: COLMAP does not report full disks."""
 
 
 @contextmanager

@@ -10,8 +10,9 @@ from hilsplat.base.processes import remove_leftovers
 VIEW_CACHES = ("masks", "clip", "contributions")
 """Caches of finished views: a missing entry costs time but does not change a result."""
 
-CHECKPOINTS, FIT_DAYS = "gaussians", 1.0
-"""Cache of fit checkpoints, and the age below which a checkpoint is kept: its fit may still be running."""
+CHECKPOINTS = "gaussians"  # cache of fit checkpoints
+FIT_DAYS = 1.0
+"""Age below which a checkpoint is kept: its fit may still be running. Fits write them far more often."""
 
 
 def caches(folder: Path) -> dict[str, list[Path]]:

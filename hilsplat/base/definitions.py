@@ -10,8 +10,10 @@ from hilsplat.base.errors import HilsplatError
 
 PACKAGE = "hilsplat"
 
-NEUTRAL_DECORATORS = {"cache", "cached_property", "compiled", "contextmanager", "dataclass", "lru_cache"}
-NEUTRAL_DECORATORS |= {"no_type_check", "overload"}
+NEUTRAL_DECORATORS = {
+    *("cache", "cached_property", "compiled", "contextmanager", "dataclass", "lru_cache"),
+    *("no_type_check", "overload"),
+}
 """Decorators that do not register anything: a definition with only these counts only if it is reached."""
 
 PROSE = {

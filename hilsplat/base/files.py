@@ -29,8 +29,13 @@ def project_path(path: str | Path) -> Path:
     return installed if not Path(path).exists() and installed.exists() else Path(path)
 
 
-def list_images(folder: Path, suffixes: Collection[str] = IMAGE_SUFFIXES) -> list[Path]:
-    """Return the image files in a folder, or those with other suffixes, sorted, without hidden files."""
+def list_images(folder: Path) -> list[Path]:
+    """Return the image files in a folder, sorted, without hidden files."""
+    return list_files(folder, IMAGE_SUFFIXES)
+
+
+def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Return the files in a folder with one of these suffixes, sorted, without hidden files."""
     return sorted(
         path
         for path in Path(folder).iterdir()

@@ -61,8 +61,8 @@ def end_with_workflow() -> None:
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
 """Name of a folder of unfinished files; it is hidden, so digests ignore it."""
 
-LOCK, FORMER = ".lock", ".former"
-"""In such a folder, the file that its writer locks, and a folder for the version that is being replaced."""
+LOCK = ".lock"  # in such a folder, the file that its writer locks
+FORMER = ".former"  # and a folder for the version that is being replaced
 
 
 @functools.cache

@@ -23,8 +23,10 @@ from hilsplat.base.artifacts import (
 )
 from hilsplat.base.errors import ArtifactError, HilsplatError
 
-LIBRARIES: tuple[str, ...] = ("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime")
-LIBRARIES += ("opencv-contrib-python-headless", "pandas", "snakemake")
+LIBRARIES = (
+    *("hilsplat", "numpy", "scipy", "torch", "numba", "pycolmap", "onnxruntime"),
+    *("opencv-contrib-python-headless", "pandas", "snakemake"),
+)
 """Libraries that affect results."""
 
 SOFTWARE = {"Software": "hilsplat"}
@@ -235,7 +237,11 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Raise ArtifactError if a PNG, or a file always written `beside` it, would replace a foreign file."""
+    """Check the name of a picture, and that neither it nor `beside` would replace a foreign file.
+
+    Raises:
+        ArtifactError: the name does not end in .png, or there is a file that hilsplat did not draw.
+    """
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")
     if _is_something(path) and not _is_own_picture(path):

@@ -74,13 +74,14 @@ class Dataset:
         root = data_root / self.folder
         if self._has_begun(root):
             return root
-        for deeper in filter(self._has_begun, _folders(root)):
-            raise SceneError(
-                f"{self.title} is one level too deep in {root}",
-                expected=f"its scenes in {root}",
-                found=f"its scenes in {deeper}",
-                fix=f"move the content of {deeper} one level up",
-            )
+        for deeper in _folders(root):
+            if self._has_begun(deeper):
+                raise SceneError(
+                    f"{self.title} is one level too deep in {root}",
+                    expected=f"its scenes in {root}",
+                    found=f"its scenes in {deeper}",
+                    fix=f"move the content of {deeper} one level up",
+                )
         if self._has_begun(data_root):
             raise SceneError(
                 f"{data_root} is the folder of {self.title} itself",

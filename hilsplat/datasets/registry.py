@@ -5,7 +5,7 @@ A reader's module describes its data set in a constant (see `dataset.Dataset`); 
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 from hilsplat.base.errors import HilsplatError, SceneError
 from hilsplat.base.plugins import Plugins
@@ -51,8 +51,7 @@ def open_labelled(name: str, data_root: Path) -> "LabelledScene":
             found=f"a data set with labels on {dataset.labels}",
             fix=LISTED,
         )
-    scene: Any = open_labels(name, data_root)
-    return scene
+    return cast("LabelledScene", open_labels(name, data_root))
 
 
 def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":

@@ -24,7 +24,7 @@ level protocols."""
 
 
 @dataclass(frozen=True)
-class Extra:
+class ExtraProtocols:
     """Protocols beyond those that score every labelled image (`protocols.views`).
 
     `level` is the level whose texts the flat protocols query; None if the labels have no levels.
@@ -35,7 +35,7 @@ class Extra:
     level: Level | None = None
 
     @staticmethod
-    def of_world(kind: str) -> "Extra":
+    def of_world(kind: str) -> "ExtraProtocols":
         """Return the protocols of a synthetic scene, none for kind ""; raise SceneError for unknown kinds."""
         if kind and kind not in STAND_INS:
             raise SceneError(
@@ -43,17 +43,17 @@ class Extra:
                 expected=f"one of {', '.join(STAND_INS)}",
                 fix="correct the kind, or omit it",
             )
-        return Extra.of(STAND_INS.get(kind, ()), Level.WHOLE)
+        return ExtraProtocols.of(STAND_INS.get(kind, ()), Level.WHOLE)
 
     @staticmethod
-    def of(names: tuple[str, ...], level: Level | None = None) -> "Extra":
+    def of(names: tuple[str, ...], level: Level | None = None) -> "ExtraProtocols":
         """Sort named protocols into those for images and those for points."""
         cards = [card_named(name) for name in names]
         points = tuple(card for card in cards if card.classes)
-        return Extra(tuple(card for card in cards if not card.classes), points, level)
+        return ExtraProtocols(tuple(card for card in cards if not card.classes), points, level)
 
     @staticmethod
-    def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, Extra]":
+    def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, ExtraProtocols]":
         """Return data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines"."""
         dataset = name.partition("/")[0]
-        return dataset, open_labels(name, data_root), Extra.of(dataset_of(dataset).protocols)
+        return dataset, open_labels(name, data_root), ExtraProtocols.of(dataset_of(dataset).protocols)

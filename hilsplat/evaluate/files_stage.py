@@ -18,7 +18,7 @@ from hilsplat.base.progress import stage_log
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.evaluate.extra_protocols import Extra
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.answers import mask_rows
@@ -89,14 +89,14 @@ def run_evaluate_files(
         views: dict[str, Callable[[], ViewTruth]] = {}
         points: Mapping[str, LabelledPoints] = {}
         if truth is not None and scene is not None:
-            extra = Extra.of_world(kind)
+            extra = ExtraProtocols.of_world(kind)
             if any((predictions / f"{each}.txt").is_file() for each in _files_of(extra.points)):
                 points = labelled_points(truth.parent, kind)
             else:
                 least_px = min_region_px or EvaluateSettings().min_region_px
                 views = annotated_truths(truth, Scene.load(scene), least_px)
         else:
-            dataset, known, extra = Extra.open(labels, data_root)
+            dataset, known, extra = ExtraProtocols.open(labels, data_root)
             name = labels.partition("/")[2]
             if isinstance(known, PointScene):
                 points = known.truth
@@ -124,7 +124,7 @@ def run_evaluate_files(
 
 
 def _mask_rows(
-    predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], extra: Extra
+    predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], extra: ExtraProtocols
 ) -> Iterator[tuple[str, Measured]]:
     """Yield the rows of all views, whose files are read first, so that a missing one is reported at once."""
     found = {view: read_view_masks(predictions, view) for view in views}
@@ -171,7 +171,7 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
             )
 
 
-def _flat_rows(masks: Masks, truth: ViewTruth, extra: Extra) -> Iterator[Measured]:
+def _flat_rows(masks: Masks, truth: ViewTruth, extra: ExtraProtocols) -> Iterator[Measured]:
     """Yield rows of masks without a level, under LERF's protocols for all texts, then the data set's own."""
     for query in truth.categories:
         for card in (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN):
@@ -233,7 +233,7 @@ def _files_of(protocols: Sequence[cards.ProtocolCard]) -> list[str]:
 
 
 def _point_rows(
-    predictions: Path, truth: Mapping[str, LabelledPoints], extra: Extra
+    predictions: Path, truth: Mapping[str, LabelledPoints], extra: ExtraProtocols
 ) -> Iterator[Measured | InstanceMatches]:
     """Yield the rows of points under each protocol whose file exists, and the matches of instances."""
     scored = []

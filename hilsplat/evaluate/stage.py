@@ -10,7 +10,7 @@ from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
 from hilsplat.evaluate.diagnostics.world_answers import measure_world_consistency
-from hilsplat.evaluate.extra_protocols import Extra
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
@@ -64,7 +64,7 @@ def run_evaluate(
         parts: the finished scene; its test views were held out from all earlier stages.
         dataset: data set in every row, like `scene` and `variant`.
         truth: ground-truth folder of a synthetic scene.
-        kind: kind of synthetic scene, which determines the benchmarks it substitutes for (`Extra.of_world`).
+        kind: kind of synthetic scene, which determines its benchmarks (`ExtraProtocols.of_world`).
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
     Raises:
@@ -81,9 +81,11 @@ def run_evaluate(
         scores.append(Score(data, scene, variant, label, view=view, **vars(measured)))
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
-        scored: list[tuple[str, Annotations, Extra]] = [Extra.open(name, data_root) for name in labels]
+        scored: list[tuple[str, Annotations, ExtraProtocols]] = [
+            ExtraProtocols.open(name, data_root) for name in labels
+        ]
         if truth is not None:
-            scored.append((dataset, truth, Extra.of_world(kind)))
+            scored.append((dataset, truth, ExtraProtocols.of_world(kind)))
         if not scored:
             logger.info("%s/%s has no annotations: nothing to score", dataset, scene)
         else:
@@ -140,7 +142,7 @@ def known_truths(
 def point_rows(
     answers: LanguageScene,
     known: Annotations,
-    extra: Extra,
+    extra: ExtraProtocols,
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
@@ -163,8 +165,9 @@ def point_rows(
                 answers.scene.name,
                 error,
             )
-    modes = (settings.methods, settings.points, threads)
-    yield from measure_scene_points(answers, points, transform, extra.points, *modes)
+    yield from measure_scene_points(
+        answers, points, transform, extra.points, settings.methods, settings.points, threads
+    )
 
 
 def query_seconds(
@@ -180,6 +183,9 @@ def query_seconds(
     def by_tree(text: str) -> object:
         return answers.node_masks(view, answers.select((text,), view=view).ids)
 
-    queries = {"field": by_field, "tree": by_tree}
-    timed = {method: queries[method] for method in filter(settings.methods.__contains__, queries)}
+    timed: dict[str, Callable[[str], object]] = {}
+    if "field" in settings.methods:
+        timed["field"] = by_field
+    if "tree" in settings.methods:
+        timed["tree"] = by_tree
     return time_queries(answers, timed, view, texts)

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import atomic_folder, read_json, require_free_space, write_json
 from hilsplat.base.errors import SceneError
-from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_images
+from hilsplat.base.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, list_files, list_images
 from hilsplat.scene.layouts import has_known_poses, photo_folder, unwrapped
 
 MARK = ".made_from.json"
@@ -58,7 +58,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
             return [f"{len(list_images(folder))} frames of {named} are in {target}", *notes]
 
     elif source.is_dir():
-        beside = list_images(photo_folder(source), VIDEO_SUFFIXES)
+        beside = list_files(photo_folder(source), VIDEO_SUFFIXES)
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used" if beside else ""
         yield PreparedFolder(source, (note,) if note else ())
         return
@@ -98,7 +98,7 @@ def _videos_of(source: Path) -> list[Path]:
         return [source] if source.suffix.lower() in VIDEO_SUFFIXES else []
     if list_images(photo_folder(source)) or has_known_poses(source):
         return []
-    return list_images(source, VIDEO_SUFFIXES)
+    return list_files(source, VIDEO_SUFFIXES)
 
 
 def unpack_photographs(archive: Path, folder: Path) -> None:

@@ -329,9 +329,11 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
     for view, entry in views.items():
         if entry["registered"]:
             continue
-        near = [(-count, other) for other, count in shared[view].items() if views[other]["registered"]]
-        best = sorted(each for each in near if each[0])[:NEIGHBOURS]
-        entry["belongs_near"] = [{"view": other, "matches": -count} for count, other in best]
+        near = [
+            (count, other) for other, count in shared[view].items() if count and views[other]["registered"]
+        ]
+        near.sort(key=lambda pair: (-pair[0], pair[1]))
+        entry["belongs_near"] = [{"view": other, "matches": count} for count, other in near[:NEIGHBOURS]]
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:

@@ -93,7 +93,8 @@ def onnx() -> Iterator[Finding]:
 
 def cuda() -> Iterator[Finding]:
     """Check whether torch and gsplat can use CUDA, and whether their renders match the CPU's."""
-    from hilsplat.splat.rasterise.device import cuda_disagreement, cuda_problem
+    from hilsplat.splat.rasterise.device import cuda_problem
+    from hilsplat.splat.rasterise.parity import cuda_disagreement
 
     if problem := cuda_problem():
         fix = "on a machine with an NVIDIA GPU: pip install 'hilsplat[gpu]'"
@@ -105,7 +106,7 @@ def cuda() -> Iterator[Finding]:
 
 def kernels() -> Iterator[Finding]:
     """Compile or load the rasteriser's loops, and render a small scene."""
-    from hilsplat.splat.rasterise.device import disagreement
+    from hilsplat.splat.rasterise.parity import disagreement
 
     begin = time.monotonic()
     apart = disagreement("cpu", "cpu")

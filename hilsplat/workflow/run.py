@@ -117,7 +117,8 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
 
     Args:
         targets: scenes (`photos/desk`, `desk`), rules (`tables`) or files; empty for everything.
-        options: Snakemake options.
+        configs: files that override config/config.yaml, in order.
+        options: passed to Snakemake unchanged.
 
     Returns:
         Snakemake's exit status.

@@ -101,6 +101,11 @@ def scan_street(
         points = origin + measured[:, None] * directions[kept]
         rows.append((points, ids[kept], np.full(kept.sum(), pose), measured, beams[kept]))
     points, ids, pose_index, ranges, beam = (np.concatenate(column) for column in zip(*rows, strict=True))
-    points, ranges = points.astype(np.float32), ranges.astype(np.float32)
-    ids, pose_index, beam = (column.astype(np.int32) for column in (ids, pose_index, beam))
-    return LidarScan(points, ids, pose_index, ranges, beam, origins)
+    return LidarScan(
+        points.astype(np.float32),
+        ids.astype(np.int32),
+        pose_index.astype(np.int32),
+        ranges.astype(np.float32),
+        beam.astype(np.int32),
+        origins,
+    )

@@ -49,14 +49,17 @@ SPLITS: dict[str, str] = {
 """Id and name of each class, by split."""
 
 
-CLASSES: tuple[tuple[int, str, str], ...] = tuple(
-    sorted(
-        (int(entry.split(" ", 1)[0]), entry.split(" ", 1)[1], split)
-        for split, listed in SPLITS.items()
-        for entry in words_of(listed)
-    )
-)
-"""Id, name and split of each class, by id."""
+def _table() -> list[tuple[int, str, str]]:
+    """Return id, name and split of each class, by id."""
+    rows = []
+    for split, listed in SPLITS.items():
+        for entry in words_of(listed):
+            label, name = entry.split(" ", 1)
+            rows.append((int(label), name, split))
+    return sorted(rows)
+
+
+CLASSES: tuple[tuple[int, str, str], ...] = tuple(_table())
 _NAMES = {label: name for label, name, _ in CLASSES}
 
 SCANNET200 = ClassSet.of("scannet200", "ScanNet200 benchmark", _NAMES)

@@ -49,7 +49,7 @@ class LidarFrame:
 
     Attributes:
         inclinations: inclinations of the rows, radians, highest first.
-        pixel_pose: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel, for both returns.
+        pixel_pose: roll, pitch, yaw (radians), x, y, z (metres) of the vehicle in the world at each pixel.
         returns: first and, if there is one, second return.
     """
 

@@ -29,9 +29,10 @@ RECORD = "individual_files_{split}_segment-{segment}_with_camera_labels.tfrecord
 
 def find_parquet(root: Path, segment: str) -> Path | None:
     """Return the split folder that contains a segment in release 2, or None."""
-    places = (root / split for split in SPLITS)
-    has_labels = (path for path in places if parquet.component_path(path, LABELS, segment).is_file())
-    return next(has_labels, None)
+    for split in SPLITS:
+        if parquet.component_path(root / split, LABELS, segment).is_file():
+            return root / split
+    return None
 
 
 def find_record(root: Path, segment: str) -> Path | None:

@@ -18,7 +18,8 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
     Raises:
         MisalignedArtifactError: fewer than three cameras are shared, or all have the same position.
     """
-    shared = [name for name in found.names if name in set(true.names)]
+    known = set(true.names)
+    shared = [name for name in found.names if name in known]
     if len(shared) < MIN_SHARED:
         raise MisalignedArtifactError(
             "the ground-truth cameras and the scene's cameras belong to different images",

@@ -82,13 +82,19 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
             own = [fit[level] for fit in fits.values()]
             best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
             number = sum(fit.masks for fit in own)
-            shares = (best.mean(), (best >= FIT_IOU).mean()) if len(best) else (np.nan, np.nan)
+            iou, recall = (best.mean(), (best >= FIT_IOU).mean()) if len(best) else (np.nan, np.nan)
             precision = sum(fit.fitting for fit in own) / number if number else np.nan
             rows.append(
                 [
-                    *(scene.name, masks_label(masks_folder), level.label, str(len(own)), str(len(best))),
-                    *(f"{share:.4f}" for share in shares),
-                    *(f"{number / max(1, len(own)):.1f}", f"{precision:.4f}"),
+                    scene.name,
+                    masks_label(masks_folder),
+                    level.label,
+                    str(len(own)),
+                    str(len(best)),
+                    f"{iou:.4f}",
+                    f"{recall:.4f}",
+                    f"{number / max(1, len(own)):.1f}",
+                    f"{precision:.4f}",
                 ]
             )
         figure = draw_fits(scene, truth, Path(masks_folder), fits, median_and_worst(fits))

@@ -43,7 +43,9 @@ def measure_world_consistency(
         return
     true = Cameras.load(truth / "cameras.npz")
     mesh = TrueMesh.load(truth / "mesh.ply")
-    views = [view for view in answers.scene.cameras.names if view in set(true.names)]
+    known = set(true.names)
+    views = [view for view in answers.scene.cameras.names if view in known]
+    methods = [method for method in METHODS if method in settings.methods]
     nearest = dict(neighbours(true, views, 1))
     pairs = [(view, nearest[view]) for view in truths if view in nearest]
     for number, pair in enumerate(pairs):
@@ -51,7 +53,7 @@ def measure_world_consistency(
         points = shared_points(here, mesh.depth(here), there, mesh.depth(there))
         queries = spread(truths[pair[0]]().queries, TEXTS_PER_LEVEL)
         mask_of = answers_of(answers, selections, answered, pair, queries, settings)
-        for method in (method for method in METHODS if method in settings.methods):
+        for method in methods:
             protocol = label_of(VIEW_CONSISTENCY, method, settings)
             for query in queries:
                 assert query.level is not None

@@ -20,8 +20,7 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.classes.class_set import ClassSet
 from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES, splits_of
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
-from hilsplat.evaluate.metrics import instances
-from hilsplat.evaluate.metrics import point_classes as means
+from hilsplat.evaluate.metrics import instances, point_classes
 from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou, pooled
 from hilsplat.evaluate.protocols.cards import INSTANCES, ProtocolCard
 from hilsplat.evaluate.protocols.carry import CarriedPoints, Mode, carried_to, classify
@@ -31,13 +30,13 @@ if TYPE_CHECKING:
     from hilsplat.query.language_scene import LanguageScene
 
 MEANS: dict[str, Callable[[ClassCounts], float]] = {
-    "miou_present": means.miou_over_present,
-    "macc_present": means.macc_over_present,
-    "miou_occurring": means.miou_over_occurring,
-    "miou_all": means.miou_over_all,
-    "macc_all": means.macc_over_all,
-    "miou_absent_as_one": means.miou_absent_as_one,
-    "frequency_weighted_iou": means.frequency_weighted_iou,
+    "miou_present": point_classes.miou_over_present,
+    "macc_present": point_classes.macc_over_present,
+    "miou_occurring": point_classes.miou_over_occurring,
+    "miou_all": point_classes.miou_over_all,
+    "macc_all": point_classes.macc_over_all,
+    "miou_absent_as_one": point_classes.miou_absent_as_one,
+    "frequency_weighted_iou": point_classes.frequency_weighted_iou,
 }
 """Metrics with one number per scene, or one for all scenes under a pooled protocol."""
 
@@ -99,7 +98,7 @@ def pooled_points(card: ProtocolCard, scenes: Iterable[Iterable[Any]], classes: 
     values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
     if "miou_head" in card.metrics:
         for split, members in splits_of(classes).items():
-            values[f"miou_{split}"] = means.miou_over_occurring(counts, np.array(members))
+            values[f"miou_{split}"] = point_classes.miou_over_occurring(counts, np.array(members))
     return values
 
 
@@ -139,7 +138,7 @@ def measure_instances(
         yield Measured(method, "", "", metric, protocol, value, len(scans))
 
 
-def point_classes(
+def classes_of_points(
     scene: "LanguageScene", carried: CarriedPoints, method: str, texts: Sequence[str]
 ) -> Int32[np.ndarray, " P"]:
     """Return labels 1 .. K of points by "tree" or "field"; 0 if no Gaussian is assigned to a point."""
@@ -230,5 +229,5 @@ def measure_scene_points(
             if method in methods:
                 key = (id(points.xyz), method, classes.name)
                 if key not in labels_of:
-                    labels_of[key] = point_classes(scene, carried, method, classes.texts)
+                    labels_of[key] = classes_of_points(scene, carried, method, classes.texts)
                 yield from measure_points(card, method, labels, labels_of[key], classes, carried.mode)

@@ -53,8 +53,10 @@ TABLES: dict[str, TableKind] = {
     "components": TableKind(component_table, LEVELLED, "component_variants"),
     "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
     "cost-seconds": TableKind(partial(cost_table, seconds=True), LEVELLED, shows_costs=True),
-    "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", True),
-    "pruning-seconds": TableKind(partial(pruning_table, seconds=True), LEVELLED, "pruning_variants", True),
+    "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),
+    "pruning-seconds": TableKind(
+        partial(pruning_table, seconds=True), LEVELLED, "pruning_variants", shows_costs=True
+    ),
     "efficiency": TableKind(efficiency_table, LEVELLED, shows_costs=True),
     "efficiency-seconds": TableKind(partial(efficiency_table, seconds=True), LEVELLED, shows_costs=True),
     "theta": TableKind(theta_table, LEVELLED, "theta_variants"),

@@ -188,8 +188,11 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
             raise ArtifactError(
                 f"{path} is not a valid benchmark file: {error}", fix="run its stage again"
             ) from error
-        # Snakemake writes "-" or null for values that it could not sample.
-        sampled = (record.get(name) for name in ("cpu_time", "max_rss"))
-        cpu_s, peak_mib = (float(value) if isinstance(value, int | float) else 0.0 for value in sampled)
+        cpu_s, peak_mib = _number(record.get("cpu_time")), _number(record.get("max_rss"))
         jobs.append(Job(path.stem, dataset, scene, variant, elapsed_s, cpu_s, peak_mib))
     return jobs
+
+
+def _number(value: object) -> float:
+    """Return a sampled value; Snakemake writes "-" or null for values that it could not sample."""
+    return float(value) if isinstance(value, int | float) else 0.0

@@ -237,7 +237,7 @@ def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
     steps of 9 degrees. Fewer views shorten the drive rather than increase the steps. `arc_deg` is unused,
     because a drive is not a ring.
     """
-    rng, pitch_rng = (np.random.default_rng([scene.seed, purpose]) for purpose in (25, 26))
+    rng, pitch_rng = np.random.default_rng([scene.seed, 25]), np.random.default_rng([scene.seed, 26])
     length = DRIVE_X[1] - DRIVE_X[0]
     step = min(MAX_STEP, length / max(1, views - 1))
     start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2

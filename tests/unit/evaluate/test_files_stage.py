@@ -12,7 +12,7 @@ from hilsplat.base.images import write_png
 from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
-from hilsplat.evaluate.extra_protocols import Extra
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.files_stage import run_evaluate_files
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import LEVEL_AUTO, LEVEL_GIVEN, card_named
@@ -138,8 +138,10 @@ def data_set(monkeypatch):
     """Function that lets `--labels set/scene` open what it is given."""
 
     def put(known, flat=(), points=()):
-        extra = Extra(*(tuple(map(card_named, names)) for names in (flat, points)))
-        monkeypatch.setattr(Extra, "open", staticmethod(lambda name, data_root: ("set", known, extra)))
+        extra = ExtraProtocols(*(tuple(map(card_named, names)) for names in (flat, points)))
+        monkeypatch.setattr(
+            ExtraProtocols, "open", staticmethod(lambda name, data_root: ("set", known, extra))
+        )
 
     return put
 

@@ -8,7 +8,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.evaluate.extra_protocols import Extra
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.figures import panel
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.settings import EvaluateSettings, FiguresSettings
@@ -71,7 +71,9 @@ def rows(opened, monkeypatch, tmp_path):
     """Function that evaluates the block world and returns its scores, sorted."""
 
     def evaluate(labels=None):
-        monkeypatch.setattr(Extra, "open", staticmethod(lambda name, data_root: (name, labels, Extra())))
+        monkeypatch.setattr(
+            ExtraProtocols, "open", staticmethod(lambda name, data_root: (name, labels, ExtraProtocols()))
+        )
         given = {"truth": None, "labels": ["lerf"]} if labels else {}
         scores = opened.evaluate(tmp_path / "scores.csv", dataset="lerf", **given)
         keys = ["view", "method", "query", "level", "metric", "protocol"]
@@ -132,6 +134,13 @@ def test_a_region_with_a_broken_chain_is_queried_but_belongs_to_no_family():
     assert truth.families() == [[(("bear",), [("bear", "head")])], []]
 
 
+def test_a_label_smaller_than_its_view_is_enlarged():
+    mask = np.zeros((4, 6), bool)
+    mask[2, 3] = True
+    (dot,) = ViewTruth.of_regions([region_of(mask, "dot")], (8, 12)).categories
+    assert np.argwhere(dot.truth).tolist() == [[4, 6], [4, 7], [5, 6], [5, 7]]
+
+
 def test_labels_shrink_as_public_evaluators_shrink_them():
     # OpenCV's nearest takes the pixel under the corner; at an eighth, Pillow takes the one under the centre.
     mask = np.zeros((48, 48), bool)
@@ -143,7 +152,9 @@ def test_labels_shrink_as_public_evaluators_shrink_them():
     np.testing.assert_array_equal(dots.eighth, np.asarray(small))
 
 
-@pytest.mark.parametrize(("name", "found"), [("lerf_ovs", "no scene"), ("scannet/scene0000_00", "on points")])
+@pytest.mark.parametrize(
+    ("name", "found"), [("lerf_ovs", "does not contain a scene name"), ("scannet/scene0000_00", "on points")]
+)
 def test_names_without_image_labels_are_refused(tmp_path, name, found):
     with pytest.raises(SceneError, match=found):
         open_labelled(name, tmp_path)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import DeviceError
-from hilsplat.splat.rasterise import binning, cuda, device
+from hilsplat.splat.rasterise import binning, cuda, device, parity
 from hilsplat.splat.rasterise.api import draw, pixel_weights
 from hilsplat.splat.rasterise.binning import bin_gaussians, fill_lists
 from hilsplat.splat.rasterise.device import choose_device
@@ -160,7 +160,7 @@ def without_device(monkeypatch):
 
 @pytest.mark.usefixtures("without_device")
 def test_gsplats_reference_draws_what_our_kernels_draw():
-    assert device.disagreement("cpu", "cuda") is None
+    assert parity.disagreement("cpu", "cuda") is None
 
 
 @pytest.mark.usefixtures("without_device")
@@ -170,4 +170,4 @@ def test_gsplats_reference_draws_what_our_kernels_draw():
 )
 def test_the_self_test_detects_other_conventions(monkeypatch, name, value, what):
     monkeypatch.setattr(cuda, name, value)
-    assert what in device.disagreement("cpu", "cuda")
+    assert what in parity.disagreement("cpu", "cuda")

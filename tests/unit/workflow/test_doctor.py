@@ -15,7 +15,7 @@ from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
 from hilsplat.cli.main import app
 from hilsplat.models.folder import ModelFolder
-from hilsplat.splat.rasterise import api, device
+from hilsplat.splat.rasterise import api, parity
 from hilsplat.workflow import doctor
 from tests.unit.models.test_store import lay
 
@@ -79,7 +79,7 @@ def test_two_builds_of_onnxruntime_are_a_fault(monkeypatch):
 )
 def test_cuda_is_optional_but_must_agree_with_the_cpu(monkeypatch, problem, apart, state):
     monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_problem", lambda: problem)
-    monkeypatch.setattr("hilsplat.splat.rasterise.device.cuda_disagreement", lambda: apart)
+    monkeypatch.setattr("hilsplat.splat.rasterise.parity.cuda_disagreement", lambda: apart)
     assert [found.state for found in doctor.cuda()] == [state]
 
 
@@ -162,9 +162,9 @@ def test_a_check_that_fails_unexpectedly_does_not_stop_the_others(monkeypatch):
 
 def test_the_cuda_self_test_runs_once(monkeypatch, tmp_path):
     drawn = []
-    monkeypatch.setattr(device, "disagreement", lambda one, other: drawn.append(other))
+    monkeypatch.setattr(parity, "disagreement", lambda one, other: drawn.append(other))
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "gsplat", SimpleNamespace(__version__="1.5"))
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a GPU")
-    assert device.cuda_disagreement() is None and device.cuda_disagreement() is None
+    assert parity.cuda_disagreement() is None and parity.cuda_disagreement() is None
     assert drawn == ["cuda"]

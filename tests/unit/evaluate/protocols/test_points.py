@@ -11,7 +11,7 @@ from hilsplat.datasets.classes.waymo import WAYMO_22
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
-from hilsplat.evaluate.extra_protocols import STAND_INS, Extra
+from hilsplat.evaluate.extra_protocols import STAND_INS, ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_named
 from hilsplat.evaluate.protocols.carry import carried_to
@@ -209,14 +209,14 @@ def test_cameras_on_a_line_still_fix_the_similarity():
 
 def test_stand_ins_and_data_sets_name_protocols_that_exist():
     for kind in STAND_INS:
-        asked = Extra.of_world(kind)
+        asked = ExtraProtocols.of_world(kind)
         assert len(asked.flat) + len(asked.points) == len(STAND_INS[kind])
-    assert not Extra.of_world("").flat and not Extra.of_world("").points
+    assert not ExtraProtocols.of_world("").flat and not ExtraProtocols.of_world("").points
     for dataset in DATASETS.values():
-        asked = Extra.of(dataset.protocols)
+        asked = ExtraProtocols.of(dataset.protocols)
         assert len(asked.flat) + len(asked.points) == len(dataset.protocols)
         assert bool(asked.points) == (dataset.labels == "points" and bool(dataset.protocols))
     with pytest.raises(SceneError, match="one of tabletop, room, street"):
-        Extra.of_world("table")
+        ExtraProtocols.of_world("table")
     with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplatt'"):
         card_named("lerf/langsplatt")
