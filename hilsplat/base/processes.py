@@ -80,7 +80,7 @@ def is_unfinished(path: Path) -> bool:
 def unfinished_folder(parent: Path) -> Iterator[Path]:
     """Create a folder for unfinished files, and delete it at the end.
 
-    A locked file in it tells `remove_leftovers` that the writer is alive: the system releases the lock when
+    A locked file in it shows `remove_leftovers` that the writer is alive: the system releases the lock when
     the writer ends, even if it is killed. Process ids have no meaning in other containers and after a reboot.
     The folder itself is not locked, because NFS can lock only files.
     """

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import label_maps, painted_indicator, random_half
+from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
 from hilsplat.field.adam import Adam
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
 from hilsplat.field.problem import QuadraticProblem

@@ -21,7 +21,7 @@ from scipy.cluster.vq import vq
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS
 from hilsplat.base.progress import track
-from hilsplat.contributions.stage import painted_indicator
+from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings

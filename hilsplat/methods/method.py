@@ -21,7 +21,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import label_maps
+from hilsplat.contributions.view_matrices import label_maps
 from hilsplat.field.code import LinearCode, autoencoder_file, load_code, load_latents
 from hilsplat.field.language_field import LanguageField
 from hilsplat.methods.registry import method_of

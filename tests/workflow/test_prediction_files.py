@@ -1,4 +1,4 @@
-"""The answers of the tiny scene, written as files, have the scores of the run."""
+"""Masks that the tiny scene answers with, written as files, get the same scores as in the run."""
 
 from pathlib import Path
 

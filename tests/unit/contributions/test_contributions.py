@@ -21,14 +21,8 @@ from hilsplat.contributions.quadratic import (
 )
 from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import (
-    ArrayStream,
-    label_maps,
-    labelled_rows,
-    random_half,
-    run_contributions,
-    view_contributions,
-)
+from hilsplat.contributions.stage import ArrayStream, run_contributions
+from hilsplat.contributions.view_matrices import label_maps, labelled_rows, random_half, view_contributions
 from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
@@ -168,7 +162,7 @@ def test_gram_depends_neither_on_threads_nor_on_how_the_pixels_are_divided(merge
     one = built([stack_weights(parts)])
     assert_same_gram(built(parts), one)
     assert_same_gram(built(parts, threads=2), one)
-    # large parts (here two) are added in their turn
+    # large parts (here two) are added in turn
     monkeypatch.setattr(quadratic_builder, "LARGE_PART", sorted(part.nonzeros for part in parts)[2])
     assert_same_gram(built(parts, keep="gram"), one)
     # too many weights to hold: G of any size

@@ -150,7 +150,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
 
 @pytest.fixture
 def opened(block_world, monkeypatch):
-    """Parts of the block world, what a stage asks for when it opens them, and the evaluate stage."""
+    """Parts of the block world, the inputs with which a stage opens them, and the evaluate stage."""
     from hilsplat.evaluate import stage
     from hilsplat.evaluate.figures import panel
     from hilsplat.evaluate.scores import read_scores

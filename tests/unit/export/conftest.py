@@ -35,7 +35,7 @@ def export(folder: Path, out: Path) -> Path:
 def enliven(model) -> None:
     """Replace the tiny initial weights, whose outputs would hardly depend on the inputs.
 
-    SAM's positional frequencies are a buffer that transformers draws anew for every model.
+    SAM's positional frequencies are a buffer that transformers draws again for every model.
     """
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():

@@ -12,7 +12,7 @@ from hilsplat.base.artifacts import read_index, read_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
-from hilsplat.contributions.stage import painted_indicator
+from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field

@@ -79,7 +79,7 @@ def hub(repositories, monkeypatch, tmp_path) -> Iterator[LoopbackHub]:
 
 @pytest.fixture
 def waits(monkeypatch) -> list[float]:
-    """Seconds of the waits, which are skipped."""
+    """Waiting times, in seconds, which are skipped."""
     seconds: list[float] = []
     monkeypatch.setattr(get.time, "sleep", seconds.append)
     return seconds

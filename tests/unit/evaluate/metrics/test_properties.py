@@ -18,7 +18,7 @@ from hilsplat.evaluate.metrics.hierarchy import (
 from hilsplat.evaluate.metrics.point_classes import ClassCounts
 from hilsplat.evaluate.protocols.cards import CARDS
 
-# Every metric as a function of two label images with labels 0 .. 3, of which the second is the truth.
+# Every metric as a function of two label images with labels 0 .. 3; the second is the ground truth.
 # Masks are where a label is 1; families are label 1 or 2 (parent) with its part of label 2 (child).
 
 

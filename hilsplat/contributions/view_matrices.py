@@ -1,0 +1,78 @@
+"""The matrices of one view: masks over Gaussians, and the rows of W that show a mask."""
+
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Int32
+
+from hilsplat.base.levels import LEVELS
+from hilsplat.contributions.compositing import visible_mass
+from hilsplat.contributions.kernels import move_to_front, summed_masks
+from hilsplat.contributions.quadratic import StackedWeights
+from hilsplat.segment.masks import HierarchicalMasks
+
+
+def label_maps(masks: HierarchicalMasks) -> Int32[np.ndarray, "P 3"]:
+    """Return the row of the painted mask at each pixel and level, -1 for none."""
+    return np.stack([masks.label_map(level).reshape(-1) for level in LEVELS], axis=1)
+
+
+def painted_indicator(labels: Int32[np.ndarray, "P 3"], num_masks: int, pixels: np.ndarray) -> sp.csr_matrix:
+    """Return B: one row per mask, with ones at the given pixels that show the mask (float64)."""
+    pixel, level = np.nonzero((labels >= 0) & pixels[:, None])
+    ones = np.ones(len(pixel))
+    return sp.csr_matrix((ones, (labels[pixel, level], pixel)), shape=(num_masks, len(labels)))
+
+
+def random_half(view: str, pixels: int) -> np.ndarray:
+    """Select each pixel with probability 1/2, seeded by the view's name."""
+    seed = int.from_bytes(hashlib.sha256(view.encode()).digest()[:8], "little")
+    return np.random.default_rng(seed).random(pixels) < 0.5
+
+
+def view_contributions(
+    view: str, weights: sp.csr_matrix, masks: HierarchicalMasks, threads: int = 1
+) -> dict[str, np.ndarray]:
+    """Return all matrices of one view except W as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
+
+    The view's name seeds the random halves; `weights` are normalised. The result is independent of threads.
+    """
+    total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
+    shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]
+    edges = [0, *np.searchsorted(total_px, shares).tolist(), len(masks)]
+    pixels = label_maps(masks), random_half(view, weights.shape[0])
+    W = weights.indptr, weights.indices, weights.data
+    level_index = masks.level.astype(np.int64) - 1
+
+    def some(first: int, last: int) -> tuple[np.ndarray, ...]:
+        runs = masks.runs, masks.offsets, level_index
+        return summed_masks(first, last, *runs, *pixels, *W, weights.shape[1])
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        parts = zip(*pool.map(some, edges[:-1], edges[1:]), strict=True)
+        counts, sizes, columns, sums = (np.concatenate(each) for each in parts)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    shown, in_half = counts.T
+    arrays = {"pixels": shown.copy(), "half_pixels": in_half.copy(), "mass": visible_mass(weights)}
+    areas = {"S": np.ones(len(masks)), "A": np.maximum(shown, 1), "A_half": np.maximum(in_half, 1)}
+    for index, (name, area) in enumerate(areas.items()):
+        present = sums[:, index] > 0
+        scaled = np.repeat(1.0 / area, sizes) * sums[:, index]
+        arrays[f"{name}_data"] = scaled[present].astype(np.float32)
+        arrays[f"{name}_indices"] = columns[present]
+        arrays[f"{name}_indptr"] = np.concatenate([[0], np.cumsum(present)])[starts]
+    return arrays
+
+
+def labelled_rows(weights: sp.csr_matrix, labels: Int32[np.ndarray, "P 3"]) -> StackedWeights:
+    """Return the rows of W with Gaussians and a mask at any level, in the memory of `weights`."""
+    sizes = np.diff(weights.indptr)
+    valid = (labels >= 0) & (sizes > 0)[:, None]
+    rows = np.flatnonzero(valid.any(axis=1))
+    kept = move_to_front(rows, weights.indptr, weights.indices, weights.data)
+    indptr = np.concatenate([[0], np.cumsum(sizes[rows])])
+    arrays = (weights.data[:kept], weights.indices[:kept], indptr.astype(weights.indptr.dtype))
+    matrix = sp.csr_matrix(arrays, shape=(len(rows), weights.shape[1]), copy=False)
+    return StackedWeights(matrix, valid[rows])
