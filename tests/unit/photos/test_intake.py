@@ -214,7 +214,7 @@ def test_ten_bit_hlg_video_is_mapped_to_srgb(tmp_path):
 
 @pytest.mark.parametrize(("size", "expected"), [((64, 48), (254, 0, 0)), ((1280, 720), (255, 24, 0))])
 def test_the_matrix_of_an_untagged_stream_follows_its_size(size, expected):
-    """BT.601's pure red, (81, 90, 240), is read as BT.601 below 720 lines and as BT.709 above."""
+    """BT.601's pure red, (81, 90, 240), is read as BT.601 below 720 lines, otherwise as BT.709."""
     frame = av.VideoFrame(*size, "yuv420p")
     for plane, code in zip(frame.planes, (81, 90, 240), strict=True):
         plane.update(bytes([code]) * plane.buffer_size)
