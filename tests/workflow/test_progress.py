@@ -26,7 +26,7 @@ def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finishe
     assert "Error in rule contributions:" in failed.stderr
     assert "shell:" in failed.stderr and " contributions --scene" in failed.stderr
     assert "Logfile" in failed.stderr  # profiles/default was found
-    assert "has a mask" in failed.stderr.partition("Logfile")[2]
+    assert "has masks" in failed.stderr.partition("Logfile")[2]
 
 
 def test_verbose_restores_snakemakes_own_output(copy_of_finished: Project) -> None:

@@ -114,7 +114,7 @@ def test_a_view_without_predictions_or_with_two_is_refused_but_its_folder_may_be
             "001.png: whole/bear: the mask and the labels differ in size\n"
             "  expected  64 x 64 \\(height x width\\)\n  found     32 x 64",
         ),
-        ("baer", np.full((64, 64), 255), "the labels have no text 'baer'\n(.|\n)*rename it 'bear'"),
+        ("baer", np.full((64, 64), 255), "the labels have no text 'baer'\n(.|\n)*rename it to .bear."),
         ("whole/nose", np.full((64, 64), 255), "the labels have no text 'nose' at level whole"),
         ("bear", np.ones((64, 64)), "none is foreground"),
     ],

@@ -67,7 +67,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
         ("source", "world:tabletop", "is not the name of a synthetic world"),
         ("source", "gone", "gone is missing"),
         ("source", "", "it is empty"),
-        ("source", "phone", r"has no images(.|\n)*1 files \.dng"),
+        ("source", "phone", r"has no images(.|\n)*1 files \(\.dng"),
         ("gaussians", "gone.ply", "is missing"),
         ("gaussians", "desk", "is a folder"),
         ("gaussians", "notes.txt", "is not a PLY: it begins with b'hell'"),

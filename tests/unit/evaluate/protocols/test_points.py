@@ -16,11 +16,11 @@ from hilsplat.evaluate.metrics.instances import average_precision, match_instanc
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_named
 from hilsplat.evaluate.protocols.carry import carried_to
 from hilsplat.evaluate.protocols.points import (
+    classes_of_points,
     measure_instances,
     measure_points,
     measure_scene_points,
     node_instances,
-    point_classes,
     pooled_points,
 )
 from hilsplat.evaluate.scores import Measured, read_instances, read_scores, write_instances, write_scores
@@ -138,7 +138,7 @@ def points_of(block_world, count=1):
 def test_points_get_the_class_of_the_node_or_latent_of_their_gaussians(block_world, method, mode):
     points, ids = points_of(block_world)
     carried = carried_to(points.xyz, block_world.answers.gaussians, mode, radius=0.001)
-    found = point_classes(block_world.answers, carried, method, CLASSES.texts)
+    found = classes_of_points(block_world.answers, carried, method, CLASSES.texts)
     labelled = ids > 0
     assert np.array_equal(found[labelled], CLASSES.labels(ids)[labelled])
     if mode in ("nearest", "frozen"):
