@@ -1,7 +1,7 @@
 """Time to score a view: 20 annotated texts at 986 x 728 px, with given relevancy maps and node masks."""
 
 import time
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,8 +9,9 @@ import pytest
 
 from benchmarks.goals import Goal
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.evaluate.protocols.answers import Selections
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.settings import EvaluateSettings
 
@@ -47,7 +48,7 @@ class Answers:
 @cache
 def annotated_view() -> tuple[Answers, ViewTruth]:
     """Return a view with five objects of 200 x 300 px, each with a half, a quarter and a rim."""
-    queries, regions, by_path = [], [], {}
+    regions, labelled = [], []
     for thing in range(5):
         top, left = 60 + 250 * (thing // 3), 20 + 320 * (thing % 3)
         parts = (("thing", 1, 200, 300), ("half", 2, 200, 150), ("quarter", 3, 100, 150), ("rim", 3, 40, 150))
@@ -57,13 +58,11 @@ def annotated_view() -> tuple[Answers, ViewTruth]:
             region[top : top + height, left : left + width] = True
             text = f"{name} {thing}"
             path = (*path[: level - 1], text)
-            box = np.array([[left, top, left + width - 1, top + height - 1]])
-            queries.append(Query(text, Level(level), (path,), region, box))
+            pixels = partial(np.asarray, region)
+            labelled.append(LabelledRegion(text, SIZE_HW, pixels, level=Level(level), path=path))
             regions.append(region)
-            by_path[path] = region
-    texts = [query.text for query in queries]
-    categories = tuple(Query(q.text, None, q.paths, q.truth, q.boxes_xyxy) for q in queries)
-    return Answers(texts, regions), ViewTruth(tuple(queries), categories, by_path)
+    answers = Answers([region.text for region in labelled], regions)
+    return answers, ViewTruth.of_regions(labelled, SIZE_HW)
 
 
 @one_thread

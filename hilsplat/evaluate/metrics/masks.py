@@ -106,9 +106,3 @@ def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B
 def hits_the_mask(points_xy: Int[np.ndarray, "P 2"], truth: Bool[np.ndarray, "H W"]) -> bool:
     """Return whether any point is in the ground-truth region, which is stricter than the box."""
     return bool(truth[points_xy[:, 1], points_xy[:, 0]].any())
-
-
-def box_of(mask: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, " 4"]:
-    """Return the xyxy box of a region, borders included as in LERF; other boxes are end-exclusive."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return np.array([columns[0], rows[0], columns[-1], rows[-1]])

@@ -2,7 +2,7 @@
 
 | mode | source of a point's label or feature |
 |---|---|
-| `frozen` | its own Gaussian, fitted without moving (OpenGaussian); transparent ones are not scored |
+| `frozen` | its own Gaussian, the one with the point's number, fitted without moving (OpenGaussian) |
 | `nearest` | the nearest Gaussian that is opaque enough |
 | `vote` | a vote of the k nearest within a radius, weighted by opacity; none beyond the radius |
 | `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
@@ -25,6 +25,9 @@ Mode = Literal["frozen", "nearest", "vote", "density"]
 
 OPACITY_MIN = 0.1
 """Gaussians below this opacity are transparent; OpenGaussian excludes them from the evaluation."""
+
+NEIGHBOURS = {"nearest": 1, "vote": 5, "density": 8}
+"""Number of Gaussians assigned to a point."""
 
 CHUNK_POINTS = 65536
 """Number of points processed at once; bounds memory use."""
@@ -72,93 +75,59 @@ class CarriedPoints:
 def carried_to(
     points: Float[np.ndarray, "P 3"], gaussians: Gaussians, mode: Mode, radius: float, threads: int = 1
 ) -> CarriedPoints:
-    """Assign Gaussians to points; positions and the radius of a vote are in scene units."""
-    means, opacities = gaussians.means, gaussians.opacities
-    if mode == "frozen":
-        return frozen(opacities, len(points))
-    if mode == "nearest":
-        return nearest(points, means, opacities, threads)
-    if mode == "vote":
-        return vote(points, means, opacities, radius, threads=threads)
-    return density(points, means, opacities, gaussians.scales, gaussians.quats, threads=threads)
+    """Assign Gaussians to points; positions and the radius of a vote are in scene units.
 
-
-def frozen(opacities: Float[np.ndarray, " N"], num_points: int) -> CarriedPoints:
-    """Assign Gaussian i to point i; the fit must not have moved, split or dropped any Gaussian.
-
-    As in OpenGaussian's `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
+    `frozen`: the fit must not have moved, split or dropped any Gaussian. As in OpenGaussian's
+    `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
+    `vote`: a point without a Gaussian within the radius has no prediction, which counts as a miss.
+    `density`: the weight opacity * exp(-d**2 / 2), d the Mahalanobis distance, is the alpha that 3DGS blends
+    at the point. Candidates are the nearest centres, so a large Gaussian with a distant centre has no weight.
+    Relative weights are used even far from all Gaussians, so every point has a prediction.
 
     Raises:
-        MisalignedArtifactError: the numbers of Gaussians and points differ.
+        MisalignedArtifactError: no Gaussian is opaque enough, or under `frozen`, the numbers of Gaussians and
+            points differ.
     """
-    if len(opacities) != num_points:
-        raise MisalignedArtifactError(
-            "the Gaussians do not correspond to the points of the ground truth",
-            expected=f"{num_points} Gaussians, one per point",
-            found=len(opacities),
-            fix="fit with frozen points, or use mode nearest, vote or density",
-        )
-    index = np.arange(num_points, dtype=np.int64)[:, None]
-    return CarriedPoints("frozen", index, np.ones((num_points, 1)), opacities >= OPACITY_MIN)
+    opacities = gaussians.opacities
+    if mode == "frozen":
+        if len(opacities) != len(points):
+            raise MisalignedArtifactError(
+                "the Gaussians do not correspond to the points of the ground truth",
+                expected=f"{len(points)} Gaussians, one per point",
+                found=len(opacities),
+                fix="fit with frozen points, or use mode nearest, vote or density",
+            )
+        index = np.arange(len(points), dtype=np.int64)[:, None]
+        return CarriedPoints("frozen", index, np.ones(index.shape), opacities >= OPACITY_MIN)
+    k, reach = NEIGHBOURS[mode], radius if mode == "vote" else np.inf
+    index, distance = _neighbours(points, gaussians.means, opacities, k, reach, threads)
+    if mode == "nearest":
+        name, weight = "nearest", np.ones(index.shape)
+    elif mode == "vote":
+        name = f"vote of {k} within {radius:g}"
+        weight = _normalised(np.where(np.isfinite(distance), opacities[index], 0.0))
+    else:
+        name = f"density of {k}"
+        weight = _normalised(_densities(points, gaussians, opacities, index, distance))
+    return CarriedPoints(name, index, weight, np.ones(len(points), dtype=bool))
 
 
-def nearest(
-    points: Float[np.ndarray, "P 3"],
-    means: Float[np.ndarray, "N 3"],
-    opacities: Float[np.ndarray, " N"],
-    threads: int = 1,
-) -> CarriedPoints:
-    """Assign the nearest Gaussian that is not transparent, at any distance."""
-    index, _ = _neighbours(points, means, opacities, 1, np.inf, threads)
-    return CarriedPoints("nearest", index, np.ones(index.shape), np.ones(len(points), dtype=bool))
-
-
-def vote(
-    points: Float[np.ndarray, "P 3"],
-    means: Float[np.ndarray, "N 3"],
-    opacities: Float[np.ndarray, " N"],
-    radius: float = 0.1,
-    k: int = 5,
-    threads: int = 1,
-) -> CarriedPoints:
-    """Assign the k nearest Gaussians that are not transparent within a radius, weighted by opacity.
-
-    A point without such a Gaussian has no prediction, which counts as a miss.
-    """
-    index, distance = _neighbours(points, means, opacities, k, radius, threads)
-    weight = np.where(np.isfinite(distance), opacities[index], 0.0)
-    return CarriedPoints(
-        f"vote of {k} within {radius:g}", index, _normalised(weight), np.ones(len(points), dtype=bool)
-    )
-
-
-def density(
-    points: Float[np.ndarray, "P 3"],
-    means: Float[np.ndarray, "N 3"],
-    opacities: Float[np.ndarray, " N"],
-    scales: Float[np.ndarray, "N 3"],
-    quats: Float[np.ndarray, "N 4"],
-    k: int = 8,
-    threads: int = 1,
-) -> CarriedPoints:
-    """Assign the k nearest Gaussians, weighted by opacity * exp(-d**2 / 2), d the Mahalanobis distance.
-
-    This weight is the alpha that 3DGS blends at the point. Candidates are the nearest centres that are not
-    transparent, so a large Gaussian with a distant centre has no weight. Relative weights are used even far
-    from all Gaussians, so every point has a prediction. Quaternions (wxyz) may have any non-zero length.
-    """
-    index, distance = _neighbours(points, means, opacities, k, np.inf, threads)
+def _densities(
+    points: np.ndarray, gaussians: Gaussians, opacities: np.ndarray, index: np.ndarray, distance: np.ndarray
+) -> np.ndarray:
+    """Return opacity times Gaussian falloff at each point, up to a factor per point; 0 if out of reach."""
     # Matrices (N, 3, 3) that map an offset from the centre to standard deviations.
-    whiten = rotation_matrices(quats).transpose(0, 2, 1) / scales.astype(float)[:, :, None]
+    turns = rotation_matrices(gaussians.quats).transpose(0, 2, 1)
+    whiten = turns / gaussians.scales.astype(float)[:, :, None]
     weight = np.empty(index.shape)
     for rows in _chunks(len(points)):
-        offset = points[rows, None, :].astype(float) - means[index[rows]]
+        offset = points[rows, None, :].astype(float) - gaussians.means[index[rows]]
         squared = (np.einsum("pkij,pkj->pki", whiten[index[rows]], offset) ** 2).sum(axis=2)
         log_weight = np.log(opacities[index[rows]].astype(float)) - squared / 2
         log_weight = np.where(np.isfinite(distance[rows]), log_weight, -np.inf)
         # Subtracting the maximum preserves the ratios and prevents underflow of all weights to zero.
         weight[rows] = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
-    return CarriedPoints(f"density of {k}", index, _normalised(weight), np.ones(len(points), dtype=bool))
+    return weight
 
 
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:

@@ -23,7 +23,7 @@ from hilsplat.evaluate.protocols.cards import (
     OVS_NODES,
     ProtocolCard,
 )
-from hilsplat.evaluate.protocols.view_truth import Query, eighth_of, kept_by_pillow
+from hilsplat.evaluate.protocols.view_truth import Query, kept_by_pillow
 from hilsplat.evaluate.scores import Measured
 
 
@@ -117,10 +117,8 @@ def argmax_rows(
     if not queries:
         return
     ordered = sorted(queries, key=lambda query: query.text)
-    size_hw, small = ordered[0].truth.shape, ordered[0].eighth
-    rows, columns = kept_by_pillow(size_hw, eighth_of(size_hw) if small is None else small.shape)
-    grid = np.ix_(rows, columns)
-    truth = np.stack([query.truth[grid] if query.eighth is None else query.eighth for query in ordered])
+    size_hw, truth = ordered[0].truth.shape, np.stack([query.eighth for query in ordered])
+    rows, columns = kept_by_pillow(size_hw, truth.shape[1:])
     compared = truth.any(axis=0) if is_stand_in else np.full(truth.shape[1:], True)
     pixels = (rows[:, None] * size_hw[1] + columns)[compared]
     if len(pixels):

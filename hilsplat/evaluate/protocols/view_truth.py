@@ -14,7 +14,6 @@ from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, check_label_size
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.metrics.masks import box_of
 from hilsplat.scene.scene import Scene
 
 logger = logging.getLogger(__name__)
@@ -35,8 +34,8 @@ class Query:
     paths: tuple[tuple[str, ...], ...]  # distinct chains of texts that lead to its nodes
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]  # of each annotated node, borders included
+    eighth: Bool[np.ndarray, "h w"]  # at an eighth of the image's size, read from the label
     any_grey: Bool[np.ndarray, "H W"] | None = None  # region for ground truth `any grey`, if it differs
-    eighth: Bool[np.ndarray, "h w"] | None = None  # at an eighth of the image's size, read from the label
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
         """Return the ground-truth region for protocols with this `truth`, `labels` or `any grey`."""
@@ -51,7 +50,7 @@ class ViewTruth:
     categories: tuple[Query, ...]  # one per text, merged over levels
     regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]  # of each path that is large enough
     # Texts that the labels list but the view doesn't show compete in an argmax, and may have `any_grey`.
-    absent: tuple[Query, ...] = ()
+    absent: tuple[Query, ...]
 
     @staticmethod
     def of(
@@ -62,8 +61,7 @@ class ViewTruth:
         Raises:
             MisalignedArtifactError: label images and camera differ in size.
         """
-        queries: list[Query] = []
-        by_path: dict[tuple[str, ...], np.ndarray] = {}
+        regions: list[LabelledRegion] = []
         for level in LEVELS:
             texts = annotations.texts(view, level)
             if not texts:
@@ -77,24 +75,19 @@ class ViewTruth:
                     fix="annotate the images of the scene folder, or run poses without shrinking them",
                 )
             for text, ids in texts.items():
-                regions = {node: labels == node for node in ids}
-                truth = np.any(list(regions.values()), axis=0)
-                if np.count_nonzero(truth) < min_px:
-                    continue
-                boxes = np.stack([box_of(region) for region in regions.values() if region.any()])
-                paths = tuple(dict.fromkeys(annotations.path_of(node) for node in ids))
-                queries.append(Query(text, level, paths, truth, boxes))
-                for node, region in regions.items():
-                    path = annotations.path_of(node)
-                    by_path[path] = by_path[path] | region if path in by_path else region
-        large = {path: region for path, region in by_path.items() if np.count_nonzero(region) >= min_px}
-        return ViewTruth(tuple(queries), _merged(queries, by_level=False), large)
+                for node in ids:
+                    pixels, path = partial(np.equal, labels, node), annotations.path_of(node)
+                    regions.append(LabelledRegion(text, labels.shape, pixels, level=level, path=path))
+        return ViewTruth.of_regions(regions, size_hw, min_px=min_px)
 
     @staticmethod
     def of_regions(
-        regions: Iterable[LabelledRegion], size_hw: tuple[int, int], image_hw: tuple[int, int] | None = None
+        regions: Iterable[LabelledRegion],
+        size_hw: tuple[int, int],
+        image_hw: tuple[int, int] | None = None,
+        min_px: int = 0,
     ) -> "ViewTruth":
-        """Return the ground truth of a view of a published data set, with or without levels.
+        """Return the ground truth of a view from its regions, with or without levels.
 
         Regions of one text and level are merged, keeping all their boxes. A region with a broken chain of
         parents is queried but belongs to no family.
@@ -102,6 +95,7 @@ class ViewTruth:
         Args:
             size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
             image_hw: size of the image, if different.
+            min_px: texts and paths with fewer pixels in the view are omitted.
         """
         small_hw = eighth_of(image_hw or size_hw)
         single: list[Query] = []
@@ -112,15 +106,16 @@ class ViewTruth:
                 continue
             grey = region.mask(size_hw, any_grey=True) if region.any_grey else None
             small = region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))]
-            single.append(Query(region.text, level, (path,), mask, region.boxes(size_hw), grey, small))
+            single.append(Query(region.text, level, (path,), mask, region.boxes(size_hw), small, grey))
             if level is not None and len(path) == int(level):
                 by_path[path] = by_path[path] | mask if path in by_path else mask
-        queries = _merged(single, by_level=True)
+        merged = _merged(single, by_level=True)
+        queries = [query for query in merged if np.count_nonzero(query.truth) >= min_px]
         united = _merged(queries, by_level=False)
         return ViewTruth(
             tuple(query for query in queries if query.level is not None),
             tuple(query for query in united if query.truth.any()),
-            by_path,
+            {path: mask for path, mask in by_path.items() if np.count_nonzero(mask) >= min_px},
             tuple(query for query in united if not query.truth.any()),
         )
 
@@ -161,16 +156,12 @@ def _merged(queries: Iterable[Query], by_level: bool) -> tuple[Query, ...]:
         paths = tuple(dict.fromkeys(path for query in same for path in query.paths))
         truth = np.any([query.truth for query in same], axis=0)
         boxes = np.concatenate([query.boxes_xyxy for query in same])
-        with_grey = same if any(query.any_grey is not None for query in same) else []
-        grey = _union(query.region("any grey") for query in with_grey)
-        merged.append(Query(text, level, paths, truth, boxes, grey, _union(query.eighth for query in same)))
+        eighth = np.any([query.eighth for query in same], axis=0)
+        grey = None
+        if any(query.any_grey is not None for query in same):
+            grey = np.any([query.region("any grey") for query in same], axis=0)
+        merged.append(Query(text, level, paths, truth, boxes, eighth, grey))
     return tuple(merged)
-
-
-def _union(masks: Iterable[np.ndarray | None]) -> np.ndarray | None:
-    """Return the union of the masks that aren't None, or None."""
-    known = [mask for mask in masks if mask is not None]
-    return np.any(known, axis=0) if known else None
 
 
 def eighth_of(size_hw: tuple[int, int]) -> tuple[int, int]:
