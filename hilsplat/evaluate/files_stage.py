@@ -24,7 +24,7 @@ from hilsplat.evaluate.protocols import cards
 from hilsplat.evaluate.protocols.answers import mask_rows
 from hilsplat.evaluate.protocols.flat_views import argmax_rows
 from hilsplat.evaluate.protocols.points import class_set, instance_scan, measure_points
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, annotated_truths
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import consistency_rows
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.scene.scene import Scene
@@ -94,7 +94,7 @@ def run_evaluate_files(
                 points = labelled_points(truth.parent, kind)
             else:
                 least_px = min_region_px or EvaluateSettings().min_region_px
-                views = annotated_truths(truth, Scene.load(scene), least_px)
+                views = truths_of(truth, Scene.load(scene), least_px)
         else:
             dataset, known, extra = ExtraProtocols.open(labels, data_root)
             name = labels.partition("/")[2]

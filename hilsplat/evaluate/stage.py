@@ -1,14 +1,14 @@
 """The evaluate stage: scores a finished scene against its annotations and writes `scores.csv`."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
+from hilsplat.evaluate.diagnostics.alignment import scene_from_true
 from hilsplat.evaluate.diagnostics.world_answers import measure_world_consistency
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
@@ -16,14 +16,13 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.points import measure_scene_points
-from hilsplat.evaluate.protocols.view_truth import ViewTruth, annotated_truths, labelled_truths
+from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.evaluate.protocols.views import measure_view, relevancy_departures, rule_of
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.evaluate.tables.costs import time_queries, write_times
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.finished import SceneParts
-from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
 from hilsplat.settings import EvaluateSettings
 
@@ -92,7 +91,10 @@ def run_evaluate(
             answers = LanguageScene.from_parts(parts, settings, threads=threads)
             posed, selections = answers.scene, Selections(answers)
             for data, known, protocols in scored:
-                truths = known_truths(known, posed, settings)
+                min_px = settings.min_region_px
+                truths = {} if isinstance(known, PointScene) else truths_of(known, posed, min_px)
+                if not truths and not isinstance(known, PointScene):
+                    logger.warning("no view of %s is annotated: nothing to score", posed.name)
                 counts[f"views of {data}"] = len(truths)
                 kept: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
@@ -124,21 +126,6 @@ def run_evaluate(
         write_scores(out, scores)
 
 
-def known_truths(
-    known: Annotations, posed: Scene, settings: EvaluateSettings
-) -> Mapping[str, Callable[[], ViewTruth]]:
-    """Return the ground-truth regions by view; empty for labels on points."""
-    if isinstance(known, PointScene):
-        return {}
-    if isinstance(known, LabelledScene):
-        truths = labelled_truths(known, posed)
-    else:
-        truths = annotated_truths(known, posed, settings.min_region_px)
-    if not truths:
-        logger.warning("no view of %s is annotated: nothing to score", posed.name)
-    return truths
-
-
 def point_rows(
     answers: LanguageScene,
     known: Annotations,
@@ -156,9 +143,7 @@ def point_rows(
     else:
         kind = "street" if any(card.classes.startswith("waymo") for card in extra.points) else "room"
         points = labelled_points(known.parent, kind)
-        true, found = Cameras.load(known / "cameras.npz"), answers.scene.cameras
-        transform = scene_from_true(true, found)
-        error = camera_error(true, found, transform)
+        transform, error = scene_from_true(Cameras.load(known / "cameras.npz"), answers.scene.cameras)
         if error > MAX_CAMERA_ERROR_M:
             logger.warning(
                 "%s: cameras are %.2f m from the ground truth (median); point scores are meaningless",

@@ -9,11 +9,13 @@ from hilsplat.scene.cameras import Cameras
 MIN_SHARED = 3
 
 
-def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]:
-    """Return the similarity that maps ground-truth to scene coordinates, from the cameras shared by name.
+def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, "4 4"], float]:
+    """Return the similarity that maps ground-truth to scene coordinates, and the median camera error.
 
-    The rotation is the mean of those between the cameras' orientations (orthogonal Procrustes), so that it is
-    determined even for cameras on a straight line; scale and offset are least squares over the centres.
+    Cameras are matched by name. The rotation is the mean of those between the cameras' orientations
+    (orthogonal Procrustes), so that it is determined even for cameras on a straight line; scale and offset
+    are least squares over the centres. The error is the distance of estimated from true centres, in the units
+    of the ground truth.
 
     Raises:
         MisalignedArtifactError: fewer than three cameras are shared, or all have the same position.
@@ -46,12 +48,5 @@ def scene_from_true(true: Cameras, found: Cameras) -> Float64[np.ndarray, "4 4"]
     transform = np.eye(4)
     transform[:3, :3] = scale * rotation
     transform[:3, 3] = there_mean - scale * rotation @ here_mean
-    return transform
-
-
-def camera_error(true: Cameras, found: Cameras, scene_from_true: Float64[np.ndarray, "4 4"]) -> float:
-    """Return the median distance of estimated camera centres from the ground truth, in its units."""
-    turned, offset = scene_from_true[:3, :3], scene_from_true[:3, 3]
-    shared = [name for name in found.names if name in set(true.names)]
-    apart = [np.linalg.norm(turned @ true[name].centre + offset - found[name].centre) for name in shared]
-    return float(np.median(apart) / np.cbrt(np.linalg.det(turned)))
+    apart = np.linalg.norm(here @ transform[:3, :3].T + transform[:3, 3] - there, axis=1)
+    return transform, float(np.median(apart) / scale)

@@ -14,7 +14,7 @@ from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.registry import open_labelled
-from hilsplat.evaluate.protocols.view_truth import labelled_truths
+from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
@@ -109,7 +109,7 @@ def run_label_fits(
     """
     folder, scene = Path(folder), Scene.load(folder / "scene")
     labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"
-    labelled_truths(labelled, scene)  # raises if they don't fit
+    truths_of(labelled, scene, 0)  # raises if they don't fit
     tree = SemanticTree.load(folder / variant / "semantic_tree")
     gaussians = load_ply(folder / "gaussians.ply")
     fits: dict[tuple[str, str], dict[Level, Fits]] = {}

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
-from hilsplat.evaluate.figures.panel import Shown, annotated_rows, free_rows, truths_of
-from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.figures.panel import Shown, annotated_rows, free_rows, shown_truths
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
@@ -97,7 +96,7 @@ def run_comparison(
             for variant in variants
             for method in (("tree", "field") if variant == "default" else ("field",))
         ]
-        truths = truths_of(scene, truth, labels, data_root, evaluate)
+        truths = shown_truths(scene, truth, labels, data_root, evaluate)
         own = () if truths else queries
         rows = [*annotated_rows(truths, settings), *free_rows(methods[0].scene, own, settings)]
         save_png_and_pdf(draw_methods(methods, rows, evaluate), out)
@@ -157,16 +156,14 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
     answers = [method.masks(rows, evaluate) for method in track(list(methods), "methods compared")]
     for number, (axes, row) in enumerate(zip(by_query, rows, strict=False)):
         image = first.image(row.view)
-        title = f"truth, {row.view}" if row.truth is not None else row.view
         query = f"“{row.text}” ({row.level.label})\n" if many and row.level else ""
-        show(axes[0], paint_answer(image, None, row.truth), query + title)
+        show(axes[0], paint_answer(image, None, row.truth), query + row.title)
         if not many:
             label_left(axes[0], row.text, row.level)
         for place, method, masks in zip(axes[1:], methods, answers, strict=True):
-            mask = masks[number]
-            score = f"IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
+            score = row.score(masks[number])
             named = score if many else f"{method.title}\n{score}".rstrip()
-            show(place, paint_answer(image, mask, row.truth), named)
+            show(place, paint_answer(image, masks[number], row.truth), named)
     if many:
         for axes, method in zip(grid[1:, 0], methods, strict=True):
             label_left(axes, method.title)
@@ -184,9 +181,8 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
         image = first.image(row.view)
         show(grid[0][column], paint_answer(image, None, row.truth), row.view)
         for place, masks in enumerate(answers, start=1):
-            mask = masks[column]
-            score = f"IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
-            show(grid[place][column], paint_answer(image, mask, row.truth), score)
+            picture = paint_answer(image, masks[column], row.truth)
+            show(grid[place][column], picture, row.score(masks[column]))
     label_left(grid[0][0], "photograph")
     for place, method in enumerate(methods, start=1):
         label_left(grid[place][0], method.title)

@@ -16,7 +16,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.metrics.masks import iou, peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.view_truth import ViewTruth, annotated_truths, labelled_truths
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, truths_of
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
@@ -58,6 +58,15 @@ class Shown:
         own = self.level is None or by_path
         return answers.select(self.path if own else self.path[-1:], level=self.level, view=self.view)
 
+    @property
+    def title(self) -> str:
+        """Title of the photograph."""
+        return self.view if self.truth is None else f"truth, {self.view}"
+
+    def score(self, mask: Bool[np.ndarray, "H W"]) -> str:
+        """Return the IoU of an answer with the ground truth, for its title; empty if that is unknown."""
+        return "" if self.truth is None else f"IoU {iou(mask, self.truth):.2f}"
+
     def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
         """Return the mask of the tree's answer in the view."""
         return answers.node_masks(self.view, self.hits(answers, by_path=by_path).ids)
@@ -89,19 +98,18 @@ def run_figures(
                 shutil.copyfile(source, temporary)
     answers = LanguageScene.from_parts(parts, evaluate, threads=threads)
     with stage_log("figures", answers.scene.name) as counts:
-        truths = truths_of(answers.scene, truth, labels, data_root, evaluate)
+        truths = shown_truths(answers.scene, truth, labels, data_root, evaluate)
         rows = annotated_rows(truths, settings) if truths else free_rows(answers, queries, settings)
         save_png_and_pdf(draw_panel(answers, parts.masks, rows, evaluate), out)
         counts["queries"] = len(rows)
 
 
-def truths_of(
+def shown_truths(
     scene: Scene, truth: Path | None, labels: str, data_root: Path, evaluate: EvaluateSettings
 ) -> Mapping[str, Callable[[], ViewTruth]]:
     """Return the ground-truth regions in a scene's views; empty if it has no annotations or labels."""
-    if labels:
-        return labelled_truths(open_labelled(labels, data_root), scene)
-    return annotated_truths(truth, scene, evaluate.min_region_px) if truth is not None else {}
+    known = open_labelled(labels, data_root) if labels else truth
+    return {} if known is None else truths_of(known, scene, evaluate.min_region_px)
 
 
 def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:
@@ -207,12 +215,11 @@ def draw_queries(
         if columns == 7:
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))
         pictures.append(("field", field_mask))
-        title = f"truth, {row.view}" if row.truth is not None else row.view
-        show(axes[0], paint_answer(image, None, row.truth), title)
+        show(axes[0], paint_answer(image, None, row.truth), row.title)
         label_left(axes[0], "\n".join(textwrap.wrap(row.text, 20)), level)
         for place, (name, mask) in zip(axes[1:], pictures, strict=False):
-            score = f": IoU {iou(mask, row.truth):.2f}" if row.truth is not None else ""
-            show(place, paint_answer(image, mask, row.truth), name + score)
+            score = row.score(mask)
+            show(place, paint_answer(image, mask, row.truth), f"{name}: {score}" if score else name)
         axes[len(pictures)].plot(*points[0], "o", **RING)
         low, high = float(relevancy.min()), float(relevancy.max())
         for each in LEVELS:

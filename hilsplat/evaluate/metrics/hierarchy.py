@@ -40,12 +40,13 @@ def children_consistency(family: Family, reading: Reading) -> list[float]:
 
 
 def hierarchical_consistency(
-    transitions: Sequence[Sequence[Family]], reading: Reading = "containment", pooled: bool = False
-) -> float:
-    """Return the HC of one view (paper, Sec. IV, Eq. 7), averaged over children, parents and levels in turn.
+    transitions: Sequence[Sequence[Family]], reading: Reading = "containment"
+) -> tuple[float, float]:
+    """Return the HC of one view (paper, Sec. IV, Eq. 7), and its mean over all parents of all levels at once.
 
-    Every parent has the same weight, regardless of its number of children. A scene's value is the mean over
-    its views with at least one parent; then scenes are averaged.
+    HC is averaged over children, parents and levels in turn, so every parent of a level has the same weight,
+    regardless of its number of children. A scene's value is the mean over its views with at least one parent;
+    then scenes are averaged.
 
     Departs: the printed normaliser uses N_l outside the sum over l, where it is undefined; here it is the
     mean over the parents of each level, then over the L - 1 transitions. A transition without parents
@@ -53,22 +54,18 @@ def hierarchical_consistency(
 
     Args:
         transitions: families per level of the parent: wholes first, then parts.
-        pooled: whether to average over all parents of all levels at once instead.
     """
-    return mean_over_parents(consistency_of_families(transitions, reading), pooled)
-
-
-def consistency_of_families(transitions: Sequence[Sequence[Family]], reading: Reading) -> list[list[float]]:
-    """Return the score of each parent, the mean over its children, per level of the parent."""
-    return [
+    scores = [
         [float(np.mean(children_consistency(family, reading))) for family in families]
         for families in transitions
     ]
+    parents = [score for of_level in scores for score in of_level]
+    return _mean_over_levels(scores), float(np.mean(parents)) if parents else 0.0
 
 
 def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
     """Return containment averaged over all children of a level, then over levels."""
-    return mean_over_parents(
+    return _mean_over_levels(
         [
             [term for family in families for term in children_consistency(family, "containment")]
             for families in transitions
@@ -76,9 +73,5 @@ def consistency_per_child(transitions: Sequence[Sequence[Family]]) -> float:
     )
 
 
-def mean_over_parents(scores: Sequence[Sequence[float]], pooled: bool = False) -> float:
-    """Return the mean over parents per level and then over levels, or over all parents at once."""
-    if pooled:
-        every = [score for level in scores for score in level]
-        return float(np.mean(every)) if every else 0.0
-    return float(np.mean([np.mean(level) if level else 0.0 for level in scores]))
+def _mean_over_levels(scores: Sequence[Sequence[float]]) -> float:
+    return float(np.mean([np.mean(of_level) if of_level else 0.0 for of_level in scores]))

@@ -181,26 +181,30 @@ def kept_by_pillow(
     return kept(old_hw[0], new_hw[0]), kept(old_hw[1], new_hw[1])
 
 
-def annotated_truths(truth: Path, posed: Scene, min_region_px: int) -> dict[str, Callable[[], ViewTruth]]:
-    """Return the ground-truth regions in each annotated test view, loaded on demand."""
-    annotations = HierarchyAnnotations.load(truth)
-    return {
-        view: partial(ViewTruth.of, annotations, view, posed.cameras[view].size_hw, min_region_px)
-        for view in posed.views("test")
-        if annotations.views.get(view)
-    }
+def truths_of(
+    known: LabelledScene | Path, posed: Scene, min_region_px: int
+) -> dict[str, Callable[[], ViewTruth]]:
+    """Return the ground-truth regions by view, loaded on demand.
 
-
-def labelled_truths(labels: LabelledScene, posed: Scene) -> dict[str, Callable[[], ViewTruth]]:
-    """Return the ground-truth regions in each labelled view of a published data set, loaded on demand."""
-    for sentence in labels.warnings:
-        logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
+    Those of a synthetic scene (a ground-truth folder) are in annotated test views and have at least
+    `min_region_px` pixels; those of a published data set are all regions in all labelled views.
+    """
     truths: dict[str, Callable[[], ViewTruth]] = {}
-    labels.check_posed(posed.cameras.names)
-    for view, regions in labels.views.items():
+    if isinstance(known, Path):
+        annotations = HierarchyAnnotations.load(known)
+        for view in posed.views("test"):
+            if annotations.views.get(view):
+                size_hw = posed.cameras[view].size_hw
+                truths[view] = partial(ViewTruth.of, annotations, view, size_hw, min_region_px)
+        return truths
+    name = f"{known.dataset}/{known.scene}"
+    for sentence in known.warnings:
+        logger.warning("%s: %s", name, sentence)
+    known.check_posed(posed.cameras.names)
+    for view, regions in known.views.items():
         size_hw = posed.cameras[view].size_hw
         for label_hw in sorted({region.size_hw for region in regions}):
             for sentence in check_label_size(f"a label of view {view}", label_hw, size_hw, SHAPE_TOLERANCE):
-                logger.warning("%s/%s: %s", labels.dataset, labels.scene, sentence)
+                logger.warning("%s: %s", name, sentence)
         truths[view] = partial(ViewTruth.of_regions, regions, size_hw)
     return truths

@@ -289,9 +289,8 @@ def consistency_rows(
         for transition in transitions
     ]
     for reading in hierarchy.READINGS:
-        scores = hierarchy.consistency_of_families(families, reading)
-        for suffix, pooled in (("", False), ("_pooled", True)):
-            value = hierarchy.mean_over_parents(scores, pooled)
-            yield Measured(method, "", "", f"hc_{reading}{suffix}", protocol, value, parents)
+        mean, pooled = hierarchy.hierarchical_consistency(families, reading)
+        yield Measured(method, "", "", f"hc_{reading}", protocol, mean, parents)
+        yield Measured(method, "", "", f"hc_{reading}_pooled", protocol, pooled, parents)
     per_child = hierarchy.consistency_per_child(families)
     yield Measured(method, "", "", "hc_containment_per_child", protocol, per_child, parents)
