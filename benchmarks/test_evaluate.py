@@ -10,7 +10,7 @@ import pytest
 from benchmarks.goals import Goal
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.labelled import LabelledRegion
-from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.settings import EvaluateSettings
@@ -70,9 +70,9 @@ def annotated_view() -> tuple[Answers, ViewTruth]:
 def test_scoring_a_view(benchmark, method):
     answers, truth = annotated_view()
     settings = EvaluateSettings(methods=(method,))
-    selections = Selections(answers)
+    selections, masks = Selections(answers), PackedMasks(SIZE_HW)
     benchmark.extra_info |= {"case": scoring(method), "count": len(truth.queries), "of": "queries"}
-    assert benchmark(lambda: list(measure_view(answers, selections, truth, VIEW, SIZE_HW, settings)))
+    assert benchmark(lambda: list(measure_view(selections, truth, VIEW, masks, settings)))
 
 
 def scoring(method: str) -> str:

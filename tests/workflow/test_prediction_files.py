@@ -28,7 +28,7 @@ def write_answers(folder: Path, scene_folder: Path, method: str) -> None:
         size_hw = scene.scene.cameras[view].size_hw
         truth = ViewTruth.of(annotations, view, size_hw, settings.min_region_px)
         kept = PackedMasks(size_hw)
-        list(measure_view(scene, Selections(scene), truth, view, size_hw, settings, None, kept))
+        list(measure_view(Selections(scene), truth, view, kept, settings))
         masks = {query.text: kept.get((method, auto, query.text)) for query in truth.categories}
         for query in truth.queries:
             mask = kept.get((method, given, query.text, query.level))

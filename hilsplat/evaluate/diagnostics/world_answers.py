@@ -18,7 +18,7 @@ from hilsplat.evaluate.scores import Measured
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import EvaluateSettings
-from hilsplat.world.mesh import TrueMesh
+from hilsplat.world.truth import TrueMesh
 
 METHODS = ("field", "tree")
 TEXTS_PER_LEVEL = 4

@@ -16,7 +16,7 @@ from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
-from hilsplat.world.mesh import TrueMesh
+from hilsplat.world.truth import TrueMesh
 
 TRUTH = "true regions"
 """Row name of the labels, an upper limit for any masks (below 1: label borders are off by up to a pixel)."""

@@ -17,9 +17,9 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.tables.measured import row_name
-from hilsplat.query.caches import Opened
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.pictures import label_left, paint_answer, save_png_and_pdf, show
+from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings

@@ -1,12 +1,12 @@
 """Answers of a scene in one view, cached, and their score rows."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics import masks
 from hilsplat.evaluate.protocols.cards import LERF_LANGSPLAT
@@ -20,15 +20,23 @@ NO_POINTS = np.zeros((0, 2), np.int64)
 """Peaks of answers without localization."""
 
 
-@dataclass(frozen=True)
-class ViewMaps:
-    """Functions that compute one method's maps of one view for any texts.
+def relevancy_of(
+    scene: "LanguageScene", method: str, texts: Sequence[str], view: str
+) -> Float32[np.ndarray, "T 3 H W"]:
+    """Return the relevancy maps of texts by "field" or "tree".
 
-    Pixels are row * width + column; the plain cosine is -inf at levels without one.
+    Raises:
+        ArtifactError: a relevancy is not a number.
     """
-
-    relevancy: Callable[[Sequence[str]], Float32[np.ndarray, "T 3 H W"]]
-    cosine: Callable[[Sequence[str], Int64[np.ndarray, " P"]], Float32[np.ndarray, "T 3 P"]]
+    render = scene.field_relevancy if method == "field" else scene.node_relevancy_map
+    found = np.asarray(render(tuple(texts), view), dtype=np.float32)
+    if np.isnan(found).any():
+        raise ArtifactError(
+            f"the relevancy of view {view} is not a number at {np.isnan(found).sum()} pixels",
+            expected="a finite relevancy everywhere",
+            fix="check the field and the vectors of the scene for NaN",
+        )
+    return found
 
 
 class PackedMasks:

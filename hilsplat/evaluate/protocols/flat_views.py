@@ -7,6 +7,7 @@ parts; the protocol names then include `wholes`.
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.metrics.masks import peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import Border, RelevancyRule, SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import NO_POINTS, ViewMaps, class_map_rows, mask_rows
+from hilsplat.evaluate.protocols.answers import NO_POINTS, class_map_rows, mask_rows, relevancy_of
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -26,6 +27,9 @@ from hilsplat.evaluate.protocols.cards import (
 from hilsplat.evaluate.protocols.view_truth import Query, kept_by_pillow
 from hilsplat.evaluate.scores import Measured
 
+if TYPE_CHECKING:
+    from hilsplat.query.language_scene import LanguageScene
+
 
 class FlatProtocols:
     """Scores one view under further protocols, one text at a time.
@@ -35,11 +39,17 @@ class FlatProtocols:
         words: settings that change the relevancy, for the protocol names.
     """
 
-    def __init__(self, cards: Sequence[ProtocolCard], level: Level | None, words: Sequence[str] = ()) -> None:
-        self.cards, self.level = tuple(cards), level
+    def __init__(
+        self,
+        scene: "LanguageScene",
+        view: str,
+        cards: Sequence[ProtocolCard],
+        level: Level | None,
+        words: Sequence[str] = (),
+    ) -> None:
+        self.scene, self.view, self.cards, self.level = scene, view, tuple(cards), level
         self.words = [*(["wholes"] if level is Level.WHOLE else []), *words]
-        self._maps: dict[str, ViewMaps] = {}
-        self._queries: dict[str, Query] = {}
+        self._queries: dict[str, dict[str, Query]] = {}  # by method and text, for the argmax
 
     def add(
         self,
@@ -48,7 +58,6 @@ class FlatProtocols:
         nodes_mask: Bool[np.ndarray, "H W"] | None,
         category: Query,
         queries: Sequence[Query],
-        maps: ViewMaps,
     ) -> Iterator[Measured]:
         """Yield the rows of one text and method.
 
@@ -57,7 +66,6 @@ class FlatProtocols:
                 mask from the relevancy maps.
             category: the text, merged over levels.
             queries: the text at each level.
-            maps: the method's maps for any text.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
@@ -83,21 +91,25 @@ class FlatProtocols:
             else:
                 smoothed = smoothed_by(rule.filter_px, rule.mix, rule.border)
                 other = dict(card.united).get(flat.text)
-                united = None if other is None else maps.relevancy((other,))[0]
+                united = relevancy_of(self.scene, method, (other,), self.view)[0] if other else None
                 mask, _ = relevancy_mask(smoothed, None, rule, united)
                 if {"localization_box", "localization_mask"} & set(card.metrics):
                     points, _ = peak_points(smoothed.filtered, None)
             answered = replace(flat, truth=region)
             yield from mask_rows(method, answered, card.labelled(self.words), mask, points, card.metrics)
         if OVS_ARGMAX in self.cards:
-            self._maps[method] = maps
-            self._queries[flat.text] = flat
+            self._queries.setdefault(method, {})[flat.text] = flat
 
     def finish(self) -> Iterator[Measured]:
         """Yield the rows that need all texts of the view: 3D-OVS by argmax over texts and levels."""
-        queries, words = list(self._queries.values()), ["best level", *self.words]
-        for method, maps in self._maps.items():
-            yield from argmax_rows(method, queries, maps.cosine, words, self.level is not None)
+        words = ["best level", *self.words]
+        for method, queries in self._queries.items():
+            cosine_of = functools.partial(self._cosine, method)
+            yield from argmax_rows(method, list(queries.values()), cosine_of, words, self.level is not None)
+
+    def _cosine(self, method: str, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]) -> np.ndarray:
+        render = self.scene.field_cosine if method == "field" else self.scene.node_cosine
+        return np.asarray(render(tuple(texts), self.view, pixels), np.float32)
 
 
 def argmax_rows(

@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int, Int32
 
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES, splits_of
+from hilsplat.datasets.classes import SCANNET200_INSTANCES, ClassSet, splits_of
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.evaluate.metrics import instances, point_classes
 from hilsplat.evaluate.metrics.point_classes import ClassCounts, class_accuracy, class_iou, pooled

@@ -18,11 +18,9 @@ prediction counts as 0. Only Gaussians and nodes visible in the view compete, ex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.metrics import hierarchy
 from hilsplat.evaluate.metrics.masks import best_threshold_iou, peak_points
@@ -34,14 +32,11 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     relevancy_mask,
 )
 from hilsplat.evaluate.protocols import cards
-from hilsplat.evaluate.protocols.answers import NO_POINTS, PackedMasks, Selections, ViewMaps, mask_rows
+from hilsplat.evaluate.protocols.answers import NO_POINTS, PackedMasks, Selections, mask_rows, relevancy_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
 from hilsplat.evaluate.scores import Measured
 from hilsplat.settings import EvaluateSettings
-
-if TYPE_CHECKING:
-    from hilsplat.query.language_scene import LanguageScene
 
 RELEVANCY_CHUNK_MIB = 512
 """Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
@@ -94,22 +89,20 @@ def relevancy_departures(settings: EvaluateSettings) -> list[str]:
 
 
 def measure_view(
-    scene: "LanguageScene",
     selections: Selections,
     truth: ViewTruth,
     view: str,
-    size_hw: tuple[int, int],
+    masks: PackedMasks,
     settings: EvaluateSettings,
     also: FlatProtocols | None = None,
-    masks: PackedMasks | None = None,
 ) -> Iterator[Measured]:
     """Yield all rows of one view, in no particular order.
 
     Args:
-        also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
         masks: stores the answers, for measures between views.
+        also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
     """
-    answers = _ViewAnswers(selections, view, settings, PackedMasks(size_hw) if masks is None else masks)
+    answers, scene = _ViewAnswers(selections, view, settings, masks), selections.scene
     rule = rule_of(settings)
 
     def by_map(smoothed: SmoothedRelevancy, level: Level | None) -> np.ndarray:
@@ -118,25 +111,18 @@ def measure_view(
     def by_nodes(text: str, level: Level | None) -> np.ndarray:
         return answers.of_nodes((text,), level)
 
-    def maps_of(render: Callable, cosine: Callable) -> ViewMaps:
-        return ViewMaps(
-            lambda texts: _relevancy(render, texts, view),
-            lambda texts, pixels: np.asarray(cosine(tuple(texts), view, pixels), np.float32),
-        )
-
-    field_maps = maps_of(scene.field_relevancy, scene.field_cosine)
-    node_maps = maps_of(scene.node_relevancy_map, scene.node_cosine)
-
+    needs_nodes = "tree" in settings.methods or "tree-path" in settings.methods
     categories = [*truth.categories, *(truth.absent if also else ())]
-    per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * size_hw[0] * size_hw[1])))
+    height, width = masks.size_hw
+    per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * height * width)))
     for start in range(0, len(categories), per_chunk):
         chunk = categories[start : start + per_chunk]
         texts = [category.text for category in chunk]
-        fields = field_maps.relevancy(texts) if "field" in settings.methods else None
-        nodes = node_maps.relevancy(texts) if {"tree", "tree-path"} & set(settings.methods) else None
+        fields = relevancy_of(scene, "field", texts, view) if "field" in settings.methods else None
+        nodes = relevancy_of(scene, "tree", texts, view) if needs_nodes else None
         for row, category in enumerate(chunk):
             queries = [query for query in truth.queries if query.text == category.text]
-            for method, found, maps in (("field", fields, field_maps), ("tree", nodes, node_maps)):
+            for method, found in (("field", fields), ("tree", nodes)):
                 if found is None or method not in settings.methods:
                     continue
                 mask = None
@@ -149,23 +135,12 @@ def measure_view(
                         mask = by_nodes(category.text, None) if also is not None else None
                     yield from answers.rows(method, flat, smoothed, answer, category, queries)
                 if also is not None:
-                    yield from also.add(method, found[row], mask, category, queries, maps)
+                    yield from also.add(method, found[row], mask, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from answers.path_rows(nodes[row], queries)
     if also is not None:
         yield from also.finish()
     yield from answers.consistency_rows(truth)
-
-
-def _relevancy(render: Callable, texts: Sequence[str], view: str) -> np.ndarray:
-    found = np.asarray(render(tuple(texts), view), dtype=np.float32)
-    if np.isnan(found).any():
-        raise ArtifactError(
-            f"the relevancy of view {view} is not a number at {np.isnan(found).sum()} pixels",
-            expected="a finite relevancy everywhere",
-            fix="check the field and the vectors of the scene for NaN",
-        )
-    return found
 
 
 @dataclass(frozen=True)
@@ -264,9 +239,7 @@ class _ViewAnswers:
             return truth.own_part(path, self.masks.get((method, protocol, *key)))
 
         for method, of_method in of_methods.items():
-            if method not in ("truth", *self.settings.methods):
-                continue
-            for card in of_method:
+            for card in of_method if method in ("truth", *self.settings.methods) else ():
                 protocol = label_of(card, method, self.settings)
                 yield from consistency_rows(method, protocol, truth, partial(mask_of, method, card, protocol))
 

@@ -4,20 +4,15 @@ Times differ from run to run, so they are not in `scores.csv`, which is reproduc
 """
 
 import math
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hilsplat.base.artifacts import parse_json, write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import read_provenance, require_beginning
 from hilsplat.base.tables import read_csv, write_csv
 from hilsplat.configuration import SECTIONS
-
-if TYPE_CHECKING:
-    from hilsplat.query.language_scene import LanguageScene
 
 PREPARATION = ("masks", "coverage_tree", "clip")
 TRAINING = ("contributions", "semantic_tree", "autoencoder", "field")
@@ -49,30 +44,6 @@ class Cost:
     train_s: float  # wall-clock time of contributions, semantic tree, autoencoder and field
     peak_mib: float  # peak resident memory of the training jobs
     query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
-
-
-def time_queries(
-    answers: "LanguageScene", queries: Mapping[str, Callable[[str], object]], view: str, texts: Sequence[str]
-) -> dict[str, float]:
-    """Return the seconds per query of each method: text encoding, view weights, relevancy and mask.
-
-    The view's weights and the text's vector are timed once and added, because later queries reuse them.
-    `queries` compute the mask of a text, with weights and vectors cached; the median over texts is used.
-    """
-    start = time.perf_counter()
-    answers.encode_texts([texts[0]])
-    answers.pixel_weights(view)
-    shared_s = time.perf_counter() - start
-    seconds = {}
-    for method, query in queries.items():
-        query(texts[0])  # compiles and fills caches
-        taken = []
-        for text in texts:
-            start = time.perf_counter()
-            query(text)
-            taken.append(time.perf_counter() - start)
-        seconds[method] = shared_s + sorted(taken)[len(taken) // 2]
-    return seconds
 
 
 def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: Mapping[str, float]) -> None:

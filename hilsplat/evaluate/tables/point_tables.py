@@ -127,7 +127,7 @@ def scannet_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
     of_benchmark = part[part["protocol"].str.startswith(BENCHMARK)]
     if of_benchmark.empty and not scans:
         return cells
-    from hilsplat.datasets.classes.scannet200 import SCANNET200
+    from hilsplat.datasets.classes import SCANNET200
     from hilsplat.evaluate.protocols.points import measure_instances, pooled_points
 
     if not of_benchmark.empty:  # the counts of all scenes are pooled
@@ -143,7 +143,7 @@ def waymo_table(sources: Sources) -> Table:
     """Build the table of mIoU over 22 classes, with counts pooled over scenes (paper: Waymo)."""
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
-        from hilsplat.datasets.classes.waymo import WAYMO_22
+        from hilsplat.datasets.classes import WAYMO_22
         from hilsplat.evaluate.protocols.points import pooled_points
 
         means = pooled_points(card_of(part["protocol"].iloc[0]), rows_of_scenes(part), WAYMO_22)
