@@ -7,11 +7,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int32
 
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.classes.replica import REPLICA_48, REPLICA_51
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_15, SCANNET_19
-from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
-from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.datasets.classes import (
+    REPLICA_48,
+    REPLICA_51,
+    SCANNET200,
+    SCANNET200_INSTANCES,
+    SCANNET_10,
+    SCANNET_15,
+    SCANNET_19,
+    WAYMO_22,
+    ClassSet,
+)
 from hilsplat.datasets.dataset import SceneReport
 from hilsplat.scene.posed_images import PosedImage
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, Int32
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
-from hilsplat.datasets.classes.replica import NAMES, SCENES
+from hilsplat.datasets.classes import REPLICA_NAMES
 from hilsplat.datasets.dataset import Dataset, listing
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
@@ -146,12 +146,12 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
             expected="id_to_label: a list of class ids; classes: objects with id and name",
             fix=UNPACK_AGAIN,
         ) from error
-    other = [f"{number} {name}" for number, name in names.items() if NAMES.get(number) != name]
-    strange = sorted(set(classes[classes > 0].tolist()) - set(NAMES))
+    other = [f"{number} {name}" for number, name in names.items() if REPLICA_NAMES.get(number) != name]
+    strange = sorted(set(classes[classes > 0].tolist()) - set(REPLICA_NAMES))
     if other or strange:
         raise SceneError(
             f"{path} has classes that are not in Replica",
-            expected=f"the {len(NAMES)} classes of the release, such as {NAMES[1]} (1)",
+            expected=f"the {len(REPLICA_NAMES)} classes of the release, such as {REPLICA_NAMES[1]} (1)",
             found=", ".join([*other[:5], *(f"class id {number}" for number in strange[:5])]),
             fix="use the file of the original release",
         )
@@ -217,11 +217,11 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
             found=f"{len(labels)}",
             fix="use the mesh and the labels of the same scene and release",
         )
-    unknown = Counter(labels[~np.isin(labels, [*NAMES, 0, -1, -2])].tolist())
+    unknown = Counter(labels[~np.isin(labels, [*REPLICA_NAMES, 0, -1, -2])].tolist())
     if unknown:
         raise SceneError(
             f"{path} has classes that are not in Replica",
-            expected=f"1 to {max(NAMES)}, 0, -1 or -2",
+            expected=f"1 to {max(REPLICA_NAMES)}, 0, -1 or -2",
             found=", ".join(f"{number} ({count} lines)" for number, count in sorted(unknown.items())[:5]),
             fix="use semantic_labels_<scene>.txt, not instance_labels_<scene>.txt",
         )
@@ -283,7 +283,7 @@ DATASET = Dataset(
     title="Replica",
     labels="points",
     folder="replica",
-    scenes=SCENES,
+    scenes=(*(f"office_{number}" for number in range(5)), *(f"room_{number}" for number in range(3))),
     licence="Replica Research Terms",
     terms="Non-commercial research and education only; do not pass the data on.",
     citation="Straub et al., The Replica Dataset: A Digital Replica of Indoor Spaces, arXiv 1906.05797, 2019",

@@ -16,8 +16,7 @@ from jaxtyping import Float, Int32
 
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
-from hilsplat.datasets.classes.scannet import OPENGAUSSIAN_SCENES
-from hilsplat.datasets.classes.scannet200 import SCANNET200
+from hilsplat.datasets.classes import SCANNET200
 from hilsplat.datasets.dataset import Dataset, listing
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
@@ -246,6 +245,11 @@ def _label_files(scan: str) -> tuple[str, ...]:
     suffixes = ("_vh_clean_2.labels.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")
     return tuple(f"scans/{scan}/{scan}{suffix}" for suffix in suffixes)
 
+
+OPENGAUSSIAN_SCENES = tuple(
+    f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)
+)
+"""The ten scans of OpenGaussian's table. All but the last are in the training split."""
 
 DATASET = Dataset(
     name="scannet",

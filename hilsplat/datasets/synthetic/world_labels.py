@@ -9,15 +9,15 @@ from jaxtyping import Int32
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.classes import replica, scannet, scannet200, waymo
+from hilsplat.datasets.classes import NYU40, REPLICA_NAMES, SCANNET200, WAYMO_22
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.datasets.points.point_files import ply_column, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 
 OTHERPROP = 40
 """NYU40's class for small objects without a class of their own."""
-SCANNET200_NAMES = {"sofa": "couch", "television": "tv", "bear": "stuffed animal", "mug": "cup"}
-REPLICA_NAMES = {
+SCANNET200_WORDS = {"sofa": "couch", "television": "tv", "bear": "stuffed animal", "mug": "cup"}
+REPLICA_WORDS = {
     "bookshelf": "shelf",
     "counter": "countertop",
     "plant": "indoor-plant",
@@ -58,21 +58,21 @@ COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 
 def scannet_ids(text: str) -> tuple[int, int]:
     """Return the ScanNet200 id (0 for none) and NYU40 id of a world class."""
-    name = SCANNET200_NAMES.get(text, text)
-    fine = dict(zip(scannet200.SCANNET200.texts, scannet200.SCANNET200.ids, strict=True))
-    broad = {query: number for number, query in scannet.NYU40.items()}
+    name = SCANNET200_WORDS.get(text, text)
+    fine = dict(zip(SCANNET200.texts, SCANNET200.ids, strict=True))
+    broad = {query: number for number, query in NYU40.items()}
     return fine.get(name, 0), broad.get(text, OTHERPROP)
 
 
 def replica_id(text: str) -> int:
     """Return Replica's class id of a world class, 0 for none."""
-    name = REPLICA_NAMES.get(text, text)
-    return {query: number for number, query in replica.NAMES.items()}.get(name, 0)
+    name = REPLICA_WORDS.get(text, text)
+    return {query: number for number, query in REPLICA_NAMES.items()}.get(name, 0)
 
 
 def waymo_labels(node_ids: Int32[np.ndarray, "P 3"], texts: Sequence[str]) -> Int32[np.ndarray, "P 2"]:
     """Return the instance and Waymo class of each point, from its nodes (whole, part, subpart)."""
-    number = dict(zip(waymo.WAYMO_22.texts, waymo.WAYMO_22.ids, strict=True))
+    number = dict(zip(WAYMO_22.texts, WAYMO_22.ids, strict=True))
     of_node = np.array([number.get(WAYMO_CLASSES.get(text, ""), 0) for text in texts] + [0])
     whole, part = of_node[node_ids[:, 0]], of_node[node_ids[:, 1]]
     classes = np.where(part > 0, part, whole)

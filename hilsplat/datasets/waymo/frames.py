@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.datasets.classes import WAYMO_22
 from hilsplat.datasets.points.labelled_points import LabelledPoints
 from hilsplat.scene.posed_images import PosedImage
 

@@ -9,7 +9,7 @@ import pytest
 
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.base.images import write_png
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
+from hilsplat.datasets.classes import SCANNET_10, SCANNET_19
 from hilsplat.datasets.labelled import LabelledRegion, LabelledScene
 from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
-from hilsplat.datasets.classes.replica import REPLICA_48
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
-from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES
+from hilsplat.datasets.classes import REPLICA_48, SCANNET200, SCANNET200_INSTANCES, SCANNET_10, SCANNET_19
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.scene.importers.known_views import read_transforms

@@ -16,7 +16,7 @@ from PIL import Image
 
 from hilsplat.base.artifacts import read_npz, write_json, write_text
 from hilsplat.base.images import read_image
-from hilsplat.datasets.classes.replica import NAMES
+from hilsplat.datasets.classes import REPLICA_NAMES
 from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
 from hilsplat.datasets.points.scannet import LABEL_TABLE
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -153,12 +153,14 @@ def write_semantic_mesh(
     of_face = (object_of_face + 1).astype(np.int32)
     labels = [NO_OBJECT, *(number or UNDEFINED for number in classes)]
     objects = [
-        {"id": row, "class_id": number, "class_name": NAMES.get(number, "undefined")}
+        {"id": row, "class_id": number, "class_name": REPLICA_NAMES.get(number, "undefined")}
         for row, number in enumerate(labels)
         if row
     ]
     info = {
-        "classes": [{"id": n, "name": name, "children": [], "parents": []} for n, name in NAMES.items()],
+        "classes": [
+            {"id": n, "name": name, "children": [], "parents": []} for n, name in REPLICA_NAMES.items()
+        ],
         "gravity_dir": [0.0, 0.0, -1.0],
         "id_to_label": labels,
         "objects": objects[::-1],  # real files do not sort them either

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SceneError
-from hilsplat.datasets.classes.class_set import ClassSet
-from hilsplat.datasets.classes.scannet import SCANNET_10, SCANNET_19
-from hilsplat.datasets.classes.scannet200 import SCANNET200, SCANNET200_INSTANCES, splits_of
-from hilsplat.datasets.classes.waymo import WAYMO_22
+from hilsplat.datasets.classes import (
+    SCANNET200,
+    SCANNET200_INSTANCES,
+    SCANNET_10,
+    SCANNET_19,
+    WAYMO_22,
+    ClassSet,
+    splits_of,
+)
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true

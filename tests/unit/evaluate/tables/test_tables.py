@@ -11,7 +11,7 @@ import pytest
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.configuration import RunSettings
-from hilsplat.datasets.classes.scannet200 import SCANNET200_INSTANCES
+from hilsplat.datasets.classes import SCANNET200_INSTANCES
 from hilsplat.evaluate.metrics.instances import match_instances
 from hilsplat.evaluate.scores import write_instances, write_scores
 from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
