@@ -214,12 +214,8 @@ def write_json(path: Path, value: Any) -> None:
 
 def read_json(path: Path) -> Any:
     """Read JSON; raise ArtifactError if the file is missing or invalid."""
-    try:
+    with _readable(path, "is not valid JSON", (ValueError, OSError)):
         return parse_json(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except (ValueError, OSError) as error:
-        raise ArtifactError(f"{path} is not valid JSON: {error}", fix=remake(path)) from error
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -231,13 +227,16 @@ def parse_json(text: str | bytes) -> Any:
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[None]:
+def _readable(
+    path: Path, problem: str = "cannot be read", errors: tuple[type[Exception], ...] = DAMAGE
+) -> Iterator[None]:
+    """Raise ArtifactError if the file is missing, or if reading it raises one of these errors."""
     try:
         yield
     except FileNotFoundError as error:
         raise ArtifactError(f"{path} is missing", fix=remake(path)) from error
-    except DAMAGE as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix=remake(path)) from error
+    except errors as error:
+        raise ArtifactError(f"{path} {problem}: {error}", fix=remake(path)) from error
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
@@ -339,9 +338,20 @@ SEALED = (".json", ".npy", ".npz", ".png", ".safetensors")
 """Suffixes of the files whose checksums are in an artifact's index."""
 
 
-def read_index(folder: Path) -> dict[str, Any]:
-    """Read a folder's index; raise ArtifactError if the folder is incomplete or the index was changed."""
-    return copy.deepcopy(_index(Path(folder)))
+def read_index(folder: Path, *entries: str) -> dict[str, Any]:
+    """Read a folder's index.
+
+    Raises:
+        ArtifactError: the folder is incomplete, or the index was changed or lacks one of the entries.
+    """
+    index = copy.deepcopy(_index(Path(folder)))
+    if missing := [entry for entry in entries if entry not in index]:
+        raise ArtifactError(
+            f"{folder} was written by another version",
+            expected=f"{', '.join(missing)} in {INDEX}",
+            fix=remake(Path(folder)),
+        )
+    return index
 
 
 def _index(folder: Path) -> dict[str, Any]:
@@ -397,18 +407,6 @@ def _crc32_of_file(path: Path) -> int:
         while block := stream.read(1 << 20):
             total = zlib.crc32(block, total)
     return total
-
-
-def read_full_index(folder: Path, *entries: str) -> dict[str, Any]:
-    """Read a folder artifact's index; raise ArtifactError if it is missing or lacks one of the entries."""
-    index = read_index(folder)
-    if missing := [entry for entry in entries if entry not in index]:
-        raise ArtifactError(
-            f"{folder} was written by another version",
-            expected=f"{', '.join(missing)} in {INDEX}",
-            fix=remake(Path(folder)),
-        )
-    return index
 
 
 class ViewCache:

@@ -23,8 +23,7 @@ from hilsplat.cli.stage import app, start_logging  # noqa: E402
 
 # `hilsplat --help` lists the commands in this order.
 # isort: off
-from hilsplat.cli import scene_commands, stage_commands, evaluate_commands, user_commands  # noqa: E402, F401
-from hilsplat.cli import group_commands  # noqa: E402, F401
+from hilsplat.cli import scene_commands, stage_commands, user_commands, group_commands  # noqa: E402, F401
 # isort: on
 
 

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.arrays import read_into
-from hilsplat.base.artifacts import read_full_index, read_npy, sealed
+from hilsplat.base.artifacts import read_index, read_npy, sealed
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
@@ -106,7 +106,7 @@ class Contributions:
             ArtifactError: if it is missing, damaged or from another version.
         """
         folder, names = Path(folder), ("num_gaussians", "gaussians_sha256", "cameras_sha256", "min_weight")
-        index = read_full_index(folder, *names)
+        index = read_index(folder, *names)
         known = {name: index[name] for name in names}
         views = tuple(index["views"])
         return read_into(Contributions, sealed(folder, "rows.npz"), folder=folder, views=views, **known)

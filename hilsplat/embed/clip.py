@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float16, Float32, Int64, UInt8
 from tokenizers import Tokenizer
 
-from hilsplat.base.artifacts import read_full_index, read_json
+from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import MisalignedArtifactError, ModelError
 from hilsplat.base.files import INSTALLED
-from hilsplat.base.processes import in_order
 from hilsplat.models.folder import WHOLE_COPY, ModelFolder, input_side_px, open_model_folder
 from hilsplat.models.network import Network, require_one_space
 from hilsplat.models.store import MODELS, user_models
@@ -30,16 +29,13 @@ MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # of model folders in `mo
 class ClipModel:
     """A loaded CLIP model.
 
-    Args:
-        threads: number of crop batches embedded in parallel; results do not depend on it.
-        template: prompt template, in which each text replaces `{}`.
+    In the prompt template, each text replaces `{}`.
     """
 
     precision: str = "fp32"  # or "int8", of the vision network
 
-    def __init__(self, model: ModelFolder, threads: int = 1, template: str = "{}") -> None:
+    def __init__(self, model: ModelFolder, template: str = "{}") -> None:
         self.model = model
-        self.threads = threads
         self.template = template
         self._known_texts: dict[str, np.ndarray] = {}
         self.digest = model.digest
@@ -107,9 +103,9 @@ class ClipModel:
         return int(named or 0)
 
     @staticmethod
-    def load(folder: Path, threads: int = 1, template: str = "{}", variant: str = "") -> "ClipModel":
+    def load(folder: Path, template: str = "{}", variant: str = "") -> "ClipModel":
         """Open a model folder and its vision network; errors as in `open_model_folder`."""
-        model = ClipModel(open_model_folder(folder, "clip", variant=variant), threads, template)
+        model = ClipModel(open_model_folder(folder, "clip", variant=variant), template)
         _ = model.vision  # open and check it now
         return model
 
@@ -154,14 +150,12 @@ class ClipModel:
         """Return a unit vector for each mask of a view, or for the given rows (see `crop`)."""
         settings = settings or ClipSettings()
         chosen = range(len(masks)) if rows is None else rows.tolist()
-
-        def embed(start: int) -> np.ndarray:
-            batch = chosen[start : start + settings.batch]
-            return self.embed_crops(np.stack([self.crop(image, masks, row, settings) for row in batch]))
-
-        parts = list(in_order(embed, range(0, len(chosen), settings.batch), self.threads))
-        if not parts:
+        if not chosen:
             return np.zeros((0, self.width), dtype=np.float16)
+        parts = []
+        for start in range(0, len(chosen), settings.batch):
+            crops = [self.crop(image, masks, row, settings) for row in chosen[start : start + settings.batch]]
+            parts.append(self.embed_crops(np.stack(crops)))
         return np.concatenate(parts).astype(np.float16)
 
     def crop(
@@ -213,7 +207,7 @@ def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
     return (vectors / np.where(length > 0, length, 1)).astype(np.float32)
 
 
-def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> ClipModel:
+def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
     """Open the CLIP model that embedded the masks of a clip artifact, even if its folder was moved.
 
     The model is identified by its digest. The search covers the recorded path and every folder in `models/`,
@@ -223,7 +217,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
     Raises:
         ModelError: no CLIP model was found with the digest of the one that embedded the masks.
     """
-    index = read_full_index(clip_folder, "model", "model_sha256")
+    index = read_index(clip_folder, "model", "model_sha256")
     recorded, expected = Path(index["model"]), index["model_sha256"]
     variant = index.get("model_variant", "")
     roots = list(dict.fromkeys([Path.cwd(), *Path(clip_folder).resolve().parents, INSTALLED]))
@@ -239,7 +233,7 @@ def open_clip_of(clip_folder: Path, threads: int = 1, template: str = "{}") -> C
         except ModelError:
             continue  # a SAM model, or an incomplete copy
         if model.digest == expected:
-            return ClipModel(model, threads, template)
+            return ClipModel(model, template)
         seen[place] = model.digest
     raise ModelError(
         f"the CLIP model that embedded the masks in {clip_folder} was not found",

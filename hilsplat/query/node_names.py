@@ -13,7 +13,7 @@ from hilsplat.base.artifacts import (
     INDEX,
     ViewCache,
     atomic_folder,
-    read_full_index,
+    read_index,
     read_json,
     read_npy,
     remake,
@@ -130,7 +130,7 @@ class NodeNaming:
         """
         if not folder.is_dir():
             return None
-        index = read_full_index(folder, "tree_sha256", "clip_sha256", "nodes")
+        index = read_index(folder, "tree_sha256", "clip_sha256", "nodes")
         made_for = index["tree_sha256"], index["clip_sha256"]
         if made_for != (tree_digest(semantic_tree), _clip_digest(clip_folder)):
             return None
@@ -159,7 +159,6 @@ def run_names(
     cache: Path,
     settings: QuerySettings,
     evaluate: EvaluateSettings,
-    threads: int,
 ) -> None:
     """Name the nodes of a tree.
 
@@ -173,7 +172,7 @@ def run_names(
         ModelError: the CLIP that embedded the masks is not found.
     """
     tree = SemanticTree.load(semantic_tree, clip_folder)
-    model = open_clip_of(clip_folder, threads, evaluate.template)
+    model = open_clip_of(clip_folder, evaluate.template)
     path = vocabulary_file(settings.vocabulary, model.model.folder)
     vocabulary = Vocabulary.read(path)
     absent = vocabulary.absent or Vocabulary.read(COMMON).absent

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from hilsplat.base.artifacts import read_full_index, read_npz, sealed, write_index, write_npz
+from hilsplat.base.artifacts import read_index, read_npz, sealed, write_index, write_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import read_image
 from hilsplat.scene.cameras import Cameras
@@ -74,7 +74,7 @@ class Scene:
     def load(folder: Path) -> "Scene":
         """Read a scene folder written by the poses stage."""
         folder = Path(folder)
-        index = read_full_index(folder, "name", "unit")
+        index = read_index(folder, "name", "unit")
         points = read_npz(sealed(folder, "points.npz"), "xyz", "rgb", "scene_from_source")
         return Scene(
             folder=folder,

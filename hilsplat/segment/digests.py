@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
-from hilsplat.base.artifacts import INDEX, read_full_index, remake, sha256_of_bytes
+from hilsplat.base.artifacts import INDEX, read_index, remake, sha256_of_bytes
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
@@ -42,7 +42,7 @@ def digests_in(folder: Path) -> dict[str, str]:
     An ArtifactError is raised if the artifact is missing, incomplete or from another version of hilsplat.
     """
     digests: dict[str, str] = {}
-    for view, entry in read_full_index(folder, "views")["views"].items():
+    for view, entry in read_index(folder, "views")["views"].items():
         digest = entry.get(MASKS_SHA256) if isinstance(entry, dict) else None
         if not isinstance(digest, str):
             raise ArtifactError(

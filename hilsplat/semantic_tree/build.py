@@ -15,7 +15,6 @@ from jaxtyping import Float, Float32, Int32, Int64
 
 from hilsplat.base.artifacts import (
     atomic_folder,
-    read_full_index,
     read_index,
     write_index,
     write_json,
@@ -207,7 +206,7 @@ def run_semantic_tree(
     scene = read_index(contributions_folder)["scene"]
     require_same_masks(contributions_folder, masks_folder)
     with stage_log("semantic tree", scene) as counts:
-        join_wholes = read_full_index(masks_folder, "segmenter")["segmenter"] == "graph"
+        join_wholes = read_index(masks_folder, "segmenter")["segmenter"] == "graph"
         tree = build_tree(contributions, settings, threads, join_wholes, nodes_of)
         per_level = {level.label: len(tree.nodes_of(level)) for level in LEVELS}
         orphans = {

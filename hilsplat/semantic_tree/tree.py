@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
 
 from hilsplat.base.arrays import read_into
-from hilsplat.base.artifacts import read_full_index, remake, sealed
+from hilsplat.base.artifacts import read_index, remake, sealed
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.embed.vectors import mask_embeddings
@@ -121,7 +121,7 @@ class SemanticTree:
             MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
         """
         folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")
-        index = read_full_index(folder, *names)
+        index = read_index(folder, *names)
         known = {"view_names": tuple(index["views"]), **{name: index[name] for name in names}}
         tree = read_into(SemanticTree, sealed(folder, "tree.npz"), LIMITS, **known)
         tree._require_whole(folder / "tree.npz")

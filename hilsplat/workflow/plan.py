@@ -25,7 +25,7 @@ from hilsplat.scene.sheet import (
     row_of_data,
 )
 from hilsplat.workflow.models import check_device, check_models, describe_models, doubt_about_photographs
-from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant, options_of, truth_argument
+from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant, options_of
 from hilsplat.workflow.stages import stage_code
 
 LEAST_PHOTOGRAPHS = 16
@@ -264,16 +264,12 @@ class Plan:
         return self.data.truth(job)
 
     def masks_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of masks for key views, imported masks or the diagnostic segmenter."""
+        """Return the options of masks for imported masks, key views or the diagnostic segmenter."""
         if self.masks_stage(job) == "langsplat":
-            return self.data.features_option(job)
-        if input.gaussians:
-            masks, tree = input.key_masks, input.key_tree
-            return options_of({"gaussians": input.gaussians, "key-masks": masks, "semantic-tree": tree})
-        if self.masks_stage(job) != "truth_masks":
-            return ""
-        faults = self.stages(job).perturb.model_dump_json()
-        return f"{truth_argument(input)} {options_of({'perturb': faults})}"
+            return options_of({"features": self.row(job).features})
+        faults = self.stages(job).perturb.model_dump_json() if input.truth else ""
+        key = {"gaussians": input.gaussians, "key-masks": input.key_masks, "semantic-tree": input.key_tree}
+        return options_of({**key, "truth": input.truth, "perturb": faults})
 
     def crops_tree(self, job: VariantJob) -> list[str]:
         """Return the input of clip: the semantic tree that selects crops; empty if all masks are embedded."""
@@ -282,9 +278,7 @@ class Plan:
 
     def crops_tree_option(self, job: VariantJob, input: Any) -> str:
         """Return the option of clip for `crops_tree`, or for imported vectors."""
-        if self.row(job).features:
-            return self.data.features_option(job)
-        return options_of({"semantic-tree": input.semantic_tree})
+        return options_of({"semantic-tree": input.semantic_tree, "features": self.row(job).features})
 
     def tree_stage(self, job: VariantJob) -> str:
         """Return the stage of the semantic tree: linked masks, or clustered features."""
@@ -300,8 +294,8 @@ class Plan:
         if not input.coverage_tree:
             return ""
         field = self.settings("field")(job)
-        options = options_of({"coverage-tree": input.coverage_tree, "field-settings": field})
-        return f"{options} --seed {self.seed(job)}"
+        seed = str(self.seed(job))
+        return options_of({"coverage-tree": input.coverage_tree, "field-settings": field, "seed": seed})
 
     def rendered(self, job: VariantJob) -> list[str]:
         """Return the input of field: scene, Gaussians and masks, if the literal trainer renders them."""

@@ -42,7 +42,10 @@ def of_variant(job: Job, variant: str) -> VariantJob:
 
 
 def options_of(named: Mapping[str, Any]) -> str:
-    """Return quoted command-line options, without those whose value is empty."""
+    """Return quoted command-line options, without those whose value is empty.
+
+    A path in a job's input is the job's own, which a module may have prefixed.
+    """
     return " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in named.items() if value)
 
 
@@ -142,9 +145,6 @@ class SceneData:
         folder = self.row(job).features
         return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
-    def features_option(self, job: Job) -> str:
-        return options_of({"features": self.row(job).features})
-
     def labels(self, row: SceneRow) -> tuple[str, ...]:
         """Return the labels of a scene, as `data set/scene`: published ones and your own annotations."""
         return () if row.world else self._labels(row)
@@ -170,7 +170,7 @@ class SceneData:
         """Return the options of evaluate: the ground truth or labels that a scene is scored against."""
         row = self.row(job)
         if row.world:
-            return f"{truth_argument(input)} --kind {row.world[0]}"
+            return options_of({"truth": input.truth, "kind": row.world[0]})
         options = [options_of({"labels": labels}) for labels in self.labels(row)]
         return " ".join([*options, options_of({"data-root": Path(self.data_root)})])
 
@@ -178,13 +178,8 @@ class SceneData:
         """Return the options of figures: the ground truth or labels for queries and outlines, if any."""
         row = self.row(job)
         if row.world:
-            return truth_argument(input)
+            return options_of({"truth": input.truth})
         on_images = [labels for labels in self.labels(row) if not is_exported(f"{DATA_PREFIX}{labels}")]
         if not on_images:
             return ""
         return options_of({"labels": on_images[-1], "data-root": Path(self.data_root)})
-
-
-def truth_argument(input: Any) -> str:
-    """Return the option for the input `truth`, with the job's own path, because a module may prefix it."""
-    return options_of({"truth": input.truth if isinstance(input.truth, str) else input.truth[0]})
