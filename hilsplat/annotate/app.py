@@ -23,7 +23,6 @@ from hilsplat.annotate.labels import (
     Place,
     Rings,
     cut_to_parents,
-    fill_rings,
     known_labels,
     label_path,
     traced,
@@ -31,6 +30,7 @@ from hilsplat.annotate.labels import (
 )
 from hilsplat.annotate.proposals import Clicks, Proposals
 from hilsplat.base.errors import ArtifactError, SettingsError
+from hilsplat.datasets.images.polygons import fill_polygons
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import version_of
 from hilsplat.web.guard import Guard
@@ -127,7 +127,7 @@ class OpenedScene(ShownScene):
                 fix=f"hilsplat run {self.photographs}",
             )
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
-        self.changes.note((self.photographs, folder / "gaussians.ply", *proposing))
+        self.note((self.photographs, folder / "gaussians.ply", *proposing))
         self.scene = Scene.load(self.photographs)
         self.proposals = Proposals(self.scene, folder, variant, threads)
         self.clicks = Clicks(self.scene, folder / variant / "masks")
@@ -137,7 +137,7 @@ class OpenedScene(ShownScene):
 
     def same_photographs(self) -> AbstractContextManager[None]:
         """Guard photographs and drawing: as `unchanged`, but parts other than photographs may change."""
-        return self.changes.unchanged(self.scene.name, self.photographs)
+        return self.unchanged(self.photographs)
 
     def described(self) -> dict[str, Any]:
         """Describe the photographs and available proposals."""
@@ -219,7 +219,7 @@ def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, An
 def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
     """Return polygons and area of a region: polygons, plus or minus a stroke, inside another region."""
     size_hw = opened.scene.cameras[view_name(opened.scene, asked.view)].size_hw
-    mask = drawn = fill_rings(asked.add, size_hw)
+    mask = drawn = fill_polygons(asked.add, size_hw)
     if asked.stroke is not None:
         painted = np.zeros(size_hw, np.uint8)
         points, radius = np.array(asked.stroke.points, np.int32), asked.stroke.radius
@@ -228,7 +228,7 @@ def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
             cv2.circle(painted, (int(x), int(y)), round(radius), 1, cv2.FILLED)
         mask = mask & (painted == 0) if asked.stroke.erase else mask | (painted > 0)
     if asked.inside is not None:
-        mask = mask & fill_rings(asked.inside, size_hw)
+        mask = mask & fill_polygons(asked.inside, size_hw)
     is_drawn = len(asked.add) == 1 and np.array_equal(mask, drawn)  # few corners are easier to edit
     return {"polygons": asked.add if is_drawn else traced(mask), "area_px": int(np.count_nonzero(mask))}
 

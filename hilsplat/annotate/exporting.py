@@ -19,7 +19,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.web.coco import coco_region
+from hilsplat.web.coco import coco_content, coco_region
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
 OURS = ("level", "parent", "origin")
@@ -120,21 +120,14 @@ def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> st
 def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
     """Format labels as COCO, with run lengths, because COCO fills polygons differently than we do."""
     texts = sorted({label.text for labels in known.values() for label in labels})
-    content: dict[str, Any] = {
-        "info": {"description": "annotations by hilsplat"},
-        "images": [],
-        "categories": [{"id": 1 + number, "name": text} for number, text in enumerate(texts)],
-        "annotations": [],
-    }
+    content = coco_content("annotations by hilsplat", known, cameras, texts)
     for number, (view, labels) in enumerate(known.items()):
-        height, width = cameras[view].size_hw
-        content["images"].append({"id": number, "file_name": view, "height": height, "width": width})
         for label in labels:
             described = {
                 "id": len(content["annotations"]) + 1,
                 "image_id": number,
                 "category_id": 1 + texts.index(label.text),
-                **coco_region(label.mask((height, width))),
+                **coco_region(label.mask(cameras[view].size_hw)),
                 "thing": label.id,
             }
             content["annotations"].append({**described, **_ours(label)})

@@ -70,19 +70,12 @@ class Label(Message):
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """Return the region."""
-        return fill_rings(self.polygons, size_hw)
-
-
-def fill_rings(
-    rings: Sequence[Sequence[tuple[int, int]]], size_hw: tuple[int, int]
-) -> Bool[np.ndarray, "H W"]:
-    """Return the union of filled polygons."""
-    return fill_polygons([np.array(ring, np.float64).reshape(-1, 2) for ring in rings], size_hw)
+        return fill_polygons(self.polygons, size_hw)
 
 
 def traced(mask: Bool[np.ndarray, "H W"]) -> list[list[tuple[int, int]]]:
     """Return polygons that contain exactly the pixels of a mask."""
-    return [[(int(x), int(y)) for x, y in polygon] for polygon in trace_polygons(mask)]
+    return [whole_pixels(polygon) for polygon in trace_polygons(mask)]
 
 
 def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[Label]:

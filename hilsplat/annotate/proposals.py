@@ -19,8 +19,8 @@ from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.query.caches import ViewStore
 from hilsplat.query.names import read_names
+from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import HEADS, SamModel, enlarged
@@ -182,21 +182,19 @@ class Proposals:
     def _seen(self, view: str) -> np.ndarray:
         """Return the visible mass of each Gaussian in a view, px."""
         weights = self._weights(view)
-        return self._kept.get(
-            ("seen", view), lambda: np.asarray(weights.sum(axis=0)).ravel(), lambda sums: sums.nbytes
-        )
+        return self._kept.get(("seen", view), lambda: np.asarray(weights.sum(axis=0)).ravel())
 
     def _weights(self, view: str) -> sp.csr_matrix:
         assert self.gaussians is not None
         gaussians, camera = self.gaussians, self.scene.cameras[view]
         least = self.tree.min_weight if self.tree is not None else 0.0
-        return self._kept.get(
-            ("weights", view),
-            lambda: normalised_weights(
+
+        def compute() -> sp.csr_matrix:
+            return normalised_weights(
                 pixel_weights(gaussians, camera, min_weight=least, threads=self.threads)
-            ),
-            lambda kept: kept.data.nbytes + kept.indices.nbytes + kept.indptr.nbytes,
-        )
+            )
+
+        return self._kept.get(("weights", view), compute)
 
 
 def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:

@@ -133,7 +133,6 @@ class FieldScene(SceneViews):
         return self._views.get(
             ("latents", view),
             lambda: rendered_latents(self.view_weights(view), self.trained()[0].features),
-            lambda kept: sum(a.nbytes + b.nbytes for a, b in kept),
         )
 
     def _placed_latents(self, view: str) -> list:
@@ -141,7 +140,6 @@ class FieldScene(SceneViews):
         return self._views.get(
             ("placed", view),
             lambda: [self._latent_relevancy.prepare(latents) for _, latents in self.latents(view)],
-            lambda kept: sum(each.nbytes for each in kept),
         )
 
     @cached_property

@@ -19,13 +19,13 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.field.code import autoencoder_file, load_code
 from hilsplat.field.language_field import LanguageField
 from hilsplat.models.store import is_embedded, meaningless
-from hilsplat.query.caches import Opened
 from hilsplat.query.field_answers import FieldScene
 from hilsplat.query.hits import Doubt, Hit, doubts_of
 from hilsplat.query.names import PATH_SEPARATOR, NodeNames, read_names
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.query.node_search import NodeHits, TextAnswer, search
 from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_margins
+from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.boxes import OrientedBox
@@ -33,7 +33,7 @@ from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import EvaluateSettings
 
 if TYPE_CHECKING:
-    from hilsplat.viewer.embedded import EmbeddedViewer
+    from hilsplat.viewer.app import EmbeddedViewer
 
 logger = logging.getLogger(__name__)
 
@@ -128,7 +128,7 @@ class LanguageScene(FieldScene):
         gaussians = opened.get(load_ply, parts.gaussians)
         tree = opened.get(SemanticTree.load, parts.semantic_tree, parts.clip)
         made_for = {"semantic tree": tree.gaussians_sha256}
-        clip = opened.get(open_clip_of, parts.clip, threads, settings.template)
+        clip = opened.get(open_clip_of, parts.clip, settings.template)
         language = code = None
         if parts.field is not None and parts.autoencoder is not None:
             language = opened.get(LanguageField.load, parts.field)
@@ -173,7 +173,7 @@ class LanguageScene(FieldScene):
         Raises:
             ArtifactError: the scene was assembled from parts, or has too many Gaussians to show.
         """
-        from hilsplat.viewer.embedded import EmbeddedViewer
+        from hilsplat.viewer.app import EmbeddedViewer
 
         if self.finished is None:
             raise ArtifactError("the scene was assembled from parts", fix="open it with hilsplat.open")

@@ -103,15 +103,8 @@ def relevancy(
     return relevancy_of_margins(margins(embeddings, texts, canonical), scale)
 
 
-class _PreparedView:
-    @property
-    def nbytes(self) -> int:
-        """Memory used, bytes."""
-        return sum(array.nbytes for array in vars(self).values())
-
-
 @dataclass(frozen=True)
-class LinearView(_PreparedView):
+class LinearView:
     """Latents of a view, prepared for look-ups.
 
     Attributes:
@@ -126,7 +119,7 @@ class LinearView(_PreparedView):
 
 
 @dataclass(frozen=True)
-class ProjectedView(_PreparedView):
+class ProjectedView:
     """Decoded vectors of a view, prepared for look-ups.
 
     Attributes:

@@ -1,7 +1,9 @@
-"""Nodes and pixels that a scene's views show; slow results are cached per view."""
+"""Nodes and pixels that a scene's views show; artifacts are opened once, and results cached per view."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,7 +12,6 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.query.caches import ViewStore
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -20,7 +21,56 @@ from hilsplat.splat.gaussians import Gaussians
 MIN_SHOWN_SHARE = 1e-4
 """Minimum share of a view that shows a node: 14 px of 384 x 384 are too few."""
 
+VIEW_CACHE_MIB = 1024.0
+
 Nodes = Sequence[int] | Int64[np.ndarray, " n"]
+
+
+class Opened:
+    """Artifacts by path, each opened and hashed once because the variants of a scene share most of them."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Hashable, ...], Any] = {}
+
+    def get(self, how: Callable[..., Any], path: Path, *more: Hashable) -> Any:
+        """Return `how(path, *more)`, computed on the first call."""
+        key = (how, Path(path).resolve(), *more)
+        if key not in self._kept:
+            self._kept[key] = how(path, *more)
+        return self._kept[key]
+
+
+class ViewStore:
+    """Cache of results per view; above `max_mib`, the least recently used are dropped."""
+
+    def __init__(self, max_mib: float = VIEW_CACHE_MIB) -> None:
+        self._max_bytes = max_mib * 2**20
+        self._kept: dict[tuple, tuple[Any, int]] = {}
+
+    def get(self, key: tuple, compute: Callable[[], Any]) -> Any:
+        """Return the cached value, or compute and cache it; the second item of a key is the view."""
+        if key in self._kept:
+            self._kept[key] = self._kept.pop(key)
+            return self._kept[key][0]
+        value = compute()
+        self._kept[key] = (value, _nbytes(value))
+        while len(self._kept) > 1 and sum(nbytes for _, nbytes in self._kept.values()) > self._max_bytes:
+            self._kept.pop(next(iter(self._kept)))
+        return value
+
+    def forget(self, view: str) -> None:
+        """Drop the results of a view."""
+        for key in [key for key in self._kept if key[1] == view]:
+            del self._kept[key]
+
+
+def _nbytes(value: Any) -> int:
+    """Return the memory of an array, or of the arrays in a list, a tuple or an object's attributes, bytes."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, list | tuple):
+        return sum(map(_nbytes, value))
+    return sum(part.nbytes for part in vars(value).values() if isinstance(part, np.ndarray))
 
 
 @dataclass(frozen=True)
@@ -57,7 +107,7 @@ class SceneViews:
             pixels.setflags(write=False)
             return pixels
 
-        return self._views.get(("image", view), read, lambda kept: kept.nbytes)
+        return self._views.get(("image", view), read)
 
     def forget(self, view: str) -> None:
         """Free the cached results of a view; later queries recompute them."""
@@ -65,18 +115,13 @@ class SceneViews:
 
     def view_weights(self, view: str) -> sp.csr_matrix:
         """Return W of a view with rows divided by alpha; rows with an alpha below 0.5 are empty."""
-        return self._views.get(
-            ("weights", view),
-            lambda: normalised_weights(self.pixel_weights(view)),
-            lambda kept: kept.data.nbytes + kept.indices.nbytes + kept.indptr.nbytes,
-        )
+        return self._views.get(("weights", view), lambda: normalised_weights(self.pixel_weights(view)))
 
     def view_nodes(self, view: str, level: Level) -> ViewNodes:
         """Return the nodes of a level in each pixel of a view."""
         return self._views.get(
             ("nodes", view, level),
             lambda: ViewNodes.of(self.view_weights(view), self.tree.node_of_gaussian[:, level.index]),
-            lambda kept: kept.nbytes,
         )
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
@@ -88,7 +133,7 @@ class SceneViews:
             area_px = np.sum([self.view_nodes(view, level).area_px(num) for level in LEVELS], axis=0)
             return np.asarray(area_px >= MIN_SHOWN_SHARE * height * width)
 
-        return self._views.get(("shown", view), measure, lambda kept: kept.nbytes)
+        return self._views.get(("shown", view), measure)
 
     def gaussians_of(self, ids: Nodes) -> Int64[np.ndarray, " g"]:
         """Return the rows of `gaussians.ply` that belong to any of the nodes."""

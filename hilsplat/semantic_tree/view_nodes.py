@@ -38,11 +38,6 @@ class ViewNodes:
         )
         return ViewNodes(indptr, nodes, shares, np.diff(weights.indptr) > 0)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory used, bytes."""
-        return sum(each.nbytes for each in (self.indptr, self.nodes, self.shares, self.covered))
-
     def area_px(self, num_nodes: int) -> Int64[np.ndarray, " n"]:
         """Return the number of pixels in which each node has a share above 0.5."""
         return np.bincount(self.nodes[self.shares > 0.5], minlength=num_nodes)

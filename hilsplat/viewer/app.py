@@ -1,17 +1,23 @@
-"""HTTP server of the viewer page."""
+"""HTTP server of the viewer page, started by `hilsplat view` or embedded in a notebook."""
 
 import base64
+import secrets
+import threading
 from collections.abc import Callable, Mapping
+from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
+import uvicorn
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import write_names
+from hilsplat.scene.finished import FinishedScene
 from hilsplat.viewer import answers, exports, wire
 from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.openapi import description
@@ -20,7 +26,18 @@ from hilsplat.viewer.saved_files import SavedFiles, node_of
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.guard import Guard
 from hilsplat.web.scene_thread import SceneThread
-from hilsplat.web.server import Pages, answer, encoded, guarded, plain, read, serve, version_sent
+from hilsplat.web.server import (
+    Pages,
+    answer,
+    configured,
+    encoded,
+    guarded,
+    listening_at,
+    plain,
+    read,
+    serve,
+    version_sent,
+)
 
 
 class Viewer:
@@ -148,3 +165,43 @@ def run_view(
     viewer.thread.worker.submit(shown.warm_up).result()
     about = f"{shown.scene.name}: {len(shown.gaussians)} Gaussians"
     serve(viewer.app, about, port=port, browser=browser, on_ready=on_ready)
+
+
+class EmbeddedViewer:
+    """A notebook frame with the page of a scene; `close` stops its server.
+
+    Args:
+        found: the finished scene.
+        text, height, proxy: as in `LanguageScene.show`.
+        threads: number of threads for rasterising and look-ups.
+    """
+
+    def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
+        self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text
+        self.viewer = Viewer(ViewerScene(found.folder, found.variant, threads))
+        listening = listening_at(0)
+        self.port: int = listening.getsockname()[1]
+        app = self.viewer.app(self.token, embedded=True)
+        self.server = uvicorn.Server(configured(app))
+        self.thread = threading.Thread(
+            target=self.server.run, kwargs={"sockets": [listening]}, daemon=True, name="hilsplat viewer"
+        )
+        self.thread.start()
+
+    @property
+    def address(self) -> str:
+        """Address of the page; anyone who has it can see the scene until the server is closed."""
+        base = self.proxy.format(port=self.port) if self.proxy else f"http://127.0.0.1:{self.port}/"
+        asked = f"#{urlencode({'q': self.text})}" if self.text else ""
+        return f"{base}?{urlencode({'token': self.token, 'embedded': 1})}{asked}"
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe src="{escape(self.address)}" title="hilsplat" width="100%" height="{self.height}" '
+            'allow="clipboard-write; fullscreen" style="border: 0"></iframe>'
+        )
+
+    def close(self) -> None:
+        """Stop the server."""
+        self.server.should_exit = True
+        self.thread.join(timeout=10)

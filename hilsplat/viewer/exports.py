@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.viewer.frames import Paint, painted
 from hilsplat.viewer.wire import Film, Group
-from hilsplat.web.coco import coco_region
+from hilsplat.web.coco import coco_content, coco_region
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
@@ -76,16 +75,10 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
     nodes = sorted({node for group in groups for node in group.nodes})
     yield 0, len(scene.views)
     held = io.BytesIO()
-    coco: dict[str, Any] = {
-        "info": {"description": f"{scene.scene.name}: masks of nodes, by hilsplat"},
-        "images": [],
-        "categories": [{"id": number + 1, "name": group.name} for number, group in enumerate(groups)],
-        "annotations": [],
-    }
+    description = f"{scene.scene.name}: masks of nodes, by hilsplat"
+    coco = coco_content(description, scene.views, scene.scene.cameras, [group.name for group in groups])
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
         for number, view in enumerate(scene.views):
-            height, width = scene.scene.cameras[view].size_hw
-            coco["images"].append({"id": number, "file_name": view, "height": height, "width": width})
             for node in nodes:
                 mask = scene.node_masks(view, [node])
                 if not mask.any():
@@ -95,9 +88,9 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
                 name = f"masks/{Path(view).stem}/{node}.png"
                 archive.writestr(name, png.getvalue(), compress_type=zipfile.ZIP_STORED)
                 described = {"image_id": number, "node": node, **coco_region(mask)}
-                for category, group in enumerate(groups):
+                for category, group in enumerate(groups, 1):
                     if node in group.nodes:
-                        found = {"id": len(coco["annotations"]) + 1, "category_id": category + 1}
+                        found = {"id": len(coco["annotations"]) + 1, "category_id": category}
                         coco["annotations"].append({**found, **described})
             yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))

@@ -11,9 +11,9 @@ import numpy as np
 from hilsplat.base.artifacts import read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.query.caches import Opened, ViewStore
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.names import NodeNames, tree_digest
+from hilsplat.query.scene_views import Opened, ViewStore
 from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
@@ -66,7 +66,7 @@ class ViewerScene(ShownScene):
             raise ArtifactError(
                 f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"hilsplat run {ply}"
             )
-        self.changes.note((self.folder / "scene", ply))
+        self.note((self.folder / "scene", ply))
         self.scene = self.opened.get(Scene.load, self.folder / "scene")
         self.gaussians: Gaussians = self.opened.get(load_ply, ply)
         if len(self.gaussians) > MAX_GAUSSIANS:
@@ -112,7 +112,7 @@ class ViewerScene(ShownScene):
                 )
             with self.unchanged():
                 found = FinishedScene.locate(self.folder, variant)
-                self.changes.note(found.parts.as_inputs().values())
+                self.note(found.parts.as_inputs().values())
                 opened = LanguageScene.of(found, threads=self.threads, opened=self.opened)
             if len(opened.tree) > payload.MAX_NODES:
                 raise ArtifactError(f"the tree of {variant} has {len(opened.tree)} nodes, too many to show")

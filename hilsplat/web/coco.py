@@ -1,10 +1,29 @@
 """Masks in COCO's format, which both pages export."""
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool
+
+from hilsplat.scene.cameras import Cameras
+
+
+def coco_content(
+    description: str, views: Iterable[str], cameras: Cameras, categories: Sequence[str]
+) -> dict[str, Any]:
+    """Return a file without annotations; views are numbered from 0, categories from 1."""
+    images = []
+    for number, view in enumerate(views):
+        height, width = cameras[view].size_hw
+        images.append({"id": number, "file_name": view, "height": height, "width": width})
+    return {
+        "info": {"description": description},
+        "images": images,
+        "categories": [{"id": number, "name": name} for number, name in enumerate(categories, 1)],
+        "annotations": [],
+    }
 
 
 def coco_region(mask: Bool[np.ndarray, "H W"]) -> dict[str, Any]:

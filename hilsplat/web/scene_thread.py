@@ -7,9 +7,10 @@ own.
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
@@ -17,33 +18,60 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from hilsplat.base.artifacts import INDEX
 from hilsplat.base.images import resize_to_fit
 from hilsplat.scene.scene import Scene
-from hilsplat.web.file_changes import FileChanges, StaleSceneError
+from hilsplat.web.file_changes import StaleSceneError
 from hilsplat.web.server import answer, encoded, plain, read, view_name
 
 THUMB_PX = 160
 
 
 class ShownScene:
-    """A scene as a page opened it; `state` identifies this opening. Subclasses set `scene`."""
+    """A scene as a page opened it; `state` identifies this opening. Subclasses set `scene`.
+
+    Writers always replace the whole file, so `stat` detects a rewritten file without reading it. A folder's
+    state is that of its index, which is written last.
+    """
 
     scene: Scene
 
     def __init__(self) -> None:
         self.state = secrets.token_hex(4)
-        self.changes = FileChanges()
+        self._seen: dict[Path, tuple[int, int, int] | None] = {}
 
-    def changed(self) -> list[str]:
-        """Return opened parts that were rewritten or deleted; the page still shows what was opened."""
-        return sorted({path.name for path in self.changes.changed()})
+    def note(self, parts: Iterable[Path]) -> None:
+        """Record the current state of parts that are opened next, except those recorded before."""
+        for part in parts:
+            self._seen.setdefault(part, _state_of(part))
 
-    def unchanged(self) -> AbstractContextManager[None]:
-        """Guard disk reads: raise StaleSceneError if a part was rewritten before or during the read."""
-        return self.changes.unchanged(self.scene.name)
+    def changed(self, *parts: Path) -> list[str]:
+        """Return the names of recorded parts, by default all, that were rewritten or deleted.
+
+        The page still shows what was opened.
+        """
+        return sorted({part.name for part in parts or self._seen if _state_of(part) != self._seen[part]})
+
+    @contextmanager
+    def unchanged(self, *parts: Path) -> Iterator[None]:
+        """Guard disk reads: fail if recorded parts, by default all, were rewritten.
+
+        Raises:
+            StaleSceneError: a part was rewritten before or during the read.
+        """
+        self._require_unchanged(parts)
+        yield
+        self._require_unchanged(parts)
+
+    def _require_unchanged(self, parts: tuple[Path, ...]) -> None:
+        if changed := self.changed(*parts):
+            raise StaleSceneError(
+                f"{', '.join(changed)} of {self.scene.name} changed on the disk since the page was loaded",
+                fix="reload the page",
+            )
 
     def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard reads of photographs as `unchanged`."""
+        """Guard reads of photographs, as `unchanged`."""
         return self.unchanged()
 
     def news(self) -> dict[str, Any]:
@@ -57,6 +85,14 @@ class ShownScene:
     def described(self) -> dict[str, Any]:
         """Describe the scene to a newly opened page."""
         raise NotImplementedError
+
+
+def _state_of(part: Path) -> tuple[int, int, int] | None:
+    try:
+        found = (part / INDEX if part.is_dir() else part).stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 Shown = TypeVar("Shown", bound=ShownScene)

@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
-def fill_polygons(
-    polygons: Sequence[Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"]], size_hw: tuple[int, int]
-) -> Bool[np.ndarray, "H W"]:
+
+def fill_polygons(polygons: Sequence[Polygon], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     """Return the union of polygons (vertices x, y): truncated to integers, even-odd fill, border included.
 
     This is OpenCV's `fillPoly` on int32 vertices, used by LangSplat's evaluation. Pixel (x, y) is the vertex

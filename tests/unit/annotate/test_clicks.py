@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import fill_rings
 from hilsplat.annotate.proposals import KEPT_VIEWS, Clicks
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
+from hilsplat.datasets.images.polygons import fill_polygons
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from tests.conftest import PROJECT
@@ -61,7 +61,7 @@ def clicks(scene, tmp_path_factory) -> Clicks:
 
 def test_a_click_outlines_the_thing_at_it(clicks):
     best, *others = clicks.outlines("000.png", [(*LEFT[0], True)], None)
-    assert iou(fill_rings(best.polygons, SIZE), disc(*LEFT)) > 0.8
+    assert iou(fill_polygons(best.polygons, SIZE), disc(*LEFT)) > 0.8
     assert best.what == "by sam-tiny" and best.level == Level.WHOLE  # the three heads agree
     assert len(others) < 3
 
@@ -69,13 +69,13 @@ def test_a_click_outlines_the_thing_at_it(clicks):
 def test_a_box_outlines_the_thing_that_fills_it(clicks):
     (x, y), (a, b) = RIGHT
     best, *_ = clicks.outlines("000.png", [], (x - a, y - b, x + a, y + b))
-    assert iou(fill_rings(best.polygons, SIZE), disc(*RIGHT)) > 0.8
+    assert iou(fill_polygons(best.polygons, SIZE), disc(*RIGHT)) > 0.8
 
 
 def test_things_at_clicks_outside_are_not_outlined(clicks):
     asked = [(*LEFT[0], True), (*RIGHT[0], False), (10, 10, False)]
     best, *_ = clicks.outlines("000.png", asked, None)
-    found = fill_rings(best.polygons, SIZE)
+    found = fill_polygons(best.polygons, SIZE)
     assert found[LEFT[0][::-1]] and not found[RIGHT[0][::-1]] and not found[10, 10]
 
 

@@ -30,7 +30,7 @@ def desk(desk_project, tmp_path_factory) -> Path:
     (project / "models/colours/vocabulary.txt").write_text(words)
     default = project / SCENE / "default"
     places = (default / "semantic_tree", default / "clip", default / "names", project / "cache")
-    run_names(*places, QuerySettings(), EvaluateSettings(), 1)
+    run_names(*places, QuerySettings(), EvaluateSettings())
     return project / SCENE
 
 

@@ -11,10 +11,10 @@ from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import load_code
 from hilsplat.field.field import run_field
 from hilsplat.field.language_field import LanguageField
-from hilsplat.query.caches import ViewStore
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
 from hilsplat.query.relevancy_kernels import fill_maps
+from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.finished import FinishedScene, require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.build import run_semantic_tree
@@ -349,10 +349,10 @@ def test_levels_at_which_every_ancestor_exists_are_preferred(scene):
 def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
     assert scene.nodes_shown("000.png").all()
     hidden = np.arange(7) != NODE["A top left"]
-    scene._views.get(("shown", "half"), lambda: hidden, lambda kept: 0)
+    scene._views.get(("shown", "half"), lambda: hidden)
     named = replace(scene, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("half",))))
     assert [hit.node for hit in named.query(text, "subpart", view="half")] == [NODE["B corner"]]
-    named._views.get(("shown", "none"), lambda: np.zeros(7, bool), lambda kept: 0)
+    named._views.get(("shown", "none"), lambda: np.zeros(7, bool))
     dark = replace(named, scene=replace(scene.scene, cameras=replace(scene.scene.cameras, names=("none",))))
     assert dark.query(text, view="none") == []
     with pytest.raises(SettingsError, match="has no view 'x'"):

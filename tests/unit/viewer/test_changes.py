@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.viewer_scene import ViewerScene
-from hilsplat.web.file_changes import FileChanges
+from hilsplat.web.scene_thread import ShownScene
 from tests.unit.artifact_changes import change_index, write_again
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import browsing
@@ -150,14 +150,13 @@ def test_an_outline_has_the_digest_of_its_tree(page, desk):
 
 
 def test_created_and_replaced_files_count_as_changed(tmp_path):
-    changes, file, folder = FileChanges(), tmp_path / "a.npz", tmp_path / "b"
+    shown, file, folder = ShownScene(), tmp_path / "a.npz", tmp_path / "b"
     file.write_bytes(b"one")
-    changes.note([file, folder])
-    assert changes.changed() == []
+    shown.note([file, folder])
+    assert shown.changed() == []
     write_again(file)
-    assert changes.changed() == [file]
-    changes.note([file])  # what was opened is what counts
-    assert changes.changed() == [file]
+    assert shown.changed() == ["a.npz"] and shown.changed(folder) == []
+    shown.note([file])  # the state before opening is what counts
     folder.mkdir()
     (folder / "index.json").write_text("{}")
-    assert changes.changed() == [file, folder]
+    assert shown.changed() == ["a.npz", "b"]
