@@ -233,8 +233,7 @@ def _picture_half(network):
     from hilsplat.embed.clip import ClipModel
 
     model = object.__new__(ClipModel)
-    model.vision, model.pixels, model.vector = network, "pixel_values", "image_embeds"
-    model.threads, model.side_px = 1, 224
+    model.vision, model.side_px = network, 224
     model.mean, model.std, model.rescale = (
         np.zeros(3, np.float32),
         np.ones(3, np.float32),

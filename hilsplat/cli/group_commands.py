@@ -158,7 +158,7 @@ def models_get(
 @models_app.command("list")
 def models_list() -> None:
     """List released and installed models, with size, licence and use."""
-    from hilsplat.hub.overview import models_table
+    from hilsplat.models.store import models_table
 
     typer.echo(models_table())
 
@@ -169,8 +169,7 @@ def models_check(
     variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
 ) -> None:
     """Describe a model folder, or all installed ones, and time one image."""
-    from hilsplat.embed.model_check import check_model
-    from hilsplat.hub.overview import check_models
+    from hilsplat.embed.model_check import check_model, check_models
 
     text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
     typer.echo(text)

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from hilsplat.base.artifacts import read_json, write_json
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.embed.clip import ClipModel
 from hilsplat.models.folder import input_side_px, open_model_folder
 from hilsplat.models.int8 import int8_network, may_be_int8
 from hilsplat.models.network import execution_providers, require_one_space
+from hilsplat.models.store import broken_models, present_models
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
@@ -58,6 +59,18 @@ def check_model(folder: Path, variant: str = "") -> str:
     _remember(folder, variant, seconds, CACHE)
     lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]
     return "\n".join(lines)
+
+
+def check_models() -> tuple[str, int]:
+    """Return the report of `check_model` on every installed model, and the number of broken models."""
+    texts, num_failed = [], 0
+    for folder in [*(model.folder for model in present_models()), *broken_models()]:
+        try:
+            texts.append(check_model(folder))
+        except HilsplatError as error:
+            texts.append(f"{folder} does not work: {error}")
+            num_failed += 1
+    return "\n\n".join(texts) or "no model is installed", num_failed
 
 
 def provider_disagreement(folder: Path) -> str | None:

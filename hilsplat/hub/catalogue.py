@@ -1,6 +1,5 @@
 """Models by name, the files of their repositories on the hub, and which of these a model needs."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,9 @@ from huggingface_hub.errors import (
     OfflineModeIsEnabled,
 )
 from huggingface_hub.utils import validate_repo_id
+from huggingface_hub.utils.sha import git_hash
 
-from hilsplat.base.artifacts import parse_json
+from hilsplat.base.artifacts import parse_json, sha256_of_file
 from hilsplat.base.errors import DownloadError
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
 from hilsplat.models.onnx_graph import WHOLE
@@ -84,11 +84,7 @@ class HubFile:
 
     def digest_of(self, path: Path) -> str:
         """Return the digest of a local file, of the same kind as the listed one."""
-        with path.open("rb") as stream:
-            if len(self.digest) == 64:
-                return hashlib.file_digest(stream, "sha256").hexdigest()
-            content = stream.read()
-        return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+        return sha256_of_file(path) if len(self.digest) == 64 else git_hash(path.read_bytes())
 
 
 @dataclass(frozen=True)

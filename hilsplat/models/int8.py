@@ -17,7 +17,7 @@ from hilsplat.models.onnx_graph import needed_names
 logger = logging.getLogger(__name__)
 
 RECIPE = "dynamic, per channel, 1"
-"""Version of the quantisation: change it whenever the same network would give different bytes."""
+"""Version of the quantisation: change it whenever quantising the same network produces different bytes."""
 
 WORDS = (
     *("object", "things", "stuff", "texture", "person", "face", "hand", "animal", "head", "toy", "cup"),

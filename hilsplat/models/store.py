@@ -65,6 +65,7 @@ RELEASES = (
 
 RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
 """Models that `hilsplat models get` downloads without a name; docs/models.md gives the reasons."""
+COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<11} {}"  # of `models_table`
 
 
 @dataclass(frozen=True)
@@ -110,15 +111,15 @@ def model_path(path: str | Path) -> Path:
     return of_user if not place.exists() and place.parent == MODELS and of_user.exists() else place
 
 
-def present_models(*stores: Path) -> list[PresentModel]:
-    """Return the models in folders, best first: released models in order, others by name, embedded last.
+def present_models() -> list[PresentModel]:
+    """Return the installed models, best first: released models in order, others by name, embedded last.
 
-    If several stores (parent folders of models) contain the same name, the first store is used. Default: the
-    project's models, the user's models, and the embedded models of the installation.
+    If several folders have the same name, the project's models take precedence, then the user's models, then
+    the embedded models of the installation.
     """
     order = {release.name: number for number, release in enumerate(RELEASES)}
     by_name: dict[str, PresentModel] = {}
-    for folder in _folders(*stores):
+    for folder in _folders():
         if folder.name not in by_name and (model := read_model(folder)) is not None:
             by_name[folder.name] = model
     return sorted(
@@ -133,10 +134,9 @@ def broken_models() -> list[Path]:
     return [folder for folder in folders if any(folder.rglob("*.onnx")) and read_model(folder) is None]
 
 
-def _folders(*stores: Path) -> list[Path]:
-    paths = [path for store in stores or (MODELS, user_models()) for path in store.glob("[!.]*")]
-    embedded = [] if stores else [project_path(path) for path in EMBEDDED.values()]
-    return [path for path in paths if path.is_dir()] + embedded
+def _folders() -> list[Path]:
+    paths = [path for store in (MODELS, user_models()) for path in store.glob("[!.]*")]
+    return [path for path in paths if path.is_dir()] + [project_path(path) for path in EMBEDDED.values()]
 
 
 @functools.cache
@@ -164,6 +164,37 @@ def real_model(family: str) -> Path | None:
     """Return the model that `auto` selects: the best pretrained model of a family, or None."""
     models = (model for model in present_models() if model.family == family)
     return next((model.folder for model in models if not model.embedded), None)
+
+
+def models_table() -> str:
+    """Return a table of released and installed models, with those that are used for photographs."""
+    here = {model.folder.name: model for model in present_models()}
+    chosen = (real_model("sam"), real_model("clip"))
+
+    def state(name: str) -> str:
+        if name not in here:
+            return "incomplete" if (user_models() / f".{name}.part").is_dir() else ""
+        return "in use" if here[name].folder in chosen else "installed"
+
+    rows: list[tuple[object, ...]] = [("name", "kind", "MB", "licence", "", "use")]
+    for release in RELEASES:
+        use = release.use + (" (recommended)" if release.name in RECOMMENDED else "")
+        kind, licence = release.family.upper(), release.licence
+        rows.append((release.name, kind, release.megabytes, licence, state(release.name), use))
+    released = [release.name for release in RELEASES]
+    for name, model in here.items():
+        if name not in released:
+            files = [path for path in model.folder.rglob("*") if path.is_file()]
+            megabytes = f"{sum(path.stat().st_size for path in files) / 1e6:.0f}"
+            use = "the synthetic world only" if model.embedded else ""
+            rows.append((name, model.family.upper(), megabytes, "", state(name), use))
+    lines = [COLUMNS.format(*row).rstrip() for row in rows]
+    lines += [
+        "",
+        "hilsplat models get NAME, or owner/name on the hub; without a name, the recommended pair",
+        f"Models are stored in {user_models()}; those in a project's models/ take precedence.",
+    ]
+    return "\n".join(lines)
 
 
 def meaningless(name: str) -> str:

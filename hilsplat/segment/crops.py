@@ -5,7 +5,6 @@ from jaxtyping import Bool, UInt8
 
 from hilsplat.base.errors import EmptyMaskError
 
-BACKGROUNDS = ("black", "keep", "dim")
 DIM = 0.35  # brightness factor of pixels outside the mask for the background `dim`
 
 
@@ -48,8 +47,6 @@ def crop_to_square(
         as_langsplat: follow LangSplat's preprocessing: omit the last row and column of the box (but keep at
             least one), and use bilinear resizing for shrinking, too.
     """
-    if background not in BACKGROUNDS:
-        raise ValueError(f"background {background!r} is not one of {', '.join(BACKGROUNDS)}")
     if background != "keep":
         outside = (box * DIM + 0.5).astype(np.uint8) if background == "dim" else np.uint8(0)
         box = np.where(inside[..., None], box, outside)

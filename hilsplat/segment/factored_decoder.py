@@ -18,6 +18,7 @@ The two attentions of a layer, its layer norm and the next attention process one
 for several prompts (`decoder_kernels`). Operations on tokens alone are plain numpy here.
 """
 
+from collections import namedtuple
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -66,38 +67,18 @@ class FirstPrompts(NamedTuple):
     offset: np.ndarray  # products of `queries` with the keys of that constant
 
 
-class SecondLayer(NamedTuple):
-    """Image arrays that the kernels read at the second layer; names as in `FirstLayer`.
-
-    Queries and products have two parts, for the values of the first and of the second layer.
-    """
-
-    scaled_queries: np.ndarray
-    fixed_queries: np.ndarray
-    before_first: np.ndarray
-    before_second: np.ndarray
-    square: np.ndarray
-    cross_first: np.ndarray
-    cross_second: np.ndarray
-    scaled_keys: np.ndarray
-    fixed_keys: np.ndarray
-    values: np.ndarray
-
-
-class SecondPrompts(NamedTuple):
-    """Prompt arrays that the kernels read at the second layer; names as in `FirstPrompts`."""
-
-    update_keys: np.ndarray
-    update_low: np.ndarray
-    update_offset: np.ndarray
-    twice_changes: np.ndarray
-    linear: np.ndarray
-    gram: np.ndarray
-    last: np.ndarray
-    square: np.ndarray
-    queries: np.ndarray
-    low: np.ndarray
-    offset: np.ndarray
+SecondLayer = namedtuple(
+    "SecondLayer",
+    "scaled_queries fixed_queries before_first before_second square cross_first cross_second "
+    "scaled_keys fixed_keys values",
+)
+"""Image arrays that the kernels read at the second layer; names as in `FirstLayer`. Queries and products have
+two parts, for the values of the first and of the second layer."""
+SecondPrompts = namedtuple(
+    "SecondPrompts",
+    "update_keys update_low update_offset twice_changes linear gram last square queries low offset",
+)
+"""Prompt arrays that the kernels read at the second layer; names as in `FirstPrompts`."""
 
 
 class Upscaling(NamedTuple):

@@ -16,7 +16,7 @@ from hilsplat.segment.kernels import areas_and_boxes, paint_runs, shared_pixels,
 
 MAX_SIDE_PX = 2**15
 LIMITS = {"level": (1, 3), "predicted_iou": (-1, 2), "stability": (0, 1)}
-"""Ranges of values accepted from a file. SAM's predicted IoUs are slightly outside [0, 1]."""
+"""Ranges of values accepted from a file. SAM's predicted IoUs may be slightly outside [0, 1]."""
 
 
 def encode_runs(

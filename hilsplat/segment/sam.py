@@ -28,8 +28,7 @@ from hilsplat.models.network import Network, execution_providers, require_three_
 from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.decoder_weights import DecoderGraph
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
-from hilsplat.segment.kernels import areas_and_boxes, upscaled_runs
-from hilsplat.segment.logit_kernels import quantise_logits
+from hilsplat.segment.kernels import areas_and_boxes, quantise_logits, upscaled_runs
 from hilsplat.settings import MasksSettings
 
 logger = logging.getLogger(__name__)
@@ -426,9 +425,7 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return the first low-resolution pixel that contributes to each pixel, and its and later ones' weights.
-
-    Both are along one axis.
+    """Return, for one axis, the first low-resolution pixel read by each pixel, and the weights from there on.
 
     The weights combine SamProcessor's steps: bilinear from `low` to the padded input, cropping to the resized
     image, bilinear to the original size.

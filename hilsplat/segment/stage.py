@@ -55,9 +55,9 @@ def run_masks(
         cache: folder of the view cache. For SAM it contains the decoder's candidates and the masks, so
             changing thresholds doesn't rerun the networks, and changing levels needs no computation.
         threads: views processed in parallel if they fit into memory; the result does not depend on it.
-        memory_mib: memory that the stage may use; None: all free memory.
-        key_views: views to segment; None: every training view.
-        prompts: function that returns a view's prompt points for SAM (x, y, px); None: the settings' grid.
+        memory_mib: memory that the stage may use; None for all free memory.
+        key_views: views to segment; None for every training view.
+        prompts: function that returns a view's prompt points for SAM (x, y, px); None for the settings' grid.
         finished: output of this stage whose views are reused as they are.
     """
     scene = Scene.load(scene_folder)

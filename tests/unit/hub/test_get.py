@@ -13,10 +13,10 @@ from huggingface_hub.utils import reset_sessions
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import DiskSpaceError, DownloadError, ModelError
+from hilsplat.embed.model_check import check_models
 from hilsplat.hub import get
 from hilsplat.hub.get import get_models
-from hilsplat.hub.overview import check_models, models_table
-from hilsplat.models.store import real_model
+from hilsplat.models.store import models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
 from tests.unit.hub.conftest import CLIP, SAM, point_at
 
