@@ -13,7 +13,7 @@ from hilsplat.base.progress import stage_log, track
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.synthetic.world_labels import labelled_points
-from hilsplat.evaluate.diagnostics.world_answers import measure_world_consistency
+from hilsplat.evaluate.diagnostics.world_consistency import measure_world_consistency
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
@@ -117,9 +117,7 @@ def run_evaluate(
                         seconds = time_queries(answers, view, texts, settings)
                     answers.forget(view)  # reused memory need not be cleared again
                 if isinstance(known, Path) and truths and settings.view_consistency:
-                    for view, row in measure_world_consistency(
-                        answers, selections, truths, kept, known, settings
-                    ):
+                    for view, row in measure_world_consistency(selections, truths, kept, known, settings):
                         keep(data, view, row)
                 for each in point_rows(answers, known, protocols, settings, threads):
                     if isinstance(each, Measured):

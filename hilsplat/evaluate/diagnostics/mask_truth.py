@@ -80,23 +80,13 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
         rows = []
         for level in LEVELS:  # means are over regions, not over views
             own = [fit[level] for fit in fits.values()]
-            best = np.concatenate([fit.best for fit in own]) if own else np.zeros(0)
+            best = np.concatenate([fit.best for fit in own])
             number = sum(fit.masks for fit in own)
             iou, recall = (best.mean(), (best >= FIT_IOU).mean()) if len(best) else (np.nan, np.nan)
             precision = sum(fit.fitting for fit in own) / number if number else np.nan
-            rows.append(
-                [
-                    scene.name,
-                    masks_label(masks_folder),
-                    level.label,
-                    str(len(own)),
-                    str(len(best)),
-                    f"{iou:.4f}",
-                    f"{recall:.4f}",
-                    f"{number / max(1, len(own)):.1f}",
-                    f"{precision:.4f}",
-                ]
-            )
+            numbers = [str(len(own)), str(len(best)), f"{iou:.4f}", f"{recall:.4f}"]
+            numbers += [f"{number / len(own):.1f}", f"{precision:.4f}"]
+            rows.append([scene.name, masks_label(masks_folder), level.label, *numbers])
         figure = draw_fits(scene, truth, Path(masks_folder), fits, median_and_worst(fits))
         save_png_and_pdf(figure, out)
         write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
@@ -111,7 +101,7 @@ def median_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
         return float(best.mean()) if len(best) else 1.0
 
     order = sorted(fits, key=lambda view: (mean_of(view), view))
-    return list(dict.fromkeys([order[len(order) // 2], order[0]])) if order else []
+    return list(dict.fromkeys([order[len(order) // 2], order[0]]))
 
 
 def draw_fits(
@@ -122,37 +112,26 @@ def draw_fits(
     views: list[str],
 ) -> Figure:
     """Draw two rows per view: masks by level, then ground-truth regions coloured by their best IoU."""
-    tall, wide = max(1, 2 * len(views)), 1 + len(LEVELS)
-    example = scene.cameras[views[0]].size_hw if views else (1, 1)
-    height_in = 3.1 * example[0] / example[1] + 0.3
-    figure = Figure(figsize=(3.1 * wide, tall * height_in), layout="constrained")
+    tall, wide = 2 * len(views), 1 + len(LEVELS)
+    height, width = scene.cameras[views[0]].size_hw
+    figure = Figure(figsize=(3.1 * wide, tall * (3.1 * height / width + 0.3)), layout="constrained")
     axes = figure.subplots(tall, wide, squeeze=False)
-    for each in axes.flat:
-        each.set_axis_off()
     for number, view in enumerate(views):
         image = scene.image(view)
         masks = HierarchicalMasks.load(masks_folder / f"{view}.npz")
         above, below = axes[2 * number], axes[2 * number + 1]
-        above[0].set_axis_on()
         show(above[0], image, f"{view}: {('median view', 'worst view')[number]}")
         for level in LEVELS:
             fit = fits[view][level]
             column = 1 + level.index
-            for row in (above, below):
-                row[column].set_axis_on()
             show(above[column], paint_level(image, masks, level), f"{level.label}: {fit.masks} masks")
-            recall = f", {(fit.best >= FIT_IOU).sum()} found" if len(fit.best) else ""
-            mean = f", mean IoU {fit.best.mean():.2f}" if len(fit.best) else ""
-            show(
-                below[column],
-                paint_fits(image, truth.label_image(view, level), fit),
-                f"{len(fit.best)} regions{recall}{mean}",
-            )
-        bar = figure.colorbar(
-            ScalarMappable(cmap=COLOURS),
-            cax=below[0].inset_axes((0.1, 0.5, 0.8, 0.05)),
-            orientation="horizontal",
-        )
+            title = f"{len(fit.best)} regions"
+            if len(fit.best):
+                title += f", {(fit.best >= FIT_IOU).sum()} found, mean IoU {fit.best.mean():.2f}"
+            show(below[column], paint_fits(image, truth.label_image(view, level), fit), title)
+        below[0].set_axis_off()
+        scale = below[0].inset_axes((0.1, 0.5, 0.8, 0.05))
+        bar = figure.colorbar(ScalarMappable(cmap=COLOURS), cax=scale, orientation="horizontal")
         bar.ax.tick_params(labelsize=7)
         bar.set_label("IoU of a true region with\nthe mask that fits it best", fontsize=8)
     return figure

@@ -1,6 +1,6 @@
-"""View consistency of masks on a synthetic scene: whether surface points share masks in both of two views."""
+"""View consistency of masks and answers on a synthetic scene, by its exact geometry."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -13,9 +13,17 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
+from hilsplat.evaluate.protocols.cards import VIEW_CONSISTENCY
+from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth
+from hilsplat.evaluate.protocols.views import given_key, label_of, rule_of
+from hilsplat.evaluate.scores import Measured
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.origin import masks_label
+from hilsplat.settings import EvaluateSettings
 from hilsplat.world.truth import TrueMesh
 
 TRUTH = "true regions"
@@ -35,16 +43,9 @@ MIN_POINTS = 16
 MAX_POINTS = 50_000
 """Maximum number of shared points per pair of views; more are evenly subsampled."""
 
-
-@dataclass(frozen=True)
-class SharedPoints:
-    """Row-major pixels of views A (each at most once) and B that show the same surface points."""
-
-    pixel_a: Int64[np.ndarray, " P"]
-    pixel_b: Int64[np.ndarray, " P"]
-
-    def __len__(self) -> int:
-        return len(self.pixel_a)
+METHODS = ("field", "tree")
+TEXTS_PER_LEVEL = 4
+"""Texts per level and view, each queried in two views."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,10 @@ def shared_points(
     depth_b: Float[np.ndarray, "Hb Wb"],
     tolerance: float = DEPTH_TOLERANCE,
     most: int = MAX_POINTS,
-) -> SharedPoints:
-    """Return at most `most` points of view A's pixel centres, evenly spaced, that are also visible in view B.
+) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, " P"]]:
+    """Return row-major pixels of A (each at most once) and of B that show the same surface points.
+
+    At most `most` of A's pixel centres are used, evenly spaced.
 
     A point is lifted by A's depth and projected into B. It is visible there if B's depth at the projection
     equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse depth, which
@@ -108,7 +111,7 @@ def shared_points(
     if len(pixel_a) > most:
         kept = np.linspace(0, len(pixel_a) - 1, most).astype(np.int64)
         pixel_a, pixel_b = pixel_a[kept], pixel_b[kept]
-    return SharedPoints(pixel_a, pixel_b)
+    return pixel_a, pixel_b
 
 
 def best_ious(
@@ -163,15 +166,18 @@ def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> 
 
 
 def view_agreement(
-    masks_a: Bool[np.ndarray, "Ma Ha Wa"], masks_b: Bool[np.ndarray, "Mb Hb Wb"], points: SharedPoints
+    masks_a: Bool[np.ndarray, "Ma Ha Wa"],
+    masks_b: Bool[np.ndarray, "Mb Hb Wb"],
+    pixel_a: Int64[np.ndarray, " P"],
+    pixel_b: Int64[np.ndarray, " P"],
 ) -> Agreement:
-    """Return the agreement of the masks of one level between two views.
+    """Return the agreement of the masks of one level between two views, at shared points.
 
     Masks of a view may overlap. `best_iou` uses them as they are, the disagreements use the smallest mask at
     each point (`painted`), like the language field.
     """
-    inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, points.pixel_a]
-    inside_b = masks_b.reshape(len(masks_b), np.prod(masks_b.shape[1:], dtype=int))[:, points.pixel_b]
+    inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, pixel_a]
+    inside_b = masks_b.reshape(len(masks_b), np.prod(masks_b.shape[1:], dtype=int))[:, pixel_b]
     ious = best_ious(inside_a, inside_b)
     all_pairs, joined = pair_disagreement(
         painted(inside_a, masks_a.sum(axis=(1, 2))), painted(inside_b, masks_b.sum(axis=(1, 2)))
@@ -251,10 +257,10 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         (name, level): [] for name in sources for level in LEVELS
     }
     for a, b in pairs:
-        points = shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b))
-        for name, level in found:
+        pixel_a, pixel_b = shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b))
+        for (name, level), parts in found.items():
             of_level = sources[name]
-            found[name, level].append(view_agreement(of_level(a, level), of_level(b, level), points))
+            parts.append(view_agreement(of_level(a, level), of_level(b, level), pixel_a, pixel_b))
     rows = []
     for (name, level), parts in found.items():
         one = mean_agreement(parts)
@@ -262,3 +268,82 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         rows.append([index["scene"], name, level.label, str(len(parts)), str(one.masks), *shares])
     write_csv(out, COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
+
+
+def measure_world_consistency(
+    selections: Selections,
+    truths: Mapping[str, Callable[[], ViewTruth]],
+    answered: Mapping[str, PackedMasks],
+    truth: Path,
+    settings: EvaluateSettings,
+) -> Iterator[tuple[str, Measured]]:
+    """Yield the rows of `world/view-consistency`: each annotated view and its nearest neighbour.
+
+    The IoU is that of the answers in both views, over shared surface points; `n` is the number of points in
+    the union, and texts without an answer are omitted. Nothing is yielded without a ground-truth mesh (as for
+    photographed scenes). `answered` contains the stored answers by view (`views.measure_view`).
+    """
+    if not (truth / "mesh.ply").is_file():
+        return
+    scene, true = selections.scene, Cameras.load(truth / "cameras.npz")
+    mesh = TrueMesh.load(truth / "mesh.ply")
+    known = set(true.names)
+    views = [view for view in scene.scene.cameras.names if view in known]
+    nearest = dict(neighbours(true, views, 1))
+    pairs = [(view, nearest[view]) for view in truths if view in nearest]
+    for number, (a, b) in enumerate(pairs):
+        pixel_a, pixel_b = shared_points(true[a], mesh.depth(true[a]), true[b], mesh.depth(true[b]))
+        queries = spread(truths[a]().queries, TEXTS_PER_LEVEL)
+        for method in METHODS:
+            if method not in settings.methods:
+                continue
+            protocol = label_of(VIEW_CONSISTENCY, method, settings)
+            masks_a = answers_in_view(selections, answered.get(a), method, a, queries, settings)
+            masks_b = answers_in_view(selections, answered.get(b), method, b, queries, settings)
+            for query, mask_a, mask_b in zip(queries, masks_a, masks_b, strict=True):
+                assert query.level is not None
+                seen_a, seen_b = mask_a.reshape(-1)[pixel_a], mask_b.reshape(-1)[pixel_b]
+                union, level = int(np.count_nonzero(seen_a | seen_b)), query.level.label
+                if union:
+                    value = iou(seen_a[None], seen_b[None])
+                    yield a, Measured(method, query.text, level, "view_consistency", protocol, value, union)
+        for view in {a, b} - {each for later in pairs[number + 1 :] for each in later}:
+            scene.forget(view)
+
+
+def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
+    """Return at most `per_level` texts per level, evenly spaced from the largest region to the smallest."""
+    chosen = []
+    for level in LEVELS:
+        same = [query for query in queries if query.level is level]
+        same.sort(key=lambda query: (-int(np.count_nonzero(query.truth)), query.text))
+        count = min(per_level, len(same))
+        chosen += [same[number * len(same) // count] for number in range(count)]
+    return chosen
+
+
+def answers_in_view(
+    selections: Selections,
+    stored: PackedMasks | None,
+    method: str,
+    view: str,
+    queries: Sequence[Query],
+    settings: EvaluateSettings,
+) -> list[Bool[np.ndarray, "H W"]]:
+    """Return a method's answer to each query at its level; the field's stored answers are reused."""
+    scene = selections.scene
+    if method == "tree":
+        size_hw = scene.scene.cameras[view].size_hw
+        nodes = [selections.nodes((query.text,), query.level, view) for query in queries]
+        return [selections.mask(view, ids, size_hw) for ids in nodes]
+    keys = [given_key(method, query, settings) for query in queries]
+    known = [stored.get(key) if stored is not None and key in stored else None for key in keys]
+    texts = [query.text for query, mask in zip(queries, known, strict=True) if mask is None]
+    missing, rule = list(dict.fromkeys(texts)), rule_of(settings)
+    maps = dict(zip(missing, scene.field_relevancy(missing, view), strict=True)) if missing else {}
+    masks = []
+    for query, mask in zip(queries, known, strict=True):
+        if mask is None:
+            mask, _ = relevancy_mask(SmoothedRelevancy.of(maps[query.text], rule), query.level, rule)
+        masks.append(mask)
+    return masks
