@@ -30,7 +30,7 @@ from hilsplat.annotate.labels import (
 )
 from hilsplat.annotate.proposals import Clicks, Proposals
 from hilsplat.base.errors import ArtifactError, SettingsError
-from hilsplat.datasets.images.polygons import fill_polygons
+from hilsplat.datasets.images.isat import fill_polygons
 from hilsplat.scene.scene import Scene
 from hilsplat.web.file_changes import version_of
 from hilsplat.web.guard import Guard

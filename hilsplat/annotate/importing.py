@@ -13,8 +13,7 @@ from jaxtyping import Bool
 from hilsplat.annotate.labels import Label, labels_of, whole_pixels
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.isat import parse_isat
-from hilsplat.datasets.images.polygons import trace_polygons
+from hilsplat.datasets.images.isat import parse_isat, trace_polygons
 from hilsplat.scene.cameras import Cameras
 
 

@@ -18,8 +18,7 @@ from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import SceneError, SettingsError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import by_id, parents_of
-from hilsplat.datasets.images.isat import IsatFile, read_isat
-from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
+from hilsplat.datasets.images.isat import IsatFile, fill_polygons, read_isat, trace_polygons
 from hilsplat.scene.cameras import Cameras
 from hilsplat.web.file_changes import replacing, version_of
 from hilsplat.web.messages import MAX_SIDE_PX, Message, Text

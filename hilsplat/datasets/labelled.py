@@ -4,11 +4,12 @@ Labels, images and poses are keyed by view name ("frame_00041.png", see `scene.v
 a label matches its image and camera even if other views are missing.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -25,8 +26,6 @@ from hilsplat.scene.view_names import view_name
 
 if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
-
-Found = TypeVar("Found")
 
 ROUNDING_PX = 1.0
 """A label counts as a scaled copy of its image if, after scaling, their sides differ by at most this."""
@@ -177,7 +176,8 @@ def images_by_view(folder: Path) -> dict[str, Path]:
 
 def image_size_hw(path: Path) -> tuple[int, int]:
     """Return an image's height and width as stored, from its header; raise ImageError if it is unreadable."""
-    return _read("image", path, lambda image: (image.height, image.width))
+    with _opened("image", path) as image:
+        return image.height, image.width
 
 
 def mask_region(
@@ -204,13 +204,15 @@ def mask_region(
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
     """Return which pixels of a grey mask file are at least `least`; raise ImageError if it is damaged."""
-    return _read("mask", path, lambda image: np.asarray(image.convert("L")) >= least)
+    with _opened("mask", path) as image:
+        return np.asarray(image.convert("L")) >= least
 
 
-def _read(kind: str, path: Path, read: Callable[[Image.Image], Found]) -> Found:
+@contextmanager
+def _opened(kind: str, path: Path) -> Iterator[Image.Image]:
     try:
         with open_image(path) as image:
-            return read(image)
+            yield image
     except FileNotFoundError as error:
         raise ImageError(f"{kind} {path} is missing") from error
     except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for a damaged PNG
@@ -256,18 +258,6 @@ def require_images(labelled: Iterable[str], images: Mapping[str, Path]) -> None:
             found=f"{len(images)} images, {next(iter(images))} to {list(images)[-1]}",
             fix="unpack the images again; other releases number them differently",
         )
-
-
-def unlisted_texts(found: Iterable[str], published: Collection[str]) -> list[str]:
-    """Return a sentence naming texts that a non-empty published list lacks, if any."""
-    new = sorted(set(found) - set(published))
-    return [f"texts missing from the published list: {', '.join(new)}"] if published and new else []
-
-
-def missing_frames(what: str, listed: Iterable[str], present: Iterable[str]) -> list[str]:
-    """Return a sentence naming published frames without `what`, if any."""
-    gone = sorted(set(listed) - set(present))
-    return [f"published frames without {what}: {', '.join(gone)}"] if gone else []
 
 
 def posed_images(folder: Path, dataset: str) -> dict[str, "KnownView"]:

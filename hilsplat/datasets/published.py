@@ -10,6 +10,7 @@ office_desk from figure captions of the LangSplat supplement, perhaps incomplete
 """
 
 import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 _LISTS = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
@@ -23,3 +24,20 @@ PROMPTS: dict[str, dict[str, list[str]]] = _LISTS["prompts"]
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
 """Number of (frame, category) pairs of LERF-OVS, derived: the smallest counts for which whole numbers of hits
 give all published localization figures."""
+
+
+def differences(
+    dataset: str, scene: str, present: Mapping[str, Iterable[str]], texts: Iterable[str] = ()
+) -> list[str]:
+    """Return sentences about published frames that are missing, and texts that the published list lacks.
+
+    `present` maps a kind of file, such as "label", to the views that have one.
+    """
+    sentences = []
+    for what, views in present.items():
+        if missing := sorted(set(FRAMES.get(dataset, {}).get(scene, ())) - set(views)):
+            sentences.append(f"published frames without {what}: {', '.join(missing)}")
+    listed = PROMPTS.get(dataset, {}).get(scene)
+    if listed and (new := sorted(set(texts) - set(listed))):
+        sentences.append(f"texts missing from the published list: {', '.join(new)}")
+    return sentences

@@ -21,15 +21,8 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
 from hilsplat.datasets.images.lerf_ovs import label_files, merged_regions
-from hilsplat.datasets.labelled import (
-    LabelledRegion,
-    LabelledScene,
-    check_label_size,
-    image_size_hw,
-    images_by_view,
-    missing_frames,
-)
-from hilsplat.datasets.published import FRAMES
+from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_view
+from hilsplat.datasets.published import FRAMES, differences
 
 IMAGES_OF = {"hi_lerf": "lerf_ovs", "hi_3dovs": "3d_ovs"}
 """Data set -> folder with its images, next to the data set's own folder."""
@@ -53,12 +46,10 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
         if view not in images:
             warnings.append(f"label file {path} has no image in {source / 'images'}: skipped")
             continue
-        labels = read_isat(path)
+        labels = read_isat(path, images[view])
         warnings += labels.warnings
-        warnings += check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
         views[view] = regions_of(labels, warnings)
-    listed = FRAMES[dataset].get(scene, ())
-    warnings += missing_frames("image", listed, images) + missing_frames("label", listed, files)
+    warnings += differences(dataset, scene, {"image": images, "label": files})
     return LabelledScene(dataset, scene, images, source, views, tuple(warnings))
 
 
@@ -89,17 +80,17 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
     objects = by_id(labels)
     parents = parents_of(labels, objects, warnings)
     warnings += _nesting_violations(labels, objects, parents)
-    return tuple(
-        LabelledRegion(
-            thing.category,
-            labels.size_hw,
-            partial(thing.mask, labels.size_hw),
-            thing.box_xyxy[None],
-            Level(thing.keys["level"]),
-            _path_of(number, objects, parents),
-        )
-        for number, thing in objects.items()
-    )
+    regions = []
+    for number, thing in objects.items():
+        path = [thing.category]
+        ancestor = parents[number]
+        while ancestor is not None:
+            path.insert(0, objects[ancestor].category)
+            ancestor = parents[ancestor]
+        pixels, level = partial(thing.mask, labels.size_hw), Level(thing.keys["level"])
+        box = thing.box_xyxy[None]
+        regions.append(LabelledRegion(thing.category, labels.size_hw, pixels, box, level, tuple(path)))
+    return tuple(regions)
 
 
 def by_id(labels: IsatFile) -> dict[int, IsatObject]:
@@ -173,17 +164,6 @@ def _nesting_violations(
                 f"its area is outside its parent {parent} ({objects[parent].category})"
             )
     return sentences
-
-
-def _path_of(
-    number: int | None, objects: Mapping[int, IsatObject], parents: Mapping[int, int | None]
-) -> tuple[str, ...]:
-    """Return the texts from the outermost known ancestor down to an object."""
-    texts: list[str] = []
-    while number is not None:
-        texts.insert(0, objects[number].category)
-        number = parents[number]
-    return tuple(texts)
 
 
 def _dataset(name: str, title: str, frame: str) -> Dataset:

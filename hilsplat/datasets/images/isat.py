@@ -1,21 +1,25 @@
-"""Label files of the ISAT annotation tool, the format of LERF-OVS's labels.
+"""Label files of the ISAT annotation tool, the format of LERF-OVS's labels, and polygons as masks.
 
 `objects` is a list. In each object, `category` is the text, `segmentation` one polygon as a list of [x, y]
 (a list of polygons is also accepted), `bbox` [x1, y1, x2, y2]. `group` does not identify an object: its
 numbers restart and repeat. Unknown keys are ignored.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int, Int64
 
 from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.polygons import fill_polygons
+from hilsplat.datasets.labelled import check_label_size, image_size_hw
+
+Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
 LARGEST_SIDE_PX = 20_000
 """Limit on the image size stated in a label file; drawing regions at a wrong size could exhaust memory."""
@@ -23,6 +27,39 @@ LARGEST_SIDE_PX = 20_000
 SLACK_PX = 1.0
 """Distance by which vertices may be outside the image, and boxes may differ from their polygons, without a
 warning."""
+
+
+def fill_polygons(polygons: Sequence[Polygon], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Return the union of polygons (vertices x, y): truncated to integers, even-odd fill, border included.
+
+    This is OpenCV's `fillPoly` on int32 vertices, used by LangSplat's evaluation. Pixel (x, y) is the vertex
+    (x, y) itself: the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. Anything outside the image is clipped.
+    """
+    canvas = np.zeros(size_hw, dtype=np.uint8)
+    for polygon in polygons:  # a single call would omit pixels that two polygons share
+        cv2.fillPoly(canvas, [np.asarray(polygon).astype(np.int32)], 1)
+    return canvas.astype(bool)
+
+
+def trace_polygons(mask: Bool[np.ndarray, "H W"]) -> list[Int[np.ndarray, "_ 2"]]:
+    """Return disjoint polygons whose union, filled by `fill_polygons`, equals the mask exactly.
+
+    A polygon cannot have a hole, so the mask is cut vertically through the middle of each hole.
+    """
+    mode, every = cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE
+    contours, ranks = cv2.findContours(mask.astype(np.uint8), mode, every)
+    if not contours:
+        return []
+    holes = [contour for contour, rank in zip(contours, ranks[0], strict=True) if rank[3] >= 0]
+    middles = {int(contour[..., 0].min() + contour[..., 0].max() + 1) // 2 for contour in holes}
+    edges = [0, *sorted(middles), mask.shape[1]]
+    polygons: list[np.ndarray] = []
+    for left, right in pairwise(edges):
+        strip = np.ascontiguousarray(mask[:, left:right], np.uint8)
+        for contour in cv2.findContours(strip, mode, every)[0]:
+            points = contour.reshape(-1, 2).astype(np.int64) + np.array([left, 0])
+            polygons.append(np.concatenate([points, points[-1:].repeat(max(0, 3 - len(points)), axis=0)]))
+    return polygons
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +79,7 @@ class IsatObject:
     keys: Mapping[str, Any]
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """Rasterise the object (see `polygons.fill_polygons`)."""
+        """Rasterise the object (see `fill_polygons`)."""
         return fill_polygons(self.polygons, size_hw)
 
 
@@ -56,12 +93,12 @@ class IsatFile:
     warnings: tuple[str, ...] = ()
 
 
-def read_isat(path: Path) -> IsatFile:
-    """Read and check one label file.
+def read_isat(path: Path, image: Path | None = None) -> IsatFile:
+    """Read and check one label file, and compare its size with that of its image, if given.
 
     Raises:
         SceneError: the file is not JSON, a key is missing or has the wrong type, a polygon is entirely
-            outside the image, or a box is [x, y, width, height].
+            outside the image, a box is [x, y, width, height], or the image is not a scaled copy.
     """
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
@@ -71,7 +108,11 @@ def read_isat(path: Path) -> IsatFile:
             expected="JSON with info and objects",
             fix="unpack the labels again",
         ) from error
-    return parse_isat(path, content)
+    labels = parse_isat(path, content)
+    if image is None:
+        return labels
+    resized = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(image))
+    return replace(labels, warnings=(*labels.warnings, *resized))
 
 
 def parse_isat(path: Path, content: Any) -> IsatFile:

@@ -18,9 +18,8 @@ from hilsplat.datasets.labelled import (
     mask_region,
     posed_images,
     require_images,
-    unlisted_texts,
 )
-from hilsplat.datasets.published import PROMPTS
+from hilsplat.datasets.published import differences
 
 FOREGROUND = 129
 """Lowest grey value of the foreground: the published evaluation thresholds above 128."""
@@ -60,7 +59,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
             raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
         views[view] = tuple(regions)
     read = LabelledScene("lerf_mask", scene, images, folder, views)
-    warnings += unlisted_texts(read.prompts, PROMPTS["lerf_mask"].get(scene, ()))
+    warnings += differences("lerf_mask", scene, {}, read.prompts)
     return replace(read, warnings=tuple(warnings))
 
 

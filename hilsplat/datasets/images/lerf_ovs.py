@@ -15,19 +15,9 @@ import numpy as np
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import Dataset
-from hilsplat.datasets.images.isat import IsatFile, IsatObject, read_isat
-from hilsplat.datasets.images.polygons import fill_polygons
-from hilsplat.datasets.labelled import (
-    LabelledRegion,
-    LabelledScene,
-    check_label_size,
-    image_size_hw,
-    images_by_view,
-    missing_frames,
-    require_images,
-    unlisted_texts,
-)
-from hilsplat.datasets.published import FRAMES, PAIRS, PROMPTS
+from hilsplat.datasets.images.isat import IsatFile, IsatObject, fill_polygons, read_isat
+from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_view, require_images
+from hilsplat.datasets.published import FRAMES, PAIRS, differences
 from hilsplat.scene.view_names import view_name
 
 LAYOUT = """lerf_ovs/
@@ -48,15 +38,12 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
     for view, path in files.items():
-        labels = read_isat(path)
+        labels = read_isat(path, images[view])
         warnings += labels.warnings
-        warnings += check_label_size(f"label file {path}", labels.size_hw, image_size_hw(images[view]))
         views[view] = merged_regions(labels)
     read = LabelledScene("lerf_ovs", scene, images, root / scene, views)
-    listed = FRAMES["lerf_ovs"].get(scene, ())
-    warnings += missing_frames("label", listed, views)
-    warnings += unlisted_texts(read.prompts, PROMPTS["lerf_ovs"].get(scene, ()))
-    if set(views) == set(listed) and read.num_pairs != PAIRS[scene]:
+    warnings += differences("lerf_ovs", scene, {"label": views}, read.prompts)
+    if set(views) == set(FRAMES["lerf_ovs"].get(scene, ())) and read.num_pairs != PAIRS[scene]:
         warnings.append(
             f"{read.num_pairs} (frame, category) pairs, but the published figures imply {PAIRS[scene]}"
         )

@@ -15,11 +15,9 @@ from hilsplat.datasets.labelled import (
     image_size_hw,
     images_by_view,
     mask_region,
-    missing_frames,
     require_images,
-    unlisted_texts,
 )
-from hilsplat.datasets.published import FRAMES, PROMPTS
+from hilsplat.datasets.published import FRAMES, differences
 from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.view_names import view_name
 
@@ -65,8 +63,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
         view = view_name(place.name)
         views[view] = _regions(place, prompts, image_size_hw(images[view]), warnings)
     posed = (folder / "sparse").is_dir() or (folder / POSES_BOUNDS).is_file()
-    warnings += missing_frames("segmentation", FRAMES["3d_ovs"].get(scene, ()), views)
-    warnings += unlisted_texts(prompts, PROMPTS["3d_ovs"].get(scene, ()))
+    warnings += differences("3d_ovs", scene, {"segmentation": views}, prompts)
     return LabelledScene("3d_ovs", scene, images, folder if posed else None, views, tuple(warnings))
 
 

@@ -11,7 +11,7 @@ from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
-from hilsplat.datasets.images.polygons import fill_polygons
+from hilsplat.datasets.images.isat import fill_polygons
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from tests.conftest import PROJECT

@@ -10,9 +10,8 @@ from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.hi import ANNOTATED, HI_3DOVS, HI_LERF
-from hilsplat.datasets.images.isat import read_isat
+from hilsplat.datasets.images.isat import fill_polygons, read_isat, trace_polygons
 from hilsplat.datasets.images.lerf_ovs import open_scene
-from hilsplat.datasets.images.polygons import fill_polygons, trace_polygons
 from hilsplat.datasets.labelled import posed_images
 from hilsplat.datasets.published import PAIRS, PROMPTS
 from hilsplat.datasets.registry import open_labelled
