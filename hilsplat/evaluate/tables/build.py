@@ -11,8 +11,13 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.files import project_path
 from hilsplat.evaluate.scores import read_instances, read_scores
 from hilsplat.evaluate.tables.ablation import ablation_table, component_table, omega_table, theta_table
-from hilsplat.evaluate.tables.cost_tables import SECONDS, cost_table, efficiency_table, pruning_table
-from hilsplat.evaluate.tables.costs import read_costs
+from hilsplat.evaluate.tables.costs import (
+    SECONDS,
+    cost_table,
+    efficiency_table,
+    pruning_table,
+    read_costs,
+)
 from hilsplat.evaluate.tables.formats import as_csv, as_html, as_latex, as_markdown
 from hilsplat.evaluate.tables.image_tables import frames_table, hierarchy_table, lerf_table, ovs_table
 from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
