@@ -189,10 +189,9 @@ def add_scene(
             fix="choose another name, or remove its line from the sheet first",
         )
     root = project_root(sheet)
-    with prepared_photographs(photos, root / PHOTOS / name, frames) as existing:
-        folder = existing.folder
+    with prepared_photographs(photos, root / PHOTOS / name, frames) as (folder, made):
         extra = _trained(folder, {"poses": poses, "gaussians": gaussians, "features": features})
-        notes = [*existing.notes, *_notes(folder, extra)]
+        notes = [*made, *_notes(folder, extra)]
         annotated = root / "annotated" / PHOTOS / name
         files = _labels(folder, labels)
         if annotated.exists():

@@ -83,9 +83,9 @@ def photo_doubts(photos: Sequence[CheckedPhoto], *, have_poses: bool) -> list[st
     dark = [photo.name for photo in photos if np.percentile(photo.grey, 95) < DARK_LEVEL]
     white = [photo.name for photo in photos if (photo.grey >= WHITE_LEVEL).mean() > WHITE_SHARE]
     for names, advice in (
-        (blurred, "blurred: leave them out, or retake them with more light, a steady hand and correct focus"),
-        (dark, "too dark: take them again with more light"),
-        (white, "more than half white: take them again with less exposure, unless the background is white"),
+        (blurred, "blurred: omit them, or retake them with more light, a steady hand and correct focus"),
+        (dark, "too dark: retake them with more light"),
+        (white, "more than half white: retake them with less exposure, unless the background is white"),
     ):
         if names:
             doubts.append(f"{_listed(names, photos)} {advice}")
@@ -125,9 +125,10 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
         features.pop(row)
         if motion is None:
             continue
-        if motion.displacement < SAME_PLACE:
+        displacement, turn_share = motion
+        if displacement < SAME_PLACE:
             same.append(photos[row + 1].name)
-        elif motion.turn_share >= TURN_SHARE:
+        elif turn_share >= TURN_SHARE:
             turned += 1
         else:
             moved += 1
@@ -157,7 +158,7 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that another blur preserves.
 
     Crete et al., "The blur effect" (2007), with a box of 11 px: the larger of the values along x and y.
-    Unlike the variance of the Laplacian, it barely depends on the content. A flat picture has blur 1.
+    Unlike the variance of the Laplacian, it hardly depends on the content. A flat picture has blur 1.
     """
     values = grey.astype(np.float32)
     shares = []
@@ -167,19 +168,6 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
         total = float(steps.sum(dtype=np.float64))
         shares.append(1 - float(lost.sum(dtype=np.float64)) / total if total else 1.0)
     return max(shares)
-
-
-@dataclass(frozen=True)
-class PairMotion:
-    """Motion between two pictures, measured on their verified matches.
-
-    Attributes:
-        displacement: 90th percentile of the displacements, as a share of the diagonal.
-        turn_share: share of the matches explained by a rotation of the camera about its centre.
-    """
-
-    displacement: float
-    turn_share: float
 
 
 def _feature_size(grey: UInt8[np.ndarray, "h w"]) -> tuple[int, int]:
@@ -204,11 +192,13 @@ def pair_motion(
     one: tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]],
     other: tuple[Float32[np.ndarray, "m 2"], Float32[np.ndarray, "m 128"]],
     size_hw: tuple[int, int],
-) -> PairMotion | None:
+) -> tuple[float, float] | None:
     """Measure the motion between two pictures; None if too few matches agree with an epipolar geometry.
 
-    A homography would also explain a camera that moves in front of a wall or a carpet (measured: up to 0.97
-    of the matches), so a rotation (three parameters) is fitted, with the best of several focal lengths.
+    Return the displacement of the verified matches (90th percentile, as a share of the diagonal) and the
+    share of them that is explained by a rotation of the camera about its centre. A homography would also
+    explain a camera that moves in front of a wall or a carpet (measured: up to 0.97 of the matches), so a
+    rotation (three parameters) is fitted, with the best of several focal lengths.
     """
     if min(len(one[0]), len(other[0])) < MIN_MATCHES:
         return None
@@ -229,10 +219,8 @@ def pair_motion(
     if inliers is None or inliers.sum() < MIN_MATCHES:
         return None
     a, b = a[inliers.ravel() > 0].astype(np.float64), b[inliers.ravel() > 0].astype(np.float64)
-    return PairMotion(
-        displacement=float(np.percentile(np.linalg.norm(b - a, axis=1), 90) / np.hypot(*size_hw)),
-        turn_share=max(_turn_share(a, b, size_hw, focal * max(size_hw)) for focal in FOCALS),
-    )
+    displacement = float(np.percentile(np.linalg.norm(b - a, axis=1), 90) / np.hypot(*size_hw))
+    return displacement, max(_turn_share(a, b, size_hw, focal * max(size_hw)) for focal in FOCALS)
 
 
 def _turn_share(

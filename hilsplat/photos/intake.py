@@ -5,7 +5,6 @@ import stat
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from hilsplat.base.artifacts import atomic_folder, read_json, require_free_space, write_json
@@ -24,20 +23,13 @@ POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 """Suffixes of files that may contain poses or points; Record3D's `metadata` has no suffix."""
 
 
-@dataclass(frozen=True)
-class PreparedFolder:
-    """A scene's source, with notes on its conversion and on skipped files."""
-
-    folder: Path
-    notes: tuple[str, ...] = ()
-
-
 @contextmanager
-def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[PreparedFolder]:
-    """Yield the source folder of photographs itself, or `target`, made from videos or an archive.
+def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tuple[Path, list[str]]]:
+    """Yield a scene's folder, with notes on its conversion and on skipped files.
 
-    The source is a folder of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most
-    `frames` frames are taken from videos. If the block raises an error, the converted folder is removed.
+    It is the source itself or, for videos and archives, is made at `target`. The source is a folder of
+    photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most `frames` frames are
+    extracted from videos. If the block raises an error, the converted folder is removed.
 
     Raises:
         SceneError: the source cannot be used, or the target exists and was made from other files.
@@ -59,8 +51,8 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
 
     elif source.is_dir():
         beside = list_files(photo_folder(source), VIDEO_SUFFIXES)
-        note = f"{len(beside)} videos beside the photographs (Live Photos) are not used" if beside else ""
-        yield PreparedFolder(source, (note,) if note else ())
+        note = f"{len(beside)} videos beside the photographs (Live Photos) are not used"
+        yield source, [note] if beside else []
         return
     elif source.suffix.lower() in (".zip", ".r3d"):
 
@@ -86,7 +78,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[Pr
         fix = "choose another name for the scene, or move that folder away"
         raise SceneError(f"{target} already exists", fix=fix)
     try:
-        yield PreparedFolder(unwrapped(target), tuple(notes))
+        yield unwrapped(target), notes
     except BaseException:
         shutil.rmtree(target, ignore_errors=True)
         raise

@@ -62,7 +62,8 @@ class Frame:
 
 @dataclass
 class Decoding:
-    """Statistics of decoding: duration according to the file, time of the last intact frame, counts."""
+    """Statistics of decoding: duration according to the file (or None), time of the last intact frame,
+    counts."""
 
     stated_s: float | None = None
     decoded_s: float = 0.0
@@ -162,13 +163,6 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
         yield container, stream
 
 
-def _stated_seconds(container: InputContainer, stream: VideoStream) -> float | None:
-    """Return the duration according to the file; None if it is missing, as in browser recordings."""
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * stream.time_base)
-    return container.duration / av.time_base if container.duration is not None else None
-
-
 def _decoded(
     container: InputContainer, stream: VideoStream, decoding: Decoding
 ) -> Iterator[tuple[av.VideoFrame, float]]:
@@ -202,12 +196,15 @@ def _decoded(
 def _candidates(video: Path, position: int, most: int, decoding: Decoding) -> list[Frame]:
     """Return the sharpest frame of each of at most `most` equal time spans.
 
-    The stated duration may be missing or wrong. If there are too many spans, they are therefore merged in
-    pairs, keeping the sharper frame.
+    The stated duration may be wrong, or missing as in browser recordings. If there are too many spans, they
+    are therefore merged in pairs, keeping the sharper frame.
     """
     best: dict[int, Frame] = {}
     with _opened(video) as (container, stream):
-        decoding.stated_s = _stated_seconds(container, stream)
+        if stream.duration is not None and stream.time_base is not None:
+            decoding.stated_s = float(stream.duration * stream.time_base)
+        elif container.duration is not None:
+            decoding.stated_s = container.duration / av.time_base
         span_s = max((decoding.stated_s or 0.0) / most, 1e-3)
         expected = round((decoding.stated_s or 0.0) * float(stream.average_rate or USUAL_RATE)) or None
         decoded = track(_decoded(container, stream, decoding), f"frames of {video.name}", expected)
@@ -240,7 +237,8 @@ def _write_frames(video: Path, name_of_frame: dict[int, str], folder: Path) -> N
     with _opened(video) as (container, stream):
         for number, (frame, _) in enumerate(_decoded(container, stream, Decoding())):
             if number in missing:
-                pixels = upright(rgb_pixels(frame), frame.rotation)
+                # The display matrix rotates anticlockwise; only quarter turns are applied.
+                pixels = np.ascontiguousarray(np.rot90(rgb_pixels(frame), round(frame.rotation / 90) % 4))
                 Image.fromarray(pixels).save(folder / missing.pop(number), quality=JPEG_QUALITY)
             if not missing:
                 break
@@ -249,11 +247,6 @@ def _write_frames(video: Path, name_of_frame: dict[int, str], folder: Path) -> N
             f"video {video} decoded differently the second time: {len(missing)} frames are missing",
             fix="check that no program is writing to the file, and try again",
         )
-
-
-def upright(pixels: UInt8[np.ndarray, "H W 3"], rotation_deg: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Rotate a stored frame anticlockwise by its display matrix, rounded to a quarter turn."""
-    return np.ascontiguousarray(np.rot90(pixels, round(rotation_deg / 90) % 4))
 
 
 def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
