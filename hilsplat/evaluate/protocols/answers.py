@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int, UInt8
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
@@ -109,21 +109,3 @@ def mask_rows(
     }
     for metric in metrics:
         yield Measured(method, query.text, level, metric, protocol, values[metric]())
-
-
-def class_map_rows(
-    method: str,
-    protocol: str,
-    similarity: Float[np.ndarray, "K H W"],
-    truth: Bool[np.ndarray, "K H W"],
-    texts: Sequence[str],
-) -> Iterator[Measured]:
-    """Yield the rows of one view under `3d-ovs/argmax`: IoU of each class and pixel accuracy.
-
-    `similarity` is the cosine of each pixel with each text. Texts are sorted, as the first one wins ties.
-    """
-    prediction = masks.argmax_masks(similarity)
-    for row, text in enumerate(texts):
-        yield Measured(method, text, "", "iou", protocol, masks.iou(prediction[row], truth[row]))
-    accuracy = masks.pixel_accuracy(prediction, truth)
-    yield Measured(method, "", "", "pixel_accuracy", protocol, accuracy, truth[0].size)

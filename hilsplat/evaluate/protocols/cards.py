@@ -6,7 +6,7 @@ card that affects its numbers requires a new version; a test checks this.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hilsplat.base.errors import ArtifactError
@@ -22,16 +22,10 @@ RELEVANCY_SCALE = 10.0
 NODE_SELECT = 0.95
 """A node answers a text if its cosine margin is below that of the best node in the view by at most
 1 - NODE_SELECT of the range of margins at its level, or three times that if the two nodes' cosine is at least
-0.9.
-
-Version 1 of `lerf/tree-nodes`, `hierarchy/level-given` and `-auto` used 0.85 of the range of the
-relevancies themselves. Up to version 3 of these, 2 of `hierarchy/path` and 1 of `world/view-consistency`,
-that cosine was ignored, and all nodes of the scene competed in every view. Up to version 4 of
-`lerf/tree-nodes` and `hierarchy/level-auto`, and 1 of LangSplat's variants, the coarsest level won ties."""
+0.9."""
 
 ANCESTORS = 0.2
-"""Share of the mean margin of a node's ancestors that is added to its own, except on paths; version 2 of
-`lerf/tree-nodes`, `hierarchy/level-given` and `-auto` added nothing."""
+"""Share of the mean margin of a node's ancestors that is added to its own, except on paths."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
 """How rows are averaged into a number in a table.
@@ -176,15 +170,12 @@ LERF_MASK = ProtocolCard(
     "Gaussian Grouping; departs: a missing prediction and two empty masks (there, NaN) count as 0",
     public=GAUSSIAN_GROUPING,
 )
-LERF_MASK_SKIPPING = ProtocolCard(
-    "lerf-mask/gaussian-grouping-skipping",
-    1,
-    MASK,
-    "classes",
-    "the method's own masks, one per prompt",
-    "Gaussian Grouping, skipping missing predictions; departs: two empty masks count as 0 (there, NaN)",
+LERF_MASK_SKIPPING = replace(
+    LERF_MASK,
+    name="lerf-mask/gaussian-grouping-skipping",
+    source="Gaussian Grouping, skipping missing predictions; departs: two empty masks count as 0 "
+    "(there, NaN)",
     missing="left out",
-    public=GAUSSIAN_GROUPING,
 )
 OVS_NODES = ProtocolCard(
     "3d-ovs/tree-nodes",
@@ -215,8 +206,6 @@ INSTANCES = ProtocolCard(
     classes="scannet200-instances",
     public="OpenMask3D/openmask3d@6488748 openmask3d/evaluation/eval_semantic_instance.py:evaluate_matches",
 )
-
-
 OVS_LANGSPLAT_V2 = ProtocolCard(
     "3d-ovs/langsplat-v2",
     3,

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.metrics.masks import peak_points
+from hilsplat.evaluate.metrics.masks import argmax_masks, iou, peak_points, pixel_accuracy
 from hilsplat.evaluate.metrics.relevancy_rule import Border, RelevancyRule, SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import NO_POINTS, class_map_rows, mask_rows, relevancy_of
+from hilsplat.evaluate.protocols.answers import NO_POINTS, mask_rows, relevancy_of
 from hilsplat.evaluate.protocols.cards import (
     LERF_LANGSPLAT,
     LERF_MASK,
@@ -133,8 +133,13 @@ def argmax_rows(
     rows, columns = kept_by_pillow(size_hw, truth.shape[1:])
     compared = truth.any(axis=0) if is_stand_in else np.full(truth.shape[1:], True)
     pixels = (rows[:, None] * size_hw[1] + columns)[compared]
-    if len(pixels):
-        protocol = OVS_ARGMAX.labelled([*(["labelled pixels"] if is_stand_in else []), *words])
-        texts = [query.text for query in ordered]
-        similarity = cosine_of(texts, pixels).max(axis=1)
-        yield from class_map_rows(method, protocol, similarity[:, None], truth[:, None, compared], texts)
+    if not len(pixels):
+        return
+    protocol = OVS_ARGMAX.labelled([*(["labelled pixels"] if is_stand_in else []), *words])
+    texts = [query.text for query in ordered]
+    prediction = argmax_masks(cosine_of(texts, pixels).max(axis=1)[:, None])
+    truth = truth[:, None, compared]
+    for row, text in enumerate(texts):
+        yield Measured(method, text, "", "iou", protocol, iou(prediction[row], truth[row]))
+    accuracy = pixel_accuracy(prediction, truth)
+    yield Measured(method, "", "", "pixel_accuracy", protocol, accuracy, len(pixels))
