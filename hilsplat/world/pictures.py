@@ -49,7 +49,7 @@ _GREYS = ((0.66, 0.66, 0.64), (0.63, 0.63, 0.61))
 _GROUND = Paint("grey", "mottled", *_GREYS, 3.0, 0.0, 10.0, 0.1, (5.0, 6.0, 7.0))
 
 
-def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> None:
+def draw_classes(out: Path, names: Sequence[str] = TABLETOP) -> None:
     """Draw one object of each named tabletop class, as PNG."""
     from matplotlib.figure import Figure
 
@@ -57,7 +57,7 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP, seed: int = 0) -> N
     figure = Figure(figsize=(1.5 * CLASS_COLUMNS, 1.68 * rows), dpi=100)
     for index, name in enumerate(names):
         logger.info("draw %s", name)
-        scene, camera = _alone(build_object(name, np.random.default_rng(seed)))
+        scene, camera = _alone(build_object("tabletop", name, np.random.default_rng(0)))
         axes = figure.add_subplot(rows, CLASS_COLUMNS, index + 1)
         axes.imshow(render_view(scene, camera, 3))
         axes.set_axis_off()
@@ -94,7 +94,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
     across = 2  # scenes side by side, each with four panels
     rows = -(-len(seeds) // across)
     figure = Figure(figsize=(PANEL_INCHES * 4 * across, PANEL_INCHES * rows + 0.25), dpi=100)
-    titles = ["", *(level.label for level in LEVELS)]
+    titles = ["view", *(level.label for level in LEVELS)]
     for index, seed in enumerate(seeds):
         logger.info("draw %s:%d", kind, seed)
         scene = build_scene(kind, seed, OBJECTS)
@@ -113,7 +113,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
             axes.imshow(panel, interpolation="nearest" if column else None)
             axes.set_axis_off()
             if index < across:
-                axes.set_title(title or "view", fontsize=10, pad=3)
+                axes.set_title(title, fontsize=10, pad=3)
             if column == 0:
                 _write_name(axes, 0.03, f"{kind} {seed}", 7.5)
     top = 1 - 0.24 / (PANEL_INCHES * rows + 0.25)

@@ -15,7 +15,7 @@ from hilsplat.base.compiled import compiled
 from hilsplat.scene.cameras import Camera
 from hilsplat.world.paints import srgb_from_linear
 from hilsplat.world.rays import Hits
-from hilsplat.world.scenes.scene import Style, WorldScene
+from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.textures import albedo, grains, hash01
 
 RAYS_PER_PIXEL = 9
@@ -36,23 +36,20 @@ def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
     return _labels(scene, scene.caster.nearest(*_rays(camera, 1)).triangle, camera.size_hw)
 
 
-def render_view(
-    scene: WorldScene, camera: Camera, samples: int, style: Style | None = None
-) -> UInt8[np.ndarray, "H W 3"]:
+def render_view(scene: WorldScene, camera: Camera, samples: int) -> UInt8[np.ndarray, "H W 3"]:
     """Render a view with soft shadows, occluded sky light, highlights and solid textures.
 
     Args:
         samples: sub-samples per pixel side; 3 gives clean edges, 1 is for previews.
-        style: light and exposure; None uses the scene's own.
     """
-    return _rendered(scene, camera, samples, style or scene.style)[0]
+    return _rendered(scene, camera, samples)[0]
 
 
 def render_and_label(
     scene: WorldScene, camera: Camera, samples: int
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, "3 H W"]]:
     """Render and label a view; if `samples` is odd, the labels reuse the middle sub-samples' hits."""
-    image, middle = _rendered(scene, camera, samples, scene.style)
+    image, middle = _rendered(scene, camera, samples)
     return image, _labels(scene, middle, camera.size_hw) if samples % 2 else label_view(scene, camera)
 
 
@@ -62,7 +59,7 @@ def _labels(scene: WorldScene, prim: np.ndarray, size_hw: tuple[int, int]) -> In
 
 
 def _rendered(
-    scene: WorldScene, camera: Camera, samples: int, style: Style
+    scene: WorldScene, camera: Camera, samples: int
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, " P"]]:
     """Return a view, and the triangle that the middle sub-sample of each pixel hits (-1 none).
 
@@ -76,17 +73,17 @@ def _rendered(
         origin, directions = _rays(camera, samples, rows)
         hits = scene.caster.nearest(origin, directions)
         pixels = slice(rows.start * width, rows.stop * width)
-        image[pixels] = _reflected(scene, hits, directions, samples, style)
+        image[pixels] = _reflected(scene, hits, directions, samples)
         middle[pixels] = hits.triangle[samples**2 // 2 :: samples**2]
     srgb = srgb_from_linear(np.clip(image, 0, 1))
     return (srgb * 255 + 0.5).astype(np.uint8).reshape(height, width, 3), middle
 
 
 def _reflected(
-    scene: WorldScene, hits: Hits, directions: np.ndarray, samples: int, style: Style
+    scene: WorldScene, hits: Hits, directions: np.ndarray, samples: int
 ) -> Float32[np.ndarray, "P 3"]:
     """Return the linear light of pixels from the hits and directions of their sub-samples."""
-    prim = hits.triangle
+    prim, style = hits.triangle, scene.style
     count = len(prim)
     points, facets, shading, colours = (np.empty((count, 3), np.float32) for _ in range(4))
     surface = (points, facets, shading, colours, np.empty((count, 2), np.float32))

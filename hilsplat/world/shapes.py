@@ -34,9 +34,13 @@ class Mesh:
         """Shift the mesh."""
         return Mesh(self.triangles + np.array([x, y, z]), self.normals)
 
-    def scaled(self, x: Number, y: Number | None = None, z: Number | None = None) -> "Mesh":
-        """Scale about the origin by positive factors; a single factor scales all axes."""
-        factors = np.array([x, x if y is None else y, x if z is None else z])
+    def both_sides(self, x: Number, y: Number, z: Number) -> "Mesh":
+        """Return two copies in one mesh, moved to (x, -y, z) and (x, y, z)."""
+        return joined(self.moved(x, -y, z), self.moved(x, y, z))
+
+    def scaled(self, x: Number, y: Number, z: Number) -> "Mesh":
+        """Scale about the origin by positive factors."""
+        factors = np.array([x, y, z])
         return Mesh(self.triangles * factors, _unit(self.normals / factors))
 
     def turned(self, axis: str, degrees: Number) -> "Mesh":
@@ -172,14 +176,13 @@ def cylinder(radius: Number, bottom: Number, top: Number, segments: int = 28, be
     if bevel <= 0:
         return lathe([(0, bottom), (radius, bottom), (radius, top), (0, top)], segments)
     lower = [(0, bottom), (radius - bevel, bottom), (radius, bottom + bevel)]
-    upper = [(radius, top - bevel), (radius - bevel, top), (0, top)]
-    return lathe(lower + upper, segments)
+    return lathe([*lower, (radius, top - bevel), (radius - bevel, top), (0, top)], segments)
 
 
 def ellipsoid(radii: Point, centre: Point = (0.0, 0.0, 0.0), segments: int = 24, rings: int = 12) -> Mesh:
     """Return an ellipsoid with the given semi-axes."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, rings + 1)
-    profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
+    profile = [(float(np.cos(a)), float(np.sin(a))) for a in angle]
     profile[0], profile[-1] = (0.0, -1.0), (0.0, 1.0)
     return lathe(profile, segments).scaled(*radii).moved(*centre)
 
@@ -190,7 +193,9 @@ def sphere(radius: Number, centre: Point = (0.0, 0.0, 0.0), segments: int = 24) 
 
 
 def sweep(
-    path: Sequence[Sequence[Number] | np.ndarray], radius: Number | Sequence[Number], segments: int = 12
+    path: Sequence[Sequence[Number] | np.ndarray] | np.ndarray,
+    radius: Number | Sequence[Number],
+    segments: int = 12,
 ) -> Mesh:
     """Return a round tube along a polyline, closed at both ends.
 
@@ -228,11 +233,14 @@ def sweep(
 
 
 def arc(
-    radii: tuple[Number, Number], start_deg: Number, stop_deg: Number, steps: int = 14
-) -> list[tuple[float, float, float]]:
-    """Return an elliptic arc in the x-z plane as a path for `sweep`; 0 degrees is +x, 90 is +z."""
-    angle = np.radians(np.linspace(start_deg, stop_deg, steps + 1))
-    return [(float(radii[0] * np.cos(a)), 0.0, float(radii[1] * np.sin(a))) for a in angle]
+    radii: tuple[Number, Number], start_deg: Number, stop_deg: Number, centre: Point, axis: str = "y"
+) -> Float[np.ndarray, "15 3"]:
+    """Return an elliptic arc about y or x as a path for `sweep`; 0 degrees is +x or +y, and 90 is +z."""
+    points = np.zeros((15, 3))
+    for row, angle in enumerate(np.radians(np.linspace(start_deg, stop_deg, len(points)))):
+        points[row, 0 if axis == "y" else 1] = radii[0] * np.cos(angle)
+        points[row, 2] = radii[1] * np.sin(angle)
+    return points + np.array(centre)
 
 
 def extrude(outline: Sequence[tuple[Number, Number]], depth: Number) -> Mesh:

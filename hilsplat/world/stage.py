@@ -115,9 +115,7 @@ def _record(source: str, scene: WorldScene) -> dict[str, object]:
     }
 
 
-@lru_cache(maxsize=1)
-def _scene(kind: str, seed: int, objects: int) -> WorldScene:
-    return build_scene(kind, seed, objects)
+_scene = lru_cache(maxsize=1)(build_scene)
 
 
 def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:

@@ -103,11 +103,8 @@ def faults_label(settings: PerturbSettings) -> str:
     """
     if not any(np.any(getattr(settings, fault)) for fault in FAULTS):
         return f"{SEGMENTER} (exact)"
-    usual = PerturbSettings()
     changed = []
-    for name in PerturbSettings.model_fields:
-        value = getattr(settings, name)
-        if value != getattr(usual, name):
-            text = "/".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value}"
-            changed.append(f"{name} {text}")
+    for name, value in settings.model_dump(exclude_defaults=True).items():
+        text = "/".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value}"
+        changed.append(f"{name} {text}")
     return f"{SEGMENTER} ({', '.join(changed)})" if changed else SEGMENTER

@@ -20,8 +20,7 @@ from hilsplat.world.shapes import (
 
 
 def backpack(b: Builder) -> None:
-    cloth, second, strap_paint = b.paint("cloth"), b.paint("cloth"), b.paint("cloth")
-    metal = b.paint("metal")
+    cloth, second, strap_paint, metal = b.paints("cloth", "cloth", "cloth", "metal")
     w, d, h = b.between(0.52, 0.60), b.between(0.28, 0.33), b.between(0.68, 0.76)
     bag = b.part("bag, main compartment, body", cloth, box((d, w, h), (0, 0, h / 2), 0.09))
     bag.subpart("bottom, base", "plastic", box((d + 0.03, w + 0.03, 0.15), (0, 0, 0.075), 0.04), at="of")
@@ -29,11 +28,11 @@ def backpack(b: Builder) -> None:
     for side in (-1, 1):
         shape = box((d * 0.66, 0.11, h * 0.34), (0, side * (w / 2 + 0.03), h * 0.32), 0.03)
         sides.put(b.paint("cloth") if side < 0 else strap_paint, shape)
-    shapes = [box((d + 0.07, w + 0.05, 0.13), (0.02, 0, h + 0.0), 0.05)]
+    shapes = [box((d + 0.07, w + 0.05, 0.13), (0.02, 0, h), 0.05)]
     shapes += [box((0.06, w * 0.96, h * 0.24), (d / 2 + 0.03, 0, h * 0.90), 0.02)]
     flap = b.part("flap, top flap, lid", second, *shapes)
-    shapes = [box((0.06, 0.11, 0.20), (d / 2 + 0.07, side * w * 0.27, h * 0.76), 0.015) for side in (-1, 1)]
-    flap.subpart("buckles, clasps", metal, *shapes)
+    shape = box((0.06, 0.11, 0.20), bevel=0.015).both_sides(d / 2 + 0.07, w * 0.27, h * 0.76)
+    flap.subpart("buckles, clasps", metal, shape)
     flap.subpart("loop, carry loop", strap_paint, ring(0.10, 0.038, (-0.02, 0, h + 0.10), "x"), at="of")
     shape = box((0.15, w * 0.72, h * 0.40), (d / 2 + 0.06, 0, h * 0.36), 0.05)
     pocket = b.part("front pocket, pocket", "cloth", shape)
@@ -55,16 +54,15 @@ def backpack(b: Builder) -> None:
 
 
 def boot(b: Builder) -> None:
-    leather, upper, sole_paint = b.paint("plain"), b.paint("cloth"), b.paint("plastic")
+    leather, upper, sole_paint = b.paints("plain", "cloth", "plastic")
     length, w, h = b.between(0.80, 0.90), b.between(0.30, 0.34), b.between(0.72, 0.82)
     heel_x, toe_x = -length * 0.36, length * 0.58
 
     def outline(z: float, grow: float, toe: float) -> list[tuple[float, float, float]]:
         angle = np.linspace(0, 2 * np.pi, 21)[:-1]
-        x, y = np.cos(angle), np.sin(angle)
         middle, reach = (heel_x + toe) / 2, (toe - heel_x) / 2
         points = []
-        for c, s in zip(x, y, strict=True):
+        for c, s in zip(np.cos(angle), np.sin(angle), strict=True):
             along = middle + reach * grow * (np.sign(c) * abs(c) ** 0.75)
             points.append((along, w / 2 * grow * (np.sign(s) * abs(s) ** 0.8), z))
         return points
@@ -98,8 +96,7 @@ def boot(b: Builder) -> None:
 
 
 def lantern(b: Builder) -> None:
-    metal = b.paint("metal")
-    glass = b.paint("plastic yellow white orange teal")
+    metal, glass = b.paints("metal", "plastic yellow white orange teal")
     glow = b.paint("plain red orange yellow")
     r, h = b.between(0.25, 0.29), b.between(0.40, 0.46)
     low = 0.20
@@ -110,15 +107,13 @@ def lantern(b: Builder) -> None:
     base.subpart("knob, wick wheel", "plastic", disc(0.075, 0, 0.16, 20, 0.02).moved(r * 0.92, 0, 0.085))
     profile = [(r * 0.62, low), (r * 0.80, low + h * 0.35), (r * 0.80, low + h * 0.6), (r * 0.60, low + h)]
     lamp = b.part("glass, globe, window", glass, lathe(profile))
-    flame = lamp.subpart("flame, light")
-    for a in range(0, 360, 90):
-        # The flame is on each side of the glass, because the inside of an opaque globe is never visible.
-        shape = lathe([(0, -0.02), (0.085, 0.06), (0.06, 0.14), (0, 0.25)]).scaled(0.30, 1, 1)
-        flame.put(glow, shape.moved(r * 0.80, 0, low + h * 0.28).turned("z", a + 45))
-    cage = b.part("cage, bars, guard")
-    bar = b.paint("plain black grey brown red blue")
-    for a in range(0, 360, 90):
-        cage.put(bar, box((0.05, 0.05, h), (r * 0.92, 0, low + h / 2), 0.012).turned("z", a))
+    # The flame is on each side of the glass, because the inside of an opaque globe is never visible.
+    flame = lathe([(0, -0.02), (0.085, 0.06), (0.06, 0.14), (0, 0.25)]).scaled(0.30, 1, 1)
+    flame = flame.moved(r * 0.80, 0, low + h * 0.28)
+    lamp.subpart("flame, light", glow, *[flame.turned("z", a) for a in (45, 135, 225, 315)])
+    bar = box((0.05, 0.05, h), (r * 0.92, 0, low + h / 2), 0.012)
+    bars = [bar.turned("z", a) for a in range(0, 360, 90)]
+    cage = b.part("cage, bars, guard", "plain black grey brown red blue", *bars)
     cage.subpart("hoop, middle ring", "metal", ring(r * 0.95, 0.032, (0, 0, low + h * 0.16)))
     roof, top = b.part("roof, cap, hood"), low + h
     profile = [(0, top - 0.01), (r * 1.2, top), (r * 1.12, top + 0.06)]
@@ -126,36 +121,30 @@ def lantern(b: Builder) -> None:
     roof.put(metal, lathe(profile))
     shape = lathe([(0.085, 0), (0.085, 0.08), (0.14, 0.09), (0.14, 0.145), (0, 0.17)]).moved(z=top + 0.17)
     roof.subpart("chimney, vent", "plastic", shape)
-    path = [(0, y, top + 0.08 + z) for y, _, z in arc((r * 1.22, 0.42), -4, 184)]
-    handle = b.part("handle, bail", "metal", sweep(path, 0.03))
-    grip = [(0, y, top + 0.08 + z) for y, _, z in arc((r * 1.22, 0.42), 58, 122)]
-    handle.subpart("grip", "wood", sweep(grip, 0.065), at="of")
+    radii, centre = (r * 1.22, 0.42), (0, 0, top + 0.08)
+    handle = b.part("handle, bail", "metal", sweep(arc(radii, -4, 184, centre, "x"), 0.03))
+    handle.subpart("grip", "wood", sweep(arc(radii, 58, 122, centre, "x"), 0.065), at="of")
 
 
 def chest(b: Builder) -> None:
-    wood = b.paint("wood")
-    metal = b.paint("metal")
-    gold = b.paint("metal yellow orange")
+    wood, metal, gold = b.paints("wood", "metal", "metal yellow orange")
     d, w, h = b.between(0.46, 0.54), b.between(0.74, 0.84), b.between(0.34, 0.40)
-    shapes = [box((d, w, 0.06), (0, 0, 0.05))]
-    shapes += [box((0.05, w, h), (side * (d / 2 - 0.025), 0, h / 2 + 0.02)) for side in (-1, 1)]
-    shapes += [box((d, 0.05, h), (0, side * (w / 2 - 0.025), h / 2 + 0.02)) for side in (-1, 1)]
-    chest = b.part("box, trunk, body", wood, *shapes)
-    bands = chest.subpart("bands, straps, iron bands")
-    for side, x in CORNERS:
-        shape = box((0.05, 0.105, h + 0.02), (x * (d / 2 + 0.005), side * w * 0.33, h / 2 + 0.02), 0.01)
-        bands.put(metal, shape)
+    walls = [box((0.05, w, h), (side * (d / 2 - 0.025), 0, h / 2 + 0.02)) for side in (-1, 1)]
+    ends = box((d, 0.05, h)).both_sides(0, w / 2 - 0.025, h / 2 + 0.02)
+    chest = b.part("box, trunk, body", wood, box((d, w, 0.06), (0, 0, 0.05)), *walls, ends)
+    band = box((0.05, 0.105, h + 0.02), (0, 0, h / 2 + 0.02), 0.01)
+    bands = [band.moved(x * (d / 2 + 0.005), side * w * 0.33) for side, x in CORNERS]
+    chest.subpart("bands, straps, iron bands", metal, *bands)
     chest.subpart("lock, padlock", "metal", box((0.08, 0.19, 0.20), (d / 2 + 0.02, 0, h - 0.08), 0.03))
     handles = chest.subpart("handles, side rings")
     for side in (-1, 1):
         handles.put("metal", ring(0.10, 0.035, (0, side * (w / 2 + 0.03), h * 0.52), "y"))
     lid, r = b.part("lid, cover"), d / 2
     half = [(r * np.cos(a), r * np.sin(a) * 0.8) for a in np.linspace(0, np.pi, 13)]
-    back = (-d / 2, h + 0.02)
 
     def opened(mesh):
         """Rotate a mesh by 50 degrees about the hinge at the upper back edge."""
-        return mesh.moved(r, 0, 0).turned("y", -50).moved(back[0], 0, back[1])
+        return mesh.moved(r, 0, 0).turned("y", -50).moved(-d / 2, 0, h + 0.02)
 
     lid.put("wood", opened(extrude(half, w)))
     lid.subpart("lining, inside", "cloth", opened(box((d * 0.84, w * 0.88, 0.03), (0, 0, -0.01))), at="of")
@@ -171,7 +160,7 @@ def chest(b: Builder) -> None:
 
 
 def cactus(b: Builder) -> None:
-    green, pot_paint = b.paint("plain green teal"), b.paint("ceramic")
+    green, pot_paint = b.paints("plain green teal", "ceramic")
     petal = b.paint("plain pink red yellow orange purple white")
     r, h = b.between(0.145, 0.17), b.between(0.72, 0.85)
     pot = b.part("pot, planter", pot_paint, lathe([(0, 0), (0.22, 0), (0.30, 0.30), (0, 0.28)]))
@@ -183,11 +172,9 @@ def cactus(b: Builder) -> None:
     shapes = [sweep([(0, 0, 0.28), (0, 0, h), (0, 0, h + r * 0.7)], [r, r, r * 0.62])]
     shapes += [ellipsoid((r * 0.62, r * 0.62, r * 0.4), (0, 0, h + r * 0.7))]
     stem = b.part("stem, trunk, column", green, *shapes)
-    ribs = stem.subpart("ribs, ridges")
-    rib = b.paint("plain yellow green white beige teal")
-    for k in range(6):
-        shape = sweep([(r, 0, 0.34), (r, 0, h - 0.05), (r * 0.7, 0, h + r * 0.55)], 0.032).turned("z", 60 * k)
-        ribs.put(rib, shape)
+    rib = sweep([(r, 0, 0.34), (r, 0, h - 0.05), (r * 0.7, 0, h + r * 0.55)], 0.032)
+    ribs = [rib.turned("z", 60 * k) for k in range(6)]
+    stem.subpart("ribs, ridges", "plain yellow green white beige teal", *ribs)
     top = h + r * 0.95
     single = ellipsoid((0.10, 0.065, 0.035)).turned("y", -30).moved(0.10, 0, top + 0.03)
     shapes = [single.turned("z", 72 * k) for k in range(5)]
@@ -204,14 +191,12 @@ def cactus(b: Builder) -> None:
 
 
 def windmill(b: Builder) -> None:
-    wall = b.paint(str(b.rng.choice(["brick", "stone", "plain"])))
-    roof_paint = b.paint("plain")
-    wood = b.paint("wood")
+    wall, roof_paint, wood = b.paints(str(b.rng.choice(["brick", "stone", "plain"])), "plain", "wood")
     h, r = b.between(0.72, 0.82), b.between(0.27, 0.31)
     base = b.part("base, terrace, platform", "stone", cylinder(r * 1.45, 0, 0.11, 36, 0.02))
-    shapes = [box((0.20, 0.34, 0.08), (r * 1.45, 0, 0.04), 0.01)]
-    shapes += [box((0.13, 0.26, 0.15), (r * 1.33, 0, 0.075), 0.01)]
-    base.subpart("stairs, steps", "plain", *shapes, at="of")
+    low_step = box((0.20, 0.34, 0.08), (r * 1.45, 0, 0.04), 0.01)
+    step = box((0.13, 0.26, 0.15), (r * 1.33, 0, 0.075), 0.01)
+    base.subpart("stairs, steps", "plain", low_step, step, at="of")
     tower = b.part("tower, mill body", wall, lathe([(r, 0.10), (r * 0.68, h)], 32))
     tower.subpart("door, entrance", "wood", box((0.10, 0.26, 0.33), (r * 0.90, 0, 0.27), 0.01))
     shapes = [box((0.08, 0.18, 0.20), (r * 0.83, 0, h * 0.55), 0.01).turned("z", a) for a in (75, 180, 285)]
@@ -226,9 +211,9 @@ def windmill(b: Builder) -> None:
     x, z = r * 0.80 + 0.10, h + 0.10
     hub = b.part("hub, axle", wood, disc(0.135, -0.20, 0.08, 24, 0.02).moved(x, 0, z))
     hub.subpart("cap, nut", "plastic", ellipsoid((0.09, 0.11, 0.11), (x + 0.12, 0, z)))
-    frame, cloth, turn = b.paint("wood"), b.paint("cloth"), b.between(15, 75)
-    for k in range(4):
-        angle = turn + 90 * k
+    frame, cloth = b.paints("wood", "cloth")
+    turn = b.between(15, 75)
+    for angle in (turn, turn + 90, turn + 180, turn + 270):
         shape = box((0.05, 0.075, 0.62), (0, 0, 0.32), 0.012).turned("x", angle).moved(x, 0, z)
         blade = b.part("blade, vane", frame, shape)
         shape = box((0.035, 0.17, 0.44), (0.01, 0.10, 0.40), 0.008).turned("x", angle).moved(x, 0, z)
@@ -236,7 +221,7 @@ def windmill(b: Builder) -> None:
 
 
 def birdhouse(b: Builder) -> None:
-    wood, roof_paint, dark = b.paint("wood"), b.paint("plain"), b.paint("plain black")
+    wood, roof_paint, dark = b.paints("wood", "plain", "plain black")
     w, h, low = b.between(0.44, 0.50), b.between(0.40, 0.46), 0.42
     rise, half = 0.24, w / 2
     post = b.part("post, pole", "wood", box((0.11, 0.11, low), (0, 0, low / 2), 0.015))
@@ -246,12 +231,12 @@ def birdhouse(b: Builder) -> None:
     x = w * 0.43
     body.subpart("hole, entrance", dark, disc(0.10, -0.01, 0.015, 28).moved(x, 0, low + h * 0.70))
     body.subpart("perch, stick", "plain", disc(0.058, -0.02, 0.22, 16, 0.01).moved(x, 0, low + h * 0.30))
-    shape = disc(0.10, -0.03, 0.02, 24).moved(-x - 0.0, 0, low + h * 0.55)
+    shape = disc(0.10, -0.03, 0.02, 24).moved(-x, 0, low + h * 0.55)
     body.subpart("heart, back window", "plain red pink yellow", shape)
     roof = b.part("roof")
     slope, angle = float(np.hypot(half, rise)), float(np.degrees(np.arctan2(rise, half)))
     for side in (-1, 1):
-        slab = box((w * 1.14, slope + 0.12, 0.05), (0, 0, 0), 0.012).turned("x", -side * angle)
+        slab = box((w * 1.14, slope + 0.12, 0.05), bevel=0.012).turned("x", -side * angle)
         roof.put(roof_paint, slab.moved(0, side * (half / 2 + 0.035), low + h + rise / 2 + 0.015))
     shape = box((w * 1.18, 0.10, 0.075), (0, 0, low + h + rise + 0.035), 0.02)
     roof.subpart("ridge, ridge beam", "wood", shape)
@@ -262,12 +247,11 @@ def birdhouse(b: Builder) -> None:
     bird = b.part("bird, little bird", "plain red blue yellow orange teal purple", *shapes)
     shape = lathe([(0, 0), (0.075, 0), (0, 0.17)], 14).turned("y", 90).moved(0.195, 0, z + 0.11)
     bird.subpart("beak, bill", "plain orange yellow black", shape)
-    shapes = [ellipsoid((0.12, 0.045, 0.07), (-0.04, s * 0.11, z + 0.02)) for s in (-1, 1)]
-    bird.subpart("wings", "plain", *shapes)
+    bird.subpart("wings", "plain", ellipsoid((0.12, 0.045, 0.07)).both_sides(-0.04, 0.11, z + 0.02))
 
 
 def watering_can(b: Builder) -> None:
-    tin, second = b.paint("metal"), b.paint("plastic")
+    tin, second = b.paints("metal", "plastic")
     r, h = b.between(0.30, 0.34), b.between(0.46, 0.52)
     body = b.part("body, tank, can", tin, lathe([(0, 0.02), (r, 0.02), (r * 0.88, h), (0, h)], 32))
     profile = [(0, 0), (r * 1.07, 0), (r * 1.07, 0.10), (r * 0.98, 0.11)]

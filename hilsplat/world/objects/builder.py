@@ -1,7 +1,6 @@
 """Construction of an object of the synthetic world as a true tree of whole, parts and subparts."""
 
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -25,7 +24,6 @@ CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
 
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
 _TOUCH = 0.03  # maximum gap between touching boxes, as a share of the object's size
-_PREVAILS = {1: 0.5, 2: 0.6, 3: 0.6}  # minimum share of a surface whose colour or material is named, by level
 
 
 @dataclass(frozen=True)
@@ -110,6 +108,10 @@ class Builder:
         self.pieces: list[tuple[int, Mesh, Paint]] = []
         self.added(1, NONE, names)
 
+    def paints(self, *specs: str) -> list[Paint]:
+        """Draw one paint for each specification (see `PaintBox.draw`)."""
+        return [self.paint(spec) for spec in specs]
+
     def between(self, low: float | int, high: float | int) -> float:
         """Draw a uniform random number."""
         return float(self.rng.uniform(low, high))
@@ -183,8 +185,7 @@ class Builder:
         for row, parts in corners.items():
             points = np.concatenate(parts)
             boxes[row] = np.stack([points.min(axis=0), points.max(axis=0)])
-        whole = np.stack(list(boxes.values()))
-        reach = _TOUCH * float(np.ptp(whole.reshape(-1, 3), axis=0).max())
+        reach = _TOUCH * float(np.ptp(np.concatenate(list(boxes.values())), axis=0).max())
         settled: dict[tuple[int, str, str], Paint] = {}
         repaint: dict[tuple[int, Paint], Paint] = {}
         for key, rows in groups.items():
@@ -221,8 +222,9 @@ class Builder:
             others += [f"{node.word} of the {alias}" for alias in whole.aliases]
         if node.level == 3:
             others.append(f"{node.word} {node.at} the {whole.word} {self.nodes[node.parent].word}")
-        colour, coloured = _prevailing(area, _PREVAILS[node.level], lambda paint: paint.colour)
-        material, made = _prevailing(area, _PREVAILS[node.level], lambda paint: paint.adjective)
+        least = 0.5 if node.level == 1 else 0.6
+        colour, coloured = _prevailing([(paint.colour, size) for paint, size in area.items()], least)
+        material, made = _prevailing([(paint.adjective, size) for paint, size in area.items()], least)
         if coloured:
             others.append(f"{colour} {text}")
         if made and material is not None:
@@ -253,16 +255,13 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     allowed = paint.choices or tuple(COLOURS)
     tried = [shade for shade in shades if shade.colour in allowed]
     tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
-    tried = tried or [paint]
-    return min(tried, key=short)  # on a tie the first, which is the smallest change
+    return min(tried or [paint], key=short)  # on a tie the first, which is the smallest change
 
 
-def _prevailing(
-    area: dict[Paint, float], least: float, word_of: Callable[[Paint], Word]
-) -> tuple[Word, bool]:
+def _prevailing(sizes: list[tuple[Word, float]], least: float) -> tuple[Word, bool]:
     """Return the word for most of a surface, and whether it covers at least the share `least`."""
     per_word: dict[Word, float] = defaultdict(float)
-    for paint, size in area.items():
-        per_word[word_of(paint)] += size
+    for word, size in sizes:
+        per_word[word] += size
     word = max(per_word, key=per_word.__getitem__)
     return word, per_word[word] >= least * sum(per_word.values())

@@ -20,23 +20,18 @@ from hilsplat.world.shapes import (
 
 
 def chair(b: Builder) -> None:
-    wood, cloth, accent = b.paint("wood"), b.paint("cloth"), b.paint("plain")
+    wood, cloth, accent = b.paints("wood", "cloth", "plain")
     w, seat_z, top = b.between(0.50, 0.60), b.between(0.42, 0.50), b.between(1.0, 1.15)
     seat = b.part("seat", wood, box((w, w, 0.07), (0, 0, seat_z), 0.015))
     seat.subpart("cushion, pillow", cloth, box((w * 0.86, w * 0.86, 0.11), (0.01, 0, seat_z + 0.085), 0.04))
-    back = b.part("back, backrest")
-    for side in (-1, 1):
-        size = (0.075, 0.085, top - seat_z)
-        place = (-w / 2 + 0.04, side * (w / 2 - 0.045), (top + seat_z) / 2)
-        back.put(wood, box(size, place, 0.015))
+    posts = box((0.075, 0.085, top - seat_z), bevel=0.015)
+    posts = posts.both_sides(-w / 2 + 0.04, w / 2 - 0.045, (top + seat_z) / 2)
+    back = b.part("back, backrest", wood, posts)
     shape = box((0.09, w + 0.04, 0.17), (-w / 2 + 0.04, 0, top - 0.05), 0.03)
     back.subpart("top rail, headrest", accent, shape)
-    slats = back.subpart("slats, bars")
-    slat_paint = b.paint("plain")
     low, high = seat_z + 0.06, top - 0.14
-    for i in range(3):
-        shape = box((0.05, 0.10, high - low), (-w / 2 + 0.04, (i - 1) * w * 0.26, (low + high) / 2), 0.01)
-        slats.put(slat_paint, shape)
+    slat = box((0.05, 0.10, high - low), (-w / 2 + 0.04, 0, (low + high) / 2), 0.01)
+    back.subpart("slats, bars", "plain", *[slat.moved(0, i * w * 0.26) for i in (-1, 0, 1)])
     for x, y in CORNERS:
         px, py = x * (w / 2 - 0.05), y * (w / 2 - 0.05)
         leg = b.part("leg", wood, box((0.09, 0.09, seat_z - 0.13), (px, py, (seat_z + 0.07) / 2), 0.012))
@@ -44,21 +39,18 @@ def chair(b: Builder) -> None:
 
 
 def cabinet(b: Builder) -> None:
-    wood, front, metal = b.paint("wood"), b.paint("plain"), b.paint("metal")
+    wood, front, metal = b.paints("wood", "plain", "metal")
     d, w, h = b.between(0.42, 0.5), b.between(0.62, 0.75), b.between(0.75, 0.9)
-    body = b.part("body, case, frame", wood, box((d, w, h - 0.1), (0, 0, h / 2 + 0.05), 0.012))
-    shapes = [box((0.09, 0.09, 0.12), (x * (d / 2 - 0.06), y * (w / 2 - 0.06), 0.05)) for x, y in CORNERS]
-    body.put(wood, *shapes)
+    legs = [box((0.09, 0.09, 0.12), (x * (d / 2 - 0.06), y * (w / 2 - 0.06), 0.05)) for x, y in CORNERS]
+    body = b.part("body, case, frame", wood, box((d, w, h - 0.1), (0, 0, h / 2 + 0.05), 0.012), *legs)
     body.subpart("top, board", "stone", box((d + 0.08, w + 0.08, 0.08), (0, 0, h + 0.03), 0.02))
     shape = box((0.04, w * 0.80, h * 0.62), (-d / 2 - 0.005, 0, h * 0.52), 0.01)
     body.subpart("back panel, back", "plain", shape)
-    inlays = body.subpart("side panels, sides")
-    inlay = b.paint("wood")
-    for side in (-1, 1):
-        inlays.put(inlay, box((d * 0.62, 0.04, h * 0.56), (0, side * (w / 2 + 0.003), h * 0.52), 0.01))
+    shape = box((d * 0.62, 0.04, h * 0.56), bevel=0.01).both_sides(0, w / 2 + 0.003, h * 0.52)
+    body.subpart("side panels, sides", "wood", shape)
     x, split = d / 2, h * 0.66
+    door_w, door_h = w / 2 - 0.05, split - 0.17
     for side in (-1, 1):
-        door_w, door_h = w / 2 - 0.05, split - 0.17
         y, z = side * (w / 4 - 0.003), 0.13 + door_h / 2
         door = b.part("door", front, box((0.05, door_w, door_h), (x + 0.02, y, z), 0.012))
         shape = box((0.05, door_w * 0.52, door_h * 0.66), (x + 0.04, y + side * door_w * 0.13, z), 0.015)
@@ -70,7 +62,7 @@ def cabinet(b: Builder) -> None:
 
 
 def lamp(b: Builder) -> None:
-    metal, cloth, accent = b.paint("metal"), b.paint("cloth"), b.paint("ceramic")
+    metal, cloth, accent = b.paints("metal", "cloth", "ceramic")
     h, shade_r = b.between(0.95, 1.15), b.between(0.32, 0.40)
     base = b.part("base, foot", accent, lathe([(0, 0), (0.28, 0), (0.28, 0.07), (0.20, 0.13), (0, 0.14)]))
     base.subpart("button, switch", "plastic", ellipsoid((0.09, 0.11, 0.075), (0.205, 0, 0.12)))
@@ -91,10 +83,9 @@ def lamp(b: Builder) -> None:
 
 
 def shelf(b: Builder) -> None:
-    wood, back = b.paint("wood"), b.paint("plain")
+    wood, back = b.paints("wood", "plain")
     d, w, h = b.between(0.32, 0.38), b.between(0.66, 0.8), b.between(0.85, 1.0)
-    frame = b.part("frame, case")
-    frame.put(wood, *[box((d, 0.06, h), (0, side * (w / 2 - 0.03), h / 2), 0.012) for side in (-1, 1)])
+    frame = b.part("frame, case", wood, box((d, 0.06, h), bevel=0.012).both_sides(0, w / 2 - 0.03, h / 2))
     frame.subpart("back wall, backboard", back, box((0.04, w - 0.12, h - 0.04), (-d / 2 + 0.02, 0, h / 2)))
     shapes = [box((0.04, w - 0.04, 0.13), (-d / 2 - 0.005, 0, z), 0.01) for z in (h * 0.28, h * 0.72)]
     frame.subpart("braces, back bars", "plain", *shapes)
@@ -105,8 +96,7 @@ def shelf(b: Builder) -> None:
     while y < 0.04:
         thick, tall = b.between(0.085, 0.12), b.between(0.27, 0.34)
         cover, deep = b.paint("cloth"), d * b.between(0.72, 0.9)
-        shape = box((deep, thick, tall), (0.02, y + thick / 2, bottom + tall / 2), 0.01)
-        books.subpart("book", cover, shape)
+        books.subpart("book", cover, box((deep, thick, tall), (0.02, y + thick / 2, bottom + tall / 2), 0.01))
         y += thick + 0.006
     vy, vz = w / 2 - 0.18, bottom
     shape = lathe([(0, 0), (0.08, 0), (0.135, 0.10), (0.11, 0.20), (0.05, 0.25)]).moved(0.03, vy, vz)
@@ -122,9 +112,7 @@ def shelf(b: Builder) -> None:
 
 
 def plant(b: Builder) -> None:
-    clay, rim_paint = b.paint("ceramic"), b.paint("ceramic")
-    leaf = b.paint("plain green teal")
-    stem_paint = b.paint("wood brown")
+    clay, rim_paint, leaf, stem_paint = b.paints("ceramic", "ceramic", "plain green teal", "wood brown")
     petal = b.paint("plain red pink yellow purple orange white blue")
     r, h = b.between(0.24, 0.30), b.between(0.30, 0.38)
     pot = b.part("pot, flowerpot", clay, lathe([(0, 0), (r * 0.72, 0), (r, h)]))
@@ -152,32 +140,26 @@ def plant(b: Builder) -> None:
 
 
 def clock(b: Builder) -> None:
-    case_paint = b.paint("plastic")
-    face_paint = b.paint("plain white beige yellow pink")
-    dark = b.paint("plastic black blue red purple")
-    accent = b.paint("plastic")
-    metal = b.paint("metal")
+    case_paint, face_paint = b.paints("plastic", "plain white beige yellow pink")
+    dark, accent, metal = b.paints("plastic black blue red purple", "plastic", "metal")
     r, depth = b.between(0.36, 0.42), b.between(0.22, 0.28)
     z = r + 0.13
     shape = disc(r, -depth / 2, depth / 2 - 0.02, 36, 0.03).moved(z=z)
     case = b.part("case, body, housing", case_paint, shape)
     profile = [(r + 0.01, -0.01), (r + 0.03, 0.0), (r + 0.03, 0.06), (r - 0.07, 0.07), (r - 0.08, 0.0)]
-    shape = lathe(profile, 36).turned("y", 90).moved(depth / 2 - 0.03, 0, z)
-    case.subpart("frame, ring", accent, shape)
+    case.subpart("frame, ring", accent, lathe(profile, 36).turned("y", 90).moved(depth / 2 - 0.03, 0, z))
     feet = case.subpart("feet, stand")
     for side in (-1, 1):
         path = [(0, side * r * 0.55, z - r * 0.72), (0, side * r * 0.72, 0.05)]
         feet.put(metal, sweep(path, [0.06, 0.085]))
-    shapes = [box((0.10, 0.24, 0.11), (-depth / 2 - 0.07, 0, z), 0.03)]
-    shapes += [cylinder(0.05, 0, 0.06).turned("y", -90).moved(-depth / 2, 0, z)]
-    case.subpart("key, winder", metal, *shapes)
+    axle = cylinder(0.05, 0, 0.06).turned("y", -90).moved(-depth / 2, 0, z)
+    case.subpart("key, winder", metal, box((0.10, 0.24, 0.11), (-depth / 2 - 0.07, 0, z), 0.03), axle)
     shape = disc(r * 0.72, -0.03, 0.0, 32, 0.01).moved(-depth / 2 + 0.005, 0, z)
     case.subpart("back cover, battery cover", "plain", shape)
     x = depth / 2 - 0.015
     face = b.part("face, dial", face_paint, disc(r - 0.07, 0, 0.03, 36).moved(x - 0.02, 0, z))
-    marks = face.subpart("hour marks, numbers")
-    for i in range(4):
-        marks.put(dark, box((0.03, 0.075, 0.13), (x + 0.015, 0, r - 0.16)).turned("x", 90 * i).moved(z=z))
+    mark = box((0.03, 0.075, 0.13), (x + 0.015, 0, r - 0.16))
+    face.subpart("hour marks, numbers", dark, *[mark.turned("x", 90 * i).moved(z=z) for i in range(4)])
     hands = face.subpart("hands, pointers")
     for angle, length, width in ((b.between(0, 360), 0.56, 0.07), (b.between(0, 360), 0.36, 0.09)):
         shape = box((0.03, width, r * length), (x + 0.045, 0, r * length / 2 - 0.03), 0.01)
@@ -192,17 +174,16 @@ def clock(b: Builder) -> None:
 
 
 def guitar(b: Builder) -> None:
-    wood, side_paint = b.paint("wood"), b.paint("plastic")
-    dark, metal = b.paint("plain black brown white"), b.paint("metal")
+    wood, side_paint, dark, metal = b.paints("wood", "plastic", "plain black brown white", "metal")
     wide, depth = b.between(0.30, 0.34), b.between(0.15, 0.19)
     upper, z, z2 = wide * 0.74, wide + 0.02, wide * 2.15
-    shapes = [disc(wide, -depth / 2, depth / 2, 36).moved(z=z)]
-    shapes += [disc(upper, -depth / 2, depth / 2, 32).moved(z=z2)]
-    body = b.part("body, sound box", wood, *shapes)
-    shapes = [disc(wide + 0.018, -depth / 2 + 0.03, depth / 2 - 0.03, 36).moved(z=z)]
-    shapes += [disc(upper + 0.018, -depth / 2 + 0.03, depth / 2 - 0.03, 32).moved(z=z2)]
-    body.subpart("side, binding", side_paint, *shapes, at="of")
     x = depth / 2
+    body = b.part(
+        "body, sound box", wood, disc(wide, -x, x, 36).moved(z=z), disc(upper, -x, x, 32).moved(z=z2)
+    )
+    shapes = [disc(wide + 0.018, -x + 0.03, x - 0.03, 36).moved(z=z)]
+    shapes += [disc(upper + 0.018, -x + 0.03, x - 0.03, 32).moved(z=z2)]
+    body.subpart("side, binding", side_paint, *shapes, at="of")
     shape = disc(0.125, x - 0.01, x + 0.012, 24).moved(z=wide * 1.62)
     body.subpart("sound hole, rosette", "plain black", shape)
     body.subpart("bridge, saddle", dark, box((0.07, 0.32, 0.12), (x + 0.02, 0, wide * 0.66), 0.02))
@@ -226,14 +207,11 @@ def guitar(b: Builder) -> None:
     shapes = [box((0.42, 0.52, 0.05), (0, 0, 0.025), 0.015)]
     shapes += [box((0.06, 0.06, 0.5), (-x - 0.05, 0, 0.27), 0.01)]
     stand = b.part("stand, foot, support", "metal", *shapes)
-    shapes = [box((0.30, 0.10, 0.14), (0, side * 0.2, 0.09), 0.03) for side in (-1, 1)]
-    stand.subpart("pads, cushions", "plastic", *shapes)
+    stand.subpart("pads, cushions", "plastic", box((0.30, 0.10, 0.14), bevel=0.03).both_sides(0, 0.2, 0.09))
 
 
 def radio(b: Builder) -> None:
-    case = b.paint("wood") if b.chance(0.4) else b.paint("plastic")
-    cloth = b.paint("cloth")
-    metal = b.paint("metal")
+    case, cloth, metal = b.paints("wood" if b.chance(0.4) else "plastic", "cloth", "metal")
     w, h, d = b.between(0.82, 0.95), b.between(0.46, 0.54), b.between(0.28, 0.34)
     body = b.part("case, cabinet, housing", case, box((d, w, h), (0, 0, h / 2 + 0.05), 0.04))
     x, z = d / 2, h / 2 + 0.05
@@ -254,8 +232,8 @@ def radio(b: Builder) -> None:
     for side in (-1, 1):
         knobs.put(metal, disc(0.085, 0, 0.085, 20, 0.015).moved(x + 0.015, y2 + side * 0.10, z - h * 0.17))
     up = h + 0.05
-    shapes = [box((0.07, 0.06, 0.18), (0, side * w * 0.36, up + 0.07), 0.015) for side in (-1, 1)]
-    handle = b.part("handle, carrying handle", metal, *shapes)
+    shape = box((0.07, 0.06, 0.18), bevel=0.015).both_sides(0, w * 0.36, up + 0.07)
+    handle = b.part("handle, carrying handle", metal, shape)
     handle.subpart("grip, bar", "plastic", box((0.105, w * 0.78, 0.085), (0, 0, up + 0.17), 0.03), at="of")
     y = w * 0.44
     path = [(-d * 0.35, y, up - 0.02), (-d * 0.35, y + 0.10, up + 0.52)]
@@ -264,9 +242,7 @@ def radio(b: Builder) -> None:
 
 
 def camera(b: Builder) -> None:
-    leather = b.paint("cloth black brown red green blue beige")
-    metal = b.paint("metal")
-    dark = b.paint("plain black")
+    leather, metal, dark = b.paints("cloth black brown red green blue beige", "metal", "plain black")
     w, h, d = b.between(0.78, 0.9), b.between(0.46, 0.52), b.between(0.26, 0.30)
     body = b.part("body, case", leather, box((d, w, h), (0, 0, h / 2), 0.03))
     shape = box((d + 0.03, w + 0.02, 0.12), (0, 0, h + 0.02), 0.03)
@@ -297,9 +273,7 @@ def camera(b: Builder) -> None:
 
 
 def toaster(b: Builder) -> None:
-    shell = b.paint("metal") if b.chance(0.5) else b.paint("ceramic")
-    metal = b.paint("metal")
-    dark = b.paint("plain black")
+    shell, metal, dark = b.paints("metal" if b.chance(0.5) else "ceramic", "metal", "plain black")
     length, w, h = b.between(0.74, 0.84), b.between(0.46, 0.52), b.between(0.46, 0.52)
     outline = [(-w / 2, 0.09), (w / 2, 0.09), (w / 2, h * 0.82), (w * 0.40, h * 0.96)]
     outline += [(w * 0.30, h), (-w * 0.30, h), (-w * 0.40, h * 0.96), (-w / 2, h * 0.82)]
@@ -310,18 +284,15 @@ def toaster(b: Builder) -> None:
     for side in (-1, 1):
         slots.put(dark, box((0.10, length * 0.76, 0.03), (side * w * 0.17, 0, h - 0.005)))
         panel.put(inlay, box((0.03, length * 0.62, h * 0.42), (side * w / 2, 0, h * 0.50), 0.01))
-    crumb = b.paint("plain beige yellow white")
-    crust = b.paint("plain brown orange")
+    crumb, crust = b.paints("plain beige yellow white", "plain brown orange")
+    wide, end = length * 0.62, length / 2
     for side in (-1, 1):
-        x, y, high = side * w * 0.17, 0.0, h + b.between(0.22, 0.30)
-        wide = length * 0.62
-        shape = box((0.075, wide - 0.10, 0.40), (x, y, high - 0.24), 0.01)
+        x, high = side * w * 0.17, h + b.between(0.22, 0.30)
+        shape = box((0.075, wide - 0.10, 0.40), (x, 0, high - 0.24), 0.01)
         toast = b.part("toast, bread slice, slice of bread", crumb, shape)
-        upper = box((0.065, wide, 0.085), (x, y, high - 0.02), 0.02)
-        edges = [y + end * (wide / 2 - 0.04) for end in (-1, 1)]
-        sides = [box((0.065, 0.085, 0.44), (x, edge, high - 0.22), 0.015) for edge in edges]
-        toast.subpart("crust, edge", crust, upper, *sides, at="of")
-    end = length / 2
+        upper = box((0.065, wide, 0.085), (x, 0, high - 0.02), 0.02)
+        sides = box((0.065, 0.085, 0.44), bevel=0.015).both_sides(x, wide / 2 - 0.04, high - 0.22)
+        toast.subpart("crust, edge", crust, upper, sides, at="of")
     lever = b.part("lever, push lever", metal, box((0.07, 0.05, h * 0.56), (0, end + 0.015, h * 0.56), 0.012))
     lever.subpart("knob, handle", "plastic", box((0.20, 0.13, 0.10), (0, end + 0.08, h * 0.62), 0.03))
     shape = roller(0.125, 0, 0.07, 24, 0.015).moved(0, -end + 0.01, h * 0.50)
@@ -331,15 +302,11 @@ def toaster(b: Builder) -> None:
 
 
 def headphones(b: Builder) -> None:
-    frame = b.paint("plastic")
-    pad = b.paint("cloth")
-    shell = b.paint("plastic")
-    metal = b.paint("metal")
+    frame, pad, shell, metal = b.paints("plastic", "cloth", "plastic", "metal")
     r, z = b.between(0.34, 0.39), 0.62
     stand = b.part("stand, holder", "wood", box((0.10, 0.12, z + r - 0.06), (0, 0, (z + r) / 2), 0.02))
     stand.subpart("base, foot", "stone", cylinder(0.25, 0, 0.075, 32, 0.02), at="of")
-    angle = np.radians(np.linspace(-8, 188, 19))
-    path = [(0, r * np.cos(a), z + r * np.sin(a)) for a in angle]
+    path = [(0, r * np.cos(a), z + r * np.sin(a)) for a in np.radians(np.linspace(-8, 188, 19))]
     band = b.part("headband, band, bow", frame, sweep(path, 0.055))
     cushion = np.radians(np.linspace(50, 130, 10))
     path = [(0, r * 1.01 * np.cos(a), z + r * 1.01 * np.sin(a)) for a in cushion]

@@ -7,10 +7,9 @@ from hilsplat.world.shapes import arc, box, cylinder, ellipsoid, extrude, lathe,
 
 
 def mug(b: Builder) -> None:
-    glaze, inner, accent = b.paint("ceramic"), b.paint("ceramic"), b.paint("ceramic")
+    glaze, inner, accent = b.paints("ceramic", "ceramic", "ceramic")
     r, h = b.between(0.36, 0.44), b.between(0.80, 1.0)
-    flare = b.between(0.94, 1.08)
-    top = r * flare
+    top = r * b.between(0.94, 1.08)
     cup = b.part("cup, body", glaze, lathe([(0, 0), (r * 0.92, 0), (r, 0.06), (top, h * 0.86)]))
     cup.subpart("inside, interior", inner, lathe([(top - 0.05, h), (r - 0.05, 0.12), (0, 0.12)]))
     profile = [(top, h * 0.86), (top + 0.035, h * 0.88)]
@@ -19,13 +18,13 @@ def mug(b: Builder) -> None:
     low, high = h * 0.34, h * 0.54
     profile = [(r, low), (r * 1.05, low + 0.02), (r * 1.05, high - 0.02), (r, high)]
     cup.subpart("band, stripe", "ceramic", lathe(profile))
-    path = [(x + r * 0.94, y, z + h * 0.47) for x, y, z in arc((r * 0.75, h * 0.30), -88, 88)]
+    path = arc((r * 0.75, h * 0.30), -88, 88, (r * 0.94, 0, h * 0.47))
     handle = b.part("handle", accent, sweep(path, 0.065).turned("z", 90))
     handle.subpart("thumb rest, knob", inner, ellipsoid((0.13, 0.14, 0.085), (0, r * 1.5, h * 0.77)))
 
 
 def kettle(b: Builder) -> None:
-    metal, accent, dark = b.paint("metal"), b.paint("ceramic"), b.paint("plastic")
+    metal, accent, dark = b.paints("metal", "ceramic", "plastic")
     r, h = b.between(0.40, 0.46), b.between(0.50, 0.62)
     profile = [(0, 0.05), (r, 0.05), (r * 1.04, h * 0.35), (r * 0.9, h * 0.75), (r * 0.62, h), (0, h)]
     body = b.part("body, pot", metal, lathe(profile))
@@ -38,16 +37,14 @@ def kettle(b: Builder) -> None:
     spout = b.part("spout", metal, sweep(path, [0.14, 0.10, 0.075]))
     lip = [start + np.array([0.255, 0, 0.235]), start + np.array([0.33, 0, 0.37])]
     spout.subpart("tip, mouth", accent, sweep(lip, [0.085, 0.10]))
-    path = [(x, 0, z + h * 0.72) for x, _, z in arc((r * 0.92, 0.50), 4, 176)]
-    handle = b.part("handle", dark, sweep(path, 0.045))
-    path = [(x, 0, z + h * 0.72) for x, _, z in arc((r * 0.92, 0.50), 55, 125)]
-    handle.subpart("grip", accent, sweep(path, 0.075))
+    radii, centre = (r * 0.92, 0.50), (0, 0, h * 0.72)
+    handle = b.part("handle", dark, sweep(arc(radii, 4, 176, centre), 0.045))
+    handle.subpart("grip", accent, sweep(arc(radii, 55, 125, centre), 0.075))
 
 
 def bottle(b: Builder) -> None:
     glass = b.paint("ceramic green teal blue brown purple red")
-    label_paint = b.paint("plain white beige yellow orange pink")
-    cap_paint = b.paint("metal")
+    label_paint, cap_paint = b.paints("plain white beige yellow orange pink", "metal")
     r, h = b.between(0.22, 0.26), b.between(0.62, 0.72)
     neck_r = b.between(0.085, 0.10)
     profile = [(0, 0), (r * 0.93, 0), (r, 0.04), (r, h * 0.78), (r * 0.86, h * 0.9), (neck_r * 1.15, h)]
@@ -67,9 +64,7 @@ def bottle(b: Builder) -> None:
 def cake(b: Builder) -> None:
     sponge = b.paint("plain brown beige pink yellow teal")
     icing = b.paint("snow white pink beige purple red teal")
-    cream = b.paint("plain")
-    plate_paint = b.paint("ceramic")
-    cherry = b.paint("plastic red purple orange green")
+    cream, plate_paint, cherry = b.paints("plain", "ceramic", "plastic red purple orange green")
     r, h = b.between(0.36, 0.42), b.between(0.22, 0.27)
     profile = [(0, 0.0), (r * 0.8, 0.0), (r + 0.10, 0.05), (r + 0.10, 0.07), (0, 0.06)]
     plate = b.part("plate, dish", plate_paint, lathe(profile))
@@ -96,7 +91,7 @@ def cake(b: Builder) -> None:
 
 
 def frying_pan(b: Builder) -> None:
-    metal, inner = b.paint("metal"), b.paint("plain black grey teal brown")
+    metal, inner = b.paints("metal", "plain black grey teal brown")
     r, h = b.between(0.40, 0.45), b.between(0.13, 0.17)
     pan = b.part("pan, body, dish", metal, lathe([(0, 0), (r * 0.82, 0), (r, h)], 36))
     profile = [(r - 0.02, h - 0.01), (r * 0.80, 0.035), (0, 0.03)]
@@ -107,16 +102,11 @@ def frying_pan(b: Builder) -> None:
     egg = b.part("fried egg, egg", "snow white", *shapes)
     shape = ellipsoid((0.13, 0.13, 0.085), (-0.02, 0.02, 0.085))
     egg.subpart("yolk, egg yellow", "plastic yellow orange", shape)
-    bacon = b.part("bacon, bacon strip")
-    strip = b.paint("plain red brown pink")
-    for k in range(5):
-        x = -0.18 + 0.09 * k
-        bacon.put(strip, box((0.095, 0.13, 0.05), (x, -0.26 + 0.02 * (k % 2), 0.075 + 0.02 * (k % 2)), 0.01))
-    bacon.subpart(
-        "fat, fat stripe",
-        "plain beige white yellow orange",
-        box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01),
-    )
+    places = [(-0.18 + 0.09 * k, -0.26 + 0.02 * (k % 2), 0.075 + 0.02 * (k % 2)) for k in range(5)]
+    strips = [box((0.095, 0.13, 0.05), place, 0.01) for place in places]
+    bacon = b.part("bacon, bacon strip", "plain red brown pink", *strips)
+    fat = box((0.47, 0.075, 0.05), (0, -0.25, 0.115), 0.01)
+    bacon.subpart("fat, fat stripe", "plain beige white yellow orange", fat)
     path = [(r * 0.9, 0, h * 0.7), (r + 0.12, 0, h + 0.07), (r + 0.22, 0, h + 0.11)]
     handle = b.part("handle", "metal", sweep(path, [0.07, 0.065, 0.065]))
     end = r + 0.46
@@ -126,9 +116,8 @@ def frying_pan(b: Builder) -> None:
 
 
 def burger(b: Builder) -> None:
-    bread = b.paint("plain orange beige brown")
-    seeds = b.paint("snow white beige black yellow")
-    meat, cheese = b.paint("plain brown red black"), b.paint("plain yellow orange")
+    bread, seeds = b.paints("plain orange beige brown", "snow white beige black yellow")
+    meat, cheese = b.paints("plain brown red black", "plain yellow orange")
     r = b.between(0.38, 0.42)
     profile = [(0, 0), (r * 0.9, 0), (r + 0.12, 0.06), (r + 0.10, 0.075), (0, 0.05)]
     plate = b.part("plate, dish", "ceramic", lathe(profile, 36))
@@ -142,8 +131,7 @@ def burger(b: Builder) -> None:
     patty = b.part("patty, meat", meat, lathe(profile, 32))
     slab = box((r * 1.62, r * 1.62, 0.045), (0, 0, 0.365), 0.01)
     corner = extrude([(-0.16, 0), (0.16, 0), (0, -0.14)], 0.04).turned("z", 90).moved(r * 0.98, 0, 0.385)
-    corners = [corner.turned("z", a) for a in (0, 90, 180, 270)]
-    patty.subpart("cheese, cheese slice", cheese, slab, *corners)
+    patty.subpart("cheese, cheese slice", cheese, slab, *[corner.turned("z", a) for a in (0, 90, 180, 270)])
     slab = cylinder(0.20, 0.385, 0.445, 24, 0.02)
     shapes = [slab.moved(r * 0.60 * np.cos(a), r * 0.60 * np.sin(a)) for a in (0.5, 2.6, 4.7)]
     patty.subpart("tomato, tomato slices", "plastic red pink purple", *shapes)
@@ -160,21 +148,19 @@ def burger(b: Builder) -> None:
 
 
 def fruit_basket(b: Builder) -> None:
-    straw, trim = b.paint("cloth beige brown orange white"), b.paint("wood")
+    straw, trim = b.paints("cloth beige brown orange white", "wood")
     r, h = b.between(0.38, 0.42), b.between(0.24, 0.28)
     profile = [(0, 0), (r * 0.74, 0), (r * 0.92, h * 0.5), (r, h), (r - 0.05, h), (r * 0.7, 0.10), (0, 0.10)]
     basket = b.part("bowl, basket", straw, lathe(profile, 36))
     basket.subpart("rim, edge", trim, ring(r - 0.01, 0.052, (0, 0, h), segments=36), at="of")
     profile = [(r * 0.80, h * 0.24), (r * 0.88, h * 0.25), (r * 0.965, h * 0.56), (r * 0.93, h * 0.57)]
     basket.subpart("band, stripe", "cloth", lathe(profile, 36))
-    path = [(0, y, h + z) for y, _, z in arc((r, 0.50), 0, 180)]
-    handle = b.part("handle", trim, sweep(path, 0.042))
+    handle = b.part("handle", trim, sweep(arc((r, 0.50), 0, 180, (0, 0, h), "x"), 0.042))
     shapes = [sphere(0.075, (0, 0, h + 0.50))]
     for side in (-1, 1):
         shapes.append(ellipsoid((0.055, 0.14, 0.09)).turned("x", side * 15).moved(0, side * 0.16, h + 0.51))
     handle.subpart("ribbon, bow", "cloth", *shapes)
-    apple_paint = b.paint("plastic red green yellow pink")
-    stem = b.paint("plain green brown black")
+    apple_paint, stem = b.paints("plastic red green yellow pink", "plain green brown black")
     for x, y in ((0.17, -0.17), (0.20, 0.14)):
         z = h + 0.07
         apple = b.part("apple", apple_paint, ellipsoid((0.16, 0.16, 0.15), (x, y, z)))
@@ -195,7 +181,7 @@ def fruit_basket(b: Builder) -> None:
 
 
 def ice_cream(b: Builder) -> None:
-    waffle, cup = b.paint("plain orange brown beige"), b.paint("ceramic")
+    waffle, cup = b.paints("plain orange brown beige", "ceramic")
     r, h = b.between(0.24, 0.28), b.between(0.50, 0.58)
     profile = [(0, 0), (r * 1.25, 0), (r * 1.25, 0.05), (r * 0.55, 0.10)]
     profile += [(r * 0.55, 0.22), (r * 0.9, 0.34), (r * 0.7, 0.34), (0, 0.25)]
@@ -207,7 +193,7 @@ def ice_cream(b: Builder) -> None:
     profile += [(r * 1.14, low + h + 0.03), (r * 0.8, low + h + 0.03)]
     cone.subpart("rim, edge", "plain", lathe(profile, 32), at="of")
     z = low + h + 0.10
-    taste, crumb = b.paint("snow"), b.paint("plastic")
+    taste, crumb = b.paints("snow", "plastic")
     for side in (-1, 1):
         scoop = b.part("scoop, ball, lower scoop", taste, sphere(r * 0.72, (0, side * r * 0.55, z)))
         sprinkles = scoop.subpart("sprinkles, crumbs")

@@ -21,7 +21,8 @@ TRIES = 120
 class Room:
     """Width (x), depth (y) and height of a room, m; the origin is in the middle of the floor.
 
-    Walls 0 to 3 face +x, +y, -x, -y.
+    Walls 0 to 3 face +x, +y, -x, -y. The yaw of an object with its back to a wall is 90 degrees times the
+    wall's number.
     """
 
     width: float
@@ -35,12 +36,7 @@ class Room:
     def at_wall(self, wall: int, along: float, away: float) -> Float[np.ndarray, " 2"]:
         """Return the point `away` from a wall into the room and `along` it from its middle, m."""
         half = self.width / 2 if wall % 2 == 0 else self.depth / 2
-        return rotation_about("z", yaw_of_wall(wall))[:2, :2] @ np.array([away - half, along])
-
-
-def yaw_of_wall(wall: int) -> float:
-    """Return the yaw of an object whose back is to the wall, degrees."""
-    return 90.0 * wall
+        return rotation_about("z", 90.0 * wall)[:2, :2] @ np.array([away - half, along])
 
 
 @dataclass(frozen=True)
@@ -60,9 +56,9 @@ class Space:
         sides = all(self.low[a] < other.high[a] + gap and other.low[a] < self.high[a] + gap for a in range(2))
         return sides and self.low[2] < other.high[2] and other.low[2] < self.high[2]
 
-    def beyond(self, room: Room, gap: float) -> bool:
-        """Return whether the box extends beyond the room reduced by a margin of `gap` at the walls."""
-        half = (room.width / 2 - gap, room.depth / 2 - gap)
+    def beyond(self, room: Room) -> bool:
+        """Return whether the box extends beyond the walls of a room."""
+        half = (room.width / 2, room.depth / 2)
         return any(self.low[a] < -half[a] or self.high[a] > half[a] for a in range(2))
 
     def distance_xy(self, points: Float[np.ndarray, "N 2"]) -> float:
@@ -78,11 +74,18 @@ class FloorPlan:
         self.room, self.path = room, path
         self.taken: list[Space] = []
 
-    def free(self, space: Space, gap: float = PIECE_GAP) -> bool:
-        """Return whether a box is inside the room and clear of occupied space and of the camera path."""
-        if space.beyond(self.room, 0.0) or any(space.meets(other, gap) for other in self.taken):
+    def claim(self, space: Space, gap: float = PIECE_GAP) -> bool:
+        """Occupy a box if it is inside the room and clear of occupied space and of the camera path.
+
+        Returns:
+            Whether the box was free.
+        """
+        if space.beyond(self.room) or any(space.meets(other, gap) for other in self.taken):
             return False
-        return space.high[2] <= PATH_LOW or space.distance_xy(self.path) >= PATH_GAP
+        if space.high[2] > PATH_LOW and space.distance_xy(self.path) < PATH_GAP:
+            return False
+        self.taken.append(space)
+        return True
 
     def wall_spot(
         self,
@@ -91,31 +94,32 @@ class FloorPlan:
         base_z: float,
         clear: float,
         gap: float = WALL_GAP,
-    ) -> tuple[int, Float[np.ndarray, " 2"], Space] | None:
-        """Find a random free place at a wall for an object that faces the room.
+    ) -> tuple[float, Float[np.ndarray, " 2"]] | None:
+        """Occupy a random free place at a wall for an object that faces the room.
 
         Args:
             size: depth, width and height of the object in its own frame, m.
             base_z: height of its lowest point, m.
-            clear: depth that must be free in front of it, m; it is not reserved afterwards.
+            clear: depth that must be free in front of it, m; it is not occupied.
             gap: distance from the wall, m.
 
         Returns:
-            The wall, the object's centre in x and y, and the space it occupies; None if no place is found.
+            The object's yaw in degrees, and its centre in x and y; None if no place is found.
         """
         for _ in range(TRIES):
             wall = int(rng.choice((0, 1, 2, 3)))
             slack = self.room.wall_length(wall) / 2 - size[1] / 2 - 0.04
             if slack <= 0:
                 continue
-            along = float(rng.uniform(-slack, slack))
-            spot = self.room.at_wall(wall, along, gap + size[0] / 2)
-            space = turned_space(spot, size, yaw_of_wall(wall), base_z)
+            along, yaw = float(rng.uniform(-slack, slack)), 90.0 * wall
             deeper = np.array([size[0] + clear, size[1], size[2]])
             middle = self.room.at_wall(wall, along, gap + deeper[0] / 2)
-            front = turned_space(middle, deeper, yaw_of_wall(wall), base_z)
-            if self.free(space) and not any(front.meets(other, 0.0) for other in self.taken):
-                return wall, spot, space
+            front = turned_space(middle, deeper, yaw, base_z)
+            spot = self.room.at_wall(wall, along, gap + size[0] / 2)
+            if any(front.meets(other, 0.0) for other in self.taken):
+                continue
+            if self.claim(turned_space(spot, size, yaw, base_z)):
+                return yaw, spot
         return None
 
 

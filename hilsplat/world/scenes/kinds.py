@@ -7,7 +7,7 @@ import numpy as np
 
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.cameras import Camera, Cameras
-from hilsplat.world.scenes import room, room_cameras, street, tabletop
+from hilsplat.world.scenes import room, street, tabletop
 from hilsplat.world.scenes.scene import WorldScene
 
 
@@ -28,7 +28,7 @@ class SceneKind(NamedTuple):
 
 KINDS: dict[str, SceneKind] = {
     "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_cameras, tabletop.training_camera),
-    "room": SceneKind(room.build_room, room_cameras.loop_cameras, room_cameras.training_camera),
+    "room": SceneKind(room.build_room, room.loop_cameras, room.training_camera),
     "street": SceneKind(street.build_street, street.drive_cameras, street.training_camera),
 }
 """Scene kinds by their name in the scene sheet."""

@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.levels import NONE
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import ROOM_THINGS, build_furniture, build_object
+from hilsplat.world.objects.catalogue import ROOM_THINGS, build_object
 from hilsplat.world.paints import PaintBox
-from hilsplat.world.scenes.floorplan import WALL_GAP, FloorPlan, Room, Space, turned_space, yaw_of_wall
-from hilsplat.world.scenes.room_cameras import path_points
+from hilsplat.world.scenes.floorplan import WALL_GAP, FloorPlan, Room, Space, turned_space
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import Mesh, box, rotation_about
+from hilsplat.world.views import arc_azimuths, looking_at, numbered_cameras, pinhole
 
 logger = logging.getLogger(__name__)
 
@@ -52,15 +53,8 @@ LARGE: tuple[Piece, ...] = (
 )
 """Pieces placed at a wall, drawn in random order; none repeats before all have been drawn."""
 
-SUPPORTS: dict[str, str] = {
-    "table": "table top",
-    "desk": "desk top",
-    "cabinet": "cabinet top",
-    "nightstand": "nightstand top",
-    "counter": "counter top",
-    "tv stand": "tv stand top",
-}
-"""Furniture that can carry things, and the text of the node that carries them."""
+SUPPORTS = ("table", "desk", "cabinet", "nightstand", "counter", "tv stand")
+"""Furniture that can carry things, on its part or subpart "top"."""
 
 THING_SIZES: dict[str, tuple[float, float]] = {
     "mug": (0.15, 0.2), "kettle": (0.24, 0.3), "bottle": (0.3, 0.36), "cake": (0.22, 0.28),
@@ -79,22 +73,28 @@ MAX_FLAT = 0.05
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
 """Shares of grey in the colours of walls, floor and ceiling, so that the objects stand out."""
 
+FOV_DEG = 62.0
+EYE_HEIGHTS = (1.34, 1.7)
+"""Alternating heights of the cameras, m; the difference adds parallax that the loop alone lacks."""
+PATH_SHARE = 0.27
+"""Semi-axes of the camera loop, as shares of the room's width and depth."""
+LOOK_AT_Z = 0.78
+
 
 class _Furnishing:
     """A room while it is being furnished: the scene so far, occupied space, and supports for things."""
 
-    def __init__(self, seed: int, room: Room, path: np.ndarray) -> None:
-        self.seed, self.plan = seed, FloorPlan(room, path)
+    def __init__(self, seed: int, rng: np.random.Generator, plan: FloorPlan) -> None:
+        self.seed, self.rng, self.plan = seed, rng, plan
         self.assembly = Assembly()
         self.placed: list[PlacedObject] = []
         self.supports: list[Support] = []
         self._drawn = 0
 
-    def model(self, name: str, *, thing: bool = False) -> ObjectModel:
+    def model(self, name: str, kind: str = "room") -> ObjectModel:
         """Draw the next object of a class."""
         self._drawn += 1
-        rng = np.random.default_rng([self.seed, 22, self._drawn])
-        return build_object(name, rng) if thing else build_furniture(name, rng)
+        return build_object(kind, name, np.random.default_rng([self.seed, 22, self._drawn]))
 
     def put(
         self, model: ObjectModel, spot: np.ndarray, yaw_deg: float, base_z: float = 0.0, scale: float = 1.0
@@ -110,7 +110,7 @@ class _Furnishing:
         size = (radius, space.high[2] - base_z)
         self.placed.append(PlacedObject(model.name, node, (float(x), float(y)), *size, yaw_deg, base_z))
         if model.name in SUPPORTS:
-            self.supports.append(_support(model, added, SUPPORTS[model.name]))
+            self.supports.append(_support(model, added))
 
 
 class Support(NamedTuple):
@@ -133,9 +133,9 @@ class Support(NamedTuple):
         return max([self.top.high[2], *(space.high[2] for space in self.flat if space.meets(below, 0.0))])
 
 
-def _support(model: ObjectModel, triangles: np.ndarray, text: str) -> Support:
-    """Return the support that the node named `text` of an object added as `triangles` provides."""
-    node = next(row for row, found in enumerate(model.nodes) if found.text == text)
+def _support(model: ObjectModel, triangles: np.ndarray) -> Support:
+    """Return the support that the top of an object added as `triangles` provides."""
+    node = next(row for row, found in enumerate(model.nodes) if found.text == f"{model.name} top")
     own = model.node_ids[:, model.nodes[node].level - 1] == node
     board = own & (model.node_ids[:, 2] == NONE) if model.nodes[node].level == 2 else own
     top = Space.of(triangles[board].reshape(-1, 3))
@@ -161,91 +161,88 @@ def build_room(seed: int, objects: int) -> WorldScene:
     """
     rng = np.random.default_rng([seed, 21])
     room = Room(float(rng.uniform(4.4, 5.0)), float(rng.uniform(3.8, 4.3)), 2.55)
-    work = _Furnishing(seed, room, path_points(room, np.linspace(0, 360, 72, endpoint=False)))
-    fixtures = _add_fixtures(work, rng)
-    furniture = _furnish(work, rng, max(1, round(FURNITURE_SHARE * objects)))
-    pictures = _hang_pictures(work, rng)
+    plan = FloorPlan(room, path_points(room, np.linspace(0, 360, 72, endpoint=False)))
+    work = _Furnishing(seed, rng, plan)
+    _add_fixtures(work)
+    furniture = _furnish(work, max(1, round(FURNITURE_SHARE * objects)))
+    pictures = _hang_pictures(work)
     count = objects - furniture
     names = [str(name) for _ in range(1 + count // len(ROOM_THINGS)) for name in rng.permutation(ROOM_THINGS)]
-    things = sum(_add_thing(work, rng, name) for name in names[:count])
+    things = sum(_add_thing(work, name) for name in names[:count])
     logger.info(
         "scene room:%d: %d pieces of furniture, %d things of %d objects asked, %d fixtures: %s",
-        seed, furniture, things, objects, fixtures + pictures, ", ".join(thing.name for thing in work.placed),
+        seed, furniture, things, objects, 3 + pictures, ", ".join(thing.name for thing in work.placed),
     )  # fmt: skip
     _add_shell(work.assembly, room, np.random.default_rng([seed, 23]))
     style = _style(room, np.random.default_rng([seed, 24]))
-    asked = objects + fixtures + 2
+    asked = objects + 5  # with door, window, curtain and two pictures
     return work.assembly.finished("room", seed, asked, work.placed, style)
 
 
-def _add_fixtures(work: _Furnishing, rng: np.random.Generator) -> int:
-    """Add a door, and a window with a curtain on another wall; return the number of objects."""
+def _add_fixtures(work: _Furnishing) -> None:
+    """Add a door, and a window with a curtain on another wall."""
     room, plan = work.plan.room, work.plan
-    door_wall, window_wall = (int(wall) for wall in rng.permutation(4)[:2])
+    door_wall, window_wall = (int(wall) for wall in work.rng.permutation(4)[:2])
     model = work.model("door")
     size = size_of(model)
     reach = room.wall_length(door_wall) / 2 - size[1] / 2 - 0.12
-    along = float(rng.choice([-1, 1]) * reach * rng.uniform(0.6, 1.0))
-    yaw = yaw_of_wall(door_wall)
+    along = float(work.rng.choice([-1, 1]) * reach * work.rng.uniform(0.6, 1.0))
+    yaw = 90.0 * door_wall
     work.put(model, room.at_wall(door_wall, along, size[0] / 2), yaw)
     # The entrance and the swing of the door stay free.
     entrance = room.at_wall(door_wall, along, 0.4)
     plan.taken.append(turned_space(entrance, np.array([0.8, size[1], 2.1]), yaw, 0.0))
     window, curtain = work.model("window"), work.model("curtain")
-    yaw = yaw_of_wall(window_wall)
-    along = float(rng.uniform(-0.3, 0.3))
+    yaw = 90.0 * window_wall
+    along = float(work.rng.uniform(-0.3, 0.3))
     for model, base_z in ((window, 0.92), (curtain, 0.84)):
         size = size_of(model)
         spot = room.at_wall(window_wall, along, size[0] / 2)
         work.put(model, spot, yaw, base_z)
     plan.taken.append(turned_space(spot, size, yaw, base_z))
-    return 3
 
 
-def _furnish(work: _Furnishing, rng: np.random.Generator, count: int) -> int:
+def _furnish(work: _Furnishing, count: int) -> int:
     """Place large pieces with their partners at the walls, and a table in the middle; return their number."""
     done, failures = 0, 0
     queue: list[Piece] = []
-    with_rug = count >= 4 and bool(rng.random() < 0.5)
+    with_rug = count >= 4 and bool(work.rng.random() < 0.5)
     # The table is placed last, in the space that is left; lamp and stool need a minimum number of pieces.
     extras = [(5, "lamp"), (7, "stool")]
     table_at = count - 1 - with_rug if count >= 3 else count
     while done < count and failures < 2 * len(LARGE):
         if done >= table_at:
             table_at = count
-            done += _put_table(work, rng, with_rug and done + 2 <= count)
+            done += _put_table(work, with_rug and done + 2 <= count)
             continue
         if extras and done >= extras[0][0]:
-            done += _put_at_wall(work, rng, Piece(extras.pop(0)[1], 0.0, 0.0))
+            done += _put_at_wall(work, Piece(extras.pop(0)[1], 0.0, 0.0))
             continue
         if not queue:
-            queue = [LARGE[row] for row in rng.permutation(len(LARGE))]
+            queue = [LARGE[row] for row in work.rng.permutation(len(LARGE))]
         piece = queue.pop()
-        if not _put_at_wall(work, rng, piece):
+        if not _put_at_wall(work, piece):
             failures += 1
             continue
         done += 1
         owner = len(work.placed) - 1
         for name, where in piece.partners:
             if done < count:
-                done += _put_partner(work, rng, owner, name, where)
+                done += _put_partner(work, owner, name, where)
     if done < count:
         logger.warning("scene room:%d: no place left for %d pieces of furniture", work.seed, count - done)
     return done
 
 
-def _put_at_wall(
-    work: _Furnishing, rng: np.random.Generator, piece: Piece, base_z: float = 0.0, gap: float = WALL_GAP
-) -> bool:
+def _put_at_wall(work: _Furnishing, piece: Piece, base_z: float = 0.0, gap: float = WALL_GAP) -> bool:
     """Place a piece at a wall, and return whether it fits."""
     model = work.model(piece.name)
     size = size_of(model) + np.array([0, 0, piece.above])
-    found = work.plan.wall_spot(rng, size, base_z, piece.clear, gap)
+    found = work.plan.wall_spot(work.rng, size, base_z, piece.clear, gap)
     if found is None:
         return False
-    wall, spot, space = found
-    work.plan.taken.append(space)
-    work.put(model, spot, yaw_of_wall(wall), base_z)
+    yaw, spot = found
+    work.put(model, spot, yaw, base_z)
     return True
 
 
@@ -253,7 +250,7 @@ ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
 """Offset of a partner towards the front of its support, from the support's middle, m."""
 
 
-def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, name: str, where: str) -> bool:
+def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bool:
     """Place a partner of a piece before it, beside it or on it; return whether it fits."""
     model = work.model(name)
     size = size_of(model)
@@ -269,7 +266,7 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
         support.stand.append((spot, radius))
         work.put(model, spot, owner.yaw_deg, support.height_at(spot, 0.4 * radius))
         return True
-    for side in rng.permutation([-1.0, 1.0]):
+    for side in work.rng.permutation([-1.0, 1.0]):
         if where == "before":
             offset, yaw = np.array([half_depth + size[0] / 2 + 0.06, -0.1 * half_width]), owner.yaw_deg + 180
         else:
@@ -277,24 +274,22 @@ def _put_partner(work: _Furnishing, rng: np.random.Generator, owner_row: int, na
             yaw = owner.yaw_deg
         spot = middle + turn @ offset
         space = turned_space(spot, size + np.array([0, 0, 0.45 if name in SUPPORTS else 0.0]), yaw, 0.0)
-        if work.plan.free(space, 0.02):
-            work.plan.taken.append(space)
+        if work.plan.claim(space, 0.02):
             work.put(model, spot, yaw)
             return True
     return False
 
 
-def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> int:
+def _put_table(work: _Furnishing, with_rug: bool) -> int:
     """Place a table near the middle of the room, optionally on a rug; return the number of pieces."""
     model, rug = work.model("table"), work.model("rug")
     size = size_of(rug) if with_rug else size_of(model)
     base_z = float(size_of(rug)[2]) if with_rug else 0.0
     for attempt in range(80):
-        yaw = 90.0 * int(rng.integers(4))
-        spot = rng.uniform(-1, 1, 2) * np.array([1.6, 1.0]) * (0.15 + 0.006 * attempt)
+        yaw = 90.0 * int(work.rng.integers(4))
+        spot = work.rng.uniform(-1, 1, 2) * np.array([1.6, 1.0]) * (0.15 + 0.006 * attempt)
         space = turned_space(spot, np.array([size[0], size[1], size_of(model)[2] + 0.46]), yaw, 0.0)
-        if work.plan.free(space, 0.25):
-            work.plan.taken.append(space)
+        if work.plan.claim(space, 0.25):
             if with_rug:
                 work.put(rug, spot, yaw)
             work.put(model, spot, yaw, base_z)
@@ -302,57 +297,50 @@ def _put_table(work: _Furnishing, rng: np.random.Generator, with_rug: bool) -> i
     return 0
 
 
-def _hang_pictures(work: _Furnishing, rng: np.random.Generator) -> int:
+def _hang_pictures(work: _Furnishing) -> int:
     """Hang a picture, and another or a mirror, on free wall space at eye height; return their number."""
-    names = ("picture", str(rng.choice(["picture", "mirror"])))
+    names = ("picture", str(work.rng.choice(["picture", "mirror"])))
     pieces = [Piece(name, 0.0, 0.25) for name in names]
-    return sum(_put_at_wall(work, rng, piece, float(rng.uniform(1.28, 1.4)), gap=0.0) for piece in pieces)
+    return sum(_put_at_wall(work, piece, float(work.rng.uniform(1.28, 1.4)), gap=0.0) for piece in pieces)
 
 
-def _add_thing(work: _Furnishing, rng: np.random.Generator, name: str) -> bool:
+def _add_thing(work: _Furnishing, name: str) -> bool:
     """Place a thing on furniture or the floor, facing the middle of the room; return whether it fits."""
-    model = work.model(name, thing=True)
+    model = work.model(name, "tabletop")
     _, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
-    target = float(rng.uniform(*THING_SIZES.get(name, TOY_SIZE)))
+    target = float(work.rng.uniform(*THING_SIZES.get(name, TOY_SIZE)))
     scale = min(target / height, MAX_THING_RADIUS / radius)
     radius *= scale
     pattern = model.materials.copy()
     pattern[:, 7] *= PATTERN_FACTOR  # cells of the texture per metre, see Paint.row
     model = replace(model, materials=pattern)
-    found = _thing_spot(work, rng, radius, height * scale)
+    found = _thing_spot(work, radius, height * scale)
     if found is None:
         logger.warning("scene room:%d: no place left for the %s", work.seed, name)
         return False
     spot, base_z = found
-    yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + rng.uniform(-50, 50))
+    yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + work.rng.uniform(-50, 50))
     # The footprint is a circle that rotates about its centre, so any yaw keeps it in place.
     work.put(model, spot, yaw, base_z, scale)
     return True
 
 
-def _thing_spot(
-    work: _Furnishing, rng: np.random.Generator, radius: float, height: float
-) -> tuple[np.ndarray, float] | None:
+def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.ndarray, float] | None:
     """Return x, y and base height on the emptiest support with a free place, else on the floor at a wall."""
-    order = sorted(range(len(work.supports)), key=lambda row: (len(work.supports[row].stand), rng.random()))
-    for row in order:
-        support = work.supports[row]
+    for support in sorted(work.supports, key=lambda each: (len(each.stand), work.rng.random())):
         low = np.array(support.top.low[:2]) + radius + EDGE
         high = np.array(support.top.high[:2]) - radius - EDGE
         if (high <= low).any():
             continue
         for _ in range(60):
-            spot = rng.uniform(low, high)
+            spot = work.rng.uniform(low, high)
             if all(np.linalg.norm(spot - other) > radius + size + 0.02 for other, size in support.stand):
                 support.stand.append((spot, radius))
                 return spot, support.height_at(spot, 0.6 * radius)
     size = np.array([2 * radius, 2 * radius, height])
-    found = work.plan.wall_spot(rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
-    if found is None:
-        return None
-    work.plan.taken.append(found[2])
-    return found[1], 0.0
+    found = work.plan.wall_spot(work.rng, size, 0.0, 0.2, gap=WALL_GAP + 0.05)
+    return None if found is None else (found[1], 0.0)
 
 
 def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None:
@@ -370,12 +358,11 @@ def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None
         group = str(rng.choice(["brick", "collage", "stone", "plain", "cloth"]))
         paint = paints.draw(group, scale=0.4).paled(WALL_PALE)
         half, length = (w / 2, d) if wall % 2 == 0 else (d / 2, w)
-        upright = _plane(h, length).turned("y", 90).moved(-half, 0, h / 2).turned("z", yaw_of_wall(wall))
-        pieces.append((upright, paint))
+        upright = _plane(h, length).turned("y", 90).moved(-half, 0, h / 2)
         board = box((0.018, length - 0.04, 0.09), (0.009 - half, 0, 0.045), 0.004)
-        pieces.append((board.turned("z", yaw_of_wall(wall)), skirting))
+        pieces += [(upright.turned("z", 90 * wall), paint), (board.turned("z", 90 * wall), skirting)]
     assembly.add_surroundings("wall", ("walls", "room wall"), pieces)
-    above = _plane(w, d).turned("x", 180).moved(0, 0, h)
+    above = plane.turned("x", 180).moved(0, 0, h)
     assembly.add_surroundings("ceiling", ("room ceiling",), [(above, ceiling)])
 
 
@@ -400,3 +387,71 @@ def _style(room: Room, rng: np.random.Generator) -> Style:
     ground = sky * np.array([1.12, 1.06, 0.98])
     lamp, above, below = (tuple(colour.tolist()) for colour in (light, sky, ground))
     return Style(position, radius, lamp, above, below, float(rng.uniform(1.05, 1.2)))
+
+
+def path_points(room: Room, azimuths_deg: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
+    """Return x and y of points on the camera loop, an ellipse about the middle of the room."""
+    angle = np.radians(azimuths_deg)
+    axes = PATH_SHARE * np.array([room.width, room.depth])
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) * axes
+
+
+def room_of(scene: WorldScene) -> Room:
+    """Return the interior dimensions of a room scene."""
+    high = scene.triangles.reshape(-1, 3).max(axis=0)
+    return Room(2 * float(high[0]), 2 * float(high[1]), float(high[2]))
+
+
+def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+    """Return cameras on a loop through the room that look across its middle from two alternating heights.
+
+    The views show the far wall with everything in front of it, and the middle from all sides. A camera that
+    rotates in place and looks outwards would give no parallax.
+    """
+    rng = np.random.default_rng([scene.seed, 25])
+    spots = path_points(room_of(scene), arc_azimuths(views, arc_deg) + rng.uniform(-1, 1, views))
+    transforms = []
+    for i in range(views):
+        centre = np.array([*spots[i], EYE_HEIGHTS[i % 2] + rng.uniform(-0.03, 0.03)])
+        target = np.array([*(-0.5 * spots[i]), LOOK_AT_Z]) + rng.uniform(-0.04, 0.04, 3)
+        transforms.append(looking_at(centre, target))
+    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+
+
+def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
+    """Return a random camera for training: a third as in `loop_cameras`, the others near one object.
+
+    The position is inside the room and outside all objects.
+    """
+    room = room_of(scene)
+    if rng.random() < 1 / 3:
+        spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
+        centre = np.array([*spot, rng.uniform(1.3, 1.78)])
+        target = np.array([*(-0.5 * spot), LOOK_AT_Z]) + rng.uniform(-0.3, 0.3, 3)
+    else:
+        thing = scene.placed[int(rng.integers(len(scene.placed)))]
+        target = np.array([*thing.centre_xy, thing.base_z + 0.5 * thing.height]) + rng.uniform(-0.1, 0.1, 3)
+        size = max(thing.footprint, thing.height / 2)
+        centre = _free_centre(scene, room, target, size, rng)
+    K = pinhole(image_px, rng.uniform(54, 66))
+    return Camera("random.png", looking_at(centre, target), K, (image_px, image_px))
+
+
+def _free_centre(
+    scene: WorldScene, room: Room, target: np.ndarray, size: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Return a position outside all objects from which an object of this size fills much of a view."""
+    things = [scene.triangles[scene.node_ids[:, 0] == thing.node] for thing in scene.placed]
+    boxes = [(corners.min(axis=(0, 1)), corners.max(axis=(0, 1))) for corners in things]
+    half = np.array([room.width, room.depth]) / 2 - 0.2
+    for _ in range(200):
+        azimuth, distance = rng.uniform(0, 2 * np.pi), size * rng.uniform(1.7, 3.2) + 0.35
+        flat = target[:2] + distance * np.array([np.cos(azimuth), np.sin(azimuth)])
+        centre = np.array([*flat, np.clip(target[2] + rng.uniform(0.05, 0.6) * distance, 0.45, 1.9)])
+        if (np.abs(flat) < half).all() and all(
+            ((centre < low - 0.12) | (centre > high + 0.12)).any() for low, high in boxes
+        ):
+            return centre
+    # Near an object enclosed by furniture, only the loop is certain to be free.
+    spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
+    return np.array([*spot, rng.uniform(1.3, 1.75)])

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import build_street_object
+from hilsplat.world.objects.catalogue import build_object
+from hilsplat.world.paints import Colour, Paint
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
-from hilsplat.world.scenes.street_ground import FRONT, KERB, LANE, SCALE, add_ground
-from hilsplat.world.shapes import rotation_about
+from hilsplat.world.shapes import Mesh, box, joined, lathe, rotation_about
 from hilsplat.world.views import looking_at, numbered_cameras, on_sphere, pinhole
 
 logger = logging.getLogger(__name__)
@@ -34,6 +34,19 @@ THINGS_X = (-9.0, 25.0)
 """Extent of vehicles, people and furniture, m, in view of the drive."""
 GAP = 0.12
 TRIES = 200
+
+LANE = 3.2
+KERB = 5.7
+"""Half the width of the road, m: a lane and a parking strip."""
+FRONT = 8.7
+"""Distance of the house fronts from the middle of the road, m."""
+WALK_Z = 0.14
+SCALE = 4.0
+"""`Style.scale`: textures and occlusion distance are four times as large as on a table."""
+ROAD_X = (-34.0, 50.0)
+DOME_RADIUS = 115.0
+DOME_HEIGHT = 62.0
+CROSSING_X = (14.2, 16.8)
 
 LANE_Y = -LANE / 2
 """Middle of the driver's lane, m (traffic keeps to the right)."""
@@ -83,7 +96,7 @@ class _Street:
     def draw(self, name: str) -> ObjectModel:
         """Draw the next object of a class; its look depends on the seed and the number drawn before."""
         self.drawn += 1
-        return build_street_object(name, np.random.default_rng([self.seed, 22, self.drawn]))
+        return build_object("street", name, np.random.default_rng([self.seed, 22, self.drawn]))
 
     def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
         """Place an object at a spot and return it, or return None if it would intersect another."""
@@ -178,13 +191,13 @@ def build_street(seed: int, objects: int) -> WorldScene:
             placed.append(thing)
     furniture = 0
     for i, name in enumerate(FURNITURE):
-        side = -1 if i == 0 or (i > 1 and rng.random() < 0.5) or i == 1 else 1
+        side = -1 if i <= 1 or rng.random() < 0.5 else 1
         thing = street.try_spots(name, partial(street.furniture_spot, side))
         if thing is None:
             logger.info("scene street:%d: no place left for the %s", seed, name)
         else:
             furniture += 1
-    add_ground(street.assembly, np.random.default_rng([seed, 23]))
+    _add_ground(street.assembly, np.random.default_rng([seed, 23]))
     logger.info(
         "scene street:%d: %d of %d vehicles and people placed (%s), %d pieces of furniture, %d buildings",
         seed, len(placed), objects, ", ".join(thing.name for thing in placed), furniture, houses,
@@ -211,6 +224,86 @@ def _add_buildings(street: _Street) -> int:
             count += street.put(model, _Spot(x, y + width / 2, 0.14, yaw)) is not None
             y += width
     return count
+
+
+def _add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add the surroundings as wholes without parts.
+
+    Their texts are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
+    """
+    middle, length = (ROAD_X[0] + ROAD_X[1]) / 2, ROAD_X[1] - ROAD_X[0]
+    tar, pale = float(rng.uniform(0.34, 0.44)), rng.uniform(0.02, 0.06, 3)
+    lighter = tuple((1.22 * tar + pale).tolist())
+    asphalt = _paint("grey", "mottled", (tar, tar, 1.03 * tar), lighter, 22.0, rng)
+    flags = _paint("beige", "collage", (0.66, 0.62, 0.56), (0.55, 0.53, 0.52), float(rng.uniform(8, 12)), rng)
+    stone = _paint("white", "stone", (0.78, 0.77, 0.74), (0.62, 0.62, 0.62), 10.0, rng)
+    lines = _paint("white", "mottled", (0.88, 0.88, 0.86), (0.72, 0.72, 0.70), 10.0, rng)
+    grass = _paint("green", "mottled", (0.34, 0.50, 0.22), (0.46, 0.56, 0.30), 6.0, rng)
+    road = [(box((length, 2 * KERB, 0.2), (middle, 0, -0.1)), asphalt)]
+    road.append((_patches(rng), _paint("black", "mottled", (0.22, 0.22, 0.24), (0.30, 0.30, 0.32), 9.0, rng)))
+    assembly.add_surroundings("road", ("street", "asphalt", "roadway"), road)
+    assembly.add_surroundings("lane marker", ("lane marking", "road marking"), [(_markings(), lines)])
+    wide = FRONT - KERB - 0.2
+    kerbs = box((length, 0.2, WALK_Z + 0.1)).both_sides(middle, KERB + 0.1, WALK_Z / 2 - 0.05)
+    walks = box((length, wide + 0.6, 0.2)).both_sides(middle, KERB + 0.5 + wide / 2, WALK_Z - 0.1)
+    assembly.add_surroundings("curb", ("kerb", "curbstone"), [(kerbs, stone)])
+    assembly.add_surroundings("sidewalk", ("pavement", "footpath"), [(walks, flags)])
+    lawn = box((2 * DOME_RADIUS, 2 * DOME_RADIUS, 0.2), (middle, 0, -0.13))
+    assembly.add_surroundings("ground", ("other ground", "lawn"), [(lawn, grass)])
+    blue = (0.36 + 0.08 * float(rng.random()), 0.60, 0.90)
+    offset = tuple(rng.uniform(3, 90, 3).tolist())
+    sky = Paint("blue", "mottled", blue, (0.93, 0.94, 0.96), 0.42, 0.0, 0.0, 0.0, offset)
+    assembly.add_surroundings("sky", ("clouds", "blue sky"), [(_dome(middle), sky)])
+
+
+def _paint(
+    colour: str, kind: str, first: Colour, second: Colour, scale: float, rng: np.random.Generator
+) -> Paint:
+    """Return a dull paint with strong grain, because structure from motion needs detail on large surfaces."""
+    offset = tuple(rng.uniform(3.0, 17.0, 3).tolist())
+    return Paint(colour, kind, first, second, scale, 0.03, 8.0, 0.34, offset)
+
+
+def _patches(rng: np.random.Generator) -> Mesh:
+    """Return repaired patches and manhole covers of the road."""
+    pieces = []
+    for _ in range(14):
+        size = (float(rng.uniform(0.6, 2.2)), float(rng.uniform(0.5, 1.6)), 0.02)
+        y = float(rng.uniform(-KERB + 1.0, KERB - 1.0))
+        pieces.append(box(size, (float(rng.uniform(-18, 34)), y, -0.004)))
+    return joined(*pieces)
+
+
+def _markings() -> Mesh:
+    """Return lane dashes, lines and ticks of the parking strips, a zebra crossing and a stop line."""
+    pieces = []
+
+    def mark(x0: float, x1: float, y0: float, y1: float) -> None:
+        pieces.append(box((x1 - x0, y1 - y0, 0.02), ((x0 + x1) / 2, (y0 + y1) / 2, 0.002)))
+
+    low, high = CROSSING_X
+    for x in np.arange(ROAD_X[0] + 1, ROAD_X[1] - 2, 4.0).tolist():
+        if x + 2 < low - 1.5 or x > high + 0.5:
+            mark(x, x + 2.0, -0.08, 0.08)
+    for side in (-1.0, 1.0):
+        for x0, x1 in ((ROAD_X[0], low - 0.6), (high + 0.6, ROAD_X[1])):
+            mark(x0, x1, side * LANE - 0.06, side * LANE + 0.06)
+        for x in np.arange(ROAD_X[0] + 3, ROAD_X[1], 6.0).tolist():
+            if x < low - 0.6 or x > high + 0.6:
+                edge = side * LANE
+                mark(x - 0.06, x + 0.06, min(edge, side * KERB), max(edge, side * KERB))
+    for y in np.arange(-KERB + 0.5, KERB - 0.5, 1.0).tolist():
+        mark(low, high, y, y + 0.5)
+    mark(low - 1.4, low - 1.0, -LANE + 0.2, -0.2)
+    return joined(*pieces)
+
+
+def _dome(middle: float) -> Mesh:
+    """Return the sky: half an ellipsoid over the scene, near enough for its clouds to show parallax."""
+    angle = np.linspace(-0.02, np.pi / 2, 15)
+    profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
+    profile[-1] = (0.0, 1.0)
+    return lathe(profile, 48).scaled(DOME_RADIUS, DOME_RADIUS, DOME_HEIGHT).moved(middle, 0, 0)
 
 
 def _daylight(rng: np.random.Generator) -> Style:
@@ -279,7 +372,7 @@ def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, 
         away = rng.uniform(0.7, 1.5) * size
         centre = target + away * on_sphere(float(toward), 0.0, 1.0)
         centre[2] = rng.uniform(0.9, 2.6)
-        inside = (corners.reshape(-1, 3).min(axis=0) < centre) & (centre < high)
+        inside = (low < centre) & (centre < high)
         if abs(centre[1]) > FRONT - 0.5 or inside.all():
             continue
         if _sees(scene, centre, corners, node, rng):

@@ -49,24 +49,23 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
     typical = min(MAX_FOOTPRINT, TABLE_RADIUS * float(np.sqrt(COVERED_SHARE / objects)))
     drawn = []
     for i in range(objects):
-        name = TABLETOP[order[i]]
-        model = build_object(name, np.random.default_rng([seed, 2, i]))
+        model = build_object("tabletop", TABLETOP[order[i]], np.random.default_rng([seed, 2, i]))
         centre, radius = footprint_of(model.triangles)
         height = float(model.triangles[..., 2].max())
         size = typical * float(rng.uniform(0.92, 1.08))
         scale = min(size / radius, MAX_HEIGHT_TO_FOOTPRINT * size / height)
-        drawn.append((name, model, centre * scale, radius * scale, height * scale, scale))
-    drawn.sort(key=lambda entry: -entry[3])
-    spots = _layout(rng, [entry[3] for entry in drawn])
+        drawn.append((model, centre * scale, radius * scale, height * scale, scale))
+    drawn.sort(key=lambda entry: -entry[2])
+    spots = _layout(rng, [entry[2] for entry in drawn])
     placed: list[PlacedObject] = []
-    for (name, model, centre, radius, height, scale), spot in zip(drawn, spots, strict=True):
+    for (model, centre, radius, height, scale), spot in zip(drawn, spots, strict=True):
         if spot is None:
-            logger.warning("scene tabletop:%d: no place left for the %s", seed, name)
+            logger.warning("scene tabletop:%d: no place left for the %s", seed, model.name)
             continue
         yaw = float(rng.uniform(-110, 110))
         xy = spot - rotation_about("z", yaw)[:2, :2] @ centre
         node = assembly.add_object(model, scale, xy, yaw)
-        placed.append(PlacedObject(name, node, (float(spot[0]), float(spot[1])), radius, height, yaw))
+        placed.append(PlacedObject(model.name, node, (float(spot[0]), float(spot[1])), radius, height, yaw))
     logger.info("scene tabletop:%d: %d of %d objects placed", seed, len(placed), objects)
     _add_room(assembly, np.random.default_rng([seed, 3]))
     style = Style.draw(np.random.default_rng([seed, 4]))

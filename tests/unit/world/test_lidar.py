@@ -18,7 +18,7 @@ from hilsplat.world.lidar import (
 from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.stage import run_world
-from tests.unit.world.depth import depth_view
+from hilsplat.world.truth import TrueMesh
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +76,11 @@ def test_the_sky_gives_no_return_and_a_share_of_returns_is_dropped(street, centr
 
 
 def test_visible_points_have_the_label_of_their_pixel(street, cameras, centres):
-    scan = scan_street(street, centres)
+    scan, mesh = scan_street(street, centres), TrueMesh(street.triangles)
     assert 50_000 < len(scan.points) < 150_000
     for name in ("004.png", "021.png"):
         camera = cameras[name]
-        labels, depth = label_view(street, camera), depth_view(street, camera)
+        labels, depth = label_view(street, camera), mesh.depth(camera)
         seen = scan.points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
         ahead = seen[:, 2] > 0.5
         xy = (seen[ahead] @ camera.K.T)[:, :2] / seen[ahead, 2:]

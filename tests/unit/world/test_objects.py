@@ -7,30 +7,31 @@ import pytest
 
 from hilsplat.base.errors import SceneError
 from hilsplat.world.objects.builder import NEIGHBOUR_CONTRAST, PARENT_CONTRAST, Builder
-from hilsplat.world.objects.catalogue import (
-    FURNITURE,
-    STREET,
-    TABLETOP,
-    build_furniture,
-    build_object,
-    build_street_object,
-)
+from hilsplat.world.objects.catalogue import CLASSES, TABLETOP, build_object
 from hilsplat.world.paints import COLOURS, KINDS, TEXTURES, Paint, PaintBox, colour_word, lab_from_srgb
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.shapes import Mesh, box, cylinder, disc, extrude, loft, ring, sphere, sweep
 from hilsplat.world.textures import pattern
 
+SIZES = {"tabletop": (0.0, np.inf), "room": (0.3, 2.7), "street": (0.5, 16)}
+"""Smallest and largest objects by kind of scene; full size in metres, no larger than a house."""
+
 
 @cache
-def built(name, build=build_object):
+def built(name, kind="tabletop"):
     """One object of a class, drawn once for all tests."""
-    return build(name, np.random.default_rng(0))
+    return build_object(kind, name, np.random.default_rng(0))
 
 
 def volume(mesh: Mesh) -> float:
     """Enclosed volume; positive if triangles are wound outwards."""
     a, b, c = mesh.triangles[:, 0], mesh.triangles[:, 1], mesh.triangles[:, 2]
     return float((a * np.cross(b, c)).sum() / 6)
+
+
+def square(half, z):
+    """Corners of a horizontal square, counter-clockwise."""
+    return [(-half, -half, z), (half, -half, z), (half, half, z), (-half, half, z)]
 
 
 @pytest.mark.parametrize(
@@ -47,24 +48,8 @@ def volume(mesh: Mesh) -> float:
         (ring(1.0, 0.25, segments=128), 2 * np.pi**2 * 0.25**2),  # Pappus; its tube has 12 sides, see below
         (ring(1.0, 0.25, axis="x", segments=128), 2 * np.pi**2 * 0.25**2),
         # A frustum of squares with sides 2 and 1 and height 3: h / 3 * (A + B + sqrt(A * B)) = 7.
-        (
-            loft(
-                [
-                    [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)],
-                    [(-0.5, -0.5, 3), (0.5, -0.5, 3), (0.5, 0.5, 3), (-0.5, 0.5, 3)],
-                ]
-            ),
-            7.0,
-        ),
-        (
-            loft(
-                [
-                    [(-1, 1, 0), (1, 1, 0), (1, -1, 0), (-1, -1, 0)],
-                    [(-1, 1, 1), (1, 1, 1), (1, -1, 1), (-1, -1, 1)],
-                ]
-            ),
-            4.0,
-        ),
+        (loft([square(1, 0), square(0.5, 3)]), 7.0),
+        (loft([square(1, 0)[::-1], square(1, 1)[::-1]]), 4.0),
         (sweep([(0, 0, 0), (0, 0, 1), (0, 0, 2)], 0.5, segments=128), np.pi / 2),
     ],
 )
@@ -75,16 +60,9 @@ def test_primitives_are_closed_and_wound_outwards(mesh, expected):
     assert ((facet[:, None] * mesh.normals).sum(axis=-1) > 0).all()
 
 
-CLASSES = [
-    *((build_object, name, (0.0, np.inf)) for name in TABLETOP),
-    *((build_furniture, name, (0.3, 2.7)) for name in FURNITURE),  # full size, metres
-    *((build_street_object, name, (0.5, 16)) for name in STREET),  # no larger than a house
-]
-
-
-@pytest.mark.parametrize(("build", "name", "sizes"), CLASSES)
-def test_every_class_has_two_parts_and_two_subparts_with_consistent_ids(build, name, sizes):
-    for model in (built(name, build), build(name, np.random.default_rng(1))):
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in CLASSES for name in CLASSES[kind]])
+def test_every_class_has_two_parts_and_two_subparts_with_consistent_ids(kind, name):
+    for model in (built(name, kind), build_object(kind, name, np.random.default_rng(1))):
         texts = {level: {node.text for node in model.nodes if node.level == level} for level in (1, 2, 3)}
         assert texts[1] == {name}
         assert len(texts[2]) >= 2 and len(texts[3]) >= 2
@@ -100,11 +78,12 @@ def test_every_class_has_two_parts_and_two_subparts_with_consistent_ids(build, n
         assert set(np.unique(model.node_ids)) - {-1} == set(range(len(model.nodes)))
         assert model.triangles[..., 2].min() == pytest.approx(0.0, abs=1e-9)
         assert np.linalg.norm(model.normals, axis=-1) == pytest.approx(1.0, abs=1e-6)
-        assert sizes[0] < np.ptp(model.triangles.reshape(-1, 3), axis=0).max() < sizes[1]
+        smallest, largest = SIZES[kind]
+        assert smallest < np.ptp(model.triangles.reshape(-1, 3), axis=0).max() < largest
 
 
 def test_no_text_names_two_kinds_of_node():
-    models = [built(name) for name in TABLETOP] + [built(name, build_furniture) for name in FURNITURE]
+    models = [built(name, kind) for kind in ("tabletop", "room") for name in CLASSES[kind]]
     room = build_scene("room", 100, 1)
     named: dict[str, set[str]] = {}
     for nodes in (*(model.nodes for model in models), [room.nodes[node] for node in room.background]):
@@ -191,7 +170,7 @@ def test_shades_are_darker_below_1_and_lighter_above():
 
 
 def test_synonyms_contain_aliases_attributes_and_relations():
-    model = build_object("bear", np.random.default_rng(0))
+    model = built("bear")
     whole = model.nodes[0]
     assert "teddy bear" in whole.synonyms
     assert {"brown bear", "furry bear", "brown furry bear"} <= set(whole.synonyms)
@@ -200,14 +179,14 @@ def test_synonyms_contain_aliases_attributes_and_relations():
     assert model.nodes[muzzle.parent].text == "bear head"
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (build_object, "unknown object class 'unicorn'\n  expected  one of bear, snowman"),
-        (build_furniture, "unknown class of furniture 'unicorn'\n  expected  one of bed, sofa"),
-        (build_street_object, "unknown class of a street 'unicorn'\n  expected  one of car, truck"),
-    ],
-)
-def test_the_error_about_an_unknown_class_lists_the_known_ones(build, message):
-    with pytest.raises(SceneError, match=message):
-        build("unicorn", np.random.default_rng(0))
+def test_synonyms_of_street_objects_include_the_waymo_class():
+    classes = dict.fromkeys(("car", "truck", "bus"), "vehicle") | dict.fromkeys(
+        ("tree", "bush"), "vegetation"
+    )
+    for name, waymo_class in (classes | {"traffic sign": "sign"}).items():
+        assert waymo_class in built(name, "street").nodes[0].synonyms
+
+
+def test_the_error_about_an_unknown_class_lists_the_known_ones():
+    with pytest.raises(SceneError, match="unknown room object 'unicorn'\n  expected  one of bed, sofa"):
+        built("unicorn", "room")

@@ -4,33 +4,21 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Camera
 from hilsplat.world import render
 from hilsplat.world.paints import Paint
 from hilsplat.world.rays import RayCaster
 from hilsplat.world.render import label_view, render_and_label, render_view
 from hilsplat.world.scenes.kinds import build_scene
-from hilsplat.world.scenes.scene import Style, WorldScene
+from hilsplat.world.scenes.scene import Style
 from hilsplat.world.scenes.tabletop import ring_cameras, training_camera
-from hilsplat.world.shapes import Mesh, box, joined, sphere
+from hilsplat.world.shapes import box, joined, sphere
 from hilsplat.world.textures import fractal_noise, grains, hash01
+from hilsplat.world.truth import TrueMesh
 from hilsplat.world.views import looking_at, pinhole
-from tests.unit.world.depth import depth_view
+from tests.unit.world.scenes import scene_of
 
-GREY = Paint("grey", "mottled", (0.5, 0.5, 0.5), (0.5, 0.5, 0.5), 9.0, 0.0, 10.0, 0.0, (5.0, 6.0, 7.0))
 STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0, 0.3, (5.0, 6.0, 7.0))
-
-
-def scene_of(mesh: Mesh, paint: Paint = GREY) -> WorldScene:
-    """One node, one material, no room."""
-    count = len(mesh)
-    corners = mesh.triangles.astype(np.float32)
-    return WorldScene(
-        "test", 0, 1, (), corners, mesh.normals.astype(np.float32), corners,
-        np.tile(np.int32([0, -1, -1]), (count, 1)), np.zeros(count, np.int32), paint.row()[None],
-        (AnnotatedNode(0, 1, -1, "thing"),), frozenset(), Style(),
-    )  # fmt: skip
 
 
 def camera_at(centre, target=(0.0, 0.0, 0.0), side_px: int = 64, fov_deg: float = 50.0) -> Camera:
@@ -48,7 +36,7 @@ def test_label_image_of_a_box_is_its_analytic_projection():
     labels = label_view(scene, camera)
     assert np.array_equal(labels[0] == 0, expected)
     assert (labels[1:] == -1).all()
-    assert depth_view(scene, camera)[32, 32] == pytest.approx(3.5, abs=1e-5)
+    assert TrueMesh(scene.triangles).depth(camera)[32, 32] == pytest.approx(3.5, abs=1e-5)
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -87,11 +75,11 @@ def test_a_surface_point_has_one_colour_in_all_views():
 
 def test_the_floor_below_a_slab_is_in_shadow():
     # Light straight above a floating slab: the floor right below is dark, far from it bright.
-    scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.02), (0, 0, 0.8))))
-    style = Style(light_position=(0.0, 0.0, 4.0))
+    mesh = joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.02), (0, 0, 0.8)))
+    scene = scene_of(mesh, style=Style(light_position=(0.0, 0.0, 4.0)))
     camera = camera_at((2.0, 0, 0.5))
     columns, rows = projected(camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.8, 0.0]])).astype(int)
-    under, beside = render_view(scene, camera, 3, style)[rows, columns].mean(axis=1)
+    under, beside = render_view(scene, camera, 3)[rows, columns].mean(axis=1)
     assert under < 0.75 * beside
 
 
@@ -124,17 +112,17 @@ def test_image_and_labels_do_not_depend_on_the_height_of_bands(monkeypatch, samp
 
 
 def test_omitted_shadow_rays_do_not_change_the_image(monkeypatch):
-    scene = scene_of(joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.6), (0, 0, 0.8))))
-    style = Style(light_position=(1.0, 0.0, 4.0))
+    mesh = joined(box((4, 4, 0.1), (0, 0, -0.05)), box((0.6, 0.6, 0.6), (0, 0, 0.8)))
+    scene = scene_of(mesh, style=Style(light_position=(1.0, 0.0, 4.0)))
     camera = camera_at((-2.0, 0, 0.9))
     blocked, rays = RayCaster.blocked, []
     monkeypatch.setattr(render, "BAND_RAYS", 10**9)
     monkeypatch.setattr(RayCaster, "blocked", lambda *of: (rays.append(len(of[1])), blocked(*of))[1])
-    image = render_view(scene, camera, 3, style)
+    image = render_view(scene, camera, 3)
     assert rays[0] < rays[1] < (3 * 64) ** 2  # to the light, to the sky, from the camera
     # each receives light and sky, if it is there at all
     monkeypatch.setattr(render, "_receivers", lambda prim, *_: (np.flatnonzero(prim >= 0),) * 2)
-    assert np.array_equal(image, render_view(scene, camera, 3, style)) and rays[2] == rays[3] == rays[1]
+    assert np.array_equal(image, render_view(scene, camera, 3)) and rays[2] == rays[3] == rays[1]
 
 
 def test_ring_cameras_alternate_in_elevation_and_are_nine_degrees_apart():

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from hilsplat.world.objects.catalogue import FURNITURE
+from hilsplat.world.objects.catalogue import CLASSES
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras, training_camera
-from hilsplat.world.scenes.room_cameras import room_of
+from hilsplat.world.scenes.room import room_of
 
 SCANNET_19 = {
     *("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf"),
@@ -39,7 +39,7 @@ def test_eight_rooms_contain_the_classes_of_scannet(rooms):
     seen = {node.text for scene in rooms for node in scene.nodes if node.level == 1}
     assert seen >= SCANNET_19 | {"television", "monitor", "nightstand", "tv stand", "lamp", "rug", "stool"}
     for scene in rooms:
-        furniture = {thing.name for thing in scene.placed} & set(FURNITURE)
+        furniture = {thing.name for thing in scene.placed} & set(CLASSES["room"])
         assert len(furniture) >= 8
 
 

@@ -5,19 +5,21 @@ import itertools
 import numpy as np
 import pytest
 
-from hilsplat.world.objects.catalogue import STREET, build_street_object
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.scenes.street import (
+    FRONT,
+    KERB,
+    LANE,
     LANE_Y,
     MAX_STEP,
     SWAY_M,
     SWEEP_DEG,
+    WALK_Z,
     drive_cameras,
     part_boxes,
     training_camera,
 )
-from hilsplat.world.scenes.street_ground import FRONT, KERB, LANE, WALK_Z
 from hilsplat.world.views import looking_at
 
 VEHICLES = {"car", "truck", "bus"}
@@ -26,14 +28,6 @@ VEHICLES = {"car", "truck", "bus"}
 def things(scene: WorldScene) -> list[int]:
     """Ids of all wholes but the surroundings."""
     return sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
-
-
-def test_synonyms_include_the_waymo_class():
-    models = {name: build_street_object(name, np.random.default_rng(0)) for name in STREET}
-    classes = dict.fromkeys(VEHICLES, "vehicle") | {"traffic sign": "sign"}
-    for name, waymo_class in (classes | dict.fromkeys(("tree", "bush"), "vegetation")).items():
-        assert waymo_class in models[name].nodes[0].synonyms
-    assert "tree trunk" in {node.text for node in models["tree"].nodes}
 
 
 def test_boxes_of_parts_of_different_objects_do_not_intersect(street):

@@ -1,28 +1,18 @@
-"""The true mesh has short edges, node ids on both sides of borders, and the number of views per vertex."""
+"""The true mesh has short edges, node ids on both sides of borders, views per vertex, and exact depth."""
 
 from collections import Counter
 
 import numpy as np
 import pytest
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
-from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.scene.cameras import Cameras
-from hilsplat.world.scenes.scene import Style, WorldScene
-from hilsplat.world.shapes import box
-from hilsplat.world.truth import refined, unique_rows, views_of_points, write_mesh
+from hilsplat.world.shapes import Mesh, box
+from hilsplat.world.truth import TrueMesh, refined, unique_rows, views_of_points, write_mesh
 from hilsplat.world.views import looking_at, numbered_cameras, pinhole
-
-
-def scene_of(triangles: np.ndarray, node_ids: np.ndarray) -> WorldScene:
-    triangles = triangles.astype(np.float32)
-    nodes = tuple(AnnotatedNode(i, 1, -1, f"thing {i}", ()) for i in range(int(node_ids.max()) + 1))
-    count = len(triangles)
-    return WorldScene(
-        "room", 100, 1, (), triangles, np.zeros_like(triangles), triangles, node_ids.astype(np.int32),
-        np.zeros(count, np.int32), np.zeros((1, 14), np.float32), nodes, frozenset(), Style(),
-    )  # fmt: skip
+from tests.unit.world.scenes import scene_of
 
 
 def cameras_at(*centres: tuple[float, float, float]) -> Cameras:
@@ -67,7 +57,7 @@ def test_small_triangles_are_unchanged():
 def test_a_vertex_on_a_border_has_one_copy_per_node(tmp_path):
     # Two triangles of a square share its diagonal; they belong to two wholes, one of which has a part.
     square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32)
-    scene = scene_of(square, np.array([[0, -1, -1], [1, 2, -1]]))
+    scene = scene_of(Mesh(square, square), node_ids=[[0, -1, -1], [1, 2, -1]])
     write_mesh(tmp_path / "mesh.ply", scene, cameras_at((0.1, 0.0, 3.0), (0.1, 0.0, -3.0)))
     mesh = PlyData.read(tmp_path / "mesh.ply")
     vertices, faces = mesh["vertex"].data, mesh["face"].data
@@ -83,7 +73,8 @@ def test_hidden_points_are_not_counted_as_seen():
     # A plate at z = 0 under a small plate at z = 1: seen from above, its middle is hidden, its corner not.
     plate = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]], np.float32)
     lid = plate * np.float32(0.2) + np.array([0, 0, 1], np.float32)
-    scene = scene_of(np.concatenate([plate, lid]), np.zeros((4, 3), np.int32))
+    both = np.concatenate([plate, lid])
+    scene = scene_of(Mesh(both, both))
     points = np.array([[0, 0, 0], [0.9, 0.9, 0], [0, 0, 1], [0, 0, 9]], np.float32)
     above, below, near = cameras_at((0.01, 0, 4.0)), cameras_at((0.01, 0, -4.0)), cameras_at((0.01, 0, 0.5))
     assert views_of_points(scene, above, points).tolist() == [0, 1, 1, 0]
@@ -96,3 +87,34 @@ def test_unique_rows_equal_numpys():
     unique, index = np.unique(rows, axis=0, return_inverse=True)
     for found, expected in zip(unique_rows(rows), (unique, index.reshape(-1)), strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+def test_the_written_mesh_gives_the_depth_of_the_scene_along_the_optical_axis(tmp_path):
+    # A camera 4 above a box of height 1 sees its top at depth 3.5 in all pixels and nothing around it.
+    cameras = cameras_at((0.0, 0.001, 4.0))
+    write_mesh(tmp_path / "mesh.ply", scene_of(box((1.0, 1.0, 1.0))), cameras)
+    depth = TrueMesh.load(tmp_path / "mesh.ply").depth(cameras["000.png"])
+    assert depth[24:40, 24:40] == pytest.approx(3.5, abs=2e-3)
+    assert np.isinf(depth[:8]).all()
+
+
+def quad(path):
+    """Write a mesh whose only face has four corners."""
+    vertices = np.zeros(4, dtype=[(axis, "f4") for axis in "xyz"])
+    faces = np.empty(1, dtype=[("vertex_indices", object)])
+    faces[0] = (np.arange(4, dtype=np.int32),)
+    PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(str(path))
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path: None, r"mesh\.ply is missing"),
+        (lambda path: path.write_bytes(b"no mesh"), r"mesh\.ply cannot be read"),
+        (quad, r"mesh\.ply cannot be read"),
+    ],
+)
+def test_a_missing_or_damaged_mesh_is_reported(tmp_path, write, message):
+    write(tmp_path / "mesh.ply")
+    with pytest.raises(ArtifactError, match=message):
+        TrueMesh.load(tmp_path / "mesh.ply")
