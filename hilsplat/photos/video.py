@@ -62,8 +62,7 @@ class Frame:
 
 @dataclass
 class Decoding:
-    """Statistics of decoding: duration according to the file (or None), time of the last intact frame,
-    counts."""
+    """Decoding statistics: duration stated by the file, time of the last intact frame, counts."""
 
     stated_s: float | None = None
     decoded_s: float = 0.0

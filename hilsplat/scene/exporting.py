@@ -14,19 +14,16 @@ from hilsplat.scene.posed_images import PosedImage, write_posed_images
 from hilsplat.scene.scene import Scene
 
 
-def source_images(scene: Scene) -> list[PosedImage]:
-    """Return the undistorted images of a scene with their poses in the source's coordinates."""
-    poses = move_cameras(scene.cameras.cam_from_world, np.linalg.inv(scene.scene_from_source))
-    return [
+def in_source(scene: Scene) -> tuple[list[PosedImage], Float64[np.ndarray, "P 3"]]:
+    """Return undistorted images with their poses, and sparse points, in the coordinates of the source."""
+    source_from_scene = np.linalg.inv(scene.scene_from_source)
+    poses = move_cameras(scene.cameras.cam_from_world, source_from_scene)
+    images = [
         PosedImage(name, scene.image_path(name), pose, scene.cameras[name].K, scene.cameras[name].size_hw)
         for name, pose in zip(scene.cameras.names, poses, strict=True)
     ]
-
-
-def source_points(scene: Scene) -> Float64[np.ndarray, "P 3"]:
-    """Return the sparse points of a scene in the source's coordinates."""
-    source_from_scene = np.linalg.inv(scene.scene_from_source)
-    return scene.points_xyz.astype(np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+    points = scene.points_xyz.astype(np.float64) @ source_from_scene[:3, :3].T + source_from_scene[:3, 3]
+    return images, points
 
 
 def write_colmap(scene: Scene, out: Path) -> None:
@@ -41,8 +38,7 @@ def add_colmap(scene: Scene, folder: Path) -> None:
     for view in scene.views():
         shutil.copyfile(scene.image_path(view), folder / "images" / view)
     (folder / "sparse" / "0").mkdir(parents=True)
-    model = pinhole_model(source_images(scene), source_points(scene), scene.points_rgb)
-    model.write_binary(folder / "sparse" / "0")
+    pinhole_model(*in_source(scene), scene.points_rgb).write_binary(folder / "sparse" / "0")
 
 
 def pinhole_model(
@@ -65,4 +61,4 @@ def pinhole_model(
 
 def write_nerfstudio(scene: Scene, out: Path) -> None:
     """Write `images/`, `transforms.json` and the sparse points in `points.ply`."""
-    write_posed_images(out, source_images(scene), source_points(scene), scene.points_rgb)
+    write_posed_images(out, *in_source(scene), scene.points_rgb)

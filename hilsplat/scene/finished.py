@@ -173,7 +173,7 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse a file whose digest differs from the one that an artifact was made for."""
+    """Refuse a file that an artifact, `what`, was not made for."""
     require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
 
 

@@ -97,7 +97,20 @@ def write_posed_images(
                 target.write_bytes(image.image)
             else:
                 shutil.copyfile(image.image, target)
-            frames.append(_frame(image))
+            height, width = image.size_hw
+            frame: dict[str, object] = {
+                "file_path": f"images/{image.name}",
+                "transform_matrix": (image.world_from_cam @ OPENGL_TO_OPENCV).tolist(),
+                "w": width,
+                "h": height,
+                "fl_x": float(image.K[0, 0]),
+                "fl_y": float(image.K[1, 1]),
+                "cx": float(image.K[0, 2]),
+                "cy": float(image.K[1, 2]),
+            }
+            if any(image.distortion):
+                frame.update(zip(("k1", "k2", "p1", "p2", "k3"), image.distortion, strict=True))
+            frames.append(frame)
         content: dict[str, object] = {"frames": frames}
         if points is not None:
             content["ply_file_path"] = "points.ply"
@@ -109,20 +122,3 @@ def write_posed_images(
                 table[name] = values
             PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary / "points.ply")
         write_text(temporary / "transforms.json", json.dumps(content, indent=1) + "\n")
-
-
-def _frame(image: PosedImage) -> dict[str, object]:
-    height, width = image.size_hw
-    frame: dict[str, object] = {
-        "file_path": f"images/{image.name}",
-        "transform_matrix": (image.world_from_cam @ OPENGL_TO_OPENCV).tolist(),
-        "w": width,
-        "h": height,
-        "fl_x": float(image.K[0, 0]),
-        "fl_y": float(image.K[1, 1]),
-        "cx": float(image.K[0, 2]),
-        "cy": float(image.K[1, 2]),
-    }
-    if any(image.distortion):
-        frame.update(zip(("k1", "k2", "p1", "p2", "k3"), image.distortion, strict=True))
-    return frame

@@ -225,20 +225,30 @@ def registration_report(
         views[image.view] = entry
     every_error = np.concatenate([*errors.values(), np.zeros(0)])
     num_points = models[0].num_points3D() if models else 0
-    report = {
+    points_per_view = round(num_points / len(errors), 1) if errors else 0.0
+    warnings = []
+    if 0 < len(errors) < len(images):
+        warnings.append(f"{len(images) - len(errors)} of {len(images)} views are not registered")
+    if len(members) > 1:
+        sizes = ", ".join(str(len(names)) for names in members)
+        warnings.append(f"the views fall into {len(members)} models ({sizes} views); the largest is used")
+    if errors and points_per_view < WEAK_POINTS_PER_VIEW:
+        warnings.append(
+            f"only {points_per_view} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} or more): "
+            "the poses may be wrong"
+        )
+    return {
         "images": len(images),
         "registered": len(errors),
         "models": [len(names) for names in members],
         "points": num_points,
-        "points_per_view": round(num_points / len(errors), 1) if errors else 0.0,
+        "points_per_view": points_per_view,
         "mean_track_length": round(models[0].compute_mean_track_length(), 3) if num_points else 0.0,
         "mean_reprojection_error_px": round(float(every_error.mean()), 4) if len(every_error) else None,
         "cameras": _camera_entries(models[0]) if models else [],
-        "warnings": [],
+        "warnings": warnings,
         "views": views,
     }
-    report["warnings"] = _warnings(report)
-    return report
 
 
 def _camera_entries(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
@@ -265,23 +275,6 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
             return f"in model {number} of {len(names)} views, not in the largest"
     best = entry["best_pair_matches"]
     return f"no pose found: too few matches with posed views (best pair: {best} matches)"
-
-
-def _warnings(report: Mapping[str, Any]) -> list[str]:
-    warnings = []
-    lost = report["images"] - report["registered"]
-    if report["registered"] and lost:
-        warnings.append(f"{lost} of {report['images']} views are not registered")
-    if len(report["models"]) > 1:
-        sizes = ", ".join(str(size) for size in report["models"])
-        number = len(report["models"])
-        warnings.append(f"the views fall into {number} models ({sizes} views); the largest is used")
-    if report["registered"] and report["points_per_view"] < WEAK_POINTS_PER_VIEW:
-        warnings.append(
-            f"only {report['points_per_view']} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} "
-            "or more): the poses may be wrong"
-        )
-    return warnings
 
 
 def check_registration(images: Path, name: str, report: Mapping[str, Any], settings: PosesSettings) -> None:

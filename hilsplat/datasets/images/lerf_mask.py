@@ -39,7 +39,16 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     DATASET.require(root, scene)
     folder = root / scene
     images = images_by_view(folder / "images")
-    masks = _mask_folders(folder / "test_mask", held_out_views(folder))
+    train, posed = images_by_view(folder / "images_train"), posed_images(folder, "LERF-Mask")
+    test = tuple(view for view in posed if view not in train)
+    if not test:
+        raise SceneError(
+            f"{folder} has no test view",
+            expected="posed images that are not in images_train",
+            found=f"{len(posed)} posed images, all of them in images_train",
+            fix="unpack images_train again; it is not a copy of images",
+        )
+    masks = _mask_folders(folder / "test_mask", test)
     require_images(masks, images)
     warnings: list[str] = []
     views: dict[str, tuple[LabelledRegion, ...]] = {}
@@ -61,21 +70,6 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     read = LabelledScene("lerf_mask", scene, images, folder, views)
     warnings += differences("lerf_mask", scene, {}, read.prompts)
     return replace(read, warnings=tuple(warnings))
-
-
-def held_out_views(folder: Path) -> tuple[str, ...]:
-    """Return the posed images that are not in `images_train`, by view name, sorted by stem; at least one."""
-    train = images_by_view(folder / "images_train")
-    posed = posed_images(folder, "LERF-Mask")
-    test = tuple(view for view in posed if view not in train)
-    if not test:
-        raise SceneError(
-            f"{folder} has no test view",
-            expected="posed images that are not in images_train",
-            found=f"{len(posed)} posed images, all of them in images_train",
-            fix="unpack images_train again; it is not a copy of images",
-        )
-    return test
 
 
 def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:

@@ -127,10 +127,6 @@ def sequence_folder(root: Path, scene: str) -> Path:
     )
 
 
-INSTANCES_PER_CLASS = 1000
-"""Values in instance files are class * 1000 + instance; values below 1000 are not objects."""
-
-
 def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
     """Return the class of each object id, from `info_semantic.json`; negative ids (undefined, none) become 0.
 
@@ -251,7 +247,8 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
                 found=len(values),
                 fix="use files of the same scene",
             )
-        instance = np.where(values >= INSTANCES_PER_CLASS, values, 0).astype(np.int32)
+        # Values are class * 1000 + instance; values below 1000 are not objects.
+        instance = np.where(values >= 1000, values, 0).astype(np.int32)
     return LabelledPoints(xyz, class_id, instance, "replica", faces)
 
 

@@ -4,6 +4,7 @@ pycolmap does not check record counts: a truncated file or wrong count makes it 
 """
 
 import mmap
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -16,64 +17,58 @@ POSE_BYTES = 56
 """Size of a quaternion and a translation."""
 
 
-class _Walk:
-    """A position in a file that advances over its records."""
-
-    def __init__(self, data: bytes | mmap.mmap) -> None:
-        self.data, self.at = data, 0
-
-    def number(self, form: str) -> int:
-        """Read a number."""
-        (found,) = struct.unpack_from(f"<{form}", self.data, self.at)
-        self.at += struct.calcsize(f"<{form}")
-        return int(found)
-
-    def skip(self, count: int) -> None:
-        """Advance by a number of bytes, and fail beyond the end of the file."""
-        self.at += count
-        if self.at > len(self.data):
-            raise ValueError("it is truncated")
+def _number(data: mmap.mmap, form: str) -> int:
+    """Read a number; raise struct.error beyond the end of the file."""
+    (found,) = struct.unpack(f"<{form}", data.read(struct.calcsize(f"<{form}")))
+    return int(found)
 
 
-def _camera(walk: _Walk) -> None:
-    walk.skip(4)
-    model = walk.number("i")
+def _skip(data: mmap.mmap, count: int) -> None:
+    """Advance by a number of bytes; raise ValueError beyond the end of the file."""
+    if count > len(data) - data.tell():
+        raise ValueError("it is truncated")
+    data.seek(count, os.SEEK_CUR)
+
+
+def _camera(data: mmap.mmap) -> None:
+    _skip(data, 4)
+    model = _number(data, "i")
     if not 0 <= model < len(PARAMETERS):
         raise ValueError(f"camera model {model} is unknown")
-    walk.skip(16 + 8 * PARAMETERS[model])
+    _skip(data, 16 + 8 * PARAMETERS[model])
 
 
-def _image(walk: _Walk) -> None:
-    walk.skip(4 + POSE_BYTES + 4)
-    end = walk.data.find(b"\0", walk.at)
+def _image(data: mmap.mmap) -> None:
+    _skip(data, 4 + POSE_BYTES + 4)
+    end = data.find(b"\0")
     if end < 0:
         raise ValueError("a name is not terminated")
-    walk.at = end + 1
-    walk.skip(24 * walk.number("Q"))
+    data.seek(end + 1)
+    _skip(data, 24 * _number(data, "Q"))
 
 
-def _point(walk: _Walk) -> None:
-    walk.skip(43)
-    walk.skip(8 * walk.number("Q"))
+def _point(data: mmap.mmap) -> None:
+    _skip(data, 43)
+    _skip(data, 8 * _number(data, "Q"))
 
 
-def _rig(walk: _Walk) -> None:
-    walk.skip(4)
-    sensors = walk.number("I")
+def _rig(data: mmap.mmap) -> None:
+    _skip(data, 4)
+    sensors = _number(data, "I")
     if sensors:
-        walk.skip(8)
+        _skip(data, 8)
     for _ in range(sensors - 1):
-        walk.skip(8)
-        if walk.number("B"):
-            walk.skip(POSE_BYTES)
+        _skip(data, 8)
+        if _number(data, "B"):
+            _skip(data, POSE_BYTES)
 
 
-def _frame(walk: _Walk) -> None:
-    walk.skip(8 + POSE_BYTES)
-    walk.skip(16 * walk.number("I"))
+def _frame(data: mmap.mmap) -> None:
+    _skip(data, 8 + POSE_BYTES)
+    _skip(data, 16 * _number(data, "I"))
 
 
-RECORDS: dict[str, Callable[[_Walk], None]] = {
+RECORDS: dict[str, Callable[[mmap.mmap], None]] = {
     "cameras": _camera,
     "images": _image,
     "points3D": _point,
@@ -89,25 +84,24 @@ def require_whole_files(folder: Path) -> None:
         if not path.is_file():
             continue
         try:
-            _walk(path, record)
+            _require_whole(path, record)
         except (ValueError, struct.error) as error:
             raise SceneError(
                 f"{path} is damaged: {error}", fix="copy it again, or export the model again with COLMAP"
             ) from error
 
 
-def _walk(path: Path, record: Callable[[_Walk], None]) -> None:
+def _require_whole(path: Path, record: Callable[[mmap.mmap], None]) -> None:
     if not path.stat().st_size:
         raise ValueError("it is empty")
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        walk = _Walk(data)
-        count = walk.number("Q")
+        count = _number(data, "Q")
         if count > len(data):
             raise ValueError(f"it states {count} records in {len(data)} bytes")
         for number in range(count):
             try:
-                record(walk)
+                record(data)
             except struct.error as error:
                 raise ValueError(f"it ends in record {number + 1} of {count}") from error
-        if walk.at != len(data):
-            raise ValueError(f"{len(data) - walk.at} bytes follow its {count} records")
+        if rest := len(data) - data.tell():
+            raise ValueError(f"{rest} bytes follow its {count} records")
