@@ -19,8 +19,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.field.autoencoder import train_autoencoder
-from hilsplat.field.code import LinearCode
-from hilsplat.field.language_field import LanguageField
+from hilsplat.field.code import LanguageField, LinearCode
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.scene.cameras import Cameras

@@ -1,13 +1,24 @@
-"""Adam for training with hand-written gradients, in one pass over the parameters."""
+"""Adam for training with hand-written gradients, in one pass over the parameters, and the order of views."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import no_type_check
+from typing import TypeVar, no_type_check
 
 import numpy as np
 
 from hilsplat.base.compiled import compiled
 
 BETA1, BETA2 = 0.9, 0.999  # decay rates of the moments, as in torch
+
+View = TypeVar("View")
+
+
+def in_random_order(views: Sequence[View], random: np.random.Generator, steps: int) -> Iterator[View]:
+    """Yield a view for each step; each view is used once before any is repeated."""
+    order: list[int] = []
+    for _ in range(steps):
+        order = order or random.permutation(len(views)).tolist()
+        yield views[order.pop()]
 
 
 @dataclass

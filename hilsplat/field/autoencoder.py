@@ -33,9 +33,9 @@ from hilsplat.settings import AutoencoderSettings
 
 Arrays = dict[str, np.ndarray]
 
+# Values for the backward pass through a layer: inputs (B, I) of the linear layer, after BatchNorm and ReLU;
+# normalised inputs (B, I) of the BatchNorm and reciprocal standard deviations (I), both empty without it.
 Passed = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Values for the backward pass through a layer: inputs (B, I) of the linear layer, after BatchNorm and ReLU;
-normalised inputs (B, I) of the BatchNorm and reciprocal standard deviations (I), both empty without it."""
 
 
 def mask_targets(
@@ -175,12 +175,12 @@ def loss_gradients(
     """
     channels = vectors.shape[1]
     encoder, decoder = layers_of(channels, latent)
-    codes, to_codes = _there(parameters, encoder, vectors)
+    codes, to_codes = _forward(parameters, encoder, vectors)
     latents = unit(codes)
-    outputs, to_outputs = _there(parameters, decoder, latents)
+    outputs, to_outputs = _forward(parameters, decoder, latents)
     slope = -vectors * np.float32((2 / channels + cosine_weight) / len(vectors))
-    slope = _back(parameters, decoder, to_outputs, _slope_before_unit(outputs, slope), gradients)
-    _back(parameters, encoder, to_codes, _slope_before_unit(codes, slope), gradients)
+    slope = _backward(parameters, decoder, to_outputs, _slope_before_unit(outputs, slope), gradients)
+    _backward(parameters, encoder, to_codes, _slope_before_unit(codes, slope), gradients)
 
 
 def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int) -> Arrays:
@@ -189,13 +189,13 @@ def statistics(parameters: Arrays, data: Float32[np.ndarray, "B C"], latent: int
     encoder, _ = layers_of(data.shape[1], latent)
     values = data
     for layer, after in pairwise(encoder):
-        values = _there(parameters, [layer], values)[0]
+        values = _forward(parameters, [layer], values)[0]
         found[f"{after.norm}.running_mean"] = values.mean(axis=0)
         found[f"{after.norm}.running_var"] = values.var(axis=0, ddof=1)
     return found
 
 
-def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
+def _forward(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple[np.ndarray, list[Passed]]:
     """Return the layers' outputs, using the batch's statistics, and the values for the backward pass."""
     passed = []
     for layer in layers:
@@ -211,7 +211,7 @@ def _there(parameters: Arrays, layers: list[Layer], values: np.ndarray) -> tuple
     return values, passed
 
 
-def _back(
+def _backward(
     parameters: Arrays, layers: list[Layer], passed: list[Passed], slope: np.ndarray, gradients: Arrays
 ) -> np.ndarray:
     """Compute the gradients of the layers' parameters, and return the gradient of their inputs."""
@@ -224,12 +224,12 @@ def _back(
         if layer.norm:
             names = f"{layer.norm}.weight", f"{layer.norm}.bias"
             of_norm = (gradients[name] for name in names)
-            _normalised_back(slope, scaled, spread, parameters[names[0]], *of_norm)
+            _normalised_backward(slope, scaled, spread, parameters[names[0]], *of_norm)
     return slope
 
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the gradient before `unit` from the one after it; the component along the vectors vanishes."""
+    """Return the gradient before `unit` from the gradient after it; the part along the vectors vanishes."""
     length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
     return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
@@ -257,7 +257,7 @@ def _normalised(values, weight, bias):
 
 
 @compiled(error_model="numpy")
-def _normalised_back(slope, scaled, spread, weight, of_weight, of_bias):
+def _normalised_backward(slope, scaled, spread, weight, of_weight, of_bias):
     """Convert `slope` from a BatchNorm's outputs to its inputs; write the gradients of weight and bias."""
     rows, columns = slope.shape
     of_weight[:] = 0

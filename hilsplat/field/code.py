@@ -1,6 +1,7 @@
-"""The scene's code from CLIP vectors to a few numbers and back: linear, or LangSplat's network."""
+"""The scene's code from CLIP vectors to a few numbers and back, and the language field of such codes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from hilsplat.base.arrays import read_tensors, write_tensors
+from hilsplat.base.arrays import made, read_tensors, write_tensors
 from hilsplat.base.artifacts import read_npz, remake, sealed
 from hilsplat.base.compiled import compiled
 from hilsplat.base.errors import ArtifactError
@@ -17,13 +18,12 @@ from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_product
 from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import require_same_masks
 
-CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, stay in the processor's cache
+CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, fit into the processor's cache
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 NORM_EPS = 1e-5  # epsilon added to the variances of BatchNorm, as in torch
 
 ROWS = 2 * WIDE_COLUMNS  # rows that pass through the layers together; weights are read from L2 only once
-
 UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple
 
 _add_products = rows_of_products(UNITS)
@@ -32,10 +32,10 @@ _add_products = rows_of_products(UNITS)
 class LinearCode:
     """Code e = unit(m + U z) with d principal directions about the mean.
 
-    It involves no training and no randomness. Unlike with a network, the code of an average is the average
-    of the codes, and a cosine with any vector takes d products, so relevancy needs no decoding. A network,
-    however, can adapt its d numbers nonlinearly to the scene's vectors. m is the mean, and U the basis with
-    orthonormal rows.
+    m is the mean, and U the basis with orthonormal rows. The code needs no training and no randomness. Unlike
+    with a network, the code of an average is the average of the codes, and a cosine with any vector takes d
+    products, so relevancy needs no decoding. A network, however, can adapt its d numbers nonlinearly to the
+    scene's vectors.
     """
 
     def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
@@ -85,8 +85,8 @@ class LinearCode:
 class PackedLayers(NamedTuple):
     """Dense layers with ReLUs between them, in the layout of one compiled loop.
 
-    The values stay in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
-    the registers. The summation order within a row does not depend on other rows.
+    The values fit into the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit into
+    the registers. The order of summation in a row does not depend on other rows.
     """
 
     widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then number of each layer's outputs
@@ -102,8 +102,8 @@ class PackedLayers(NamedTuple):
             missing = -len(bias) % UNITS
             weights.append(np.pad(weight, ((0, missing), (0, 0))).reshape(-1))
             biases.append(np.pad(bias, (0, missing)))
-        found = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
-        return PackedLayers(np.array(widths), *found)
+        flat_weights, flat_biases = (np.concatenate(each).astype(np.float32) for each in (weights, biases))
+        return PackedLayers(np.array(widths), flat_weights, flat_biases)
 
     def through(self, rows: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
         """Return the outputs of the last layer, scaled to unit length."""
@@ -291,3 +291,27 @@ def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarr
     """
     require_same_masks(folder, contributions.folder)
     return read_npz(sealed(folder, "latents.npz"), "latents")["latents"]
+
+
+@dataclass(frozen=True)
+class LanguageField:
+    """One latent per Gaussian and level."""
+
+    # latents of N Gaussians at three levels, coarse to fine; 0 for no latent
+    features: Float32[np.ndarray, "N 3 D"]
+    gaussians_sha256: str  # digest of the Gaussians' PLY
+    autoencoder_sha256: str  # digest of the code that decodes the latents
+
+    def save(self, path: Path) -> None:
+        """Write `field.safetensors` atomically; equal fields give equal bytes."""
+        about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
+        write_tensors(path, {"features": self.features}, **about)
+
+    @staticmethod
+    def load(path: Path) -> "LanguageField":
+        """Read `field.safetensors`.
+
+        Raises:
+            ArtifactError: the file is missing, damaged or not a language field.
+        """
+        return made(LanguageField, *read_tensors(path), path)

@@ -160,22 +160,20 @@ class Contrast:
         part, _ = part_term(means, halves, others, self.relations, self.settings)
         return {"instance": instance, "part": part}
 
-    def weighted(
-        self, features: Float32[np.ndarray, "N 3 D"], weights: tuple[float, float]
-    ) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
+    def weighted(self, features: Float32[np.ndarray, "N 3 D"]) -> tuple[float, Float32[np.ndarray, "N 3 D"]]:
         """Return the weighted sum of L_ins and L_part, and its gradient; losses of weight 0 are skipped."""
-        means, halves, others = self._means(features)
+        settings, (means, halves, others) = self.settings, self._means(features)
         total, by_means, by_halves = 0.0, np.zeros(means.shape), None
-        if weights[0]:
-            loss, gradient = instance_term(means, self.relations, self.settings)
-            total += weights[0] * loss
-            by_means += weights[0] * gradient
-        if weights[1]:
-            loss, (own, by_half, by_other) = part_term(means, halves, others, self.relations, self.settings)
-            total += weights[1] * loss
+        if settings.weight_instance:
+            loss, gradient = instance_term(means, self.relations, settings)
+            total += settings.weight_instance * loss
+            by_means += settings.weight_instance * gradient
+        if settings.weight_part:
+            loss, (own, by_half, by_other) = part_term(means, halves, others, self.relations, settings)
+            total += settings.weight_part * loss
             n, half, rest = self._counts()
-            by_means += weights[1] * (own + n / rest * by_other)
-            by_halves = weights[1] * (by_half - half / rest * by_other)
+            by_means += settings.weight_part * (own + n / rest * by_other)
+            by_halves = settings.weight_part * (by_half - half / rest * by_other)
         gradient = self.masks.spread(by_means.astype(np.float32))
         if by_halves is not None:
             gradient += self.half_masks.spread(by_halves.astype(np.float32))

@@ -1,7 +1,7 @@
 """Stage `field`: solve the language field.
 
-Geometry is frozen, so the contributions contain all inputs of the losses: see `problem` for the quadratic
-part, `contrast` for the hierarchy losses and `solver` for their minimisation.
+Geometry is frozen, so the contributions contain all inputs of the losses. The quadratic part is in `problem`,
+the contrastive losses are in `contrast`, and their minimisation is in `solver`.
 """
 
 from pathlib import Path
@@ -14,9 +14,8 @@ from hilsplat.base.errors import MisalignedArtifactError, SettingsError
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.code import autoencoder_file, load_latents
+from hilsplat.field.code import LanguageField, autoencoder_file, load_latents
 from hilsplat.field.contrast import Contrast, view_relations
-from hilsplat.field.language_field import LanguageField
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.field.solver import keep_labelled, solve_field
 from hilsplat.segment.digests import require_same_masks
@@ -70,13 +69,11 @@ def run_field(
             first = begun.features
         problem, contrast = field_losses(contributions, parents, latents, settings, first, seed, threads)
         if rendered is None:
-            features, report = solve_field(problem, contrast, settings)
+            features, report = solve_field(problem, contrast)
         else:
             from hilsplat.field.literal_trainer import train_literally
 
-            features, report = train_literally(
-                problem, contrast, contributions, rendered, settings, seed, threads
-            )
+            features, report = train_literally(problem, contrast, contributions, rendered, seed, threads)
         total_mass = contributions.mass().sum(axis=0, dtype=np.float64)
         features = keep_labelled(features, problem.mass, total_mass, settings.min_labelled_share)
         LanguageField(features, contributions.gaussians_sha256, code_sha256).save(out)
@@ -109,9 +106,8 @@ def field_losses(
     masks, half_masks = (
         MaskOperator.of(contributions.matrix(name), contributions.level, threads) for name in ("A", "A_half")
     )
-    pixels, half_pixels = (
-        count.astype(np.float32) for count in (contributions.pixels, contributions.half_pixels)
-    )
+    pixels = contributions.pixels.astype(np.float32)
+    half_pixels = contributions.half_pixels.astype(np.float32)
     weights = settings.weight_language, settings.weight_clustering, settings.ridge
     quadratic = contributions.quadratic(threads)
     problem = QuadraticProblem.of(masks, quadratic, pixels, latents, weights, start, seed)

@@ -22,7 +22,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.contributions.compositing import MIN_ALPHA
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps, painted_indicator, random_half
-from hilsplat.field.adam import Adam
+from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, instance_term, part_term
 from hilsplat.field.problem import QuadraticProblem
 from hilsplat.scene.finished import require_same
@@ -118,7 +118,6 @@ def train_literally(
     contrast: Contrast,
     contributions: Contributions,
     rendered: tuple[Path, Path, Path],  # scene, its frozen Gaussians, and masks
-    settings: FieldSettings,
     seed: int,
     threads: int,
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
@@ -130,7 +129,7 @@ def train_literally(
     Raises:
         MisalignedArtifactError: the contributions belong to other Gaussians or other masks.
     """
-    scene_folder, gaussians_ply, masks_folder = rendered
+    settings, (scene_folder, gaussians_ply, masks_folder) = contrast.settings, rendered
     scene = Scene.load(scene_folder)
     require_same("contributions", scene.name, gaussians_ply, contributions.gaussians_sha256)
     gaussians, device = load_ply(gaussians_ply), choose_device("auto")
@@ -139,13 +138,12 @@ def train_literally(
     shares = len(contributions.views), problem.total_pixels, *compared(contrast.relations)
     report: dict[str, object] = {"start": problem.terms(problem.lifted) | contrast.values(problem.lifted)}
     targets: dict[int, ViewTargets] = {}
-    order, queue = np.random.default_rng(seed), list[int]()
     adam, curve, recent = Adam(features, settings.rate), list[dict[str, float]](), list[float]()
     log_every, begin = max(1, settings.iterations // CURVE_POINTS), time.perf_counter()
     ridge = 2 * settings.ridge / problem.total_pixels * problem.mass[:, :, None]
-    for step in range(1, settings.iterations + 1):
-        queue = queue or order.permutation(len(contributions.views)).tolist()
-        number = queue.pop()
+    views = range(len(contributions.views))
+    order = in_random_order(views, np.random.default_rng(seed), settings.iterations)
+    for step, number in enumerate(order, start=1):
         camera = scene.cameras[contributions.views[number]]
         seen = draw(gaussians, camera, 0, features=features, threads=threads, device=device)
         if number not in targets:

@@ -11,7 +11,6 @@ from jaxtyping import Float, Float32
 from hilsplat.base.compiled import compiled
 from hilsplat.field.contrast import Contrast
 from hilsplat.field.problem import QuadraticProblem, add_slope, conjugate_gradient
-from hilsplat.settings import FieldSettings
 
 LBFGS_MEMORY = 8
 SUFFICIENT_DECREASE = 1e-4
@@ -21,10 +20,10 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
 def solve_field(
-    problem: QuadraticProblem, contrast: Contrast, settings: FieldSettings
+    problem: QuadraticProblem, contrast: Contrast
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Return the features, and a report with every loss before and after each phase."""
-    weights, total = (settings.weight_instance, settings.weight_part), problem.total_pixels
+    settings, total = contrast.settings, problem.total_pixels
     # L-BFGS needs much memory, so its variables are only the features visible in masks. They are scaled by
     # the square root of the mass, which makes the quadratic part nearly isotropic.
     shown = np.flatnonzero(problem.mass)
@@ -40,7 +39,7 @@ def solve_field(
         unscale(scaled)
         curved = problem.hessian_product(features)
         value = (dot(features, curved) - 2 * dot(features, right)) / total
-        contrastive, gradient = contrast.weighted(features, weights)
+        contrastive, gradient = contrast.weighted(features)
         add_slope(np.float32(2 / total), curved, right, inverse_root, gradient)
         del curved
         return value + contrastive, _rows(gradient)[shown]
@@ -54,7 +53,7 @@ def solve_field(
     else:
         features = lifted.copy()
     del at_lift
-    if any(weights) and settings.lbfgs_steps:
+    if (settings.weight_instance or settings.weight_part) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
         unscale(lbfgs(objective, _rows(features)[shown] * root, settings.lbfgs_steps, first_step))
         report["after_lbfgs"] = problem.terms(features) | contrast.values(features)
@@ -74,8 +73,8 @@ def keep_labelled(
 ) -> Float32[np.ndarray, "N 3 D"]:
     """Remove the latents of Gaussians with little of their visible weight in a level's labelled pixels.
 
-    Tables and walls have no part masks. But if a mask border extends onto them by a pixel, their Gaussians
-    get the mask's full latent and match its queries everywhere: the regression uses only labelled pixels.
+    Tables and walls have no part masks. But if a mask extends onto them by a pixel, their Gaussians get the
+    mask's full latent and match its queries everywhere, because the regression uses only labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
     return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)
@@ -84,8 +83,8 @@ def keep_labelled(
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
     """Minimise by limited-memory BFGS with step halving; every sum is computed in a fixed order.
 
-    The start `point` is overwritten. A step needs one evaluation of value and gradient, plus one per halving;
-    `first_step` is the inverse curvature assumed before the first.
+    The start `point` is overwritten. A step needs one evaluation of value and gradient, plus one per halving.
+    `first_step` is the inverse curvature that the first step assumes.
     """
     value, gradient = objective(point)
     memory: list[tuple[np.ndarray, np.ndarray, float]] = []

@@ -20,7 +20,7 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
 from hilsplat.field.field import field_losses, read_parents
 from hilsplat.field.solver import solve_field
-from hilsplat.methods.common.groups import CENTRES, group_means, merged_centres
+from hilsplat.methods.common.groups import CENTRES, clusters, group_means
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import MIN_FIT, LevelNodes, best_fits, level_ious
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
@@ -61,7 +61,7 @@ def nested_clusters(
             inside = np.flatnonzero(has & (around == cluster))
             rows, most = features[inside, level.index], farthest[level.index]
             count = int(np.clip(len(rows) // CENTRE_OF, 1, CENTRES))
-            own = merged_centres(rows, count, (most,), seed, "euclidean")[:, 0]
+            own = clusters(rows, (most,), seed, "euclidean", count)[:, 0]
             found[inside, level.index] = number + own
             number += int(own.max()) + 1
         # Gaussians without a cluster remain grouped by their whole.
@@ -92,7 +92,7 @@ def run_feature_tree(
     losses = field_settings.model_copy(update=alone)
     no_latents = np.zeros((len(contributions), settings.feature_size), np.float32)
     problem, contrast = field_losses(contributions, parents, no_latents, losses, "random", seed, threads)
-    features, _ = solve_field(problem, contrast, losses)
+    features, _ = solve_field(problem, contrast)
     farthest = farthest_alike(problem.masks.means(features), contributions, parents)
     features = np.where((problem.mass > 0)[:, :, None], features, np.float32(np.nan))
     clusters = nested_clusters(features, farthest, seed)

@@ -40,8 +40,11 @@ NEIGHBOURS = 5
 SAMPLES = 1000
 
 
-def mask_identities(contributions: Contributions, level: Level, threads: int) -> Int64[np.ndarray, " m"]:
-    """Return each mask's identity at a level, -1 for none, by our default linking via shared Gaussians."""
+def mask_identities(contributions: Contributions, level: Level, threads: int) -> Int64[np.ndarray, " M"]:
+    """Return each mask's identity at a level by our default linking via shared Gaussians; -1 for none.
+
+    Masks of other levels have none.
+    """
     mass = contributions.mass()
     visible = mass > MIN_VISIBLE_PX
     importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
@@ -50,7 +53,10 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
     total = mass.sum(axis=0, dtype=np.float64)
     settings = SemanticTreeSettings()
     settings = settings.model_copy(update={"min_views": min(settings.min_views, len(mass))})
-    return level_nodes(weights, view, mass, visible, importance, total, settings, threads).of_mask
+    found = level_nodes(weights, view, mass, visible, importance, total, settings, threads)
+    identity = np.full(len(contributions), NONE, np.int64)
+    identity[rows] = found.of_mask
+    return identity
 
 
 def neighbour_loss(
@@ -105,14 +111,11 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
     contributions, latents = inputs.contributions, inputs.latents
     views, features = labelled_views(inputs, settings.pixel_step), inputs.no_features()
     for level in LEVELS:
-        rows = contributions.rows_of(level)
-        of_row = mask_identities(contributions, level, inputs.threads)
-        has = of_row != NONE
+        identity = mask_identities(contributions, level, inputs.threads)
+        has = identity != NONE
         if not has.any():
             continue
-        identity = np.full(len(contributions), NONE, np.int64)
-        identity[rows] = of_row
         group = identity_of_gaussians(views, contributions, identity, level, settings, seed + level.index)
-        means, _ = group_means(latents[rows[has]], of_row[has], int(of_row.max()) + 1)
+        means, _ = group_means(latents[has], identity[has], int(identity.max()) + 1)
         features[:, level.index] = features_of_groups(group, means.astype(np.float32))
     return features

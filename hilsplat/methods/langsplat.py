@@ -28,8 +28,8 @@ from numba.extending import intrinsic, models, register_model
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
-from hilsplat.field.adam import Adam
-from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order, labelled_views
+from hilsplat.field.adam import Adam, in_random_order
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 # Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
@@ -133,9 +133,8 @@ def train_level(
     features, gradient = np.zeros((2, num_gaussians * wide), np.float32)
     adam = Adam(features, settings.rate)
     codes = [np.pad(latents[view.rows], ((0, 0), (0, wide - channels))).reshape(-1) for view in views]
-    order = in_random_order(list(zip(views, codes, strict=True)), np.random.default_rng(seed))
-    for _ in range(settings.steps):
-        view, own = next(order)
+    pairs, random = list(zip(views, codes, strict=True)), np.random.default_rng(seed)
+    for view, own in in_random_order(pairs, random, settings.steps):
         rows = view.weights.indptr, view.weights.indices, view.weights.data
         l1_gradient(*rows, view.labels[:, level.index], own, channels, wide, features, gradient)
         adam.step(gradient)

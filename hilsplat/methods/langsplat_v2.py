@@ -21,10 +21,10 @@ from jaxtyping import Float32, Int64
 from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
-from hilsplat.field.adam import Adam
+from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import LinearCode
 from hilsplat.methods.common.groups import kmeans
-from hilsplat.methods.method import LabelledView, MethodInputs, in_random_order, labelled_views
+from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 ENTRIES = 64  # codebook entries per level (LangSplatV2)
@@ -93,9 +93,7 @@ def train_level(
     """Train logits (from zero) and codebook; return the mixture of every Gaussian."""
     logits, entries = np.zeros((num_gaussians, len(codebook)), np.float32), codebook.copy()
     of_logits, of_entries = Adam(logits, settings.rate), Adam(entries, settings.rate)
-    order = in_random_order(views, np.random.default_rng(seed))
-    for _ in range(settings.steps):
-        view = next(order)
+    for view in in_random_order(views, np.random.default_rng(seed), settings.steps):
         pixels = view.at(level)
         targets = latents[view.rows[view.labels[pixels, level.index]]]
         _, by_logits, by_entries = step(logits, entries, view.weights[pixels], targets, code)

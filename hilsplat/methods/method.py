@@ -4,11 +4,10 @@ All other stages (Gaussians, masks, CLIP vectors, the scene's code, queries, pro
 that table rows differ only in the method.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,8 +21,7 @@ from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
 from hilsplat.contributions.view_matrices import label_maps
-from hilsplat.field.code import LinearCode, autoencoder_file, load_code, load_latents
-from hilsplat.field.language_field import LanguageField
+from hilsplat.field.code import LanguageField, LinearCode, autoencoder_file, load_code, load_latents
 from hilsplat.methods.registry import method_of
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.finished import require_same
@@ -33,8 +31,6 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import MethodSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
-
-View = TypeVar("View")
 
 
 @dataclass(frozen=True)
@@ -179,10 +175,3 @@ def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
             fix="reduce method.pixel_step, or loosen masks.predicted_iou_min and rerun the masks stage",
         )
     return found
-
-
-def in_random_order(views: Sequence[View], random: np.random.Generator) -> Iterator[View]:
-    """Yield views endlessly, each once before any is repeated."""
-    while True:
-        for number in random.permutation(len(views))[::-1]:
-            yield views[number]

@@ -104,4 +104,5 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         return hierarchical_loss(rendered, torch.from_numpy(patch[inside]), torch.from_numpy(shared))
 
     train(views, [features], loss, settings, seed)
-    return cluster_field(inputs, clusters(unit(features.detach()).numpy(), thresholds, seed))
+    distances = tuple(1 - least for least in thresholds)
+    return cluster_field(inputs, clusters(unit(features.detach()).numpy(), distances, seed, "cosine"))

@@ -153,5 +153,5 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         gated = unit(product(smooth, unit(features))[None] * gates(medians)[:, None]).numpy()
     group = np.full((contributions.num_gaussians, len(LEVELS)), NONE, np.int64)
     for level, own in zip(found, gated, strict=True):
-        group[:, level.index] = clusters(own, (COSINE,), seed)[:, 0]
+        group[:, level.index] = clusters(own, (1 - COSINE,), seed, "cosine")[:, 0]
     return cluster_field(inputs, group)

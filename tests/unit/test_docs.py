@@ -14,7 +14,7 @@ from hilsplat.base.arrays import described
 from hilsplat.cli.main import app
 from hilsplat.configuration import SECTIONS
 from hilsplat.contributions.rows import Contributions
-from hilsplat.field.language_field import LanguageField
+from hilsplat.field.code import LanguageField
 from hilsplat.scene import cameras
 from hilsplat.scene.cameras import Cameras
 from hilsplat.segment import masks

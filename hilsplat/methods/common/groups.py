@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import scipy.cluster.hierarchy
@@ -17,15 +18,13 @@ from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
 ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
-CENTRES = 256
-KMEANS_ROUNDS = 10
-MIN_SCORE = 0.2
-MIN_VIEWS = 2
-"""Minimum mask score and minimum number of views for a cluster's code: OpenGaussian's values for ScanNet;
-its number of views for LERF is 5."""
+CENTRES = 256  # k-means centres that `clusters` merges
+KMEANS_ROUNDS = 10  # Lloyd iterations for these
+MIN_SCORE = 0.2  # minimum score of a mask for a group's code: OpenGaussian's value for ScanNet
+MIN_VIEWS = 2  # minimum number of views for a group's code: as above; OpenGaussian's number for LERF is 5
 
+# function of (mask, group) pairs
 Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
-"""Function of (mask, group) pairs."""
 
 
 def kmeans(
@@ -145,16 +144,16 @@ def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Floa
 
 
 def clusters(
-    features: Float32[np.ndarray, "N D"], thresholds: tuple[float, ...], seed: int
+    features: Float32[np.ndarray, "N D"],
+    distances: tuple[float, ...],
+    seed: int,
+    metric: Literal["cosine", "euclidean"],
+    count: int = CENTRES,
 ) -> Int64[np.ndarray, "N K"]:
-    """Return each Gaussian's cluster at every cosine threshold; clusters of higher thresholds are nested."""
-    return merged_centres(features, CENTRES, tuple(1 - least for least in thresholds), seed, "cosine")
+    """Return each row's cluster at every distance: k-means centres, merged up to that average distance.
 
-
-def merged_centres(
-    features: Float32[np.ndarray, "N D"], count: int, distances: tuple[float, ...], seed: int, metric: str
-) -> Int64[np.ndarray, "N K"]:
-    """Return each row's cluster per distance: k-means centres, merged up to that average distance."""
+    Clusters of smaller distances are nested in those of larger ones. A cosine distance is 1 - cosine.
+    """
     _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
     if len(used) < 2:
@@ -194,6 +193,6 @@ def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> 
             f"method.thresholds: {settings.name} cannot nest its levels",
             expected=f"numbers that {'grow' if grow else 'fall'} from whole to subpart, such as {list(own)}",
             found=str(list(settings.thresholds)),
-            fix="reorder them",
+            fix="reorder the numbers",
         )
     return settings.thresholds

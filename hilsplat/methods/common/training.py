@@ -15,11 +15,11 @@ from torch import Tensor
 
 from hilsplat.base.device import one_torch_thread
 from hilsplat.base.progress import track
-from hilsplat.methods.method import LabelledView, in_random_order
+from hilsplat.field.adam import in_random_order
+from hilsplat.methods.method import LabelledView
 from hilsplat.settings import MethodSettings
 
 PIXELS = 4096  # maximum per step; published: VCH 4096, OmniSeg3D 32,768, others whole views
-
 START_NOISE = 0.1  # standard deviation of initial features about their common value
 
 
@@ -81,9 +81,8 @@ def train(
     random = np.random.default_rng(seed)
     with one_torch_thread():
         optimiser = torch.optim.Adam(parameters, settings.rate, eps=1e-15)
-        order = in_random_order(views, random)
-        for step in track(range(settings.steps), "steps"):
-            view = next(order)
+        order = in_random_order(views, random, settings.steps)
+        for step, view in enumerate(track(order, "steps", total=settings.steps)):
             chosen = random.permutation(len(view.labels))[:pixels]
             optimiser.zero_grad()
             loss(view.chosen(chosen), random, step / settings.steps).backward()

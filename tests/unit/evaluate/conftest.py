@@ -56,8 +56,7 @@ def encode_texts(texts):
 @pytest.fixture(scope="session")
 def block_world(tmp_path_factory) -> BlockWorld:
     from hilsplat.base.artifacts import write_index
-    from hilsplat.field.code import Autoencoder
-    from hilsplat.field.language_field import LanguageField
+    from hilsplat.field.code import Autoencoder, LanguageField
     from hilsplat.query.language_scene import LanguageScene
     from tests.unit.evaluate.plain_tree import plain_tree
 

@@ -14,9 +14,9 @@ from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.quadratic import StackedWeights
 from hilsplat.contributions.view_matrices import painted_indicator
 from hilsplat.field.autoencoder import run_autoencoder
+from hilsplat.field.code import LanguageField
 from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field
-from hilsplat.field.language_field import LanguageField
 from hilsplat.field.literal_trainer import ViewTargets, view_losses
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
 from hilsplat.field.solver import keep_labelled, solve_field
@@ -44,13 +44,13 @@ class Toy:
         self.labels[rng.random((PIXELS, 3)) < 0.2] = -1
         self.labels[self.labels == np.array([-1, 2, 5])] = -1
         self.level = np.repeat(np.array([1, 2, 3], np.uint8), 3)
-        indicator = painted_indicator(self.labels.astype(np.int32), 9, np.ones(PIXELS, bool))
-        half = painted_indicator(self.labels.astype(np.int32), 9, rng.random(PIXELS) < 0.5)
-        self.painted, self.half = indicator, half
-        self.pixels = np.asarray(indicator.sum(axis=1)).ravel().astype(np.float32)
-        self.half_pixels = np.asarray(half.sum(axis=1)).ravel().astype(np.float32)
-        self.A = (sp.diags(1 / self.pixels) @ indicator @ self.W).astype(np.float32)
-        self.A_half = (sp.diags(1 / self.half_pixels) @ half @ self.W).astype(np.float32)
+        labels = self.labels.astype(np.int32)
+        self.painted = painted_indicator(labels, 9, np.ones(PIXELS, bool))
+        self.half = painted_indicator(labels, 9, rng.random(PIXELS) < 0.5)
+        self.pixels = np.asarray(self.painted.sum(axis=1)).ravel().astype(np.float32)
+        self.half_pixels = np.asarray(self.half.sum(axis=1)).ravel().astype(np.float32)
+        self.A = (sp.diags(1 / self.pixels) @ self.painted @ self.W).astype(np.float32)
+        self.A_half = (sp.diags(1 / self.half_pixels) @ self.half @ self.W).astype(np.float32)
         self.latents = rng.normal(size=(9, CHANNELS)).astype(np.float32)
         self.problem = QuadraticProblem.of(
             MaskOperator.of(sp.csr_matrix(self.A), self.level),
@@ -62,7 +62,7 @@ class Toy:
         self.features = rng.normal(size=(GAUSSIANS, 3, CHANNELS)).astype(np.float32)
 
     def view(self, settings: FieldSettings) -> ViewTargets:
-        """The view in the form that the literal trainer reads."""
+        """The view as the literal trainer's input."""
         relations = self.contrast(settings).relations[0]
         return ViewTargets(np.arange(9), self.level.astype(np.int64) - 1, self.painted, self.half, relations)
 
@@ -130,7 +130,7 @@ def test_conjugate_gradient_reaches_the_dense_solution():
 
 
 def test_a_solved_problem_stays_solved():
-    toy = Toy((0.0, 0.0, 1.0))  # only the ridge: the lift is the answer
+    toy = Toy((0.0, 0.0, 1.0))  # only the ridge: the lifted average is the solution
     assert np.array_equal(conjugate_gradient(toy.problem, toy.problem.lifted, 3), toy.problem.lifted)
 
 
@@ -147,9 +147,9 @@ READINGS = pytest.mark.parametrize(
 @READINGS
 def test_contrastive_gradients_equal_autograd_through_the_means(readings):
     toy = Toy((1.0, 0.3, 0.1))
-    contrast = toy.contrast(FieldSettings(**readings))
+    contrast = toy.contrast(FieldSettings(**readings, weight_instance=0.5, weight_part=0.25))
     terms = contrast.values(toy.features)
-    value, gradient = contrast.weighted(toy.features, (0.5, 0.25))
+    value, gradient = contrast.weighted(toy.features)
 
     features = torch.from_numpy(toy.features).double().requires_grad_()
     own = [features[:, level - 1] for level in toy.level]
@@ -167,7 +167,8 @@ def test_contrastive_gradients_equal_autograd_through_the_means(readings):
     (expected,) = torch.autograd.grad(total, features, retain_graph=True)
     assert gradient == pytest.approx(expected.numpy(), abs=1e-5)
     (of_part,) = torch.autograd.grad(part_loss, features)
-    value, gradient = contrast.weighted(toy.features, (0.0, 1.0))  # the other is not computed
+    part_alone = toy.contrast(FieldSettings(**readings, weight_instance=0.0, weight_part=1.0))
+    value, gradient = part_alone.weighted(toy.features)
     assert value == pytest.approx(part_loss.item(), rel=1e-5)
     assert gradient == pytest.approx(of_part.numpy(), abs=1e-5)
 
@@ -177,11 +178,11 @@ def test_contrastive_weights_lower_their_terms():
     settings = FieldSettings(
         weight_clustering=0.0, weight_instance=1.0, weight_part=0.1, omega=3.0, lbfgs_steps=15
     )
-    features, report = solve_field(toy.problem, toy.contrast(settings), settings)
+    features, report = solve_field(toy.problem, toy.contrast(settings))
     assert np.isfinite(features).all()
     assert report["after_lbfgs"]["instance"] < report["after_cg"]["instance"]
     without = settings.model_copy(update={"weight_instance": 0.0, "weight_part": 0.0})
-    _, plain = solve_field(toy.problem, toy.contrast(without), without)
+    _, plain = solve_field(toy.problem, toy.contrast(without))
     assert "after_lbfgs" not in plain
     assert plain["after_cg"]["language"] < plain["lifted"]["language"]
 
@@ -194,12 +195,12 @@ def test_lbfgs_reaches_the_minimum_of_the_whole_objective():
     def objective(flat: np.ndarray) -> tuple[float, np.ndarray]:
         features = flat.reshape(toy.features.shape).astype(np.float32)
         curved, right = problem.hessian_product(features), problem.right_side()
-        value, gradient = contrast.weighted(features, (0.5, 0.1))
+        value, gradient = contrast.weighted(features)
         value += float((features * (curved - 2 * right)).sum()) / problem.total_pixels
         gradient = gradient + 2 / problem.total_pixels * (curved - right)
         return value, gradient.reshape(-1).astype(np.float64)
 
-    found, _ = solve_field(problem, contrast, settings)
+    found, _ = solve_field(problem, contrast)
     start = problem.lifted.reshape(-1).astype(np.float64)
     best = minimize(objective, start, jac=True, method="L-BFGS-B", options={"maxiter": 500}).fun
     assert objective(start)[0] > best + 0.01
@@ -218,7 +219,7 @@ def test_pruning_drops_similar_unrelated_masks():
     means = np.array([[1, 0], [1, 0.01], [1, 0.02], [0, 1]], np.float32)
     depth = np.zeros((4, 4), np.int64)
     assert distinct(means, depth, 0.95).tolist() == [0, 3]
-    depth[0, 1] = depth[1, 0] = 1  # siblings are kept apart; the third is like both
+    depth[0, 1] = depth[1, 0] = 1  # both siblings are kept; the third mask is similar to both
     assert distinct(means, depth, 0.95).tolist() == [0, 1, 3]
     assert distinct(means, depth, 1.0).tolist() == [0, 1, 2, 3]
 
@@ -235,7 +236,7 @@ def test_the_literal_trainer_has_the_objective_of_the_solver(readings):
     losses, by_maps = view_losses(maps, toy.view(settings), toy.latents, settings, shares)
     expected = toy.problem.terms(toy.features) | contrast.values(toy.features)
     assert losses == pytest.approx({name: expected[name] for name in losses}, rel=1e-4)
-    _, by_features = contrast.weighted(toy.features, (0.5, 0.25))
+    _, by_features = contrast.weighted(toy.features)
     half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
     by_features = by_features + 2 / toy.problem.total_pixels * half
     assert np.einsum("pg,pld->gld", W, by_maps) == pytest.approx(by_features, abs=1e-5)
@@ -296,17 +297,6 @@ def test_the_median_start_and_pruning_are_options_of_the_stage(boxes_with_latent
     assert pruned["contrasted_masks"] < plain["contrasted_masks"]
 
 
-def test_the_literal_trainer_and_baselines_refuse_other_gaussians(boxes_with_latents):
-    world, *own = boxes_with_latents
-    other = world.folder / "other.ply"
-    other.write_bytes(b"other")
-    rendered = world.scene, other, world.masks
-    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
-        solved_field(boxes_with_latents, "literal", LITERAL, rendered=rendered)
-    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
-        MethodInputs(*rendered, *own).view_weights(world.views[0])
-
-
 @pytest.fixture
 def flat_boxes(boxes_with_latents, monkeypatch):
     """The two boxes, with Gaussians that render them."""
@@ -359,8 +349,15 @@ def test_parts_of_masks_in_another_order_are_refused(boxes_with_latents, stale):
         solved_field(boxes_with_latents, "field")
 
 
-def test_the_literal_trainer_and_baselines_refuse_masks_in_another_order(flat_boxes):
+def test_the_literal_trainer_and_baselines_refuse_other_gaussians_and_masks_in_another_order(flat_boxes):
     world, *own = flat_boxes
+    other = world.folder / "other.ply"
+    other.write_bytes(b"other")
+    rendered = world.scene, other, world.masks
+    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+        solved_field(flat_boxes, "literal", LITERAL, rendered=rendered)
+    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+        MethodInputs(*rendered, *own).view_weights(world.views[0])
     reverse_masks(world, "001.png")
     with pytest.raises(MisalignedArtifactError, match=r"contains different masks \(view 001\.png\)"):
         solved_field(flat_boxes, "literal", LITERAL)

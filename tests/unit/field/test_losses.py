@@ -36,7 +36,7 @@ def test_reference_of_the_pixel_losses_matches_hand_computation():
 
 
 def test_depth_of_common_ancestors():
-    # 0 holds 1 and 2, 1 holds 3; 4 is unrelated
+    # 0 contains 1 and 2, 1 contains 3; 4 is unrelated
     depth = common_ancestor_depth(np.array([-1, 0, 0, 1, -1], dtype=np.int32))
     assert depth.tolist() == [
         [1, 1, 1, 1, 0],

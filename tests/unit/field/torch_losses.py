@@ -1,4 +1,4 @@
-"""The losses in torch: the reference of `hilsplat.field`, whose gradients and products are written out."""
+"""The losses in torch, from plain differences: the reference for the gradients in `hilsplat.field`."""
 
 import math
 
@@ -29,38 +29,26 @@ def clustering_loss(features: Float[Tensor, "P D"], labels: Int[Tensor, " P"]) -
     return (values - means[rows]).square().sum() / inside.sum()
 
 
-def soft_distances(means: Tensor) -> Tensor:
-    centred = means - means.detach().mean(0)
-    squares = centred.square().sum(-1)
-    apart = squares[:, None] + squares[None] - 2 * centred @ centred.T
-    return (apart.clamp(min=0) + SOFTENING**2).sqrt()
-
-
-def off_diagonal_mean(values: Tensor) -> Tensor:
-    rows = len(values)
-    if rows < 2:
-        return values.sum() * 0
-    return (values.sum() - values.diagonal().sum()) / (rows * (rows - 1))
+def log_distance_loss(means: Tensor, log_wanted: Tensor) -> Tensor:
+    squares = (means[:, None] - means[None]).square().sum(-1)
+    off = (0.5 * (squares + SOFTENING**2).log() - log_wanted)[~torch.eye(len(means), dtype=torch.bool)]
+    return off.square().mean()
 
 
 def similarity_without_parent(anchors: Tensor, others: Tensor, parent: Tensor) -> Tensor:
-    parent = parent.detach()
-    own = anchors - parent
-    length = (own.square().sum(-1, keepdim=True) + SHORTEST**2).sqrt()
-    along = own @ others.T - (own * parent).sum(-1, keepdim=True)
-    # |other - parent|^2 from products: A x B numbers instead of A x B x D.
-    squares = others.square().sum(-1) - 2 * parent @ others.T + parent.square().sum(-1, keepdim=True)
-    return along / length / (squares.clamp(min=0) + SHORTEST**2).sqrt()
+    """Cosine of anchor - parent and other - parent, with softened lengths; the parent gets no gradient."""
+    own, far = anchors - parent.detach(), others[None] - parent.detach()[:, None]
+    lengths = [(each.square().sum(-1) + SHORTEST**2).sqrt() for each in (own, far)]
+    return (own[:, None] * far).sum(-1) / lengths[0][:, None] / lengths[1]
 
 
 def instance_loss_literal(means: Tensor, level: Tensor, omega: float) -> Tensor:
     apart = (level[:, None] - level[None]).abs().to(means.dtype)
-    return off_diagonal_mean((-soft_distances(means).log() - apart * math.log(omega)).square())
+    return log_distance_loss(means, -apart * math.log(omega))
 
 
 def instance_loss_tree(means: Tensor, depth: Tensor, omega: float) -> Tensor:
-    target = depth.to(means.dtype) * math.log(omega)
-    return off_diagonal_mean((-soft_distances(means).log() - target).square())
+    return log_distance_loss(means, -depth.to(means.dtype) * math.log(omega))
 
 
 def part_loss_literal(means: Tensor, parent: Tensor, parent_means: Tensor, tau: float) -> Tensor:
@@ -68,8 +56,7 @@ def part_loss_literal(means: Tensor, parent: Tensor, parent_means: Tensor, tau: 
     has_parent = parent != NONE
     both = has_parent[:, None] & has_parent[None]
     same = parent[:, None] == parent[None]
-    itself = torch.eye(len(means), dtype=torch.bool, device=means.device)
-    positive, negative = both & same & ~itself, both & ~same
+    positive, negative = both & same & ~torch.eye(len(means), dtype=torch.bool), both & ~same
     anchors = positive.any(1) & negative.any(1)
     if not anchors.any():
         return means.sum() * 0

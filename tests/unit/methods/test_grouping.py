@@ -17,12 +17,12 @@ from hilsplat.field.code import LinearCode
 from hilsplat.methods import laga, legaussians, omniseg3d, saga, vch
 from hilsplat.methods.common import groups
 from hilsplat.methods.common.groups import associated_codes, clusters, density_clusters, kmeans, thresholds_of
-from hilsplat.methods.common.training import of_seen, product, train, unit
+from hilsplat.methods.common.training import product, train, unit
 from hilsplat.methods.gaussian_grouping import neighbour_loss
 from hilsplat.methods.method import LabelledView, labelled_views
 from hilsplat.methods.omniseg3d import hierarchical_loss, patches
 from hilsplat.methods.opengaussian import contrast_loss, instances, smoothing_loss
-from hilsplat.methods.vch import components, neighbouring_pixels, triplets, ultrametric
+from hilsplat.methods.vch import components, triplets, ultrametric
 from hilsplat.settings import MethodSettings
 
 RNG = np.random.default_rng(0)
@@ -76,22 +76,19 @@ def test_gradient_of_the_sparse_product_is_that_of_the_dense_one():
 
 @pytest.mark.parametrize(("most", "expected"), [(3, 3), (5, 5), (9, 5)])
 def test_a_step_uses_distinct_pixels_of_a_view(most, expected):
-    matrix = sp.csr_matrix(np.eye(5, dtype=np.float32))
     xy = np.stack([np.arange(5)] * 2, axis=1)
-    view = LabelledView(0, np.arange(1), matrix, np.zeros((5, 3), np.int32), xy)
-    feature, seen = torch.zeros(5, 1, requires_grad=True), []
-    shares = []
+    view = LabelledView(0, np.arange(1), sp.eye(5, format="csr"), np.zeros((5, 3), np.int32), xy)
+    feature, seen, shares = torch.zeros(5, 1, dtype=torch.float64, requires_grad=True), [], []
 
     def loss(view, random, done):
         seen.append(view.xy[:, 0].tolist())
         shares.append(done)
         return product(view.weights, feature).sum()
 
-    settings = MethodSettings(name="saga", steps=20)
-    train([view], [feature], loss, settings, 0, most)
+    train([view], [feature], loss, MethodSettings(name="saga", steps=20), 0, most)
     assert shares == [step / 20 for step in range(20)]
     assert {len(set(pixels)) for pixels in seen} == {len(pixels) for pixels in seen} == {expected}
-    assert {pixel for pixels in seen for pixel in pixels} == set(range(5))
+    assert set().union(*seen) == set(range(5))
 
 
 def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
@@ -199,11 +196,11 @@ def test_hierarchical_loss_matches_a_plain_loop_over_pixels():
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_clusters_of_higher_thresholds_are_inside_those_of_lower_ones():
+def test_clusters_of_smaller_distances_are_inside_those_of_larger_ones():
     # two pairs of directions: 20 degrees apart inside a pair, 90 between pairs
     angle = np.deg2rad([0, 20, 90, 110]).repeat(5)
     features = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-    found = clusters(features, (0.0, 0.8, 0.99), 0)
+    found = clusters(features, (1.0, 0.2, 0.01), 0, "cosine")
     assert [len(np.unique(level)) for level in found.T][1:] == [2, 4]
     for coarse, fine in ((0, 1), (1, 2)):
         assert len(np.unique(found[:, [coarse, fine]], axis=0)) == len(np.unique(found[:, fine]))
@@ -258,12 +255,6 @@ def test_the_third_pixel_of_a_triplet_is_outside_the_mask_but_inside_its_parent(
     assert set(second[0]) == {2, 3} and set(second[2]) == {0, 1, 4}
 
 
-def test_neighbouring_pixels_are_joined_once():
-    edges = neighbouring_pixels(np.array([[x, 0] for x in range(20)]))
-    assert (edges[0] < edges[1]).all() and len(np.unique(edges.T, axis=0)) == edges.shape[1]
-    assert [0, 1] in edges.T.tolist() and [0, 19] not in edges.T.tolist()
-
-
 def test_components_split_where_features_jump_and_small_ones_join_the_nearest_large_one(monkeypatch):
     means = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1).astype(np.float32)
     features = np.zeros((60, 2), np.float32)
@@ -274,14 +265,6 @@ def test_components_split_where_features_jump_and_small_ones_join_the_nearest_la
     assert found[0, 2] == 0 and found[30, 2] == 1 and found[50, 2] == 2  # largest first
     monkeypatch.setattr(vch, "LARGEST", 2)
     assert (components(features, means, (1.5, 0.95, 0.1))[50:, 2] == 1).all()
-
-
-def test_only_seen_gaussians_are_rendered_and_the_result_is_the_same():
-    matrix = sp.csr_matrix(np.float32([[0, 0.5, 0, 0.5], [0, 0, 0, 1]]))
-    features = torch.from_numpy(RNG.random((4, 3)).astype(np.float32))
-    small, seen = of_seen(matrix)
-    assert seen.tolist() == [1, 3]
-    assert torch.equal(product(small, features[seen]), product(matrix, features))
 
 
 def test_density_clusters_connect_dense_points_and_ignore_isolated_ones():
@@ -450,25 +433,25 @@ def test_the_scale_of_a_mask_is_twice_the_spread_of_its_gaussians():
         matrix = {"A": sp.csr_matrix(np.float32([[0.5, 0.5, 0], [0, 0, 1]]))}.get
         means = staticmethod(lambda: np.float32([[100, 0, 0], [106, 8, 0], [1, 1, 1]]))
 
-    assert inspect.unwrap(saga.mask_scales)(World) == pytest.approx(
-        [10, 0], abs=1e-5
-    )  # 10 apart: a deviation of 5
-
-
-def test_neighbour_averages_have_sixteen_terms_that_sum_to_one():
-    mean = saga.neighbour_mean(RNG.random((40, 3)).astype(np.float32))
-    assert np.diff(mean.indptr).tolist() == [16] * 40 and mean.sum(axis=1) == pytest.approx(1)
-    assert (mean.diagonal() > 0).all()
+    found = inspect.unwrap(saga.mask_scales)(World)
+    assert found == pytest.approx([10, 0], abs=1e-5)  # 10 apart: a deviation of 5
 
 
 # ---- k-means ----
 
 
-def test_centroids_are_the_means_of_groups():
-    groups = np.float32([[0, 0], [9, 0], [0, 0.2], [9, 0.2]])
-    centroids, nearest = kmeans(groups, 2, seed=0)
-    assert centroids[nearest] == pytest.approx(np.float32([[0, 0.1], [9, 0.1], [0, 0.1], [9, 0.1]]))
+@pytest.mark.parametrize(
+    ("rows", "count", "expected"),
+    [
+        ([[0, 0], [9, 0], [0, 0.2], [9, 0.2]], 2, [[0, 0.1], [9, 0.1], [0, 0.1], [9, 0.1]]),
+        ([[1, 2], [3, 4], [1, 2]], 4, [[1, 2], [3, 4], [1, 2]]),  # more centroids than distinct rows
+    ],
+)
+def test_centroids_are_the_means_of_groups_and_the_first_is_repeated(rows, count, expected):
+    centroids, nearest = kmeans(np.float32(rows), count, seed=1)
+    assert centroids[nearest] == pytest.approx(np.float32(expected))
     assert centroids.dtype == np.float32 and nearest.dtype == np.int64
+    assert (centroids[2:] == centroids[0]).all() and len(np.unique(centroids, axis=0)) == 2
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -478,18 +461,6 @@ def test_distant_starts_find_separated_groups_in_one_round(seed):
     _, nearest = kmeans(rows + 0.01 * rng.random(rows.shape).astype(np.float32), 3, seed, rounds=1)
     found = nearest.reshape(3, 10)
     assert (found == found[:, :1]).all() and len(np.unique(found)) == 3
-
-
-def test_more_centroids_than_different_rows_repeat_the_first_of_them():
-    rows = np.float32([[1, 2], [3, 4], [1, 2]])
-    centroids, nearest = kmeans(rows, 4, seed=1)
-    assert (centroids[nearest] == rows).all()
-    assert len(np.unique(centroids, axis=0)) == 2 and (centroids[2:] == centroids[0]).all()
-
-
-def test_centroids_of_no_rows_are_zero():
-    centroids, nearest = kmeans(np.zeros((0, 2), np.float32), 3, seed=0)
-    assert centroids.tolist() == [[0, 0]] * 3 and len(nearest) == 0
 
 
 def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads():

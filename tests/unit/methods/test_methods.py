@@ -174,7 +174,7 @@ def test_identities_link_the_masks_of_a_region_over_views(inputs_of):
     inputs = inputs_of()
     for level in LEVELS:
         rows = inputs.contributions.rows_of(level)
-        identity = mask_identities(inputs.contributions, level, 1)
+        identity = mask_identities(inputs.contributions, level, 1)[rows]
         region = inputs.latents[rows].argmax(axis=1)
         assert len(np.unique(np.stack([identity, region]), axis=1).T) == len(np.unique(region))
 

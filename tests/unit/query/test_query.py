@@ -8,9 +8,8 @@ import pytest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.field.autoencoder import run_autoencoder
-from hilsplat.field.code import load_code
+from hilsplat.field.code import LanguageField, load_code
 from hilsplat.field.field import run_field
-from hilsplat.field.language_field import LanguageField
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
 from hilsplat.query.relevancy_kernels import fill_maps
