@@ -281,21 +281,10 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         yield
     except HilsplatError:
         raise
-    except GatedRepoError as error:
-        raise DownloadError(
-            f"{requested.repository} requires you to accept its terms before downloading ({_status(error)})",
-            fix=f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again",
-        ) from error
-    except RepositoryNotFoundError as error:
-        raise DownloadError(
-            f"the hub has no repository {requested.repository}, or it is private ({_status(error)})",
-            expected=place,
-            fix="correct the name (hilsplat models list); if it is private, `hf auth login` or set HF_TOKEN",
-        ) from error
     except (requests.RequestException, *OUT_OF_REACH) as error:
         answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
-            raise _refused(answered, requested, place) from error
+            raise _refused(answered, answered.response, requested.repository, place) from error
         families = [requested.release.family] if requested.release else ["sam", "clip"]
         raise DownloadError(
             f"{requested.repository} cannot be downloaded: {type(error).__name__}, {place} is unreachable",
@@ -312,30 +301,31 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
         ) from error
 
 
-def _refused(error: requests.HTTPError, requested: ModelRequest, place: str) -> DownloadError:
-    """Return the error for a response with a status other than 2xx."""
-    response = error.response
-    assert response is not None  # an HTTPError is made from a response
-    of = f"{requested.repository} ({_status(error)})"
-    if response.status_code == requests.codes.too_many_requests:
-        return DownloadError(
-            f"the hub received too many requests to serve {of}",
-            found=f"Retry-After: {response.headers.get('Retry-After', 'not stated')}",
-            fix=f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit",
-        )
-    if response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
-        problem = f"the hub denies access to {of}"
+def _refused(
+    error: requests.HTTPError, response: requests.Response, repository: str, place: str
+) -> DownloadError:
+    """Return the error for a response with a status other than 2xx; `place` is the repository's page."""
+    status, found = f"({response.status_code} {response.reason})", str(response.url)
+    if isinstance(error, GatedRepoError):
+        problem = f"{repository} requires you to accept its terms before downloading {status}"
+        fix = f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again"
+    elif isinstance(error, RepositoryNotFoundError):
+        problem = f"the hub has no repository {repository}, or it is private {status}"
+        fix = f"correct the name (hilsplat models list; {place}); if private, `hf auth login` or set HF_TOKEN"
+    elif response.status_code == requests.codes.too_many_requests:
+        problem = f"the hub received too many requests to serve {repository} {status}"
+        found = f"Retry-After: {response.headers.get('Retry-After', 'not stated')}"
+        fix = f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit"
+    elif response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
+        problem = f"the hub denies access to {repository} {status}"
         fix = f"see {place}; run `hf auth login`, or set HF_TOKEN to a token with access"
     elif response.status_code == requests.codes.not_found:
-        problem = f"the hub does not have this revision or file of {of}"
+        problem = f"the hub does not have this revision or file of {repository} {status}"
         fix = f"correct the name or --revision; {place} lists what exists"
     else:
-        problem, fix = f"the hub does not serve {of}", f"run the command again later: {KEPT}"
-    return DownloadError(problem, found=str(response.url), fix=fix)
-
-
-def _status(error: requests.HTTPError) -> str:
-    return f"{error.response.status_code} {error.response.reason}" if error.response is not None else ""
+        problem = f"the hub does not serve {repository} {status}"
+        fix = f"run the command again later: {KEPT}"
+    return DownloadError(problem, found=found, fix=fix)
 
 
 def _innermost(error: BaseException) -> str:

@@ -319,7 +319,11 @@ def _upscale(
     level: Level,
     official: bool,
 ) -> HierarchicalMasks:
-    """Upscale candidates to masks of the view, without empty or truncated masks (`cut_by_crop`)."""
+    """Upscale candidates to masks of the view.
+
+    Empty masks are dropped, and so are truncated ones, which touch an edge of their crop that is not an edge
+    of the image.
+    """
     low_h, low_w = candidates.low_hw.tolist()
     runs, offsets = upscaled_runs(
         candidates.logits,
@@ -337,8 +341,11 @@ def _upscale(
     masks = HierarchicalMasks.from_runs(
         runs, offsets, level, candidates.predicted_iou[rows[keep]], candidates.stability[rows[keep]], size_hw
     )
-    met = last_inside(masks.box_xyxy) if official else masks.box_xyxy
-    return masks.take(np.flatnonzero(~cut_by_crop(met, crop_box, size_hw)))
+    boxes = last_inside(masks.box_xyxy) if official else masks.box_xyxy
+    near_crop = np.abs(boxes - crop_box) <= CROP_EDGE_PX
+    near_image = np.abs(boxes - np.array([0, 0, size_hw[1], size_hw[0]])) <= CROP_EDGE_PX
+    truncated = (near_crop & ~near_image).any(axis=1)
+    return masks.take(np.flatnonzero(~truncated))
 
 
 def clean_masks(
@@ -358,13 +365,3 @@ def clean_masks(
         return cleaned, changed | is_small
     large = np.flatnonzero(~is_small)
     return cleaned.take(large), changed[large]
-
-
-def cut_by_crop(
-    boxes: Int32[np.ndarray, "M 4"], crop_box: Int32[np.ndarray, " 4"], size_hw: tuple[int, int]
-) -> Bool[np.ndarray, " M"]:
-    """Return which boxes touch an edge of their crop that is not an edge of the image."""
-    image_box = np.array([0, 0, size_hw[1], size_hw[0]])
-    near_crop = np.abs(boxes - crop_box) <= CROP_EDGE_PX
-    near_image = np.abs(boxes - image_box) <= CROP_EDGE_PX
-    return (near_crop & ~near_image).any(axis=1)

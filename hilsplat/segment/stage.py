@@ -64,37 +64,34 @@ def run_masks(
     views = train_views(scene) if key_views is None else list(key_views)
     view_cache = ViewCache(Path(cache) / "masks")
     taken = digests_in(finished) if finished else {}
+    model: SamModel | None = None
+    identity: dict[str, str | None] = {"segmenter": settings.segmenter, "model": None, "model_sha256": None}
+
+    def segment(view: str) -> HierarchicalMasks:
+        if finished and view in taken:
+            return load_masks(finished, view, taken)
+        if model is None:
+            masks = graph_masks(scene, view, view_cache, settings)
+        else:
+            masks = sam_masks(scene, view, model, view_cache, settings, prompts(view))
+        if settings.levels == "head":
+            return masks
+        return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
+
     with stage_log("masks", scene.name) as counts:
         if settings.segmenter == "sam":
             model = SamModel.load(Path(settings.model), settings.variant)
             every = train_views(scene)  # independent of the views to segment
             checked = [scene.image(view) for view in every[:: max(1, len(every) // CHECKED_VIEWS)]]
             model.choose_precision(settings.precision, checked[:CHECKED_VIEWS], cache, threads)
-            identity: dict[str, str | None] = {
-                "segmenter": "sam",
-                "model": settings.model,
-                "model_sha256": model.digest,
-                "precision": model.precision,
-            }
-
+            identity.update(model=settings.model, model_sha256=model.digest, precision=model.precision)
             limit = model.thresholds(settings).points_per_batch
             batch = model.prompts_per_call(limit, settings.points_per_side**2)
             needs = needs_of(model.model, batch, as_exported=model.as_exported)
             threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
-
-            def segment(view: str) -> HierarchicalMasks:
-                if finished and view in taken:
-                    return load_masks(finished, view, taken)
-                return at_levels(sam_masks(scene, view, model, view_cache, settings, prompts(view)), settings)
-
         else:
             logger.info("masks %s: graph segmenter, without a model; levels are three scales", scene.name)
-            identity = {"segmenter": "graph", "model": None, "model_sha256": None}
-
-            def segment(view: str) -> HierarchicalMasks:
-                return at_levels(graph_masks(scene, view, view_cache, settings), settings)
-
         index: dict[str, Any] = {}
         with atomic_folder(out) as folder:
             found = in_order(segment, views, threads)
@@ -107,13 +104,6 @@ def run_masks(
             if not number:
                 logger.warning("masks %s: no view has a mask at level %s", scene.name, level)
         counts.update(views=len(views), **total, from_cache=view_cache.hits)
-
-
-def at_levels(masks: HierarchicalMasks, settings: MasksSettings) -> HierarchicalMasks:
-    """Return the masks with the segmenter's levels or the tree's, depending on the settings."""
-    if settings.levels == "head":
-        return masks
-    return with_tree_levels(masks, settings.theta or CoverageTreeSettings().theta)
 
 
 def sam_masks(

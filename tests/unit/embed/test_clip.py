@@ -12,7 +12,6 @@ from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
 from hilsplat.configuration import parse_section
 from hilsplat.embed.clip import ClipModel, open_clip_of, unit
-from hilsplat.embed.model_check import check_model
 from hilsplat.embed.stage import chosen_masks, run_clip
 from hilsplat.models.folder import open_model_folder
 from hilsplat.models.int8 import considers_int8
@@ -61,17 +60,17 @@ def test_the_settings_determine_the_pixels_of_a_crop(colour_clip):
     np.testing.assert_allclose(box, np.array([16, 9, 0]) / np.hypot(16, 9), atol=1e-2)
 
 
-@pytest.mark.parametrize(("batch", "threads"), [(1, 1), (2, 3), (64, 1)])
-def test_vectors_do_not_depend_on_batch_or_threads(colour_clip, batch, threads):
+@pytest.mark.parametrize("batch", [1, 2])
+def test_vectors_do_not_depend_on_the_batch(colour_clip, batch):
     generator = np.random.default_rng(0)
     image = generator.integers(0, 255, (12, 10, 3), dtype=np.uint8)
     masks = pack(generator.random((5, 12, 10)) > 0.7)
-    expected = ClipModel.load(colour_clip).embed_masks(image, masks)
-    found = ClipModel.load(colour_clip, threads).embed_masks(image, masks, ClipSettings(batch=batch))
-    np.testing.assert_array_equal(found, expected)
+    model = ClipModel.load(colour_clip)
+    expected = model.embed_masks(image, masks)
+    np.testing.assert_array_equal(model.embed_masks(image, masks, ClipSettings(batch=batch)), expected)
     np.testing.assert_allclose(np.linalg.norm(expected.astype(float), axis=1), 1, atol=2e-3)
     none = HierarchicalMasks.concatenate([], (12, 10))
-    assert ClipModel.load(colour_clip).embed_masks(image, none).shape == (0, 3)
+    assert model.embed_masks(image, none).shape == (0, 3)
 
 
 def test_texts_are_unit_vectors_in_order_and_inserted_into_the_template(colour_clip):
@@ -119,18 +118,6 @@ def test_a_text_without_a_word_is_refused(colour_clip):
 
 def test_zero_vectors_stay_zero():
     np.testing.assert_allclose(unit(np.array([[0, 0], [3, 4]], np.float32)), [[0, 0], [0.6, 0.8]], rtol=1e-6)
-
-
-def test_a_missing_tokenizer_is_reported(colour_clip):
-    (colour_clip / "tokenizer.json").unlink()
-    with pytest.raises(ModelError, match=r"lacks tokenizer.json"):
-        ClipModel.load(colour_clip)
-
-
-def test_check_describes_the_model(colour_clip):
-    text = check_model(colour_clip)
-    assert "kind       clip" in text and "vectors    3 numbers" in text
-    assert ClipModel.load(colour_clip).digest in text
 
 
 @pytest.fixture
@@ -220,24 +207,11 @@ def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(pr
     assert "clip-tiny runs in float32: int8 needs a pretrained model" in caplog.text
 
 
-def with_another_view(masks: Path) -> None:
-    write_index(masks, {"7.png": read_index(masks)["views"]["0.png"]}, scene="set/scene")
-
-
-def with_shuffled_rows(masks: Path) -> None:
-    found = HierarchicalMasks.load(masks / "0.png.npz")
-    found.take(np.array([1, 0])).save(masks / "0.png.npz")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [(with_another_view, r"7\.png"), (with_shuffled_rows, r"contains different masks \(view 0\.png\)")],
-)
-def test_masks_of_another_scene_or_index_are_refused(red_scene, colour_clip, tmp_path, change, words):
+def test_masks_of_another_scene_are_refused(red_scene, colour_clip, tmp_path):
     scene, masks = red_scene
-    change(masks)
+    write_index(masks, {"7.png": read_index(masks)["views"]["0.png"]}, scene="set/scene")
     settings = ClipSettings(model=str(colour_clip))
-    with pytest.raises(MisalignedArtifactError, match=words):
+    with pytest.raises(MisalignedArtifactError, match=r"do not match the training views(.|\n)*7\.png"):
         run_clip(scene, masks, None, tmp_path / "out", tmp_path / "cache", settings, threads=1)
 
 

@@ -138,19 +138,15 @@ def test_missing_files_are_reported_and_half_of_the_views_need_them(ours, scene,
 
 
 def test_views_that_differ_only_after_a_dot_are_refused(ours, tmp_path):
-    masks_folder, clip_folder = ours
     for folder in ours:
         write_index(folder, dict.fromkeys(("a.1.png", "a.2.png"), index_entry(nested())), scene="set/scene")
     with pytest.raises(ArtifactError, match=r"a.1.png, a.2.png"):
-        write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+        write_langsplat(*ours, tmp_path / "files")
 
 
 def test_vectors_of_other_masks_are_refused(ours, tmp_path):
     masks_folder, clip_folder = ours
-    reverse = nested().take(np.arange(4)[::-1])
-    reverse.save(masks_folder / "b.png.npz")
-    entries = {"a.png": index_entry(nested()), "b.png": index_entry(reverse)}
-    write_index(masks_folder, entries, scene="set/scene")
+    write_index(clip_folder, {"a.png": index_entry(nested())}, scene="set/scene")
     with pytest.raises(MisalignedArtifactError, match=r"clip .*different masks \(view b\.png\)"):
         write_langsplat(masks_folder, clip_folder, tmp_path / "files")
 

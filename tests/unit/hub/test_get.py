@@ -37,6 +37,7 @@ def files_of(folder: Path) -> list[str]:
 def test_without_a_name_the_recommended_pair_is_fetched_and_used(hub, repositories, caplog):
     caplog.set_level(logging.INFO)
     hub.repositories["onnx-community/sam2.1-hiera-small-ONNX"] = repositories[SAM]
+    hub.licences[CLIP] = "mit"
     target = Path("models/sam2.1-hiera-small")
     assert "sam2.1-hiera-small" in models_table() and "in use" not in models_table()
     text = get_models(())
@@ -45,7 +46,7 @@ def test_without_a_name_the_recommended_pair_is_fetched_and_used(hub, repositori
     assert text.endswith("photographs use sam2.1-hiera-small and clip-vit-base-patch16")
     assert "the recommended pair: sam2.1-hiera-small and clip-vit-base-patch16" in caplog.text
     assert "0.6 MB in 4 files" in caplog.text and "GB free on the disk of models" in caplog.text
-    assert "licence: Apache-2.0" in caplog.text
+    assert "licence: Apache-2.0" in caplog.text and "licence: mit" in caplog.text  # known; from the hub
     assert visible() == ["clip-vit-base-patch16", "sam2.1-hiera-small"]
     # only what is needed: no card, no quantized copies, no complete CLIP
     networks = ["onnx/prompt_encoder_mask_decoder.onnx", "onnx/vision_encoder.onnx"]
@@ -68,7 +69,6 @@ def test_without_a_name_the_recommended_pair_is_fetched_and_used(hub, repositori
 
 
 def test_the_origin_names_repository_commit_and_digests(hub, repositories):
-    hub.licences[SAM] = "apache-2.0"
     get_models([SAM], revision="main")
     origin = json.loads((TARGET / "origin.json").read_text())
     assert (origin["repository"], origin["revision"]) == (SAM, hub.commit(SAM))
@@ -76,11 +76,8 @@ def test_the_origin_names_repository_commit_and_digests(hub, repositories):
     encoder = repositories[SAM] / "onnx" / ENCODER
     assert by_path[f"onnx/{ENCODER}"]["sha256"] == sha256_of_file(encoder)
     content = (repositories[SAM] / "config.json").read_bytes()
-    assert by_path["config.json"] == {
-        "path": "config.json",
-        "bytes": len(content),
-        "git_sha1": git_sha1(content),
-    }
+    size, digest = len(content), git_sha1(content)
+    assert by_path["config.json"] == {"path": "config.json", "bytes": size, "git_sha1": digest}
     assert hub.endpoint not in (TARGET / "origin.json").read_text()
 
 
@@ -164,28 +161,24 @@ def test_a_full_disk_keeps_what_was_downloaded(hub, monkeypatch):
     assert visible() == [] and (STAGING / "config.json").is_file()
 
 
-@pytest.mark.parametrize("where", ["/api/", "/resolve/"])
-def test_a_busy_hub_is_reported(hub, waits, where):
-    hub.refusals[where] = [Refusal(429, {"Retry-After": "7200"})] * 9
-    with pytest.raises(DownloadError, match=r"too many requests(.|\n)*Retry-After: 7200(.|\n)*HF_TOKEN"):
-        get_models(["sam-vit-base"])
+BUSY = Refusal(429, {"Retry-After": "7200"})
+GATED, NO_FILE = Refusal(401, {"X-Error-Code": "GatedRepo"}), Refusal(404, {"X-Error-Code": "EntryNotFound"})
 
 
 @pytest.mark.parametrize(
-    ("refusal", "message"),
+    ("where", "refusal", "message"),
     [
-        (Refusal(503), r"does not serve Xenova/sam-vit-base \(503"),
-        (
-            Refusal(401, {"X-Error-Code": "GatedRepo"}),
-            r"requires you to accept(.|\n)*accept them at http",
-        ),
-        (Refusal(403), r"denies access to Xenova/sam-vit-base \(403"),
-        (Refusal(401), r"denies access to Xenova/sam-vit-base \(401"),
-        (Refusal(404, {"X-Error-Code": "EntryNotFound"}), r"does not have this revision or file"),
+        ("/api/", BUSY, r"too many requests(.|\n)*Retry-After: 7200(.|\n)*HF_TOKEN"),
+        ("/resolve/", BUSY, r"too many requests(.|\n)*Retry-After: 7200(.|\n)*HF_TOKEN"),
+        ("/api/", Refusal(503), r"does not serve Xenova/sam-vit-base \(503"),
+        ("/api/", GATED, r"requires you to accept(.|\n)*accept them at http"),
+        ("/api/", Refusal(403), r"denies access to Xenova/sam-vit-base \(403"),
+        ("/api/", Refusal(401), r"denies access to Xenova/sam-vit-base \(401"),
+        ("/api/", NO_FILE, r"does not have this revision or file"),
     ],
 )
-def test_refusals_suggest_a_fix(hub, waits, refusal, message):
-    hub.refusals["/api/"] = [refusal]
+def test_refusals_suggest_a_fix(hub, waits, where, refusal, message):
+    hub.refusals[where] = [refusal]
     with pytest.raises(DownloadError, match=message):
         get_models(["sam-vit-base"])
     assert waits == [] and visible() == []

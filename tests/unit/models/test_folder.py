@@ -24,8 +24,8 @@ def sam(tmp_path):
     return tmp_path / "sam"
 
 
-def outside(path, location: str) -> None:
-    """Move a network's weights and constants into a file of their own."""
+def move_weights(path, location: str) -> None:
+    """Move a network's weights and constants to a separate file."""
     model = onnx.load(path)
     path.unlink()
     options = {"size_threshold": 64, "convert_attribute": True}
@@ -33,8 +33,9 @@ def outside(path, location: str) -> None:
 
 
 @pytest.mark.parametrize("location", ["vision_encoder.onnx_data", "weights.bin", "onnx__MatMul_7"])
-def test_the_digest_covers_weights_in_a_file_of_any_name(sam, location):
-    outside(sam / "onnx/vision_encoder.onnx", location)
+def test_the_digest_covers_external_weights_in_a_file_of_any_name(sam, location):
+    assert open_model_folder(sam).digest == open_model_folder(TINY).digest  # independent of the path
+    move_weights(sam / "onnx/vision_encoder.onnx", location)
     model, weights = open_model_folder(sam), sam / "onnx" / location
     assert weights in model.files
     before = model.digest
@@ -49,17 +50,20 @@ def test_external_weights_of_constants_are_found(tmp_path):
     path = tmp_path / "constant.onnx"
     constant = helper.make_node("Constant", [], ["y"], value=value)
     save_network(path, [constant], [], [tensor("y", [4096])], {})
-    outside(path, "elsewhere")
+    move_weights(path, "elsewhere")
     assert external_weights(path, tmp_path) == [tmp_path / "elsewhere"]
 
 
-def test_weights_outside_the_folder_are_refused(sam):
-    outside(sam / "onnx/vision_encoder.onnx", "weights.bin")
-    path = sam / "onnx/vision_encoder.onnx"
-    (sam / "onnx/weights.bin").rename(sam.parent / "weights.bin")
-    (sam / "onnx/weights.bin").symlink_to(sam.parent / "weights.bin")
-    with pytest.raises(ModelError, match=r"weights are missing(.|\n)*the file weights.bin beside it"):
-        external_weights(path, sam)
+@pytest.mark.parametrize("linked", [False, True])
+def test_missing_weights_and_links_to_weights_outside_the_folder_are_refused(sam, linked):
+    path, weights = sam / "onnx/vision_encoder.onnx", sam / "onnx/weights.bin"
+    move_weights(path, weights.name)
+    weights.rename(sam.parent / "weights.bin")
+    if linked:
+        weights.symlink_to(sam.parent / "weights.bin")
+    words = r"cannot be opened: its weights are missing(.|\n)*the file weights.bin beside it"
+    with pytest.raises(ModelError, match=words):
+        open_model_folder(sam)
 
 
 def test_a_variant_is_chosen_by_its_ending(sam):
@@ -84,7 +88,7 @@ def test_variants_are_those_that_all_networks_have(sam):
 
 
 def write_whole_clip(folder, external: bool) -> None:
-    """A `model.onnx` whose halves scale their inputs by weights of their own."""
+    """A `model.onnx` whose halves scale their inputs by different weights."""
     nodes = [
         helper.make_node("Mul", ["pixel_values", "vision"], ["image_embeds"]),
         helper.make_node("Mul", ["input_ids", "text"], ["words"]),
@@ -95,13 +99,13 @@ def write_whole_clip(folder, external: bool) -> None:
     numbers = np.arange(64, dtype=np.float32)
     save_network(folder / "model.onnx", nodes, inputs, outputs, {"vision": numbers, "text": -numbers})
     if external:
-        outside(folder / "model.onnx", "model.onnx_data")
+        move_weights(folder / "model.onnx", "model.onnx_data")
 
 
 @pytest.mark.parametrize("external", [False, True])
-def test_halves_give_what_the_whole_gives_and_read_no_weights(tmp_path, external, monkeypatch):
+def test_halves_compute_the_same_as_the_whole_and_splitting_reads_no_weights(tmp_path, external, monkeypatch):
     write_whole_clip(tmp_path / "clip", external)
-    if external:  # above 2 GiB they could not be put into the network again
+    if external:  # above 2 GiB they do not fit into the graph
         monkeypatch.setattr(onnx, "load_external_data_for_model", pytest.fail)
     vision, text = split_clip(tmp_path / "clip")
     ones = np.ones((1, 64), np.float32)

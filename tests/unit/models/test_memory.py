@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from hilsplat.models.folder import ModelFolder, open_model_folder
+from hilsplat.models.folder import ModelFolder
 from hilsplat.models.memory import PROCESS_MIB, Needs, available_mib, machine_mib, needs_of
-from tests.conftest import PROJECT
 
 
 def folder(tmp_path, layout: str, config: dict, size: int, megabytes: int = 0) -> ModelFolder:
@@ -41,12 +40,6 @@ def test_a_view_of_sam_vit_b_takes_what_was_measured(tmp_path):
 def test_a_batch_of_clip_vit_b_16_takes_what_was_measured(tmp_path):
     needs = needs_of(folder(tmp_path, "clip", {"vision_config": {}}, 224), batch=64)
     assert needs.view_mib == pytest.approx(521, rel=0.25)
-
-
-@pytest.mark.parametrize("name", ["sam-tiny", "clip-tiny"])
-def test_the_embedded_models_are_small(name):
-    model = open_model_folder(PROJECT / "models" / name)
-    assert needs_of(model, 64).total_mib(2) < 4000
 
 
 def test_free_memory_is_part_of_the_machine():

@@ -7,34 +7,58 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 from onnx import TensorProto, helper
 
 from hilsplat.base.errors import ModelError
-from hilsplat.models.folder import open_model_folder
 from hilsplat.models.network import require_one_space, require_three_heads
 from hilsplat.segment.sam import SamModel
 from tests.unit.segment.handmade import save_network, tensor, write_disc_sam
 
-ENCODER = "onnx/vision_encoder.onnx"
-PREPROCESSOR = "preprocessor_config.json"
+ENCODER, CONFIG, PREPROCESSOR = "onnx/vision_encoder.onnx", "config.json", "preprocessor_config.json"
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
 
 
-def replaced(folder: Path, name: str, content: bytes) -> None:
-    (folder / name).write_bytes(content)
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        (ENCODER, b"", r"cannot be opened(.|\n)*a file of 0 bytes"),
+        (ENCODER, b"half of a network", r"vision_encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
+        (ENCODER, LFS_POINTER, r"Git LFS pointer(.|\n)*git lfs pull"),
+        (CONFIG, b"{", r"no readable config.json(.|\n)*model_type"),
+        (CONFIG, b"[]", r"another kind of model(.|\n)*model_type"),
+        (CONFIG, b'{"model_type": 3}', r"another kind of model(.|\n)*model_type"),
+        (CONFIG, b'{"model_type": "siglip2"}', r"SAM 2 or 2.1 \(sam2\)(.|\n)*siglip2(.|\n)*variable resol"),
+        (CONFIG, b'{"model_type": "sam3"}', r"SAM 2 or 2.1 \(sam2\)(.|\n)*sam3(.|\n)*use SAM 2.1"),
+        (CONFIG, b'{"model_type": "blip"}', r"SAM 2 or 2.1 \(sam2\)(.|\n)*blip(.|\n)*docs/models.md"),
+    ],
+)
+def test_damaged_or_unsupported_files_are_refused(own_sam, name, content, words):
+    (own_sam / name).write_bytes(content)
+    with pytest.raises(ModelError, match=words):
+        SamModel.load(own_sam)
 
 
-def halved(folder: Path) -> None:
-    replaced(folder, ENCODER, (folder / ENCODER).read_bytes()[: (folder / ENCODER).stat().st_size // 2])
+@pytest.mark.parametrize(
+    ("name", "entry", "words"),
+    [
+        (PREPROCESSOR, {"do_normalize": False}, "disables do_normalize"),
+        (PREPROCESSOR, {"image_std": [0, 1, 1]}, "image_std cannot be used"),
+        (PREPROCESSOR, {"image_std": [-1, 1, 1]}, "image_std cannot be used"),
+        (PREPROCESSOR, {"image_std": "x"}, "image_std cannot be used"),
+        (PREPROCESSOR, {"image_mean": [1e999, 0, 0]}, "image_mean cannot be used"),
+        (CONFIG, {"mask_generation": {"stability_min": 3}}, "config.json: mask_generation cannot be used"),
+        (CONFIG, {"mask_generation": {"segmenter": "graph"}}, "config.json: mask_generation cannot be used"),
+        (CONFIG, {"mask_generation": [1]}, "config.json: mask_generation cannot be used"),
+    ],
+)
+def test_configuration_that_cannot_be_used_is_refused(own_sam, name, entry, words):
+    (own_sam / name).write_text(json.dumps(json.loads((own_sam / name).read_text()) | entry))
+    with pytest.raises(ModelError, match=words):
+        SamModel.load(own_sam)
 
 
-def changed(folder: Path, name: str, **entries: object) -> None:
-    (folder / name).write_text(json.dumps(json.loads((folder / name).read_text()) | entries))
-
-
-def renamed(folder: Path) -> None:
+def as_variant(folder: Path) -> None:
     (folder / ENCODER).rename(folder / "onnx" / "vision_encoder_quantized.onnx")
 
 
@@ -56,33 +80,11 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "words"),
+    ("change", "words"),
     [
-        (halved, r"vision_encoder.onnx cannot be opened(.|\n)*fetch a complete copy"),
-        (partial(replaced, name=ENCODER, content=b""), r"cannot be opened(.|\n)*a file of 0 bytes"),
-        (partial(replaced, name=ENCODER, content=LFS_POINTER), r"Git LFS pointer(.|\n)*git lfs pull"),
-        *(
-            (partial(replaced, name="config.json", content=text), r"no readable config.json(.|\n)*model_type")
-            for text in (b"", b"{")
-        ),
-        *(
-            (partial(replaced, name="config.json", content=text), r"another kind of model(.|\n)*model_type")
-            for text in (b"[]", b'{"model_type": 3}')
-        ),
-        (renamed, r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"),
-        (partial(changed, name=PREPROCESSOR, do_normalize=False), "disables do_normalize"),
-        *(
-            (partial(changed, name=PREPROCESSOR, image_std=values), "image_std cannot be used")
-            for values in ([0, 1, 1], [-1, 1, 1], "x")
-        ),
-        (partial(changed, name=PREPROCESSOR, image_mean=[1e999, 0, 0]), "image_mean cannot be used"),
-        *(
-            (
-                partial(changed, name="config.json", mask_generation=own),
-                r"config.json: mask_generation cannot be used",
-            )
-            for own in ({"stability_min": 3}, {"segmenter": "graph"}, [1])
-        ),
+        (shutil.rmtree, r"is missing(.|\n)*masks.segmenter: graph, which needs no model"),
+        (as_variant, r"lacks onnx/vision_encoder.onnx(.|\n)*vision_encoder_quantized.onnx"),
+        (as_torch, r"PyTorch weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
         (
             partial(retyped, channels=3, kind=TensorProto.UINT8),
             r"unexpected or missing inputs: pixel_values(.|\n)*tensor\(uint8\)",
@@ -99,46 +101,12 @@ def retyped(folder: Path, channels: int, kind: int) -> None:
             partial(write_disc_sam, heads=4),
             r"unexpected or missing outputs(.|\n)*expected .*\(any, any, 3\)(.|\n)*'P', 4\]",
         ),
-        (as_torch, r"PyTorch weights(.|\n)*hilsplat models get(.|\n)*docs/models.md"),
-        *(
-            (
-                partial(replaced, name="config.json", content=b'{"model_type": "%s"}' % model_type),
-                rf"SAM 2 or 2.1 \(sam2\)(.|\n)*{model_type.decode()}(.|\n)*{words}",
-            )
-            for model_type, words in (
-                (b"siglip2", "variable resolution"),
-                (b"sam3", "use SAM 2.1"),
-                (b"blip", "docs/models.md"),
-            )
-        ),
     ],
 )
-def test_errors_for_damaged_folders(own_sam, damage: Callable[[Path], None], words):
-    damage(own_sam)
+def test_missing_and_unsuitable_networks_are_refused(own_sam, change: Callable[[Path], None], words):
+    change(own_sam)
     with pytest.raises(ModelError, match=words):
         SamModel.load(own_sam)
-
-
-def test_a_network_without_its_weights_file_is_named(own_sam):
-    path = own_sam / "onnx" / "prompt_encoder_mask_decoder.onnx"
-    onnx.save(
-        onnx.load(path), path, save_as_external_data=True, location="decoder.onnx_data", size_threshold=1024
-    )
-    assert SamModel.load(own_sam).longest_edge == 32
-    (own_sam / "onnx" / "decoder.onnx_data").unlink()
-    with pytest.raises(ModelError, match=r"cannot be opened(.|\n)*\.onnx_data"):
-        SamModel.load(own_sam)
-
-
-def test_another_kind_of_model_is_refused(disc_sam):
-    with pytest.raises(ModelError, match=r"another kind(.|\n)*model_type clip(.|\n)*'sam'"):
-        open_model_folder(disc_sam, "clip")
-
-
-def test_networks_may_be_beside_the_configuration(own_sam):
-    for path in (own_sam / "onnx").iterdir():
-        path.rename(own_sam / path.name)
-    assert SamModel.load(own_sam).longest_edge == 32
 
 
 def test_networks_with_undeclared_shapes_are_checked_when_they_run(tmp_path):

@@ -18,10 +18,9 @@ from hilsplat.segment.generate import (
     clean_masks,
     crop_boxes,
     decode_candidates,
-    floors,
     masks_from_candidates,
 )
-from hilsplat.segment.sam import Encoded, SamModel, Thresholds
+from hilsplat.segment.sam import Encoded, SamModel
 from hilsplat.settings import MasksSettings
 from tests.unit.segment.handmade import assert_equal_masks, generate, pack
 from tests.unit.segment.plain import mend
@@ -160,10 +159,6 @@ def test_of_two_predicted_ious_above_1_the_higher_wins(disc_sam):
 
     masks = generate(Sure(open_model_folder(disc_sam)), changed(points_per_batch="auto"), IMAGE)
     assert masks.predicted_iou.tolist() == [np.float32(1.06)] * 3
-
-
-def test_floors_are_at_most_the_thresholds():
-    assert floors(Thresholds(0.35, 0.02, 0.0, 64)) == (0.1, 0.02)
 
 
 def status_mib(name: str) -> float:

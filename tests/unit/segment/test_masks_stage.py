@@ -1,13 +1,12 @@
-"""The stages masks and coverage_tree on a small scene, and the errors for a missing model."""
+"""The stages masks and coverage_tree on a small scene."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import read_index, read_npz, sha256_of_path
-from hilsplat.base.errors import ArtifactError, ModelError
+from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import read_image
 from hilsplat.models.folder import open_model_folder
 from hilsplat.models.layouts import DECODER, PREVIEW
@@ -127,16 +126,3 @@ def test_graph_segmenter_needs_no_model(scene, tmp_path):
     settings = MasksSettings(segmenter="graph", model="nowhere")
     run_masks(scene, tmp_path / "masks", tmp_path / "cache", settings, threads=1)
     assert read_index(tmp_path / "masks")["segmenter"] == "graph"
-
-
-def test_the_error_for_a_missing_model_suggests_the_graph_segmenter(scene, tmp_path):
-    with pytest.raises(ModelError, match=r"model folder .*nowhere is missing(.|\n)*masks.segmenter: graph"):
-        run_masks(scene, tmp_path / "masks", tmp_path / "cache", MasksSettings(model="nowhere"), threads=1)
-    assert not (tmp_path / "masks").exists()
-
-
-def test_a_models_digest_depends_on_its_content_only(disc_sam, own_sam):
-    assert open_model_folder(disc_sam).digest == open_model_folder(own_sam).digest
-    settings = json.loads((own_sam / "preprocessor_config.json").read_text())
-    (own_sam / "preprocessor_config.json").write_text(json.dumps(settings | {"resample": 3}))
-    assert open_model_folder(disc_sam).digest != open_model_folder(own_sam).digest
