@@ -27,7 +27,7 @@ def main(
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world.
 
-    An interrupted training resumes, and a finished one continues if it is given more minutes.
+    An interrupted training resumes, and a finished one continues with a larger budget.
     """
     start_logging(timestamps=True)
     try:

@@ -5,12 +5,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64, Shaped, UInt8
-from scipy import ndimage
+from jaxtyping import Float, Float32, Int64, UInt8
 from torch import Tensor
 
 from models.training.data import (
     LabelledViews,
+    boxes_of,
     cut_window,
     nested_targets,
     normalised,
@@ -19,60 +19,36 @@ from models.training.data import (
 )
 from models.training.sam import HEADS, MASK_STRIDE, STRIDE, positional_embeddings
 
-MARGIN = 4
-"""Margin around a region's box that is sampled as densely as the box, mask px."""
+MARGIN = 4  # margin around a region's box that is sampled as densely as the box, mask px
 
 
 @dataclass(frozen=True)
 class CropStage:
-    """Size and number of windows and prompts of a step.
+    """Size and number of windows and prompts of a step."""
 
-    Attributes:
-        share: share of all steps.
-        crop_px: side of the windows.
-        batch: windows per step.
-        prompts: point prompts per window.
-        pixels: mask pixels per prompt at which its masks are compared with the truth.
-    """
-
-    share: float
-    crop_px: int
-    batch: int
-    prompts: int
-    pixels: int = 512
+    share: float  # share of all steps
+    crop_px: int  # side of the windows
+    batch: int  # windows per step
+    prompts: int  # point prompts per window
+    pixels: int = 512  # mask pixels per prompt at which its masks are compared with the ground truth
 
 
 @dataclass(frozen=True)
 class SamBatch:
-    """Windows, prompts and targets of one step; P prompts per window, K mask pixels per prompt.
-
-    Attributes:
-        pixels: the windows.
-        positional: positional embeddings of the windows.
-        classes: row of the text that names each pixel's region, per head; 0 for none.
-        offsets: from each pixel to its region's centre, see `region_centres`.
-        has_region: 1 where there is a region.
-        edges: 1 where a neighbour at stride 2 belongs to another region, per head.
-        points: x, y of the prompts, px.
-        labels: labels of the points: 1 inside, 0 outside, -1 no point.
-        known: 1 where a prompt has a true mask, per head.
-        places: flat indices of mask pixels.
-        weights: number of mask pixels that each represents.
-        truth: share of each of these mask pixels that belongs to the prompted region, per head.
-    """
+    """Windows, prompts and targets of one step; P prompts per window, K mask pixels per prompt."""
 
     pixels: Float[Tensor, "B 3 S S"]
-    positional: Float[Tensor, "B D s s"]
-    classes: Int64[Tensor, "B 3 s s"]
-    offsets: Float[Tensor, "B 6 s s"]
+    positional: Float[Tensor, "B D s s"]  # positional embeddings of the windows
+    classes: Int64[Tensor, "B 3 s s"]  # row of the text that names each pixel's region, per head; 0 for none
+    offsets: Float[Tensor, "B 6 s s"]  # from each pixel to its region's centre, see `region_centres`
     has_region: Float[Tensor, "B 3 s s"]
-    edges: Float[Tensor, "B 3 h w"]
-    points: Float[Tensor, "B P N 2"]
-    labels: Int64[Tensor, "B P N"]
-    known: Float[Tensor, "B P 3"]
-    places: Int64[Tensor, "B P K"]
-    weights: Float[Tensor, "B P K"]
-    truth: Float[Tensor, "B P 3 K"]
+    edges: Float[Tensor, "B 3 h w"]  # 1 where a neighbour at stride 2 is in another region, per head
+    points: Float[Tensor, "B P N 2"]  # x, y of the prompts, px
+    labels: Int64[Tensor, "B P N"]  # of the points: 1 inside, 0 outside, -1 no point
+    known: Float[Tensor, "B P 3"]  # 1 where a prompt has a ground-truth mask, per head
+    places: Int64[Tensor, "B P K"]  # flat indices of mask pixels
+    weights: Float[Tensor, "B P K"]  # number of mask pixels that each represents
+    truth: Float[Tensor, "B P 3 K"]  # share of each of these mask pixels in the prompted region, per head
 
     def to(self, device: torch.device) -> "SamBatch":
         """Return the batch on a device."""
@@ -89,17 +65,13 @@ def class_rows(views: LabelledViews) -> tuple[dict[str, int], list[np.ndarray]]:
 def draw_level_prompts(
     rng: np.random.Generator, labels: np.ndarray, targets: np.ndarray, count: int, balanced: float = 0.8
 ) -> Int64[np.ndarray, "count 2"]:
-    """Draw pixels (x, y) to prompt; for a share of them a level is drawn first, then a region, then a pixel.
+    """Draw pixels (x, y) to prompt; for the share `balanced`, draw a level, then a region, then a pixel.
 
     The probability of a region is proportional to the fourth root of its area. Small regions are thus drawn
     too, but less often than the larger regions that a grid of prompts hits. The other prompts are uniform.
 
-    Args:
-        rng: source of all choices.
-        labels: (3, H, W) node ids, -1 for none.
-        targets: from `nested_targets`; used for levels that are missing in the window.
-        count: number of prompts.
-        balanced: share of the prompts drawn by level and region.
+    `labels` contains (3, H, W) node ids, -1 for none. Levels that are missing in the window use `targets`,
+    which are from `nested_targets`.
     """
     height, width = labels.shape[1:]
     pixels = rng.integers(0, height * width, count)
@@ -120,16 +92,6 @@ def draw_level_prompts(
     return np.stack([pixels % width, pixels // width], axis=1).astype(np.int64)
 
 
-def boxes_of(target: Shaped[np.ndarray, "H W"]) -> dict[int, tuple[int, int, int, int]]:
-    """Return the box (x0, y0, x1, y1, end exclusive) of each region of a label image."""
-    found = ndimage.find_objects((target + 1).astype(np.int32))
-    return {
-        index: (box[1].start, box[0].start, box[1].stop, box[0].stop)
-        for index, box in enumerate(found)
-        if box is not None
-    }
-
-
 def compared_pixels(
     rng: np.random.Generator, blocks: np.ndarray, chosen: Int64[np.ndarray, "P 3"], count: int
 ) -> tuple[Int64[np.ndarray, "P K"], Float32[np.ndarray, "P K"], Float32[np.ndarray, "P 3 K"]]:
@@ -139,7 +101,6 @@ def compared_pixels(
     Weighted sums over these pixels estimate sums over the whole mask.
 
     Args:
-        rng: source of all choices.
         blocks: (3, h, w, n) node ids of the n pixels under each mask pixel, per head.
         chosen: node per prompt and head, -1 for none.
         count: K.
@@ -189,7 +150,7 @@ def region_edges(blocks: np.ndarray) -> Float32[np.ndarray, "heads h w"]:
     return edges
 
 
-def _strange(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def _odd_colours(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Occasionally permute or remove an image's colours, so that regions depend less on the world's hues."""
     draw = rng.random()
     if draw < 0.08:
@@ -208,22 +169,22 @@ def draw_batch(
     centre = slice(STRIDE // 2, None, STRIDE)
     side = stage.crop_px // MASK_STRIDE
     for view in rng.integers(0, len(views), stage.batch).tolist():
-        example = cut_window(rng, views.images[view], views.labels[view], stage.crop_px)
-        target = nested_targets(example.labels)
+        image, labels, window = cut_window(rng, views.images[view], views.labels[view], stage.crop_px)
+        target = nested_targets(labels)
         offset, region = region_centres(target[:, centre, centre], STRIDE)
-        place = draw_level_prompts(rng, example.labels, target, stage.prompts)
+        place = draw_level_prompts(rng, labels, target, stage.prompts)
         chosen = target[:, place[:, 1], place[:, 0]].T.astype(np.int64)  # (P, 3)
-        other = draw_level_prompts(rng, example.labels, target, stage.prompts)
+        other = draw_level_prompts(rng, labels, target, stage.prompts)
         same = target[:, other[:, 1], other[:, 0]].T
         second = np.where(same[:, 0] == chosen[:, 0], 1, np.where(same[:, 2] == chosen[:, 2], -1, 0))
         second = np.where(rng.random(stage.prompts) < 1 / 6, second, -1)
         blocks = target.reshape(3, side, MASK_STRIDE, side, MASK_STRIDE).transpose(0, 1, 3, 2, 4)
         blocks = np.ascontiguousarray(blocks).reshape(3, side, side, MASK_STRIDE**2)
         places, weights, truth = compared_pixels(rng, blocks, chosen, stage.pixels)
-        windows.append(example.window)
+        windows.append(window)
         rows.append(
             (
-                recolour(rng, _strange(rng, example.image)),
+                recolour(rng, _odd_colours(rng, image)),
                 classes[view][target[:, centre, centre]].astype(np.int64),
                 offset,
                 region.astype(np.float32),

@@ -10,14 +10,13 @@ from torch.nn import functional
 
 from models.training.sam import Residual, convolution
 
-CROP_PX = 64
-"""Side of the input crops."""
+CROP_PX = 64  # side of the input crops
 DIMENSIONS = 128
 PAD, UNKNOWN = "[PAD]", "[UNK]"
 MAX_WORDS = 16
 
+# generic phrases that relevancy compares queries with (LERF)
 CANONICAL = ("object", "things", "stuff", "texture")
-"""Generic phrases that relevancy compares queries with (LERF)."""
 
 
 def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
@@ -85,22 +84,14 @@ class ClipText(nn.Module):
 
 
 def contrastive_loss(
-    image: Float[Tensor, "B D"],
-    text: Float[Tensor, "T D"],
-    valid: Float[Tensor, "B T"],
-    scale: Float[Tensor, ""],
+    image: Float[Tensor, "B D"],  # unit vectors of crops
+    text: Float[Tensor, "T D"],  # unit vectors of texts
+    valid: Float[Tensor, "B T"],  # 1 where text j describes crop i; every crop has at least one text
+    scale: Float[Tensor, ""],  # factor of the cosines (inverse temperature)
 ) -> Float[Tensor, ""]:
-    """Return the symmetric contrastive loss.
+    """Return the mean of both directions' cross-entropy against uniform targets on the valid pairs.
 
-    Args:
-        image: unit vectors of crops.
-        text: unit vectors of texts.
-        valid: 1 where text j describes crop i; every crop has such a text, but a text may have no crop.
-        scale: factor on the cosines (inverse temperature).
-
-    Returns:
-        Mean of both directions' cross-entropy against uniform targets on the valid pairs. Texts without a
-        crop are only negatives.
+    Texts without a crop are only negatives.
     """
     logits = scale * image @ text.T
     by_image = -(valid * torch.log_softmax(logits, dim=1)).sum(dim=1) / valid.sum(dim=1)

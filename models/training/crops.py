@@ -1,4 +1,4 @@
-"""Training crops of the small CLIP, cut on demand from true, roughened and segmented masks."""
+"""Training crops of the small CLIP, cut on demand from ground-truth, roughened and segmented masks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,59 +6,38 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
-from scipy import ndimage
 
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.segment.crops import square_crop
 from hilsplat.segment.masks import HierarchicalMasks
 from models.training.clip import CANONICAL, CROP_PX
-from models.training.data import LabelledViews
+from models.training.data import LabelledViews, boxes_of
 
+# Prompt templates around a phrase; the bare phrase has the highest weight.
 FRAMES: tuple[str, ...] = (
-    "{}",
-    "{}",
-    "{}",
-    "the {}",
-    "a {}",
-    "a photo of a {}",
-    "a photo of the {}",
-    "a picture of a {}",
+    *("{}", "{}", "{}", "the {}", "a {}"),
+    *("a photo of a {}", "a photo of the {}", "a picture of a {}"),
 )
-"""Prompt templates around a phrase; the bare phrase has the highest weight."""
 GENERIC_FRAMES: tuple[str, ...] = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
-LEAST_PX = 24
-"""Minimum area of a region, px."""
-SHOWS, SHOWS_NOTHING = 0.5, 0.2
-"""IoU above which a segmented mask is matched to a node, and IoU below which it is matched to none."""
+LEAST_PX = 24  # minimum area of a region
+SHOWS = 0.5  # IoU above which a segmented mask is matched to a node
+SHOWS_NOTHING = 0.2  # IoU below which a segmented mask is matched to no node
 
 
 @dataclass(frozen=True)
 class CropTable:
-    """N masks in labelled views, with their captions.
-
-    Attributes:
-        views: the views.
-        masks: segmented masks per view; empty if none were requested.
-        view: row of the view.
-        node: id of the node that the mask matches, -1 for none.
-        level: `Level` of that node, 0 for none.
-        thing: id of the node's object, unique within a view.
-        segmented: row of the view's segmented masks, -1 for the true region.
-        box: x0, y0, x1, y1 of the mask, end exclusive, px.
-        caption: row of `phrase_sets`, -1 for none.
-        phrase_sets: the distinct sets of phrases; the first phrase of each is the query.
-    """
+    """N masks in labelled views, with their captions."""
 
     views: LabelledViews
-    masks: Sequence[HierarchicalMasks]
+    masks: Sequence[HierarchicalMasks]  # segmented masks per view; empty if none were requested
     view: Int64[np.ndarray, " N"]
-    node: Int64[np.ndarray, " N"]
-    level: Int64[np.ndarray, " N"]
-    thing: Int64[np.ndarray, " N"]
-    segmented: Int64[np.ndarray, " N"]
-    box: Int64[np.ndarray, "N 4"]
-    caption: Int64[np.ndarray, " N"]
-    phrase_sets: tuple[tuple[str, ...], ...]
+    node: Int64[np.ndarray, " N"]  # id of the node that the mask matches, -1 for none
+    level: Int64[np.ndarray, " N"]  # `Level` of that node, 0 for none
+    thing: Int64[np.ndarray, " N"]  # id of the node's object, unique within a view
+    segmented: Int64[np.ndarray, " N"]  # row of the view's segmented masks, -1 for the ground-truth region
+    box: Int64[np.ndarray, "N 4"]  # x0, y0, x1, y1 of the mask, end exclusive, px
+    caption: Int64[np.ndarray, " N"]  # row of `phrase_sets`, -1 for none
+    phrase_sets: tuple[tuple[str, ...], ...]  # distinct sets of phrases; the first of each is the query
 
     def __len__(self) -> int:
         return len(self.view)
@@ -71,7 +50,7 @@ class CropTable:
     def cut(
         self, row: int, background: str = "black", rng: np.random.Generator | None = None
     ) -> UInt8[np.ndarray, "size size 3"]:
-        """Return the CLIP crop of a mask; with `rng`, a true mask is roughened first."""
+        """Return the CLIP crop of a mask; with `rng`, a ground-truth mask is roughened first."""
         x0, y0, x1, y1 = self.box[row].tolist()
         image = self.views.images[self.view[row]]
         margin = 2 + max(x1 - x0, y1 - y0) // 8 if rng is not None else 0
@@ -149,16 +128,8 @@ def best_node(
     return best, best_iou
 
 
-def list_crops(
-    views: LabelledViews, masks: Sequence[HierarchicalMasks] = (), least_px: int = LEAST_PX
-) -> CropTable:
-    """List all masks of labelled views: the true regions, and the segmented masks, if any.
-
-    Args:
-        views: labelled views.
-        masks: segmented masks of the first views.
-        least_px: smaller regions are omitted.
-    """
+def list_crops(views: LabelledViews, masks: Sequence[HierarchicalMasks] = ()) -> CropTable:
+    """List all masks of labelled views: ground-truth regions, and segmented masks of the first views."""
     rows: list[tuple[int, ...]] = []
     boxes: list[Sequence[int]] = []
     sets: dict[tuple[str, ...], int] = {}
@@ -169,12 +140,11 @@ def list_crops(
             root[node] = root[described.parent] if described.parent >= 0 else node
         for at in LEVELS:
             areas = np.bincount(labels[at.index].reshape(-1) + 1, minlength=len(nodes) + 1)[1:]
-            for node, box in enumerate(ndimage.find_objects(labels[at.index].astype(np.int32) + 1)):
-                if box is None or areas[node] < least_px or not nodes[node].phrases:
-                    continue
-                caption = sets.setdefault(nodes[node].phrases, len(sets))
-                rows.append((view, node, nodes[node].level, root[node], -1, caption))
-                boxes.append((box[1].start, box[0].start, box[1].stop, box[0].stop))
+            for node, box in boxes_of(labels[at.index]).items():
+                if areas[node] >= LEAST_PX and nodes[node].phrases:
+                    caption = sets.setdefault(nodes[node].phrases, len(sets))
+                    rows.append((view, node, nodes[node].level, root[node], -1, caption))
+                    boxes.append(box)
         if view >= len(masks):
             continue
         found = masks[view]
@@ -200,27 +170,21 @@ def list_crops(
 def list_segmented(views: LabelledViews, masks: Sequence[HierarchicalMasks]) -> CropTable:
     """List all segmented masks in order, without captions and regardless of their content."""
     view = np.repeat(np.arange(len(masks)), [len(found) for found in masks])
-    segmented = np.concatenate([np.arange(len(found)) for found in masks] + [np.zeros(0, np.int64)])
-    box = np.concatenate([found.box_xyxy for found in masks] + [np.zeros((0, 4), np.int32)])
-    nothing = np.full(len(view), NONE, np.int64)
-    segmented = segmented.astype(np.int64)
-    none = np.zeros(len(view), np.int64)
-    return CropTable(views, masks, view, nothing, none, nothing, segmented, box.astype(np.int64), nothing, ())
+    none, level = np.full(len(view), NONE, np.int64), np.zeros(len(view), np.int64)
+    # A first empty array, because NumPy cannot concatenate nothing.
+    segmented = np.concatenate([none[:0], *(np.arange(len(found)) for found in masks)])
+    box = np.concatenate([np.zeros((0, 4), np.int64), *(found.box_xyxy for found in masks)])
+    return CropTable(views, masks, view, none, level, none, segmented, box, none, ())
 
 
 class Captioner:
     """Generator of captions for crops, with the pairs of captions and crops that match.
 
-    A small share of crops gets a canonical phrase instead of its own. This choice is independent of the
-    crop, so a canonical phrase has no specific meaning, as relevancy requires.
+    The share `generic_share` of crops gets a canonical phrase instead of its own. This choice is independent
+    of the crop, so a canonical phrase has no specific meaning, as relevancy requires.
 
-    Every query of the vocabulary and some further phrases are added to the captions of a batch as cheap
+    Every query of the vocabulary and `others` further phrases are added to the captions of a batch as cheap
     additional positives and negatives.
-
-    Args:
-        phrase_sets: distinct sets of phrases; the first of each is the query.
-        generic_share: share of crops that get a canonical phrase.
-        others: number of further phrases.
     """
 
     def __init__(
@@ -231,11 +195,8 @@ class Captioner:
         self.queries = np.array(sorted({row[phrases[0]] for phrases in phrase_sets}), np.int64)
         self.choices = [np.array([row[phrase] for phrase in phrases]) for phrases in phrase_sets]
         self.attributed = [
-            np.array(
-                [row[phrase] for phrase in phrases if phrase != text and phrase.endswith(f" {text}")], int
-            )
+            np.array([row[phrase] for phrase in phrases if phrase.endswith(f" {phrases[0]}")], int)
             for phrases in phrase_sets
-            for text in phrases[:1]
         ]
         self.generic_share = generic_share
         self.others = min(others, len(self.phrases))
@@ -245,9 +206,7 @@ class Captioner:
     ) -> tuple[list[str], Float32[np.ndarray, "B T"]]:
         """Draw texts for a batch of crops, text i for crop i; return also whether text j describes crop i.
 
-        Args:
-            rng: source of all choices.
-            captions: row of `phrase_sets` per crop, -1 for none, which selects a canonical phrase.
+        `captions` contains a row of `phrase_sets` per crop, -1 for none, which selects a canonical phrase.
         """
         texts, drawn = [], np.zeros(len(captions), np.int64)
         for index, caption in enumerate(captions.tolist()):

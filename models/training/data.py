@@ -1,17 +1,15 @@
 """Training data of the small models: rendered views with labels, cut into windows with targets."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Shaped, UInt8
+from jaxtyping import Bool, Float32, Int, Shaped, UInt8
+from scipy import ndimage
 
-from hilsplat.base.levels import Level
 from models.training.export import MEAN, STD
 from models.training.sam import HEADS, UNIT_PX
-
-HEAD_LEVELS = (Level.SUBPART, Level.PART, Level.WHOLE)
-"""Level of each output head."""
 
 
 @dataclass(frozen=True)
@@ -25,24 +23,22 @@ class LabelledNode:
 
 @dataclass(frozen=True)
 class LabelledViews:
-    """V rendered views with exact labels.
-
-    Attributes:
-        images: the views.
-        labels: node id per view, level (whole, part, subpart) and pixel, -1 for none.
-        nodes: for each view, the nodes of its scene by id.
-    """
+    """V rendered views with exact labels."""
 
     images: UInt8[np.ndarray, "V S S 3"]
-    labels: np.ndarray
-    nodes: tuple[tuple[LabelledNode, ...], ...]
+    labels: np.ndarray  # (V, 3, S, S) node id per view, level (whole, part, subpart) and pixel, -1 for none
+    nodes: tuple[tuple[LabelledNode, ...], ...]  # for each view, the nodes of its scene by id
 
     def __len__(self) -> int:
         return len(self.images)
 
     def spread(self, count: int) -> "LabelledViews":
         """Return at most `count` of the views, evenly spaced."""
-        rows = np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).round().astype(int))
+        rows = np.linspace(0, len(self) - 1, min(count, len(self)))
+        return self.chosen(np.unique(rows.round().astype(int)))
+
+    def chosen(self, rows: Sequence[int] | Int[np.ndarray, " v"]) -> "LabelledViews":
+        """Return the given views."""
         return LabelledViews(self.images[rows], self.labels[rows], tuple(self.nodes[row] for row in rows))
 
 
@@ -53,62 +49,49 @@ def normalised(images: Shaped[np.ndarray, "B H W 3"]) -> Float32[np.ndarray, "B 
     return np.ascontiguousarray((images * scale - shift).transpose(0, 3, 1, 2))
 
 
-def recolour(
-    rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"], strength: float = 1.0
-) -> UInt8[np.ndarray, "H W 3"]:
+def recolour(rng: np.random.Generator, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Vary exposure, white balance, contrast, saturation, gamma, vignette, blur and noise at random."""
     size = image.shape[:2]
-    if rng.random() < 0.15 * strength:
+    if rng.random() < 0.15:
         small = cv2.resize(image, (size[1] // 2, size[0] // 2), interpolation=cv2.INTER_AREA)
         image = cv2.resize(small, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
-    elif rng.random() < 0.25 * strength:
+    elif rng.random() < 0.25:
         image = cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.3, 1.0)))
     values = image.astype(np.float32)
-    gain = rng.normal(1.0, 0.06 * strength) * rng.normal(1.0, 0.03 * strength, 3)
+    gain = rng.normal(1.0, 0.06) * rng.normal(1.0, 0.03, 3)
     middle = float(values.mean())
-    contrast = rng.normal(1.0, 0.08 * strength)
+    contrast = rng.normal(1.0, 0.08)
     values = (values - middle) * contrast + middle
     grey = values.mean(axis=2, keepdims=True)
-    values = grey + (values - grey) * np.float32(max(0.0, rng.normal(1.0, 0.15 * strength)))
-    if rng.random() < 0.3 * strength:
+    values = grey + (values - grey) * np.float32(max(0.0, rng.normal(1.0, 0.15)))
+    if rng.random() < 0.3:
         gamma = float(np.exp(rng.normal(0, 0.15)))
         values = 255 * (values.clip(0, 255) / 255) ** np.float32(gamma)
-    if rng.random() < 0.2 * strength:
+    if rng.random() < 0.2:
         y, x = np.ogrid[-1 : 1 : size[0] * 1j, -1 : 1 : size[1] * 1j]
         values = values * (1 - rng.uniform(0.05, 0.25) * (x * x + y * y) / 2).astype(np.float32)[..., None]
     values = values * gain.astype(np.float32)
-    if rng.random() < 0.4 * strength:
+    if rng.random() < 0.4:
         values += rng.normal(0, rng.uniform(1, 6), image.shape).astype(np.float32)
     return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class SegmentExample:
-    """A training window: pixels, labels, and position in its view (x0, y0, side as shares)."""
-
-    image: UInt8[np.ndarray, "S S 3"]
-    labels: np.ndarray
-    window: tuple[float, float, float]
-
-
 def cut_window(
     rng: np.random.Generator,
-    image: UInt8[np.ndarray, "H W 3"],
-    labels: np.ndarray,
+    image: UInt8[np.ndarray, "H W 3"],  # a square view
+    labels: np.ndarray,  # (3, H, W) node ids
     size: int,
-    zoom: bool = True,
-) -> SegmentExample:
+) -> tuple[UInt8[np.ndarray, "S S 3"], np.ndarray, tuple[float, float, float]]:
     """Cut a random square from a view, possibly mirrored and scaled by up to a quarter.
 
-    Args:
-        rng: source of all choices.
-        image: a square view.
-        labels: (3, H, W) node ids.
-        size: side of the window in network pixels; the whole view if it is at least the view's side.
-        zoom: whether to scale the window.
+    `size` is the side of the window in network pixels; the window is the whole view if `size` is at least the
+    view's side.
+
+    Returns:
+        Pixels and labels of the window, and its position in the view (x0, y0, side as shares).
     """
     full = image.shape[0]
-    factor = float(np.exp(rng.uniform(-0.22, 0.25))) if zoom else 1.0
+    factor = float(np.exp(rng.uniform(-0.22, 0.25)))
     side = min(full, max(16, round(size / factor)))
     x0, y0 = int(rng.integers(0, full - side + 1)), int(rng.integers(0, full - side + 1))
     image = image[y0 : y0 + side, x0 : x0 + side]
@@ -119,18 +102,15 @@ def cut_window(
         image = cv2.resize(np.ascontiguousarray(image), (size, size), interpolation=cv2.INTER_LINEAR)
         nearest = ((np.arange(size) + 0.5) * side / size).astype(np.int64)
         labels = labels[:, nearest][:, :, nearest]
-    return SegmentExample(
-        np.ascontiguousarray(image), np.ascontiguousarray(labels), (x0 / full, y0 / full, side / full)
-    )
+    window = (x0 / full, y0 / full, side / full)
+    return np.ascontiguousarray(image), np.ascontiguousarray(labels), window
 
 
 def nested_targets(labels: np.ndarray) -> np.ndarray:
     """Return the node id per pixel and head (subpart, part, whole).
 
-    If a pixel has no subpart, its subpart is its part; if it has no part, its part is its whole.
-
-    Args:
-        labels: (3, H, W) node ids, whole, part, subpart; -1 for none. Ids differ between levels.
+    If a pixel has no subpart, its subpart is its part; if it has no part, its part is its whole. `labels`:
+    (3, H, W) node ids, whole, part, subpart; -1 for none. Ids differ between levels.
     """
     whole, part, subpart = labels
     part = np.where(part >= 0, part, whole)
@@ -140,14 +120,10 @@ def nested_targets(labels: np.ndarray) -> np.ndarray:
 def region_centres(
     targets: np.ndarray, spacing_px: int = 1
 ) -> tuple[Float32[np.ndarray, "6 H W"], Bool[np.ndarray, "3 H W"]]:
-    """Compute the offset from each pixel to the mean position of its region, per head.
+    """Return the offset from each pixel to the mean position of its region, and the pixels with a region.
 
-    Args:
-        targets: from `nested_targets`, possibly subsampled.
-        spacing_px: distance between the sampled pixels.
-
-    Returns:
-        x and y for each head in order, in units of 32 px, and a mask of pixels that have a region.
+    Offsets are x and y for each head in order, in units of 32 px. `targets` are from `nested_targets`,
+    possibly subsampled; `spacing_px` is the distance between the sampled pixels.
     """
     height, width = targets.shape[1:]
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) * spacing_px
@@ -159,3 +135,13 @@ def region_centres(
             mean = np.bincount(ids, place.reshape(-1)) / counts
             offsets[2 * head + axis] = (mean[ids].reshape(height, width) - place) / UNIT_PX
     return offsets, targets >= 0
+
+
+def boxes_of(target: Shaped[np.ndarray, "H W"]) -> dict[int, tuple[int, int, int, int]]:
+    """Return the box (x0, y0, x1, y1, end exclusive) of each region of a label image."""
+    found = ndimage.find_objects((target + 1).astype(np.int32))
+    return {
+        index: (box[1].start, box[0].start, box[1].stop, box[0].stop)
+        for index, box in enumerate(found)
+        if box is not None
+    }

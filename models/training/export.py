@@ -28,16 +28,26 @@ from models.training.sam import (
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 OPSET = 18
+# Thresholds tuned for the small segmenter (docs/experiments.md) and stored in its `config.json`.
 OWN_THRESHOLDS = Thresholds(predicted_iou_min=0.35, stability_min=0.5, nms_score=0.0, points_per_batch=16)
-"""Thresholds tuned for the small segmenter (docs/experiments.md) and stored in its `config.json`."""
-HALF_FROM = 64
-"""Initialisers with at least this many values are stored as float16."""
+HALF_FROM = 64  # initialisers with at least this many values are stored as float16
+
+# parts of `preprocessor_config.json` that both models share
+RGB = {"do_convert_rgb": True, "do_resize": True}
+SCALING = {
+    "do_rescale": True,
+    "rescale_factor": 1 / 255,
+    "do_normalize": True,
+    "image_mean": list(MEAN),
+    "image_std": list(STD),
+}
 
 
 class _VisionEncoder(nn.Module):
-    """The encoder and everything that prompts share: the map sampled at their points, and pixel features.
+    """The encoder, with the inputs of the decoder that all prompts share.
 
-    The two outputs use the names that SAM's layout gives to the encoder's outputs.
+    Its outputs are the map that is sampled at the prompts, and the pixel features. They have the names of the
+    encoder's outputs in SAM's layout.
     """
 
     positional: Tensor
@@ -63,8 +73,8 @@ class _MaskDecoder(nn.Module):
         self.preview = preview
 
     def forward(self, points: Tensor, labels: Tensor, place: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
-        answer = self.decoder.preview if self.preview else self.decoder.masks
-        return answer(points, labels, place, shared)
+        decode = self.decoder.preview if self.preview else self.decoder.masks
+        return decode(points, labels, place, shared)
 
 
 def store_as_half(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -93,10 +103,9 @@ def export_onnx(
     dynamic: dict[str, dict[int, str]],
     path: Path,
 ) -> None:
-    """Trace a module and write it with float16 weights.
+    """Trace a module, which is switched to evaluation mode, and write it with float16 weights.
 
     Args:
-        module: module to export, which is switched to evaluation mode.
         inputs: example inputs by name, in the order of the module's arguments.
         outputs: names of the outputs and their dynamic axes.
         dynamic: dynamic axes of the inputs.
@@ -123,117 +132,70 @@ def export_onnx(
 
 def export_sam(encoder: SamEncoder, decoder: SamDecoder, folder: Path) -> None:
     """Write `config.json`, `preprocessor_config.json`, the two networks of SAM's layout and the preview."""
-    folder = Path(folder)
-    vision = _VisionEncoder(encoder).eval()
+    vision, batch = _VisionEncoder(encoder).eval(), {0: "batch"}
     pixels = torch.zeros(1, 3, FRAME_PX, FRAME_PX)
     export_onnx(
         vision,
         {"pixel_values": pixels},
-        {"image_embeddings": {0: "batch"}, "image_positional_embeddings": {0: "batch"}},
-        {"pixel_values": {0: "batch"}},
+        {"image_embeddings": batch, "image_positional_embeddings": batch},
+        {"pixel_values": batch},
         folder / "onnx" / "vision_encoder.onnx",
     )
     with torch.no_grad():
         place, shared = vision(pixels)
+    inputs = {
+        # Three prompts of two points each, because axes of length one would be traced as constants.
+        "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
+        "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
+        "image_embeddings": place.repeat(2, 1, 1, 1),
+        "image_positional_embeddings": shared.repeat(2, 1, 1, 1),
+    }
+    prompts, points = {0: "batch", 1: "prompts"}, {0: "batch", 1: "prompts", 2: "points"}
+    outputs = {"iou_scores": prompts, "pred_masks": prompts}
+    dynamic = dict(zip(inputs, (points, points, batch, batch), strict=True))
     for name in (DECODER, PREVIEW):
-        export_onnx(
-            _MaskDecoder(decoder, preview=name == PREVIEW),
-            {
-                # Three prompts of two points each, because axes of length one would be traced as constants.
-                "input_points": torch.full((2, 3, 2, 2), FRAME_PX / 2.0),
-                "input_labels": torch.ones((2, 3, 2), dtype=torch.int64),
-                "image_embeddings": place.repeat(2, 1, 1, 1),
-                "image_positional_embeddings": shared.repeat(2, 1, 1, 1),
-            },
-            {
-                "iou_scores": {0: "batch", 1: "prompts"},
-                "pred_masks": {0: "batch", 1: "prompts"},
-            },
-            {
-                "input_points": {0: "batch", 1: "prompts", 2: "points"},
-                "input_labels": {0: "batch", 1: "prompts", 2: "points"},
-                "image_embeddings": {0: "batch"},
-                "image_positional_embeddings": {0: "batch"},
-            },
-            folder / "onnx" / f"{name}.onnx",
-        )
-    write_json(
-        folder / "config.json",
-        {
-            "model_type": "sam",
-            "architectures": ["TinySam"],
-            "image_size": FRAME_PX,
-            "mask_size": FRAME_PX // MASK_STRIDE,
-            "num_multimask_outputs": 3,
-            "world_only": True,
-            OWN: vars(OWN_THRESHOLDS),
-        },
-    )
-    write_json(
-        folder / "preprocessor_config.json",
-        {
-            "image_processor_type": "SamImageProcessor",
-            "do_convert_rgb": True,
-            "do_resize": True,
-            "size": {"longest_edge": FRAME_PX},
-            "resample": 2,
-            "do_rescale": True,
-            "rescale_factor": 1 / 255,
-            "do_normalize": True,
-            "image_mean": list(MEAN),
-            "image_std": list(STD),
-            "do_pad": True,
-            "pad_size": {"height": FRAME_PX, "width": FRAME_PX},
-        },
-    )
+        network = _MaskDecoder(decoder, preview=name == PREVIEW)
+        export_onnx(network, inputs, outputs, dynamic, folder / "onnx" / f"{name}.onnx")
+    config = {
+        "model_type": "sam",
+        "architectures": ["TinySam"],
+        "image_size": FRAME_PX,
+        "mask_size": FRAME_PX // MASK_STRIDE,
+        "num_multimask_outputs": 3,
+        "world_only": True,
+        OWN: vars(OWN_THRESHOLDS),
+    }
+    write_json(folder / "config.json", config)
+    size: dict[str, Any] = {"size": {"longest_edge": FRAME_PX}, "resample": 2}
+    pad = {"do_pad": True, "pad_size": {"height": FRAME_PX, "width": FRAME_PX}}
+    preprocessor = {"image_processor_type": "SamImageProcessor", **RGB, **size, **SCALING, **pad}
+    write_json(folder / "preprocessor_config.json", preprocessor)
 
 
 def export_clip(vision: ClipVision, text: ClipText, tokenizer: Tokenizer, folder: Path) -> None:
     """Write the configuration, `tokenizer.json` and the two networks of CLIP's layout."""
-    folder = Path(folder)
+    batch, words = {0: "batch"}, {0: "batch", 1: "words"}
     export_onnx(
         vision,
         {"pixel_values": torch.zeros(2, 3, CROP_PX, CROP_PX)},
-        {"image_embeds": {0: "batch"}},
-        {"pixel_values": {0: "batch"}},
+        {"image_embeds": batch},
+        {"pixel_values": batch},
         folder / "onnx" / "vision_model.onnx",
     )
+    ones = torch.ones(2, 3, dtype=torch.int64)
     export_onnx(
         text,
-        {
-            "input_ids": torch.ones(2, 3, dtype=torch.int64),
-            "attention_mask": torch.ones(2, 3, dtype=torch.int64),
-        },
-        {"text_embeds": {0: "batch"}},
-        {"input_ids": {0: "batch", 1: "words"}, "attention_mask": {0: "batch", 1: "words"}},
+        {"input_ids": ones, "attention_mask": ones.clone()},
+        {"text_embeds": batch},
+        {"input_ids": words, "attention_mask": words},
         folder / "onnx" / "text_model.onnx",
     )
     with atomic_path(folder / "tokenizer.json") as temporary:
         temporary.write_text(tokenizer.to_str(pretty=False) + "\n", encoding="utf-8")
-    write_json(
-        folder / "config.json",
-        {
-            "model_type": "clip",
-            "architectures": ["TinyClip"],
-            "projection_dim": DIMENSIONS,
-            "world_only": True,
-        },
-    )
-    size: dict[str, Any] = {"height": CROP_PX, "width": CROP_PX}
-    write_json(
-        folder / "preprocessor_config.json",
-        {
-            "image_processor_type": "CLIPImageProcessor",
-            "do_convert_rgb": True,
-            "do_resize": True,
-            "size": {"shortest_edge": CROP_PX},
-            "resample": 2,
-            "do_center_crop": True,
-            "crop_size": size,
-            "do_rescale": True,
-            "rescale_factor": 1 / 255,
-            "do_normalize": True,
-            "image_mean": list(MEAN),
-            "image_std": list(STD),
-        },
-    )
+    config = {"model_type": "clip", "architectures": ["TinyClip"], "projection_dim": DIMENSIONS}
+    write_json(folder / "config.json", config | {"world_only": True})
+    side = {"height": CROP_PX, "width": CROP_PX}
+    size: dict[str, Any] = {"size": {"shortest_edge": CROP_PX}, "resample": 2}
+    size |= {"do_center_crop": True, "crop_size": side}
+    preprocessor = {"image_processor_type": "CLIPImageProcessor", **RGB, **size, **SCALING}
+    write_json(folder / "preprocessor_config.json", preprocessor)

@@ -3,8 +3,11 @@
 import json
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,53 +18,97 @@ from torch import Tensor, nn
 
 from hilsplat.base.artifacts import atomic_path
 from hilsplat.base.errors import ArtifactError
-from models.training.steps import Budget, Curve, learning_rate, prefetched
 
 logger = logging.getLogger(__name__)
 
 Batch = TypeVar("Batch")
+Curve = list[dict[str, float]]
+"""Learning curve: rows with equal keys; the first key is `step`."""
+
+DECAY_SHARE = 0.25  # final share of a budget, during which the learning rate decays
+
+
+def has_fast_half(device: torch.device) -> bool:
+    """Return whether the device has fast bfloat16 convolutions: some GPUs, and CPUs with AVX512-BF16."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return bool(supported and supported())
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Duration of a training: minutes or steps, whichever ends first; 0 sets no limit.
+
+    A number of steps is reproducible on one machine; minutes adapt the schedule to the machine's speed.
+    """
+
+    minutes: float = 0.0
+    steps: int = 0
+
+    def __post_init__(self) -> None:
+        if self.minutes <= 0 and self.steps <= 0:
+            raise ValueError("a training needs minutes or steps")
+
+    def is_time_to_decay(self, step: int, minutes: float) -> bool:
+        """Return whether the learning rate decay should begin."""
+        by_steps = self.steps > 0 and step >= int((1 - DECAY_SHARE) * self.steps)
+        return by_steps or (self.minutes > 0 and minutes >= (1 - DECAY_SHARE) * self.minutes)
+
+    def decay_steps(self, step: int, minutes: float) -> int:
+        """Return the length of a decay that begins now: the remaining steps, or at least a quarter of all.
+
+        The shorter of two limits applies. The minimum is for a state that is already past the budget.
+        """
+        left = []
+        if self.steps > 0:
+            left.append(max(self.steps - step, round(DECAY_SHARE * self.steps)))
+        if self.minutes > 0:
+            pace = step / minutes if minutes > 0 else 1.0
+            left.append(round(max(self.minutes - minutes, DECAY_SHARE * self.minutes) * pace))
+        return max(1, min(left))
+
+
+def learning_rate(step: int, peak: float, warmup: int, decay_from: int = -1, decay_steps: int = 0) -> float:
+    """Return the rate of a step: linear warm-up, a constant phase, then linear decay to 1 % of the peak."""
+    rate = peak * min(1.0, (step + 1) / warmup)
+    if decay_from >= 0:
+        rate *= max(0.01, 1 - (step - decay_from) / max(1, decay_steps))
+    return rate
+
+
+def prefetched(make: Callable[[int], Batch], first: int) -> Generator[Batch, None, None]:
+    """Yield make(first), make(first + 1), ..., each prepared while its predecessor is in use."""
+    with ThreadPoolExecutor(1) as pool:
+        upcoming = pool.submit(make, first)
+        for step in count(first + 1):
+            ready = upcoming.result()
+            upcoming = pool.submit(make, step)
+            yield ready
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Settings of the optimiser and the training loop.
+    """Settings of the optimiser and the training loop."""
 
-    Attributes:
-        peak: learning rate of the constant phase.
-        warmup: number of warm-up steps.
-        weight_decay: weight decay of AdamW.
-        average: memory per step of the running average that gives the final weights.
-        measure_every: steps between rows of the learning curve.
-        save_every: steps between saved states.
-    """
-
-    peak: float
-    warmup: int = 100
+    peak: float  # learning rate of the constant phase
+    warmup: int = 100  # number of warm-up steps
     weight_decay: float = 0.02
-    average: float = 0.998
-    measure_every: int = 500
-    save_every: int = 200
+    average: float = 0.998  # decay per step of the running average that gives the final weights
+    measure_every: int = 500  # steps between rows of the learning curve
+    save_every: int = 200  # steps between saved states
 
 
 @dataclass
 class Progress:
-    """Progress of a training.
+    """Progress of a training."""
 
-    Attributes:
-        step: number of finished steps.
-        minutes: their duration over all runs.
-        decay_from: first step of the learning rate decay, -1 before it.
-        decay_steps: number of decay steps.
-        budget: budget that the decay was planned for.
-        rows: rows of the learning curve.
-    """
-
-    step: int = 0
-    minutes: float = 0.0
-    decay_from: int = -1
+    step: int = 0  # number of finished steps
+    minutes: float = 0.0  # their duration over all runs
+    decay_from: int = -1  # first step of the learning rate decay, -1 before it
     decay_steps: int = 0
-    budget: dict[str, float] = field(default_factory=dict)
-    rows: list[dict[str, float]] = field(default_factory=list)
+    budget: dict[str, float] = field(default_factory=dict)  # budget that the decay was planned for
+    rows: Curve = field(default_factory=list)
 
     @property
     def is_finished(self) -> bool:
@@ -72,17 +119,10 @@ class Progress:
 class Training:
     """Modules, optimiser and averaged weights of one model, with a state on disk.
 
-    `<name>.safetensors` holds the current state, `<name>-constant.safetensors` the state at the start of the
-    learning rate decay. A run with another budget resumes from the second, as if the decay had not happened:
-    the constant phase does not depend on its planned length. All randomness is derived from the step number,
-    so a resumed run repeats an uninterrupted one.
-
-    Args:
-        modules: modules by name, trained together.
-        tuning: settings of the optimiser and the loop.
-        folder: folder of the state.
-        name: base name of the state's files; it should identify everything that the weights depend on.
-        device: device of the modules.
+    `<name>.safetensors` contains the current state, `<name>-constant.safetensors` the state at the start of
+    the learning rate decay. A run with another budget resumes from the second: the constant phase does not
+    depend on its planned length. All randomness is derived from the step number, so a resumed run repeats an
+    uninterrupted one. The name should identify everything that the weights depend on.
     """
 
     def __init__(
@@ -122,10 +162,9 @@ class Training:
             make: returns the batch of a step; runs in a second thread.
             loss_of: returns the loss of a batch, and its terms for the curve.
             measure: returns the quality of the modules, which have their averaged weights at that time.
-            budget: duration of the training.
         """
         self._resume(budget)
-        curve, since = Curve(self.progress.rows), 0
+        since = 0
         sums: dict[str, float] = {}
         progress, clock = self.progress, time.monotonic()
         steps = prefetched(make, progress.step)
@@ -135,7 +174,7 @@ class Training:
                     self._save(self.constant)
                 progress.decay_from = progress.step
                 progress.decay_steps = budget.decay_steps(progress.step, progress.minutes)
-                logger.info("the learning rate falls over the last %d steps", progress.decay_steps)
+                logger.info("the learning rate decays over the last %d steps", progress.decay_steps)
                 continue
             terms = self._step(next(steps), loss_of)
             since += 1
@@ -144,16 +183,18 @@ class Training:
             now = time.monotonic()
             progress.minutes, clock = progress.minutes + (now - clock) / 60, now
             if progress.step % self.tuning.measure_every == 0 or progress.is_finished:
-                with self.averages():
+                with self._averaged_weights():
                     found = measure()
                 losses = {f"{key}_loss": value / since for key, value in sums.items()}
-                curve.add(step=progress.step, minutes=progress.minutes, **losses, **found)
+                values = {"step": progress.step, "minutes": progress.minutes, **losses, **found}
+                progress.rows.append({key: float(f"{value:.5g}") for key, value in values.items()})
+                logger.info("  ".join(f"{key} {value:g}" for key, value in progress.rows[-1].items()))
                 sums, since = {}, 0
             if progress.step % self.tuning.save_every == 0 or progress.is_finished:
                 self._save(self.now)
         steps.close()
-        self.averages().__enter__()
-        return curve
+        self._load_averages()
+        return progress.rows
 
     def _step(
         self, batch: Batch, loss_of: Callable[[Batch, int], tuple[Tensor, dict[str, float]]]
@@ -179,25 +220,34 @@ class Training:
             )
         return terms
 
-    def averages(self) -> "_Averages":
-        """Return a context in which the modules have their averaged weights and are in evaluation mode."""
-        return _Averages(self)
+    def _load_averages(self) -> None:
+        """Set the averaged weights, and switch to evaluation mode."""
+        self.modules.load_state_dict(self.modules.state_dict() | self.averaged)
+        self.modules.eval()
+
+    @contextmanager
+    def _averaged_weights(self) -> Iterator[None]:
+        """Use the averaged weights inside the context."""
+        before = {key: value.clone() for key, value in self.modules.state_dict().items()}
+        self._load_averages()
+        yield
+        self.modules.load_state_dict(before)
 
     def _resume(self, budget: Budget) -> None:
-        asked = asdict(budget)
+        planned = asdict(budget)
         if self.now.is_file():
             self._load(self.now)
-            if self.progress.decay_from >= 0 and self.progress.budget != asked:
+            if self.progress.decay_from >= 0 and self.progress.budget != planned:
                 if not self.constant.is_file():
                     raise ArtifactError(
-                        f"{self.now} cannot be trained for longer: {self.constant.name} is missing",
-                        fix="ask for the budget it was trained with, or name another --cache to begin again",
+                        f"{self.now} cannot be trained with another budget: {self.constant.name} is missing",
+                        fix="use the previous budget, or start again with another --cache folder",
                     )
-                rows = self.progress.rows
+                finished = self.progress.step
                 self._load(self.constant)
-                logger.info("another budget: continuing from step %d of %d", self.progress.step, len(rows))
+                logger.info("another budget: resuming from step %d of %d", self.progress.step, finished)
             logger.info("resuming at step %d, after %.1f minutes", self.progress.step, self.progress.minutes)
-        self.progress.budget = asked
+        self.progress.budget = planned
 
     def _save(self, path: Path) -> None:
         tensors = {f"model.{key}": value for key, value in self.modules.state_dict().items()}
@@ -215,7 +265,9 @@ class Training:
         with safe_open(path, framework="pt") as file:
             progress: dict[str, Any] = json.loads(file.metadata()["progress"])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        model = {key[6:]: value for key, value in tensors.items() if key.startswith("model.")}
+        model = {
+            key.removeprefix("model."): value for key, value in tensors.items() if key.startswith("model.")
+        }
         self.modules.load_state_dict(model)
         for key, value in self.averaged.items():
             value.copy_(tensors[f"averaged.{key}"])
@@ -231,20 +283,3 @@ class Training:
                 state["state"].setdefault(int(row), {})[what] = value
         self.optimiser.load_state_dict(state)
         self.progress = Progress(**progress)
-
-
-class _Averages:
-    """Context that swaps the averaged weights in and restores the trained ones."""
-
-    def __init__(self, training: Training) -> None:
-        self.training = training
-        self.before: dict[str, Tensor] = {}
-
-    def __enter__(self) -> None:
-        modules = self.training.modules
-        self.before = {key: value.clone() for key, value in modules.state_dict().items()}
-        modules.load_state_dict(self.before | self.training.averaged)
-        modules.eval()
-
-    def __exit__(self, *error: object) -> None:
-        self.training.modules.load_state_dict(self.before)

@@ -12,12 +12,12 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.world.paints import COLOURS
 from models.training.clip import CANONICAL, ClipText, ClipVision
-from models.training.crops import CropTable
+from models.training.crops import CropTable, list_segmented
 from models.training.data import LabelledViews, normalised
+from models.training.measure_sam import LEAST_PX, mean_or_zero
 
-CHUNK = 256
-COMMON = 20
-"""Number of most common texts of each level in the smaller set of competing texts."""
+CHUNK = 256  # crops embedded at once
+COMMON = 20  # number of most common texts of each level in the smaller set of competing texts
 
 
 def tokenised(tokenizer: Tokenizer, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
@@ -63,18 +63,12 @@ def measure_clip(
     text: ClipText,
     tokenizer: Tokenizer,
     crops: CropTable,
-    rows: np.ndarray | None = None,
+    rows: np.ndarray | None = None,  # rows to measure; None measures all
     background: str = "black",
 ) -> dict[tuple[str, str], dict[str, float]]:
     """Measure how often a crop's own text is the most similar one, per kind of mask and level.
 
-    Args:
-        vision: image encoder.
-        text: text encoder.
-        tokenizer: tokenizer of the text encoder.
-        crops: masks; those without a caption are skipped. The texts of all their nodes compete.
-        rows: rows to measure; None measures all.
-        background: background of the crops.
+    Masks without a caption are skipped. The texts of the nodes of all masks compete.
 
     Returns:
         By ("exact" or "rough", level): accuracies `top1` and `top3` among all texts, `top1_of_level` among
@@ -92,7 +86,7 @@ def measure_clip(
     hue_of_set = np.array([hue_row.get(phrase, -1) for phrase in coloured], np.int64)
     vectors = embedded_crops(vision, crops, rows, background)
     similarity = vectors @ embedded_texts(text, tokenizer, texts).T
-    yardstick = (vectors @ embedded_texts(text, tokenizer, CANONICAL).T).max(axis=1)
+    canonical = (vectors @ embedded_texts(text, tokenizer, CANONICAL).T).max(axis=1)
     true_text, hue = of_set[crops.caption[rows]], hue_of_set[crops.caption[rows]]
     if hues:
         hue_found = (vectors @ embedded_texts(text, tokenizer, hues).T).argmax(axis=1)
@@ -118,11 +112,9 @@ def measure_clip(
                 "top1": float((rank[group] == 0).mean()),
                 "top3": float((rank[group] < 3).mean()),
                 "top1_of_level": float((rank_of_level == 0).mean()),
-                "top1_of_common": float((rank_of_common[has_common] == 0).mean())
-                if has_common.any()
-                else 0.0,
-                "above_canonical": float((mine[group] > yardstick[group]).mean()),
-                "coloured": float((hue_found == hue)[has_hue].mean()) if has_hue.any() else 0.0,
+                "top1_of_common": mean_or_zero(rank_of_common[has_common] == 0),
+                "above_canonical": float((mine[group] > canonical[group]).mean()),
+                "coloured": mean_or_zero((hue_found == hue)[has_hue]),
                 "n": int(group.sum()),
             }
     return report
@@ -131,9 +123,7 @@ def measure_clip(
 def common_texts(text: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return the rows of the `COMMON` most frequent texts of each level, in ascending order.
 
-    Args:
-        text: row of each mask's text.
-        level: level of each mask; masks of level 0 are not counted.
+    `text` is the row of each mask's text. Masks of level 0 are not counted.
     """
     kept = []
     for at in LEVELS:
@@ -147,26 +137,18 @@ def measure_queries(
     text: ClipText,
     tokenizer: Tokenizer,
     views: LabelledViews,
-    masks: Sequence[HierarchicalMasks],
-    crops: CropTable,
-    least_px: int = 100,
+    masks: Sequence[HierarchicalMasks],  # automatic masks of each view
 ) -> dict[str, dict[str, float]]:
-    """Measure both models together: each text's most similar automatic mask in a view against the truth.
+    """Measure both models together: each text's most similar automatic mask in a view, and its regions.
 
-    Args:
-        vision: image encoder.
-        text: text encoder.
-        tokenizer: tokenizer of the text encoder.
-        views: labelled views.
-        masks: automatic masks of each view.
-        crops: from `list_segmented` for the same views and masks.
-        least_px: smaller regions are not queried.
+    Regions smaller than `LEAST_PX` are not queried.
 
     Returns:
         For each level: `iou`, the mean IoU of the mask most similar to the text and the union of all regions
         of the text; `instance`, the same with the region (or the union) that fits the mask best; `best`, the
         same with the best mask of the level; `n`, the number of pairs of view and text.
     """
+    crops = list_segmented(views, masks)
     vectors = embedded_crops(vision, crops, np.arange(len(crops)))
     found: dict[str, list[tuple[float, float, float]]] = {level.label: [] for level in LEVELS}
     for view in range(len(views)):
@@ -175,7 +157,7 @@ def measure_queries(
             labels = views.labels[view][level.index]
             areas = np.bincount(labels.reshape(-1) + 1, minlength=len(nodes) + 1)[1:]
             by_text: dict[str, list[int]] = {}
-            for node in np.flatnonzero(areas >= least_px).tolist():
+            for node in np.flatnonzero(areas >= LEAST_PX).tolist():
                 if nodes[node].phrases:
                     by_text.setdefault(nodes[node].phrases[0], []).append(node)
             if not by_text:
@@ -198,9 +180,9 @@ def measure_queries(
                 found[level.label].append((float(iou[pick, -1]), float(iou[pick].max()), float(iou.max())))
     return {
         label: {
-            "iou": float(np.mean([row[0] for row in rows])) if rows else 0.0,
-            "instance": float(np.mean([row[1] for row in rows])) if rows else 0.0,
-            "best": float(np.mean([row[2] for row in rows])) if rows else 0.0,
+            "iou": mean_or_zero([row[0] for row in rows]),
+            "instance": mean_or_zero([row[1] for row in rows]),
+            "best": mean_or_zero([row[2] for row in rows]),
             "n": len(rows),
         }
         for label, rows in found.items()

@@ -1,10 +1,12 @@
 """Measure the small segmenter on single points and on the pipeline's automatic masks."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Shaped, UInt8
 from torch.nn import functional
 
 from hilsplat.base.artifacts import sha256_of_bytes
@@ -15,15 +17,18 @@ from hilsplat.segment.generate import decode_candidates, masks_from_candidates
 from hilsplat.segment.masks import HierarchicalMasks, region_ious
 from hilsplat.segment.sam import SamModel
 from hilsplat.settings import MasksSettings
-from models.training.data import HEAD_LEVELS, LabelledViews, normalised
-from models.training.sam import MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
+from models.training.data import LabelledViews, normalised
+from models.training.sam import HEADS, MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
 
-LEAST_PX = 100
-"""Minimum area of a scored region, because the IoU of a few pixels is not informative."""
+LEAST_PX = 100  # minimum area of a scored region, because the IoU of a few pixels is not informative
+# area classes of regions, px: inclusive minimum, exclusive maximum
 SIZES = {"small": (0, 400), "medium": (400, 1600), "large": (1600, np.inf)}
-"""Area classes of regions, px: inclusive minimum, exclusive maximum."""
-PER_LEVEL = 8
-"""Maximum number of regions scored per view and level."""
+PER_LEVEL = 8  # maximum number of regions scored per view and level
+
+
+def mean_or_zero(values: Sequence[float] | Shaped[np.ndarray, " n"]) -> float:
+    """Return the mean, or 0 if there are no values."""
+    return float(np.mean(values)) if len(values) else 0.0
 
 
 @torch.no_grad()
@@ -47,7 +52,7 @@ def draw_regions(
 ) -> list[tuple[int, int, float, float]]:
     """Draw regions, at most `per_level` per level; return head, node and a random pixel (x, y) of each."""
     drawn = []
-    for head, level in enumerate(HEAD_LEVELS):
+    for head, level in enumerate(HEADS):
         at_level = labels[level.index]
         ids, areas = np.unique(at_level, return_counts=True)
         for node in rng.permutation(ids[(ids >= 0) & (areas >= LEAST_PX)])[:per_level]:
@@ -58,7 +63,7 @@ def draw_regions(
 
 
 def measure_sam(
-    encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews, per_level: int = PER_LEVEL, seed: int = 0
+    encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews
 ) -> dict[str, dict[str, float]]:
     """Measure the masks of single-point prompts per level, with equal weight for regions of at least 100 px.
 
@@ -71,7 +76,7 @@ def measure_sam(
     """
     found: dict[Level, list[tuple[float, float, float, float]]] = {level: [] for level in LEVELS}
     for view in range(len(views)):
-        drawn = draw_regions(np.random.default_rng((seed, 2, view)), views.labels[view], per_level)
+        drawn = draw_regions(np.random.default_rng((0, 2, view)), views.labels[view], PER_LEVEL)
         if not drawn:
             continue
         points = np.array([(x, y) for _, _, x, y in drawn])
@@ -80,7 +85,7 @@ def measure_sam(
             torch.from_numpy(logits), scale_factor=float(MASK_STRIDE), mode="bilinear", align_corners=False
         ).numpy()
         for row, (head, node, _, _) in enumerate(drawn):
-            level = HEAD_LEVELS[head]
+            level = HEADS[head]
             truth, guess = views.labels[view][level.index] == node, enlarged[row] > 0
             iou = (truth & guess).sum(axis=(1, 2)) / (truth | guess).sum(axis=(1, 2))
             found[level].append(
@@ -91,75 +96,47 @@ def measure_sam(
         values = np.array(rows).reshape(-1, 4)
         spread = len(values) > 2 and values[:, [0, 2]].std(axis=0).min() > 0
         report[level.label] = {
-            "iou": float(values[:, 0].mean()) if len(values) else 0.0,
-            "best": float(values[:, 1].mean()) if len(values) else 0.0,
-            "above_75": float((values[:, 0] > 0.75).mean()) if len(values) else 0.0,
+            "iou": mean_or_zero(values[:, 0]),
+            "best": mean_or_zero(values[:, 1]),
+            "above_75": mean_or_zero(values[:, 0] > 0.75),
             "correlation": float(np.corrcoef(values[:, 0], values[:, 2])[0, 1]) if spread else 0.0,
             "n": len(values),
         }
         for size, (least, below) in SIZES.items():
             of_size = values[(values[:, 3] >= least) & (values[:, 3] < below), 0]
             report[level.label] |= {
-                f"iou_{size}": float(of_size.mean()) if len(of_size) else 0.0,
+                f"iou_{size}": mean_or_zero(of_size),
                 f"n_{size}": len(of_size),
             }
     return report
 
 
 def automatic_masks(
-    folder: Path, views: LabelledViews, workers: int, points_per_side: int = MasksSettings().points_per_side
+    cache: Path,
+    folder: Path,
+    images: UInt8[np.ndarray, "V S S 3"],
+    workers: int,
+    points_per_side: int = MasksSettings().points_per_side,
 ) -> list[HierarchicalMasks]:
-    """Segment views with an exported segmenter as the pipeline's masks stage does.
+    """Segment views with an exported segmenter as the pipeline's masks stage does, and cache the masks.
 
     Args:
+        cache: folder that may be deleted at any time; its entries depend on the segmenter and the images.
         folder: model folder.
-        views: views to segment.
         workers: number of processes.
         points_per_side: size of the prompt grid; other settings have their defaults.
     """
-    if not len(views):
-        return []
     digest = SamModel.load(folder).digest
-    items = [(Path(folder), digest, points_per_side, image) for image in views.images]
-    return list(track(in_processes(_segment, items, workers, chunk=4), "segmenting", total=len(views)))
-
-
-def cached_masks(
-    cache: Path,
-    folder: Path,
-    digest: str,
-    views: LabelledViews,
-    count: int,
-    points_per_side: int | None,
-    workers: int,
-) -> list[HierarchicalMasks]:
-    """Return `automatic_masks` of the first views, cached by the digests of segmenter and images.
-
-    Args:
-        cache: folder that may be deleted at any time.
-        folder: model folder.
-        digest: digest of the segmenter.
-        views: views to segment.
-        count: number of views to segment.
-        points_per_side: size of the prompt grid; None for the settings' default.
-        workers: number of processes.
-    """
-    side = MasksSettings().points_per_side if points_per_side is None else points_per_side
-    settings = MasksSettings(points_per_side=side).model_dump_json()
-    images = views.images[:count]
+    settings = MasksSettings(points_per_side=points_per_side).model_dump_json()
     keys = [sha256_of_bytes(digest.encode(), settings.encode(), image.tobytes()) for image in images]
     paths = [Path(cache) / "masks" / f"{key[:24]}.npz" for key in keys]
     missing = [row for row, path in enumerate(paths) if not path.is_file()]
-    items = [(Path(folder), digest, side, images[row], paths[row]) for row in missing]
+    items = [(Path(folder), digest, points_per_side, images[row], paths[row]) for row in missing]
     if items:
-        jobs = in_processes(_segment_into, items, workers, chunk=4)
+        jobs = in_processes(_segment, items, workers, chunk=4)
         for _ in track(jobs, "segmenting", total=len(missing)):
             pass
     return [HierarchicalMasks.load(path) for path in paths]
-
-
-def _segment_into(folder: Path, digest: str, points_per_side: int, image: np.ndarray, path: Path) -> None:
-    _segment(folder, digest, points_per_side, image).save(path)
 
 
 @lru_cache(maxsize=1)
@@ -168,10 +145,10 @@ def _opened(folder: Path, digest: str) -> SamModel:
     return SamModel.load(folder)
 
 
-def _segment(folder: Path, digest: str, points_per_side: int, image: np.ndarray) -> HierarchicalMasks:
+def _segment(folder: Path, digest: str, points_per_side: int, image: np.ndarray, path: Path) -> None:
     model, settings = _opened(folder, digest), MasksSettings(points_per_side=points_per_side)
     candidates = decode_candidates(image, model, settings)
-    return masks_from_candidates(candidates, image.shape[:2], model, settings)
+    masks_from_candidates(candidates, image.shape[:2], model, settings).save(path)
 
 
 def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> dict[str, dict[str, float]]:
@@ -195,8 +172,8 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
             count += len(rows)
         values = np.array(best)
         report[level.label] = {
-            "recall": float((values >= 0.5).mean()) if len(values) else 0.0,
-            "iou": float(values.mean()) if len(values) else 0.0,
+            "recall": mean_or_zero(values >= 0.5),
+            "iou": mean_or_zero(values),
             "masks": count / max(1, len(masks)),
             "precision": fits / max(1, count),
             "n": len(values),

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -15,15 +15,8 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
-from hilsplat.world.objects.catalogue import (
-    FURNITURE,
-    GENERATOR_VERSION,
-    STREET,
-    TABLETOP,
-    build_furniture,
-    build_object,
-    build_street_object,
-)
+from hilsplat.world.objects.builder import ObjectModel
+from hilsplat.world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_object
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import build_scene, training_camera
 from hilsplat.world.scenes.scene import WorldScene
@@ -33,20 +26,20 @@ from models.training.sam import FRAME_PX
 
 logger = logging.getLogger(__name__)
 
+# Kinds of training scenes: share, and the minimum and maximum number of requested objects.
 MIXTURE: dict[str, tuple[float, int, int]] = {
     "tabletop": (0.6, 3, 10),
     "room": (0.2, 6, 14),
     "street": (0.2, 6, 14),
 }
-"""Kinds of training scenes: share, and the minimum and maximum number of requested objects."""
+# Sub-samples per pixel side: half the time of the benchmark's 3, with no visible difference in a crop.
 SAMPLES = 2
-"""Sub-samples per pixel side; half the time of the benchmark's 3, with no visible difference in a crop."""
 
 
 def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
-    """Return nodes with their phrases: the text, its synonyms, and the bare word of a part.
+    """Return nodes with their phrases: the text, its synonyms, and the bare name of a part.
 
-    The bare word ("head" of "bear head") is the usual second term of a path.
+    The bare name ("head" of "bear head") is usual as the second text of a path.
     """
     labelled = []
     for node in nodes:
@@ -71,11 +64,7 @@ def kind_of_seed(seed: int) -> tuple[str, int]:
 
 
 def scene_of_seed(seed: int) -> WorldScene:
-    """Build a training scene.
-
-    Raises:
-        SceneError: if the seed is not in the training split.
-    """
+    """Build a training scene; raise SceneError if the seed is not in the training split."""
     require_split(seed, "training")
     kind, objects = kind_of_seed(seed)
     return build_scene(kind, seed, objects)
@@ -96,6 +85,13 @@ def render_training_scene(seed: int, views: int, path: Path) -> None:
     )
 
 
+def objects_of_every_class(seed: int) -> Iterator[ObjectModel]:
+    """Build an object of each class of the world with the same seed."""
+    for kind, names in CLASSES.items():
+        for name in names:
+            yield build_object(kind, name, np.random.default_rng(seed))
+
+
 @cache
 def generator_digest() -> str:
     """Return the generator's version and a digest of an object of each class and a scene of each kind.
@@ -103,44 +99,26 @@ def generator_digest() -> str:
     The digest covers output, not code, so an edit that changes no pixel and no text keeps the cache valid.
     """
     parts: list[bytes] = []
-    for build, names in (
-        (build_object, TABLETOP),
-        (build_furniture, FURNITURE),
-        (build_street_object, STREET),
-    ):
-        for name in names:
-            model = build(name, np.random.default_rng(TRAINING_SEEDS.start))
-            texts = json.dumps([asdict(node) for node in model.nodes])
-            parts += [model.triangles.astype(np.float32).tobytes(), model.materials.tobytes(), texts.encode()]
+    for model in objects_of_every_class(TRAINING_SEEDS.start):
+        texts = json.dumps([asdict(node) for node in model.nodes])
+        parts += [model.triangles.astype(np.float32).tobytes(), model.materials.tobytes(), texts.encode()]
     for kind, (_, least, _) in MIXTURE.items():
         scene = build_scene(kind, TRAINING_SEEDS.start, least)
         camera = training_camera(scene, np.random.default_rng((TRAINING_SEEDS.start, 13)), 96)
         nodes = json.dumps([asdict(node) for node in phrases_of(scene.nodes)])
-        parts += [
-            render_view(scene, camera, 1).tobytes(),
-            label_view(scene, camera).tobytes(),
-            nodes.encode(),
-        ]
+        parts += [render_view(scene, camera, 1).tobytes(), label_view(scene, camera).tobytes()]
+        parts.append(nodes.encode())
     return f"{GENERATOR_VERSION}-{sha256_of_bytes(*parts)[:16]}"
 
 
 def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers: int) -> LabelledViews:
-    """Return views of some training scenes, and render those that the cache lacks.
+    """Return `views` views of each training scene, and render those that are not in the cache.
 
-    Args:
-        cache: folder that may be deleted at any time; its entries depend on the generator's output.
-        seeds: seeds of training scenes.
-        views: number of views per scene.
-        workers: number of rendering processes.
+    The cache may be deleted at any time. `workers` is the number of rendering processes.
     """
-    # The folder's name depends on the generator, so that changed scenes are rendered again.
-    recipe = {
-        "generator": generator_digest(),
-        "views": views,
-        "px": FRAME_PX,
-        "mixture": MIXTURE,
-        "samples": SAMPLES,
-    }
+    # The folder's name depends on the generator's output, so that changed scenes are rendered again.
+    recipe = {"generator": generator_digest(), "views": views}
+    recipe |= {"px": FRAME_PX, "mixture": MIXTURE, "samples": SAMPLES}
     folder = Path(cache) / f"views-{sha256_of_json(recipe)[:12]}"
     paths = [folder / f"{seed}.npz" for seed in seeds]
     missing = [(seed, views, path) for seed, path in zip(seeds, paths, strict=True) if not path.is_file()]

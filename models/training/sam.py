@@ -14,16 +14,13 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-FRAME_PX = 384
-"""Side of the exported model's square input, px."""
-STRIDE = 4
-"""Image pixels per pixel of the embedding."""
-MASK_STRIDE = 2
-"""Image pixels per pixel of a predicted mask."""
-UNIT_PX = 32.0
-"""Unit of relative coordinates and of offsets to centres, px."""
-HEADS = ("subpart", "part", "whole")
-"""Order of the three output masks, as in SAM: fine to coarse."""
+from hilsplat.base.levels import Level
+
+FRAME_PX = 384  # side of the exported model's square input
+STRIDE = 4  # image pixels per pixel of the embedding
+MASK_STRIDE = 2  # image pixels per pixel of a predicted mask
+UNIT_PX = 32.0  # unit of relative coordinates and of offsets to centres
+HEADS = (Level.SUBPART, Level.PART, Level.WHOLE)  # order of the three output masks, as in SAM: fine to coarse
 
 PACK = (STRIDE // MASK_STRIDE) ** 2
 PIXEL = 24
@@ -35,14 +32,12 @@ FREQUENCIES = 3
 POSITIONAL = 2 + 4 * FREQUENCIES
 HIDDEN = 16
 TOKEN = 160
+# Mask rows that the decoder computes at once, an even number. The hidden values of 16 prompts in a band fit
+# into a core's cache; for whole masks they do not, and memory access takes longer than the arithmetic.
 BAND = 6
-"""Mask rows that the decoder computes at once, an even number. The hidden values of 16 prompts in a band fit
-into a core's cache; for whole masks they do not, and memory access takes longer than the arithmetic."""
 STEM = 24
-WIDTHS = (64, 128, 192, 256)
-"""Channels at strides 4, 8, 16, 32."""
-DEPTHS = (2, 2, 3, 2)
-"""Residual blocks at the same strides."""
+WIDTHS = (64, 128, 192, 256)  # channels at strides 4, 8, 16, 32
+DEPTHS = (2, 2, 3, 2)  # residual blocks at the same strides
 
 
 def convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -120,16 +115,11 @@ class SamEncoder(nn.Module):
 
 
 def positional_embeddings(windows: Float[Tensor, "B 3"], cells: int) -> Float[Tensor, "B C cells cells"]:
-    """Return the positional embeddings of the cells.
+    """Return the positional embeddings of `cells` x `cells` cells.
 
-    Args:
-        windows: x0, y0 and side of each batch row's window as shares of the whole image; (0, 0, 1) is
-            the whole image.
-        cells: side of the embedding.
-
-    Returns:
-        Two channels with x and y in the network's input frame (units of 32 px), then sines and cosines
-        of the position in the whole image.
+    The first two channels are x and y in the network's input frame (units of 32 px), the others sines and
+    cosines of the position in the whole image. `windows` contains x0, y0 and side of each batch row's window
+    as shares of the whole image, which is (0, 0, 1).
     """
     steps = (torch.arange(cells, dtype=torch.float32) + 0.5) / cells
     local = steps * (cells * STRIDE / UNIT_PX)
@@ -193,7 +183,7 @@ class SamDecoder(nn.Module):
         embeddings: Float[Tensor, "B C s s"],
         positional: Float[Tensor, "B D s s"],
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
-        """Return predicted IoU and mask logits at stride 2, with heads in the order subpart, part, whole.
+        """Return predicted IoU and mask logits at stride 2, one mask for each of `HEADS`.
 
         Args:
             points: x, y in pixels of the encoder's frame.
@@ -213,11 +203,7 @@ class SamDecoder(nn.Module):
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 h w"]]:
         """Compute `forward` from inputs shared by an image's prompts, as in the exported decoder.
 
-        Args:
-            points: as in `forward`.
-            labels: as in `forward`.
-            place: embeddings and positional embeddings, sampled at the points.
-            shared: output of `shared_features`.
+        `place` is embeddings and positional embeddings, and `shared` the output of `shared_features`.
         """
         token, *written = self.written(points, labels, place)
         bands, seen = [], []
@@ -250,13 +236,9 @@ class SamDecoder(nn.Module):
         shared: Float[Tensor, "B K_and_1 h w"],
         rows: int,
     ) -> Iterator[Float[Tensor, "B P 3 rows w"]]:
-        """Yield mask logits in bands of rows.
+        """Yield mask logits in bands of `rows` rows, for generated weights from `written`.
 
-        Args:
-            written: matrix and bias of both layers, from `written`.
-            points: the prompts; their number stays variable in the exported graph.
-            shared: features of the pixels, as in `masks`.
-            rows: number of rows of a band.
+        The number of points stays variable in the exported graph.
         """
         first, bias, second, shift = written
         # The bias is the weight of the constant feature 1.
@@ -265,8 +247,8 @@ class SamDecoder(nn.Module):
         hidden_shape = (points.shape[0], points.shape[1], HIDDEN, -1)
         for band in shared.split(rows, dim=2):
             hidden = functional.relu(torch.matmul(first, band.flatten(2))).reshape(hidden_shape)
-            answer = torch.matmul(second, hidden) + shift[..., None]  # (B, P, 3, rows * w)
-            yield answer.reshape(*points.shape[:2], len(HEADS), -1, side)
+            logits = torch.matmul(second, hidden) + shift[..., None]  # (B, P, 3, rows * w)
+            yield logits.reshape(*points.shape[:2], len(HEADS), -1, side)
 
     def seen_iou(
         self, token: Float[Tensor, "B P T"], sampled: Float[Tensor, "B P 3 n"]
@@ -285,13 +267,7 @@ class SamDecoder(nn.Module):
     ) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3 K"]]:
         """Compute `forward` at some pixels per prompt for training, in a fraction of the time.
 
-        Args:
-            points: as in `forward`.
-            labels: as in `forward`.
-            embeddings: as in `forward`.
-            positional: as in `forward`.
-            pixels: flat indices into the mask.
-            weights: number of mask pixels that each represents.
+        `pixels` are flat indices into the mask, and `weights` the number of mask pixels that each represents.
         """
         place = torch.cat([embeddings, positional], dim=1)
         token, first, bias, second, shift = self.written(points, labels, place)
@@ -339,10 +315,8 @@ class SamDecoder(nn.Module):
     ) -> Float[Tensor, "B P 3"]:
         """Estimate each mask's IoU from its area, its confidence and the prompt; no gradient to the mask.
 
-        Args:
-            token: tokens of the prompts.
-            logits: logits at some pixels of the mask.
-            weights: number of mask pixels that each represents.
+        `logits` are those of some pixels of the mask, and `weights` the number of mask pixels that each
+        represents.
         """
         weights = weights[:, :, None]
         share = torch.sigmoid(logits.detach())

@@ -8,27 +8,19 @@ from torch.nn import functional
 from models.training.batches import SamBatch
 from models.training.sam import HEADS, SEMANTIC, STRIDE, SamDecoder, SamEncoder
 
-SEMANTIC_PIXELS = 1536
-"""Random pixels per batch for the auxiliary classifier, in addition to the prompted ones."""
+SEMANTIC_PIXELS = 1536  # random pixels per batch for the auxiliary classifier, besides the prompted ones
 
 
 def segmentation_loss(
-    scores: Float[Tensor, "B P 3"],
-    logits: Float[Tensor, "B P 3 K"],
-    truth: Float[Tensor, "B P 3 K"],
-    weights: Float[Tensor, "B P K"],
-    known: Float[Tensor, "B P 3"],
+    scores: Float[Tensor, "B P 3"],  # predicted IoU
+    logits: Float[Tensor, "B P 3 K"],  # logits at K pixels of each mask
+    truth: Float[Tensor, "B P 3 K"],  # share of each of these pixels in the prompted region
+    weights: Float[Tensor, "B P K"],  # number of mask pixels that each represents
+    known: Float[Tensor, "B P 3"],  # 1 where there is a ground-truth mask
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return the losses of the masks (dice and cross-entropy per area) and of the predicted IoU.
 
-    A prompt on an unlabelled pixel has no true mask, so only its predicted IoU is trained, towards 0.
-
-    Args:
-        scores: predicted IoU.
-        logits: logits at K pixels of each mask.
-        truth: true share of each of these pixels.
-        weights: number of mask pixels that each represents.
-        known: 1 where there is a true mask.
+    A prompt on an unlabelled pixel has no ground-truth mask, so only its predicted IoU is trained, towards 0.
     """
     weights = weights[:, :, None]
     share = torch.sigmoid(logits)
@@ -86,16 +78,7 @@ def training_loss(
     generator: torch.Generator,
     half: bool,
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    """Return the total loss of one step, and its terms.
-
-    Args:
-        encoder: encoder of the segmenter.
-        decoder: decoder of the segmenter.
-        teacher: auxiliary outputs.
-        batch: windows and targets.
-        generator: draws the pixels of the auxiliary classifier.
-        half: whether to run the encoder's convolutions in bfloat16.
-    """
+    """Return the total loss of one step and its terms; `half`: run the encoder's convolutions in bfloat16."""
     with torch.autocast(batch.pixels.device.type, torch.bfloat16, enabled=half):
         packed, offsets, semantic, sharp = encoder.features(batch.pixels)
     packed, offsets, semantic = packed.float(), offsets.float(), semantic.float()

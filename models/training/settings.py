@@ -16,10 +16,10 @@ class TrainingSettings(Section):
         0, "training steps of the segmenter, so that a second run gives the same bytes; 0: no limit", ge=0
     )
     clip_minutes: float = knob(20.0, "training time of CLIP; 0: no limit", unit="min", ge=0)
-    clip_steps: int = knob(0, "training steps of CLIP, likewise; 0: no limit", ge=0)
+    clip_steps: int = knob(0, "training steps of CLIP; 0: no limit", ge=0)
     segmented_views: int = knob(
         600,
-        "training views masked by the finished segmenter, so that CLIP learns from masks as it draws them",
+        "training views segmented by the finished segmenter, so that CLIP also learns from its masks",
         ge=0,
     )
     device: Literal["cpu", "cuda"] = knob("cpu", "device of the training")

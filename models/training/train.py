@@ -1,7 +1,6 @@
 """Recipe of the small embedded models: render, train, measure, export, and write the model cards."""
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,51 +12,55 @@ from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.base.progress import stage_log
 from hilsplat.segment.sam import SamModel
 from models.training.card import RECORD, write_clip_card, write_sam_card
-from models.training.crops import list_crops, list_segmented
+from models.training.crops import list_crops
 from models.training.data import LabelledViews
 from models.training.export import export_clip, export_sam
+from models.training.loop import Budget, Curve
 from models.training.measure_clip import measure_clip, measure_queries
-from models.training.measure_sam import (
-    automatic_masks,
-    cached_masks,
-    measure_everything,
-    measure_sam,
-)
+from models.training.measure_sam import automatic_masks, measure_everything, measure_sam
 from models.training.render import generator_digest, kind_of_seed, render_training_views, training_seeds
 from models.training.settings import TrainingSettings
-from models.training.steps import Budget, Curve
 from models.training.train_clip import train_clip
 from models.training.train_sam import train_sam
 from models.training.vocabulary import world_vocabulary
 
-logger = logging.getLogger(__name__)
-
+# Increment a version when networks, windows or losses change, so that cached trainings start again.
 RECIPE_VERSIONS = {"sam": 2, "clip": 3}
-"""Increment a version when networks, windows or losses change, so that cached trainings start again."""
 STAGES = ("render", "sam", "clip")
-AUTOMATIC_VIEWS = 48
-"""Number of unseen views that are segmented automatically to measure recall."""
-
-
-ROUGH_PROMPTS = 20
-"""Prompts per image side when training views are segmented for CLIP, fewer than at run time."""
+AUTOMATIC_VIEWS = 48  # number of held-out views that are segmented automatically to measure recall
+ROUGH_PROMPTS = 20  # prompts per image side to segment training views for CLIP; fewer than at run time
 
 
 @dataclass(frozen=True)
-class Material:
-    """Rendered views and their origin.
+class Recipe:
+    """Rendered views, and settings of the trainings with them."""
 
-    Attributes:
-        training: views for training.
-        unseen: views of other scenes, for validation.
-        unseen_kinds: scene kind of each unseen view.
-        described: description of the views for the cards.
-    """
-
+    cache: Path
+    settings: TrainingSettings
+    seed: int
+    threads: int
     training: LabelledViews
-    unseen: LabelledViews
-    unseen_kinds: tuple[str, ...]
-    described: dict[str, Any]
+    unseen: LabelledViews  # views of other scenes, for validation
+    unseen_kinds: tuple[str, ...]  # scene kind of each unseen view
+    described: dict[str, Any]  # description of the views for the cards
+
+    def state_name(self, model: str, **more: Any) -> str:
+        """Return a name derived from everything that the weights depend on, except the budget."""
+        key = {"model": model, "seed": self.seed, "version": RECIPE_VERSIONS[model], **self.described, **more}
+        return f"{model}-{sha256_of_json(key)[:12]}"
+
+    def description(self, model: str, budget: Budget, curve: Curve) -> dict[str, Any]:
+        """Return the recipe of a model for its card."""
+        return self.described | {
+            "budget": asdict(budget),
+            "steps": int(curve[-1]["step"]),
+            "minutes": curve[-1]["minutes"],
+            "seed": self.seed,
+            "threads": self.threads,
+            "device": self.settings.device,
+            "torch": torch.__version__,
+            "version": RECIPE_VERSIONS[model],
+        }
 
 
 def train_models(
@@ -70,13 +73,11 @@ def train_models(
 ) -> None:
     """Train the small SAM and CLIP on training scenes of the synthetic world, and write both model folders.
 
-    Views and training states are cached: an interrupted run resumes, and a finished one with a new budget
-    resumes from the state before its learning rate decay.
+    Rendered views and training states are cached: an interrupted run resumes, and a finished one with a new
+    budget resumes from the state before its learning rate decay.
 
     Args:
         out: folder for `sam-tiny` and `clip-tiny`.
-        cache: folder of rendered views and training states.
-        settings: numbers of scenes, and duration of the training.
         seed: seed of everything random except the scenes.
         threads: threads of torch, and number of rendering and segmenting processes.
         stages: some of `STAGES`, by default all; `clip` needs `sam-tiny` in `out`.
@@ -90,35 +91,31 @@ def train_models(
         raise SettingsError(
             "unknown stage of training", expected=f"some of {', '.join(STAGES)}", found=str(stages)
         )
-    out, cache = Path(out), Path(cache)
-    material = rendered(cache, settings, threads)
+    recipe = render_views(Path(cache), settings, seed, threads)
     threads_before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         if "sam" in stages:
-            _make_sam(out / "sam-tiny", cache, material, settings, seed, threads)
+            _make_sam(Path(out), recipe)
         if "clip" in stages:
-            _make_clip(out, cache, material, settings, seed, threads)
+            _make_clip(Path(out), recipe)
     finally:
         torch.set_num_threads(threads_before)
 
 
 def require_own_models(out: Path) -> None:
-    """Check that training does not replace another model.
-
-    Raises:
-        ModelError: if an output folder contains something other than a model trained by this package.
-    """
+    """Raise ModelError if an output folder contains something other than a model trained by this package."""
     for name in ("sam-tiny", "clip-tiny"):
         folder = Path(out) / name
         if folder.exists() and any(folder.iterdir()) and not (folder / RECORD).is_file():
             raise ModelError(
-                f"{folder} is there, and no training wrote it", fix="name another folder, or remove it first"
+                f"{folder} exists and contains no model trained by this package",
+                fix="choose another --out folder, or remove it first",
             )
 
 
-def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
-    """Return the views of a recipe, and render those that the cache lacks."""
+def render_views(cache: Path, settings: TrainingSettings, seed: int, threads: int) -> Recipe:
+    """Return a recipe with its views, and render those that are not in the cache."""
     train_seeds, other_seeds = training_seeds(settings.scenes, settings.validation_scenes)
     with stage_log("render", "training scenes") as counts:
         training = render_training_views(cache, train_seeds, settings.views, threads)
@@ -135,104 +132,74 @@ def rendered(cache: Path, settings: TrainingSettings, threads: int) -> Material:
         "kinds": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
     }
     of_view = tuple(kind_of_seed(seed)[0] for seed in other_seeds for _ in range(settings.views))
-    return Material(training, unseen, of_view, described)
+    return Recipe(cache, settings, seed, threads, training, unseen, of_view, described)
 
 
-def _state_name(model: str, material: Material, seed: int, more: Mapping[str, Any]) -> str:
-    """Return a name derived from everything that the weights depend on, except the budget."""
-    key = {"model": model, "seed": seed, "version": RECIPE_VERSIONS[model], **material.described, **more}
-    return f"{model}-{sha256_of_json(key)[:12]}"
-
-
-def _described(
-    model: str,
-    material: Material,
-    settings: TrainingSettings,
-    budget: Budget,
-    seed: int,
-    threads: int,
-    curve: Curve,
-) -> dict[str, Any]:
-    """Return the recipe for a card."""
-    return material.described | {
-        "budget": asdict(budget),
-        "steps": int(curve.rows[-1]["step"]),
-        "minutes": curve.rows[-1]["minutes"],
-        "seed": seed,
-        "threads": threads,
-        "device": settings.device,
-        "torch": torch.__version__,
-        "version": RECIPE_VERSIONS[model],
-    }
-
-
-def _make_sam(
-    folder: Path, cache: Path, material: Material, settings: TrainingSettings, seed: int, threads: int
-) -> None:
+def _make_sam(out: Path, recipe: Recipe) -> None:
+    settings, threads = recipe.settings, recipe.threads
     budget = Budget(settings.sam_minutes, settings.sam_steps)
     with stage_log("train", "sam-tiny") as counts:
-        name = _state_name("sam", material, seed, {})
         encoder, decoder, curve = train_sam(
-            material.training, material.unseen, budget, seed, cache, name, device=settings.device
+            recipe.training,
+            recipe.unseen,
+            budget,
+            recipe.seed,
+            recipe.cache,
+            recipe.state_name("sam"),
+            device=settings.device,
         )
-        with atomic_folder(folder) as temporary:
-            export_sam(encoder, decoder, temporary)
+        with atomic_folder(out / "sam-tiny") as folder:
+            export_sam(encoder, decoder, folder)
             points, automatic = {}, {}
-            for group, views in by_kind(material).items():
+            for group, views in by_kind(recipe).items():
                 points[group] = measure_sam(encoder, decoder, views)
-                masks = automatic_masks(temporary, views.spread(AUTOMATIC_VIEWS), threads)
-                automatic[group] = measure_everything(masks, views.spread(AUTOMATIC_VIEWS))
+                few = views.spread(AUTOMATIC_VIEWS)
+                masks = automatic_masks(recipe.cache, folder, few.images, threads)
+                automatic[group] = measure_everything(masks, few)
             counts.update({level: f"{value['iou']:.3f}" for level, value in points["all"].items()})
-            recipe = _described("sam", material, settings, budget, seed, threads, curve)
             metrics = {"points": points, "automatic": automatic}
-            write_sam_card(temporary, encoder, decoder, material.unseen, recipe, curve, metrics)
+            description = recipe.description("sam", budget, curve)
+            write_sam_card(folder, encoder, decoder, recipe.unseen, description, curve, metrics)
 
 
-def _make_clip(
-    out: Path, cache: Path, material: Material, settings: TrainingSettings, seed: int, threads: int
-) -> None:
+def _make_clip(out: Path, recipe: Recipe) -> None:
+    settings, threads, segmenter = recipe.settings, recipe.threads, out / "sam-tiny"
     budget = Budget(settings.clip_minutes, settings.clip_steps)
-    segmenter = out / "sam-tiny"
     with stage_log("train", "clip-tiny") as counts:
         digest = SamModel.load(segmenter).digest
-        views, unseen = material.training, material.unseen.spread(AUTOMATIC_VIEWS)
+        views, unseen = recipe.training, recipe.unseen.spread(AUTOMATIC_VIEWS)
         count = min(settings.segmented_views, len(views))
-        masks = cached_masks(cache, segmenter, digest, views, count, ROUGH_PROMPTS, threads)
-        other_masks = cached_masks(cache, segmenter, digest, unseen, len(unseen), None, threads)
-        crops, others = list_crops(views, masks), list_crops(unseen, other_masks)
+        masks = automatic_masks(recipe.cache, segmenter, views.images[:count], threads, ROUGH_PROMPTS)
+        unseen_masks = automatic_masks(recipe.cache, segmenter, unseen.images, threads)
+        crops, others = list_crops(views, masks), list_crops(unseen, unseen_masks)
         counts["masks"] = len(crops)
-        name = _state_name("clip", material, seed, {"segmenter": digest, "segmented_views": count})
+        name = recipe.state_name("clip", segmenter=digest, segmented_views=count)
         vision, text, tokenizer, curve = train_clip(
-            crops, others, budget, seed, cache, name, device=settings.device
+            crops, others, budget, recipe.seed, recipe.cache, name, device=settings.device
         )
         metrics: dict[str, Any] = {}
         for background in ("black", "keep"):
             found = measure_clip(vision, text, tokenizer, others, background=background)
             for (kind, level), value in found.items():
                 metrics.setdefault(background, {}).setdefault(kind, {})[level] = value
-        metrics["queries"] = measure_queries(
-            vision, text, tokenizer, unseen, other_masks, list_segmented(unseen, other_masks)
-        )
+        metrics["queries"] = measure_queries(vision, text, tokenizer, unseen, unseen_masks)
         counts.update({level: f"{v['top1']:.3f}" for level, v in metrics["black"]["exact"].items()})
-        recipe = _described("clip", material, settings, budget, seed, threads, curve) | {
+        description = recipe.description("clip", budget, curve) | {
             "segmenter": digest,
             "masks": len(crops),
             "segmented_masks": int(crops.rough.sum()),
             "texts_competing": len({phrases[0] for phrases in others.phrase_sets}),
         }
-        with atomic_folder(out / "clip-tiny") as temporary:
-            write_text(temporary / "vocabulary.txt", world_vocabulary())
-            export_clip(vision, text, tokenizer, temporary)
-            write_clip_card(temporary, recipe, curve, metrics)
+        with atomic_folder(out / "clip-tiny") as folder:
+            write_text(folder / "vocabulary.txt", world_vocabulary())
+            export_clip(vision, text, tokenizer, folder)
+            write_clip_card(folder, description, curve, metrics)
 
 
-def by_kind(material: Material) -> dict[str, LabelledViews]:
+def by_kind(recipe: Recipe) -> dict[str, LabelledViews]:
     """Return all unseen views, and those of each scene kind."""
-    groups = {"all": material.unseen}
-    for kind in dict.fromkeys(material.unseen_kinds):
-        rows = [row for row, of_view in enumerate(material.unseen_kinds) if of_view == kind]
-        views = material.unseen
-        groups[kind] = LabelledViews(
-            views.images[rows], views.labels[rows], tuple(views.nodes[row] for row in rows)
-        )
+    groups = {"all": recipe.unseen}
+    for kind in dict.fromkeys(recipe.unseen_kinds):
+        rows = [row for row, of_view in enumerate(recipe.unseen_kinds) if of_view == kind]
+        groups[kind] = recipe.unseen.chosen(rows)
     return groups

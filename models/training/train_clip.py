@@ -11,20 +11,15 @@ from hilsplat.base.levels import LEVELS
 from models.training.clip import CANONICAL, ClipText, ClipVision, contrastive_loss, word_tokenizer
 from models.training.crops import FRAMES, GENERIC_FRAMES, Captioner, CropTable
 from models.training.data import normalised
-from models.training.loop import Training, Tuning
+from models.training.loop import Budget, Curve, Training, Tuning, has_fast_half
 from models.training.measure_clip import measure_clip, tokenised
-from models.training.steps import Budget, Curve
-from models.training.train_sam import has_fast_half
 
 TUNING = Tuning(peak=2e-3, warmup=60, measure_every=200)
-BATCH = 192
-THING_SHARE = 0.5
-"""Share of a batch drawn in groups from one object, whose other parts are hard negatives."""
-SIBLINGS = 6
-"""Maximum number of crops in such a group."""
-KEPT_SHARE = 0.2
-"""Share of crops whose surroundings are kept, so that the setting `keep` works too."""
-QUICK_CROPS = 3000
+BATCH = 192  # crops per step
+THING_SHARE = 0.5  # share of a batch drawn in groups from one object, whose other parts are hard negatives
+SIBLINGS = 6  # maximum number of crops in such a group
+KEPT_SHARE = 0.2  # share of crops whose surroundings are kept, so that `clip.background: keep` works too
+QUICK_CROPS = 3000  # approximate number of crops measured for each row of the learning curve
 
 
 def crop_weights(crops: CropTable, nothing: float = 0.03, rough: float = 0.45) -> np.ndarray:
@@ -42,12 +37,7 @@ def crop_weights(crops: CropTable, nothing: float = 0.03, rough: float = 0.45) -
 
 
 class CropDraw:
-    """Generator of batches of rows, drawn partly one by one and partly in groups from one object.
-
-    Args:
-        crops: crops to draw from.
-        batch: number of rows in a batch.
-    """
+    """Generator of batches of rows, drawn partly one by one and partly in groups from one object."""
 
     def __init__(self, crops: CropTable, batch: int) -> None:
         self.ends = np.cumsum(crop_weights(crops))
@@ -95,28 +85,16 @@ def jittered(rng: np.random.Generator, pixels: np.ndarray) -> np.ndarray:
 
 def train_clip(
     crops: CropTable,
-    validation: CropTable,
+    validation: CropTable,  # masks of other scenes, for the learning curve
     budget: Budget,
-    seed: int,
-    state: Path,
-    name: str = "clip",
+    seed: int,  # of initial weights, batches and captions
+    state: Path,  # folder of the training's state
+    name: str = "clip",  # base name of the state's files
     batch: int = BATCH,
     tuning: Tuning = TUNING,
-    device: str = "cpu",
+    device: str = "cpu",  # or "cuda"
 ) -> tuple[ClipVision, ClipText, Tokenizer, Curve]:
-    """Train the small CLIP, or resume a training with the same name.
-
-    Args:
-        crops: masks with their captions.
-        validation: masks of other scenes, for the learning curve.
-        budget: duration of the training.
-        seed: seed of initial weights, batches and captions.
-        state: folder of the training's state.
-        name: base name of the state's files.
-        batch: crops per step.
-        tuning: settings of the optimiser and the loop.
-        device: "cpu" or "cuda".
-    """
+    """Train the small CLIP, or resume a training with the same name."""
     torch.manual_seed(seed)
     where = torch.device(device)
     half = has_fast_half(where)
@@ -128,8 +106,7 @@ def train_clip(
     scale = Scale()
     training = Training({"vision": vision, "text": text, "scale": scale}, tuning, state, name, where)
     drawer = CropDraw(crops, batch)
-    step_of_quick = max(1, len(validation) // QUICK_CROPS)
-    quick = np.arange(0, len(validation), step_of_quick)
+    quick = np.arange(0, len(validation), max(1, len(validation) // QUICK_CROPS))
 
     def make(step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rng = np.random.default_rng((seed, 3, step))
@@ -145,8 +122,8 @@ def train_clip(
         images = torch.from_numpy(normalised(jittered(rng, np.stack(cut))))
         return images.contiguous(memory_format=torch.channels_last), words, mask, torch.from_numpy(valid)
 
-    def loss_of(material: tuple[Tensor, ...], step: int) -> tuple[Tensor, dict[str, float]]:
-        pixels, words, mask, valid = (part.to(where) for part in material)
+    def loss_of(parts: tuple[Tensor, ...], step: int) -> tuple[Tensor, dict[str, float]]:
+        pixels, words, mask, valid = (part.to(where) for part in parts)
         with torch.autocast(where.type, torch.bfloat16, enabled=half):
             features = vision.layers(pixels)
         image = vision.projected(features.float())

@@ -10,30 +10,19 @@ from torch import Tensor, nn
 from hilsplat.base.levels import LEVELS
 from models.training.batches import CropStage, SamBatch, class_rows, draw_batch
 from models.training.data import LabelledViews
-from models.training.loop import Training, Tuning
+from models.training.loop import Budget, Curve, Training, Tuning, has_fast_half
 from models.training.measure_sam import measure_sam
 from models.training.sam import SamDecoder, SamEncoder
 from models.training.sam_loss import Teacher, training_loss
-from models.training.steps import Budget, Curve
 
+# Window sizes, drawn for each step: small windows cover more scenes, large ones more of each scene.
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
-"""Window sizes, drawn for each step: small windows cover more scenes, large ones more of each scene."""
+# Window sizes later in the training, which include whole views as at run time. In the first training that
+# ended with them, the IoU of wholes rose by 0.04 in 700 steps.
 GROWN_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStage(0.3, 384, 2, 96))
-"""Window sizes later in the training, which include whole views as at run time. In the first training that
-ended with them, the IoU of wholes rose by 0.04 in 700 steps."""
-GROWN_AT = 9500
-"""First step with `GROWN_STAGES`, which are also used during the whole learning rate decay."""
+GROWN_AT = 9500  # first step with `GROWN_STAGES`, which are also used during the whole learning rate decay
 TUNING = Tuning(peak=2e-3)
-QUICK_VIEWS = 24
-"""Number of unseen views measured for each row of the learning curve."""
-
-
-def has_fast_half(device: torch.device) -> bool:
-    """Return whether the device has fast bfloat16 convolutions: some GPUs, and CPUs with AVX512-BF16."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
-    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return bool(supported and supported())
+QUICK_VIEWS = 24  # number of held-out views measured for each row of the learning curve
 
 
 def stage_of_draw(draw: float, stages: Sequence[CropStage]) -> CropStage:
@@ -44,30 +33,17 @@ def stage_of_draw(draw: float, stages: Sequence[CropStage]) -> CropStage:
 
 def train_sam(
     views: LabelledViews,
-    validation: LabelledViews,
+    validation: LabelledViews,  # views of other scenes, for the learning curve
     budget: Budget,
-    seed: int,
-    state: Path,
-    name: str = "sam",
+    seed: int,  # of initial weights, windows and prompts
+    state: Path,  # folder of the training's state
+    name: str = "sam",  # base name of the state's files
     stages: Sequence[CropStage] = CROP_STAGES,
-    grown_stages: Sequence[CropStage] = GROWN_STAGES,
+    grown_stages: Sequence[CropStage] = GROWN_STAGES,  # from step `GROWN_AT` on, and during the decay
     tuning: Tuning = TUNING,
-    device: str = "cpu",
+    device: str = "cpu",  # or "cuda"
 ) -> tuple[SamEncoder, SamDecoder, Curve]:
-    """Train the small segmenter, or resume a training with the same name.
-
-    Args:
-        views: labelled views.
-        validation: views of other scenes, for the learning curve.
-        budget: duration of the training.
-        seed: seed of initial weights, windows and prompts.
-        state: folder of the training's state.
-        name: base name of the state's files.
-        stages: windows and prompts of the steps.
-        grown_stages: the same starting at step `GROWN_AT`, and during the learning rate decay.
-        tuning: settings of the optimiser and the loop.
-        device: "cpu" or "cuda".
-    """
+    """Train the small segmenter, or resume a training with the same name."""
     torch.manual_seed(seed)
     where = torch.device(device)
     half = has_fast_half(where)

@@ -5,7 +5,6 @@ import pytest
 
 from models.training.batches import (
     CropStage,
-    boxes_of,
     class_rows,
     compared_pixels,
     draw_batch,
@@ -20,23 +19,16 @@ def test_prompts_reach_a_region_of_one_pixel():
     labels = np.zeros((3, 20, 20), int)
     labels[:, 7, 3] = 5
     points = draw_level_prompts(np.random.default_rng(0), labels, labels, 400, balanced=1.0)
-    # chances grow with the fourth root of the area: 1 against 399 ** 0.25 = 4.47, so 18 % of 400
+    # probabilities grow with the fourth root of the area: 1 against 399 ** 0.25 = 4.47, so 18 % of 400
     on_pixel = (points == (3, 7)).all(axis=1).sum()
     assert 45 < on_pixel < 105
 
 
-def test_a_window_without_parts_is_prompted_in_what_there_is():
+def test_a_window_without_parts_is_prompted_in_its_wholes():
     labels = np.full((3, 8, 8), -1)
     labels[0, 2:4, 2:4] = 0
     points = draw_level_prompts(np.random.default_rng(0), labels, nested_targets(labels), 50, balanced=1.0)
     assert (labels[0, points[:, 1], points[:, 0]] == 0).all()
-
-
-def test_boxes_of_regions():
-    target = np.full((4, 6), -1)
-    target[1:3, 2:5] = 0
-    target[0, 0] = 3
-    assert boxes_of(target) == {0: (2, 1, 5, 3), 3: (0, 0, 1, 1)}
 
 
 def test_weighted_samples_estimate_areas():
@@ -52,7 +44,7 @@ def test_weighted_samples_estimate_areas():
     assert truth[0, 0].astype(bool).tolist() == ((y // 2 == 6) & (x >= 33) & (x < 35)).tolist()
 
 
-def test_edges_lie_on_both_sides_of_a_border():
+def test_edges_are_on_both_sides_of_a_border():
     blocks = np.full((1, 2, 4, 1), 0)
     blocks[0, :, 2:] = 1
     assert region_edges(blocks)[0].tolist() == [[0, 1, 1, 0]] * 2
@@ -64,7 +56,7 @@ def test_a_batch_compares_a_prompt_with_the_region_around_it():
     batch = draw_batch(views, classes, CropStage(1.0, 64, 4, 6, 256), np.random.default_rng(0))
     assert batch.truth.shape == (4, 6, 3, 256)
     assert batch.edges.shape == (4, 3, 32, 32)
-    # where the nearest compared pixel to a prompt belongs to some region, it belongs to the prompted one
+    # where the compared pixel nearest to a prompt is in a region, it is in the prompted one
     y, x = np.divmod(batch.places.numpy(), 32)
     away = (x * 2 + 1 - batch.points[:, :, 0, 0, None].numpy()) ** 2
     away += (y * 2 + 1 - batch.points[:, :, 0, 1, None].numpy()) ** 2

@@ -1,6 +1,4 @@
-"""Crops for the small CLIP: what they show, how masks are roughened, what is said of them."""
-
-from itertools import pairwise
+"""Crops for the small CLIP: their pixels, roughened masks and captions."""
 
 import numpy as np
 import pytest
@@ -9,11 +7,11 @@ from hilsplat.segment.crops import square_crop
 from models.training.clip import CANONICAL, CROP_PX
 from models.training.crops import Captioner, best_node, list_crops, list_segmented, roughen
 from models.training.measure_clip import coloured_text
-from models.training.train_clip import SIBLINGS, CropDraw, crop_weights
+from models.training.train_clip import crop_weights
 from tests.unit.training.drawn import drawn_masks, drawn_views
 
 
-def test_best_node_prefers_the_level_that_drew_the_mask_where_regions_coincide():
+def test_best_node_prefers_the_level_of_the_mask_where_regions_coincide():
     labels = np.full((3, 4, 4), -1, int)
     labels[0, :2] = 0
     labels[1, :2] = 1
@@ -40,26 +38,21 @@ def test_crops_of_the_segmenter_are_captioned_by_overlap():
     nothing[:6, :6] = True
     crops = list_crops(views, [drawn_masks((1, disc), (3, nothing))])
     assert crops.rough.tolist() == [False] * 4 + [True, True]
-    assert [crops.phrase_sets[row][0] for row in crops.caption[:5]] == [
-        "ball",
-        "coin",
-        "ball half",
-        "ball spot",
-        "coin",
-    ]
+    texts = [crops.phrase_sets[row][0] for row in crops.caption[:5]]
+    assert texts == ["ball", "coin", "ball half", "ball spot", "coin"]
     assert crops.caption[5] == -1
     assert crops.level.tolist() == [1, 1, 2, 3, 1, 0]
-    # parts belong to the thing they are part of
+    # parts and their whole have the same thing
     assert crops.thing[:4].tolist() == [0, 3, 0, 0]
 
 
-def test_captions_are_valid_for_every_crop_they_are_true_of():
+def test_captions_are_valid_for_every_crop_that_they_describe():
     captioner = Captioner((("ball", "red ball"), ("coin",)), generic_share=0.0, others=2)
     texts, valid = captioner.draw(np.random.default_rng(0), np.array([0, 0, 1]))
     assert texts[2].endswith("coin")
     assert valid[:2, :2].tolist() == [[1, 1], [1, 1]]
     assert valid[2, :3].tolist() == [0, 0, 1]
-    # beside the three captions stand both queries and two of the three phrases
+    # the three captions are followed by both queries and two of the three phrases
     assert texts[3:5] == ["ball", "coin"]
     assert valid.shape == (3, len(texts)) == (3, 7)
     for column, text in enumerate(texts):
@@ -72,12 +65,12 @@ def test_canonical_phrases_describe_only_the_crops_they_were_drawn_for():
     texts, valid = texts[:40], valid[:, :40]
     generic = np.array([any(phrase in text for phrase in CANONICAL) for text in texts])
     assert 8 < generic.sum() < 32
-    # a crop captioned "object" has that caption and, being a ball, all balls' captions
+    # a crop captioned "object" has that caption and, because it is a ball, all captions of balls
     assert valid[np.ix_(~generic, generic)].sum() == 0
     assert valid[:, ~generic].all()
 
 
-def test_a_crop_is_what_the_pipeline_cuts():
+def test_a_crop_equals_that_of_the_pipeline():
     views = drawn_views(1, 64)
     half = views.labels[0, 1] == 1
     crops = list_crops(views, [drawn_masks((2, half))])
@@ -105,16 +98,6 @@ def test_levels_are_drawn_equally_often():
     assert weights[(crops.level == 1) & crops.rough].sum() == pytest.approx(0.4 / 3)
 
 
-def test_half_of_a_batch_comes_in_groups_of_one_thing():
-    crops = list_crops(drawn_views(8, 64))
-    rows = CropDraw(crops, 40).draw(np.random.default_rng(0))
-    assert len(rows) == 40
-    grouped = list(zip(crops.view[rows[20:]], crops.thing[rows[20:]], strict=True))
-    changes = sum(first != second for first, second in pairwise(grouped))
-    # a ball has three nodes, a coin one: 20 rows are at least 20 / SIBLINGS groups and far fewer than 20
-    assert 20 / SIBLINGS - 1 <= changes < 19
-
-
-def test_the_text_of_colour_and_class_is_found_among_the_phrases():
+def test_the_phrase_of_colour_and_class_is_found():
     assert coloured_text(("kettle lid", "orange kettle lid", "striped kettle lid")) == "orange kettle lid"
     assert coloured_text(("kettle lid", "orange striped kettle lid")) is None

@@ -27,8 +27,17 @@ def session(path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
+def decoded(folder, network, pixels, points, labels):
+    """Embeddings, predicted IoUs and logits of the exported segmenter."""
+    vision = session(folder / "onnx/vision_encoder.onnx")
+    place, shared = vision.run(None, {"pixel_values": pixels.numpy()})
+    feeds = {"input_points": points.numpy(), "input_labels": labels.numpy()}
+    feeds |= {"image_embeddings": place, "image_positional_embeddings": shared}
+    return place, *session(folder / f"onnx/{network}.onnx").run(["iou_scores", "pred_masks"], feeds)
+
+
 def round_to_half(module: torch.nn.Module) -> torch.nn.Module:
-    """Weights as the file stores them, so that only the arithmetic is compared."""
+    """Round weights as in the file, so that only the arithmetic is compared."""
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.copy_(parameter.half().float())
@@ -53,17 +62,7 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
     labels = torch.ones(batch, prompts, points, dtype=torch.int64)
     if points > 1:
         labels[:, 0, 1], labels[:, 1, 1] = 0, -1
-    vision = session(folder / "onnx" / "vision_encoder.onnx")
-    place, shared = vision.run(None, {"pixel_values": pixels.numpy()})
-    scores, masks = session(folder / "onnx" / "prompt_encoder_mask_decoder.onnx").run(
-        ["iou_scores", "pred_masks"],
-        {
-            "input_points": points_xy.numpy(),
-            "input_labels": labels.numpy(),
-            "image_embeddings": place,
-            "image_positional_embeddings": shared,
-        },
-    )
+    place, scores, masks = decoded(folder, DECODER, pixels, points_xy, labels)
     with torch.no_grad():
         expected_embeddings = encoder(pixels)
         windows = torch.tensor([[0.0, 0.0, 1.0]]).repeat(batch, 1)
@@ -71,7 +70,7 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
             points_xy, labels, expected_embeddings, positional_embeddings(windows, FRAME_PX // STRIDE)
         )
     assert masks.shape == (batch, prompts, 3, FRAME_PX // MASK_STRIDE, FRAME_PX // MASK_STRIDE)
-    # Batch normalisation is folded into weights before they become float16: that is the difference.
+    # The export folds batch normalisation into weights before it rounds them to float16.
     assert np.abs(place[:, :EMBEDDING] - expected_embeddings.numpy()).max() < 5e-3
     assert np.abs(scores - expected_scores.numpy()).max() < 1e-3
     spread = np.abs(expected_masks.numpy()).max()
@@ -81,17 +80,9 @@ def test_exported_sam_equals_torch(sam, batch, prompts, points):
 def test_the_preview_is_every_second_row_and_column_of_the_masks(sam):
     generator = torch.Generator().manual_seed(5)
     pixels = torch.randn(1, 3, FRAME_PX, FRAME_PX, generator=generator)
-    place, shared = session(sam[2] / "onnx" / "vision_encoder.onnx").run(
-        None, {"pixel_values": pixels.numpy()}
-    )
-    feeds = {
-        "input_points": (torch.rand(1, 5, 1, 2, generator=generator) * FRAME_PX).numpy(),
-        "input_labels": np.ones((1, 5, 1), np.int64),
-        "image_embeddings": place,
-        "image_positional_embeddings": shared,
-    }
-    scores, masks = session(sam[2] / "onnx" / f"{DECODER}.onnx").run(["iou_scores", "pred_masks"], feeds)
-    seen, few = session(sam[2] / "onnx" / f"{PREVIEW}.onnx").run(["iou_scores", "pred_masks"], feeds)
+    points, labels = torch.rand(1, 5, 1, 2, generator=generator) * FRAME_PX, torch.ones(1, 5, 1).long()
+    _, scores, masks = decoded(sam[2], DECODER, pixels, points, labels)
+    _, seen, few = decoded(sam[2], PREVIEW, pixels, points, labels)
     np.testing.assert_allclose(seen, scores, atol=1e-6)
     np.testing.assert_allclose(few, masks[..., ::2, ::2], atol=1e-5 * np.abs(masks).max())
 

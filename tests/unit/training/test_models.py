@@ -1,4 +1,4 @@
-"""The committed small models are the files their cards describe, and they run."""
+"""The committed small models: files, training seeds and quality as in their cards."""
 
 import numpy as np
 import onnxruntime
@@ -14,10 +14,10 @@ from hilsplat.world.scenes.kinds import training_camera
 from hilsplat.world.seeds import TRAINING_SEEDS
 from models.training.card import CARD, RECORD, digests
 from models.training.crops import list_crops
-from models.training.data import HEAD_LEVELS, LabelledViews, normalised
+from models.training.data import LabelledViews, normalised
 from models.training.measure_sam import draw_regions
 from models.training.render import phrases_of, scene_of_seed
-from models.training.sam import FRAME_PX
+from models.training.sam import FRAME_PX, HEADS
 from tests.conftest import PROJECT
 from tests.unit.segment.plain import quantise
 
@@ -72,7 +72,7 @@ def test_the_committed_segmenter_is_as_good_as_its_card_says(unseen):
         encoded = model.encode(unseen.images[view])
         _, logits = model.decode(encoded, np.array([(x, y) for _, _, x, y in drawn]))
         for row, (head, node, _, _) in enumerate(drawn):
-            level = HEAD_LEVELS[head]
+            level = HEADS[head]
             truth = unseen.labels[view][level.index] == node
             (guess,) = enlarged(quantise(logits[row, head])[None].astype(np.float32), encoded.frame)
             found[level.label].append((truth & guess).sum() / (truth | guess).sum())
@@ -86,7 +86,7 @@ def test_the_committed_segmenter_predicts_from_fine_to_coarse(unseen):
     encoded = model.encode(unseen.images[0])
     scores, logits = model.decode(encoded, point_grid(8) * FRAME_PX)
     assert scores.shape == (64, 3)
-    # prompts on a true subpart: there the three heads mean three different regions
+    # at prompts on a ground-truth subpart, the three heads have three different regions
     pixels = (point_grid(8) * FRAME_PX).astype(int)
     on_subpart = unseen.labels[0, 2, pixels[:, 1], pixels[:, 0]] >= 0
     assert on_subpart.sum() >= 5
@@ -113,5 +113,5 @@ def test_the_committed_clip_is_as_good_as_its_card_says(unseen):
     card = read_json(folder / RECORD)["metrics"]["black"]["exact"]
     for level in LEVELS:
         of_level = right[crops.level == int(level)]
-        # fewer texts compete than in the card; a standard error of some twenty crops is 0.1
+        # there are fewer candidate texts than in the card; the standard error of twenty crops is 0.1
         assert of_level.mean() > card[level.label]["top1"] - 0.25

@@ -1,4 +1,4 @@
-"""The whole recipe, as small as it gets: a scene of each kind, a step each."""
+"""The recipe of both small models: scenes, phrases, and a training of two steps each."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_only_training_scenes_are_rendered_for_training():
         scene_of_seed(201)
 
 
-def test_measured_scenes_are_others_than_trained_ones():
+def test_no_scene_is_both_trained_and_measured_on():
     trained, measured = training_seeds(5, 3)
     assert trained == [1_000_000, 1_000_001, 1_000_002, 1_000_003, 1_000_004]
     assert measured == [1_999_997, 1_999_998, 1_999_999]

@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 import torch
 
+from models.training import sam_loss
 from models.training.batches import CropStage
 from models.training.clip import contrastive_loss
-from models.training.crops import list_crops, list_segmented
-from models.training.loop import Tuning
+from models.training.crops import list_crops
+from models.training.loop import Budget, Tuning, learning_rate
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import draw_regions, measure_everything
+from models.training.sam import positional_embeddings
 from models.training.sam_loss import segmentation_loss
-from models.training.steps import Budget, learning_rate, prefetched
 from models.training.train_clip import train_clip
-from models.training.train_sam import stage_of_draw, train_sam
+from models.training.train_sam import train_sam
 from tests.unit.training.drawn import drawn_masks, drawn_views
 
 SMALL = (CropStage(1.0, 64, 4, 8, 128),)
@@ -30,34 +31,29 @@ def trained(tmp_path_factory):
 
 def test_the_segmenter_learns(trained):
     _, _, curve = trained
-    assert [row["step"] for row in curve.rows] == [8, 16, 24]
-    assert curve.rows[-1]["mask_loss"] < 0.8 * curve.rows[0]["mask_loss"]
-    assert curve.rows[-1]["semantic_loss"] < curve.rows[0]["semantic_loss"]
+    assert [row["step"] for row in curve] == [8, 16, 24]
+    assert curve[-1]["mask_loss"] < 0.8 * curve[0]["mask_loss"]
+    assert curve[-1]["semantic_loss"] < curve[0]["semantic_loss"]
 
 
 def weights_of(run) -> np.ndarray:
     return torch.cat([p.detach().flatten() for module in run[:2] for p in module.parameters()]).numpy()
 
 
-def test_resuming_after_an_interruption_gives_the_same_weights(tmp_path):
+def test_resuming_after_an_interruption_gives_the_same_weights(tmp_path, monkeypatch):
     views = drawn_views(2, 64)
     tuning = Tuning(peak=2e-3, warmup=2, measure_every=100, save_every=2)
     whole = train_sam(views, views, Budget(steps=6), 3, tmp_path / "a", **WINDOWS, tuning=tuning)
+    steps = iter(range(6))
 
-    def killed(views_of_killed, step_of_death=3):
-        calls = {"count": 0}
+    def killed(*args):
+        if next(steps) == 3:
+            raise KeyboardInterrupt
+        return sam_loss.training_loss(*args)
 
-        class Mortal(type(views_of_killed)):
-            def __len__(self):
-                calls["count"] += 1
-                if calls["count"] > step_of_death + 2:
-                    raise KeyboardInterrupt
-                return super().__len__()
-
-        return Mortal(views_of_killed.images, views_of_killed.labels, views_of_killed.nodes)
-
-    with pytest.raises(KeyboardInterrupt):
-        train_sam(killed(views), views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
+    with monkeypatch.context() as context, pytest.raises(KeyboardInterrupt):
+        context.setattr("models.training.train_sam.training_loss", killed)
+        train_sam(views, views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
     assert (tmp_path / "b" / "sam.safetensors").is_file()
     resumed = train_sam(views, views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
     assert np.array_equal(weights_of(whole), weights_of(resumed))
@@ -76,9 +72,9 @@ def test_a_budget_in_minutes_schedules_the_decay_from_the_speed():
     budget = Budget(minutes=40.0)
     assert not budget.is_time_to_decay(290, 29.0)
     assert budget.is_time_to_decay(300, 30.0)
-    # 10 steps a minute, 10 minutes left
+    # ten steps per minute, ten minutes left
     assert budget.decay_steps(300, 30.0) == 100
-    # trained for longer than asked before: still a quarter of the budget to settle
+    # already longer than the budget: the decay still gets a quarter of it
     assert budget.decay_steps(1000, 100.0) == 100
     with pytest.raises(ValueError, match="minutes or steps"):
         Budget()
@@ -91,18 +87,7 @@ def test_learning_rate_rises_stays_and_falls():
     assert learning_rate(600, 1.0, 10, 400, 200) == pytest.approx(0.01)
 
 
-def test_prefetched_steps_are_in_order():
-    steps = prefetched(lambda step: step, 3)
-    assert [next(steps) for _ in range(4)] == [3, 4, 5, 6]
-    steps.close()
-
-
-def test_stages_are_drawn_in_proportion_to_their_shares():
-    stages = (CropStage(0.25, 64, 1, 1), CropStage(0.75, 128, 1, 1))
-    assert [stage_of_draw(draw, stages).crop_px for draw in (0.0, 0.24, 0.26, 0.999)] == [64, 64, 128, 128]
-
-
-def test_segmentation_loss_is_small_for_the_right_mask_and_ignores_unknown_heads():
+def test_segmentation_loss_is_near_zero_for_the_ground_truth_and_ignores_unknown_heads():
     truth = torch.zeros(1, 1, 3, 64)
     truth[..., 16:48] = 1
     weights = torch.full((1, 1, 64), 2.0)
@@ -120,8 +105,6 @@ def test_segmentation_loss_is_small_for_the_right_mask_and_ignores_unknown_heads
 
 def test_logits_at_sampled_pixels_equal_those_of_the_whole_mask(trained):
     encoder, decoder, _ = trained
-    from models.training.sam import positional_embeddings
-
     generator = torch.Generator().manual_seed(0)
     pixels = torch.randn(2, 3, 64, 64, generator=generator)
     points, labels = torch.full((2, 3, 1, 2), 20.0), torch.ones((2, 3, 1), dtype=torch.int64)
@@ -148,7 +131,7 @@ def test_recall_counts_regions_matched_at_their_level():
     labels = views.labels[0]
     masks = drawn_masks((1, labels[0] == 0), (1, labels[1] == 1))
     found = measure_everything([masks], views)
-    # of ball and coin the ball is found; its half is found as a whole only, where it fits nothing
+    # the ball is found, the coin is not; the mask of the half has the level of wholes, where it fits nothing
     assert (found["whole"]["recall"], found["whole"]["n"]) == (0.5, 2)
     assert found["part"]["recall"] == 0.0
 
@@ -160,12 +143,12 @@ def test_clip_learns_and_is_measured(tmp_path):
     vision, text, tokenizer, curve = train_clip(
         crops, others, Budget(steps=40), 0, tmp_path, batch=24, tuning=FAST
     )
-    assert curve.rows[-1]["contrastive_loss"] < curve.rows[0]["contrastive_loss"]
-    assert curve.rows[-1]["exact_whole"] > 0.5
+    assert curve[-1]["contrastive_loss"] < curve[0]["contrastive_loss"]
+    assert curve[-1]["exact_whole"] > 0.5
     found = measure_clip(vision, text, tokenizer, others)
     assert found[("rough", "whole")]["n"] == 4
-    queries = measure_queries(vision, text, tokenizer, unseen, masks, list_segmented(unseen, masks))
-    # with true masks a right answer has IoU 1, and every text names one region
+    queries = measure_queries(vision, text, tokenizer, unseen, masks)
+    # the masks are ground truth, so a correct answer has IoU 1, and every text names one region
     assert queries["whole"]["best"] == 1.0
     assert queries["whole"]["iou"] > 0.5
     assert queries["subpart"]["iou"] == 0.0  # no mask of that level was given
@@ -177,11 +160,11 @@ def test_contrastive_loss_matches_hand_computation():
     # logits [[1, 0], [0, 1]]: -log(e / (e + 1)) = log(1 + 1/e) = 0.3133 in each row and column
     loss = contrastive_loss(one, one, valid, torch.tensor(1.0))
     assert loss.item() == pytest.approx(0.31326, abs=1e-4)
-    # two crops that share both captions: the best any model can do is log 2
+    # two crops that share both captions: the minimum is log 2
     same = torch.tensor([[1.0, 0.0], [1.0, 0.0]])
     loss = contrastive_loss(same, same, torch.ones(2, 2), torch.tensor(5.0))
     assert loss.item() == pytest.approx(np.log(2), abs=1e-5)
-    # a third text that is true of neither only competes: log(2 + e) - 1 = 0.5514 by image, 0.3133 by text
+    # a third text describes neither and is only a negative: log(2 + e) - 1 = 0.5514 by image, 0.3133 by text
     three = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
     loss = contrastive_loss(one, three, torch.eye(2, 3), torch.tensor(1.0))
     assert loss.item() == pytest.approx((0.55144 + 0.31326) / 2, abs=1e-4)
