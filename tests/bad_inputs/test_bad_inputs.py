@@ -219,6 +219,11 @@ ROWS = {
         ASK,
         "the semantic tree of photos/desk was made for another cameras.npz",
     ),
+    "Gaussians of another scene beside a tree": row(
+        lambda: GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-4] + b"\0\0\x80?"),
+        ASK,
+        "of photos/desk was made for another gaussians.ply",
+    ),
     "provenance whose outputs are a list": row(
         lambda: write_record(FIELD, outputs=[]), ASK, "field.safetensors.provenance.json is damaged: outputs"
     ),
@@ -238,6 +243,9 @@ ROWS = {
     "an unknown variant": row(nothing, (*ASK, "--variant", "x"), "no variant 'x'", "default"),
     # ---- photographs and imports
     "a photograph with a brace": row(photographs("a{1}.png"), NEW, "a{1}.png", "brace", "rename"),
+    "a scene name with a space": row(photographs(), ("new", "two words", "photos"), "name", "' '"),
+    "a scene name that is a path": row(photographs(), ("new", "a/b", "photos"), "name", "'/'"),
+    "a scene name that is an option": row(photographs(), ("new", "--", "-n", "photos"), "name", "'-'"),
     "a name of 243 bytes": row(photographs("n" * 239 + ".png"), NEW, "too long", "at most 200 bytes", "243"),
     "an image of 400 megapixels": row(
         with_photographs("big.png", png_of(20_000, 20_000)), NEW, "big.png", "400000000 pixels"
@@ -307,9 +315,6 @@ ROWS = {
         with_model("config.json", DEEP), CHECK_MODEL, "models/copy has no readable config.json"
     ),
     # ---- configuration, refused while the workflow is parsed
-    "a missing model": row(
-        nothing, plan(clip={"model": "models/nope"}), "clip.model", "models/nope is missing"
-    ),
     "a misspelt group in overrides": row(
         nothing, plan(overrides={"photo": {}}), "overrides.photo", "'photos'"
     ),

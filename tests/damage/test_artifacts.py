@@ -1,5 +1,6 @@
 """Damaged artifacts raise an error that names them, or are read as before the damage; nothing crashes."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,8 @@ from hilsplat.base.artifacts import read_npz, write_index, write_npy, write_npz
 from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.contributions.rows import Contributions
 from hilsplat.embed.vectors import mask_embeddings
-from hilsplat.field.code import load_code, load_latents
+from hilsplat.field.code import LanguageField, load_code, load_latents
 from hilsplat.field.field import read_parents
-from hilsplat.field.language_field import LanguageField
 from hilsplat.query.node_names import NodeNaming
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
@@ -24,7 +24,7 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.semantic_tree.tree import SemanticTree
 from tests.damage.damages import byte_damages, damaged_bytes, equal
 from tests.unit.artifact_changes import change_index
-from tests.unit.finished_desk import SCENE, build_finished_desk
+from tests.unit.finished_desk import SCENE
 
 
 def _masks(folder: Path) -> Any:
@@ -72,8 +72,8 @@ READERS: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory) -> Path:
-    return build_finished_desk(tmp_path_factory.mktemp("damaged")) / SCENE
+def desk(desk_project, tmp_path_factory) -> Path:
+    return Path(shutil.copytree(desk_project, tmp_path_factory.mktemp("damaged") / "project")) / SCENE
 
 
 @pytest.fixture(scope="module")

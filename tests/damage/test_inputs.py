@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hilsplat.annotate.importing import imported
+from hilsplat.annotate.exchange import imported
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import read_config
 from hilsplat.scene.cameras import Cameras

@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 MODELS = ("models/sam-tiny", "models/clip-tiny")
 """The only models of the checkout that tests use."""
@@ -72,11 +70,6 @@ class Project:
         command = (sys.executable, "-c", "from hilsplat.cli.main import main; main()", *words)
         return Project(folder or self.root).run(*command, PYTHONPATH=str(self.root), **environment).stdout
 
-    def add_photos(self, name: str, source: str) -> None:
-        """Add a scene of photographs to the sheet."""
-        with (self.root / "config/scenes.tsv").open("a") as sheet:
-            sheet.write(f"photos\t{name}\tphotos\t{source}\tarbitrary\n")
-
     def planned(self, *words: str) -> set[str]:
         """Rules that a dry run would run, except for the summary that follows every other rule."""
         return {
@@ -120,15 +113,6 @@ def copy_project(source: Path, target: Path, *, results: bool) -> Project:
         rows = sheet.read_text().splitlines(keepends=True)
         sheet.write_text("".join(row for row in rows if not row.startswith("photos\t")))
     return Project(target)
-
-
-def noise_photos(folder: Path, count: int) -> Path:
-    """Write photographs in which nothing matches."""
-    folder.mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    for number in range(count):
-        Image.fromarray(rng.integers(0, 255, (96, 128, 3), dtype=np.uint8)).save(folder / f"{number}.png")
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,9 @@ def test_a_finished_stage_is_one_line_and_query_commands_follow(copy_of_finished
     assert "rule clip:" not in printed and "Select jobs" not in printed
     record = max((project.root / ".snakemake/log").iterdir(), key=lambda file: file.stat().st_mtime)
     assert "rule clip:" in record.read_text()  # Snakemake's own log has everything
+    shutil.rmtree(project.root / VECTORS)
+    printed = project.snakemake(VECTORS, "--verbose").stderr
+    assert "rule clip:" in printed and "synthetic/tiny clip: " not in printed
 
 
 def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finished: Project) -> None:
@@ -27,10 +30,3 @@ def test_a_failed_job_is_shown_in_full_with_the_log_of_its_stage(copy_of_finishe
     assert "shell:" in failed.stderr and " contributions --scene" in failed.stderr
     assert "Logfile" in failed.stderr  # profiles/default was found
     assert "has masks" in failed.stderr.partition("Logfile")[2]
-
-
-def test_verbose_restores_snakemakes_own_output(copy_of_finished: Project) -> None:
-    project = copy_of_finished
-    shutil.rmtree(project.root / SCENE / "default/coverage_tree")
-    printed = project.snakemake(f"{SCENE}/default/coverage_tree", "--verbose").stderr
-    assert "rule coverage_tree:" in printed and "coverage tree: " not in printed

@@ -77,32 +77,6 @@ def test_an_unusable_setting_is_refused_before_any_job(drawn: Project) -> None:
     assert drawn.files("results") == before
 
 
-def test_a_file_that_is_added_during_a_stage_is_refused(copy_of_finished: Project, tmp_path: Path) -> None:
-    """The photographs of a scene change while its poses are computed."""
-    project, images = copy_of_finished, copy_of_finished.root / IMAGES
-    out = tmp_path / "scene"
-    words = ["hilsplat", "poses", "--images", str(images), "--out", str(out), "--render"]
-    first = sorted(images.glob("*.png"))[0]
-    code = f"""
-import shutil
-import hilsplat.scene.poses as poses
-run = poses.run_poses
-def adding(*given):
-    run(*given)
-    shutil.copy({str(first)!r}, {str(images / "added.png")!r})
-poses.run_poses = adding
-import sys
-sys.argv = {words!r}
-from hilsplat.cli.main import main
-main()
-"""
-    refused = project.run(sys.executable, "-c", code, check=False)
-    assert refused.returncode == 1
-    assert "poses: input images changed while the stage ran" in refused.stderr
-    assert "added.png" in refused.stderr
-    assert not out.with_name("scene.provenance.json").exists()
-
-
 @contextmanager
 def job_of(project: Project, log: str, *words: str, freeze: bool = False) -> Iterator[subprocess.Popen]:
     """Start a run, and yield its process, perhaps frozen, once the log of its job exists."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import lock_path, provenance_path
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, HilsplatError
 from hilsplat.base.images import write_png
 from hilsplat.base.provenance import SOFTWARE, require_beginning, require_own_picture, require_replaceable
 from hilsplat.cli.main import app
@@ -118,6 +118,15 @@ def test_a_stage_replaces_its_output_again(tmp_path):
         with stage("table", out):
             out.write_text(text)
     assert out.read_text() == "second" and json.loads(provenance_path(out).read_text())["stage"] == "table"
+
+
+def test_an_input_that_changes_during_a_stage_leaves_no_provenance(tmp_path, photographs):
+    out = tmp_path / "table.csv"
+    message = r"table: input scores changed while the stage ran: .*added\.jpg(.|\n)*a new file"
+    with pytest.raises(HilsplatError, match=message), stage("table", out, inputs={"scores": photographs}):
+        out.write_text("text")
+        (photographs / "added.jpg").write_text("a photograph")
+    assert not provenance_path(out).exists()
 
 
 def test_pictures_replace_only_pictures_of_this_package(tmp_path):

@@ -37,10 +37,20 @@ def test_a_sound_machine_has_no_fault(project, monkeypatch):
     assert {finding.check for finding in findings} >= {"python", "libraries", "kernels", "disk", "memory"}
 
 
-def test_an_old_python_is_a_fault(monkeypatch):
-    monkeypatch.setattr("platform.python_version", lambda: "3.9.1")
-    [found] = doctor.python()
-    assert found.state == "fault" and "3.9.1" in found.found
+@pytest.mark.parametrize(
+    ("check", "name", "replacement", "words"),
+    [
+        (doctor.python, "platform.python_version", lambda: "3.9.1", "3.9.1"),
+        (doctor.onnx, "importlib.metadata.version", lambda name: "1.0", "overwrite"),
+        (doctor.video, "hilsplat.workflow.doctor._codec", lambda name, mode: name != "libx264", "libx264"),
+    ],
+)
+def test_an_old_python_two_onnxruntimes_and_a_missing_codec_are_faults(
+    monkeypatch, check, name, replacement, words
+):
+    monkeypatch.setattr(name, replacement)
+    [found] = check()
+    assert found.state == "fault" and words in found.found
 
 
 def install(monkeypatch, missing: str, **versions: str) -> None:
@@ -67,12 +77,6 @@ def test_onnxruntime_gpu_replaces_onnxruntime(monkeypatch):
     assert [found.state for found in doctor.libraries()] == ["ok"]
 
 
-def test_two_builds_of_onnxruntime_are_a_fault(monkeypatch):
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.0")
-    [found] = doctor.onnx()
-    assert found.state == "fault" and "overwrite" in found.found
-
-
 @pytest.mark.parametrize(
     ("problem", "apart", "state"),
     [("no gsplat", None, "note"), (None, "cuda differs from cpu: image by 0.3", "fault"), (None, None, "ok")],
@@ -94,12 +98,6 @@ def test_kernels_that_render_a_different_image_are_a_fault(monkeypatch):
     monkeypatch.setattr(api, "draw", bent)
     [found] = doctor.kernels()
     assert found.state == "fault" and "image by 0.1" in found.found
-
-
-def test_a_missing_codec_is_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_codec", lambda name, mode: name != "libx264")
-    [found] = doctor.video()
-    assert found.state == "fault" and "libx264" in found.found
 
 
 def test_a_broken_model_is_a_fault_and_missing_real_ones_are_noted(tmp_path, monkeypatch):

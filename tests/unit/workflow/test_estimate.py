@@ -8,8 +8,8 @@ import pytest
 from hilsplat.workflow import estimate
 from hilsplat.workflow.estimate import GPU_GAIN, RunEstimate
 from hilsplat.workflow.resources import START_S, JobResources
-from tests.unit.workflow import test_plan
-from tests.unit.workflow.test_resources import plan
+from tests.unit.workflow.plans import BENCHMARK, plan_of
+from tests.unit.workflow.test_resources import JOB, plan
 
 SCENES = ({"dataset": "synthetic", "scene": "0"}, {"dataset": "synthetic", "scene": "1"})
 
@@ -42,8 +42,7 @@ def test_jobs_are_summed_by_data_set(resources):
 def test_more_steps_prompts_and_crops_take_longer(tmp_path):
     def seconds(rule: str, **config: object) -> float:
         found = JobResources(plan(tmp_path, **config))
-        job = type("Job", (), {"dataset": "synthetic", "scene": "0", "variant": "default"})
-        return found.core_seconds(rule, job) - START_S
+        return found.core_seconds(rule, JOB) - START_S
 
     steps = {"gaussians": {"iterations": 500}}
     assert seconds("gaussians") > 2 * seconds("gaussians", **steps)
@@ -55,6 +54,7 @@ def test_more_steps_prompts_and_crops_take_longer(tmp_path):
     assert seconds("method", **longer) == pytest.approx(10 * seconds("method", **baseline), rel=0.2)
 
 
+DESK = "photos desk photos desk arbitrary"
 KEY_VIEWS = {"masks": {"key_views": 0.5}, "clip": {"crops_per_node": 3}}
 
 
@@ -62,7 +62,7 @@ KEY_VIEWS = {"masks": {"key_views": 0.5}, "clip": {"crops_per_node": 3}}
 def photographs(tmp_path, monkeypatch):
     """Seventeen photographs, a SAM of 20 s a view, a CLIP of 0.1 s a crop, and 75 s for each other stage."""
     (tmp_path / "desk").mkdir()
-    for number in range(16):
+    for number in range(17):
         (tmp_path / f"desk/photo{number}.jpg").touch()
     for module in ("estimate", "plan", "resources"):
         monkeypatch.setattr(
@@ -75,10 +75,8 @@ def photographs(tmp_path, monkeypatch):
 
 
 def test_first_answer_and_all_photographs_are_predicted(photographs):
-    masks, variants = {"prompts": "guided"}, {"key-views": KEY_VIEWS}
-    found = test_plan.plan(
-        photographs, groups=["photos"], variants=variants, main_variants=["default"], masks=masks
-    )
+    config = {"masks": {"prompts": "guided"}, "variants": {"key-views": KEY_VIEWS}}
+    found = plan_of(photographs, (DESK,), groups=["photos"], main_variants=["default"], **config)
     (line,) = estimate.forecasts(found, 2)
     # 15 training views: 150 + 7.5 x 20 + 75 + 400 x 3 x 0.1 = 495 core seconds, then 7.5 x 12.3 + 150 + 200
     assert line.startswith("photos/desk: first answer in about 4 min, all photographs in about 8 min.")
@@ -86,15 +84,13 @@ def test_first_answer_and_all_photographs_are_predicted(photographs):
 
 
 def test_without_key_views_there_is_one_time(photographs):
-    found = test_plan.plan(photographs, groups=["photos"], variants={}, main_variants=["default"])
+    found = plan_of(photographs, (DESK,), groups=["photos"])
     (line,) = estimate.forecasts(found, 1)
     assert line.startswith("photos/desk: all photographs in about 13 min.")
 
 
 def test_scenes_that_are_ready_and_synthetic_scenes_have_no_forecast(photographs, monkeypatch):
     monkeypatch.chdir(photographs)
-    found = test_plan.plan(
-        photographs, groups=["photos", "benchmark"], variants={}, main_variants=["default"]
-    )
+    found = plan_of(photographs, (*BENCHMARK, DESK), groups=["photos", "benchmark"])
     (photographs / "results/photos/desk/default/clip").mkdir(parents=True)
     assert estimate.forecasts(found, 2) == []

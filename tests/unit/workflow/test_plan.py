@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,14 +14,14 @@ from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
 from hilsplat.workflow.plan import Plan, any_of, some
 from hilsplat.workflow.records import expected_artifacts
+from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
 
-SHEET = """dataset\tscene\tgroup\tsource\tunit
-synthetic\tone\tbenchmark\tworld:tabletop:1\tmetre
-synthetic\ttwo\tbenchmark\tworld:tabletop:2\tmetre
-rooms\troom\tbenchmark\tworld:room:1\tmetre
-lerf\tfigurines\tlerf\tdata:lerf_ovs/figurines\tarbitrary
-photos\tdesk\tphotos\tdesk\tarbitrary
-"""
+ROWS = (
+    *BENCHMARK,
+    "rooms room benchmark world:room:1 metre",
+    "lerf figurines lerf data:lerf_ovs/figurines arbitrary",
+    "photos desk photos desk arbitrary",
+)
 NETWORK = {"code": "network", "latent": 3}
 VARIANTS = {
     "theta": {"coverage_tree": {"theta": 0.6}},
@@ -32,25 +31,14 @@ VARIANTS = {
 }
 
 
-@dataclass(frozen=True)
-class Job:
-    dataset: str
-    scene: str
-    variant: str = "default"
-
-
 def variants_in(paths: list[str]) -> list[str]:
     return [path.split("/")[3] for path in paths]
 
 
 def plan(folder: Path, **config: object) -> Plan:
-    (folder / "config").mkdir(exist_ok=True)
     (folder / "desk").mkdir(exist_ok=True)
     (folder / "desk/1.jpg").touch()
-    sheet = folder / "config/scenes.tsv"
-    sheet.write_text(SHEET)
-    more = {"main_variants": ["default", *VARIANTS], "variants": VARIANTS}
-    return Plan({"scenes": str(sheet), **more, **config})
+    return plan_of(folder, ROWS, **{"variants": VARIANTS, "main_variants": ["default", *VARIANTS], **config})
 
 
 def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
@@ -120,14 +108,14 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
     ],
 )
 def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage, variant, owner):
-    job = Job("synthetic", "one", variant)
+    job = Job(variant=variant)
     assert plan(tmp_path, seeds=2).shared(stage, "file")(job) == f"results/synthetic/one/{owner}/file"
 
 
 def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
     variants = {**VARIANTS, "langsplat": {"autoencoder": NETWORK, "method": {"name": "langsplat"}}}
     found = plan(tmp_path, main_variants=["langsplat"], variants=variants)
-    job = Job("synthetic", "one", "langsplat")
+    job = Job(variant="langsplat")
     code = "results/synthetic/one/network/autoencoder"
     assert found.shared("autoencoder", "autoencoder")(job) == code
     outputs = list(expected_artifacts(found))
@@ -139,8 +127,8 @@ def test_levels_by_the_tree_take_the_theta_of_the_tree(tmp_path):
     by_tree = {"masks": {"levels": "tree"}, "coverage_tree": {"theta": 0.7}}
     found = plan(tmp_path, variants={**VARIANTS, "levels": by_tree}, main_variants=["default"])
     for name, theta in (("default", None), ("theta", None), ("levels", 0.7)):
-        assert json.loads(found.settings("masks")(Job("synthetic", "one", name)))["theta"] == theta
-    assert found.shared_variant("masks", Job("synthetic", "one", "levels")) == "levels"
+        assert json.loads(found.settings("masks")(Job(variant=name)))["theta"] == theta
+    assert found.shared_variant("masks", Job(variant="levels")) == "levels"
 
 
 def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(tmp_path):
@@ -152,7 +140,7 @@ def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(
         "alone": {"field": {"start": "langsplat"}},
     }
     found = plan(tmp_path, variants=variants, main_variants=["default"], seeds=2)
-    on, literal = (Job("synthetic", "one", name) for name in ("on.seed1", "literal"))
+    on, literal = (Job(variant=name) for name in ("on.seed1", "literal"))
     first = found.first_field(on)
     assert first == ["results/synthetic/one/langsplat.seed1/field.safetensors"] and found.rendered(on) == []
     assert found.field_option(on, SimpleNamespace(rendered=[], start=first[0])) == f"--start {first[0]}"
@@ -160,21 +148,21 @@ def test_inputs_of_the_literal_trainer_and_of_a_field_that_continues_langsplats(
     assert found.first_field(literal) == [] and rendered[2] == "results/synthetic/one/default/masks"
     option = found.field_option(literal, SimpleNamespace(rendered=rendered, start=[]))
     assert option.split()[::2] == ["--scene", "--gaussians", "--masks"]
-    assert (found.field_seed(on), found.field_seed(Job("synthetic", "one"))) == (1, 0)
+    assert (found.field_seed(on), found.field_seed(Job())) == (1, 0)
     with pytest.raises(SettingsError, match=r"no variant has method\.name langsplat with the same"):
-        found.first_field(Job("synthetic", "one", "alone"))
+        found.first_field(Job(variant="alone"))
 
 
 def test_an_override_of_one_scene_changes_what_it_shares(tmp_path):
     found = plan(tmp_path, overrides={"synthetic/two": {"coverage_tree": {"theta": 0.6}}})
     shared = found.shared("field", "f")
-    assert shared(Job("synthetic", "one", "theta")).split("/")[3] == "theta"
+    assert shared(Job(variant="theta")).split("/")[3] == "theta"
     assert shared(Job("synthetic", "two", "theta")).split("/")[3] == "default"
     assert json.loads(found.settings("coverage_tree")(Job("synthetic", "two")))["theta"] == 0.6
 
 
 def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
-    found, job = plan(tmp_path, main_variants=["default", "theta", "network"]), Job("synthetic", "one")
+    found, job = plan(tmp_path, main_variants=["default", "theta", "network"]), Job()
     assert found.compared("masks", "masks")(job) == ["results/synthetic/one/default/masks"]
     assert variants_in(found.compared("field", "f")(job)) == ["default", "theta", "network"]
     assert variants_in(found.compared_scores(job)) == ["default", "theta", "network"]
@@ -184,15 +172,17 @@ def test_variants_have_our_field_or_a_baselines(tmp_path):
     found = plan(tmp_path)
     assert found.variants(by_baseline=True) == "lifted"
     assert found.variants(by_baseline=False) == "default|network|theta|truth"
-    assert found.baseline(Job("synthetic", "one", "lifted")) == ("hilsplat.methods.lifted:fit",)
+    assert found.baseline(Job(variant="lifted")) == ("hilsplat.methods.lifted:fit",)
 
 
 def test_true_labels_are_inputs_of_masks_only_for_the_diagnostic_segmenter(tmp_path):
     found = plan(tmp_path)
-    truth = Job("synthetic", "one", "truth")
-    assert found.masks_truth(Job("synthetic", "one")) == [] and found.masks_stage(truth) == "truth_masks"
+    truth = Job(variant="truth")
+    assert found.masks_truth(Job()) == [] and found.masks_stage(truth) == "truth_masks"
     assert found.masks_truth(truth) == ["results/synthetic/one/world/truth"]
-    inputs = SimpleNamespace(truth=["inner/results/synthetic/one/world/truth"], gaussians=[])
+    inputs = SimpleNamespace(
+        truth="inner/results/synthetic/one/world/truth", gaussians=[], key_masks=[], key_tree=[]
+    )
     option = found.masks_option(truth, inputs)
     assert option.startswith("--truth inner/results/synthetic/one/world/truth --perturb '{")
     with pytest.raises(SettingsError, match="photos/desk, variant truth: masks"):
@@ -206,7 +196,7 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     variants = {"key-views": {"masks": {"key_views": 0.5}}, "paper": {"autoencoder": {"targets": "mask"}}}
     config = {"groups": ["photos", "benchmark"], "variants": variants, "main_variants": ["default"]}
     found = plan(tmp_path, **config)
-    desk, key, one = Job("photos", "desk"), Job("photos", "desk", "key-views"), Job("synthetic", "one")
+    desk, key, one = Job("photos", "desk"), Job("photos", "desk", "key-views"), Job()
     assert found.first_answer(desk) == []  # sam-tiny takes seconds
 
     monkeypatch.setattr("hilsplat.workflow.plan.read_model", lambda folder: SimpleNamespace(embedded=False))
@@ -227,7 +217,7 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
 
 def test_a_vector_per_mask_is_made_only_for_variants_whose_targets_are_masks(tmp_path):
     found = plan(tmp_path, variants={"own": {"autoencoder": {"targets": "mask"}}}, main_variants=["default"])
-    default, own = Job("synthetic", "one"), Job("synthetic", "one", "own")
+    default, own = Job(), Job(variant="own")
     assert found.crops_tree(default) == ["results/synthetic/one/default/semantic_tree"]
     assert found.crops_tree(own) == []
     assert found.shared_variant("semantic_tree", own) == "default"
@@ -242,8 +232,8 @@ def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
     files = found.data.image_files(Job("photos", "desk"))
     assert [Path(file).name for file in files] == ["0.jpg", "1.jpg"]
     assert found.data.poses_option(Job("photos", "desk")) == "--no-render"
-    assert found.data.image_files(Job("synthetic", "one")) == "results/synthetic/one/world/images"
-    assert found.data.poses_option(Job("synthetic", "one")) == "--render"
+    assert found.data.image_files(Job()) == "results/synthetic/one/world/images"
+    assert found.data.poses_option(Job()) == "--render"
 
 
 def test_labels_of_a_published_scene_determine_reader_and_options(tmp_path):
@@ -297,17 +287,10 @@ def test_queries_of_a_scene_come_before_those_of_its_data_set(tmp_path):
     assert json.loads(found.queries(Job("photos", "other"))) == ["cup"]
 
 
-def test_the_digest_of_a_model_folder_depends_on_its_bytes(tmp_path):
+def test_a_segmenter_without_weights_and_a_missing_model_have_no_digest(tmp_path):
     found = plan(tmp_path, masks={"segmenter": "graph"}, clip={"model": str(tmp_path / "none")})
-    assert found.model("masks")(Job("synthetic", "one")) == "none"
-    assert found.model("clip")(Job("synthetic", "one")) == f"{tmp_path}/none is missing"
-    folder = tmp_path / "model"
-    folder.mkdir()
-    (folder / "a.onnx").write_bytes(b"1")
-    first = model_digest(folder, tmp_path / "cache")
-    model_digest.cache_clear()  # as in another process
-    (folder / "a.onnx").write_bytes(b"22")
-    assert model_digest(folder, tmp_path / "cache") != first
+    assert found.model("masks")(Job()) == "none"
+    assert found.model("clip")(Job()) == f"{tmp_path}/none is missing"
 
 
 OF_PHOTOGRAPHS = {"photos": {"masks": {"segmenter": "auto", "model": "auto"}, "clip": {"model": "auto"}}}
@@ -330,7 +313,7 @@ def embedded_models(tmp_path, monkeypatch) -> None:
 
 @pytest.mark.usefixtures("embedded_models")
 def test_a_downloaded_model_reruns_only_masks_and_clip_of_photographs(tmp_path):
-    photo, drawn = Job("photos", "desk"), Job("synthetic", "one")
+    photo, drawn = Job("photos", "desk"), Job()
 
     def parameters(job: Job) -> dict[str, str]:
         model_digest.cache_clear()  # as in another process
@@ -388,23 +371,3 @@ def test_every_rule_quotes_what_it_puts_into_a_command(project):
     assert len(commands) > 15
     placed = [place for command in commands for place in re.findall(r"{([^}]*)}", command)]
     assert {place for place in placed if not place.endswith(":q")} <= READY
-
-
-def test_no_text_of_a_configuration_can_end_a_script_of_the_report(tmp_path):
-    """Snakemake writes the parameters of figures and tables raw into a script of `report.html`."""
-    hostile = "</script><script>alert(1)</script><!--"
-    found = plan(
-        tmp_path,
-        groups=["photos"],
-        queries={"photos/desk": [hostile]},
-        labels={"default": hostile},
-        evaluate={"template": f"{hostile} {{}}", "canonical": [hostile]},
-    )
-    job = Job("photos", "desk")
-    texts = [found.queries(job), found.names(job), found.settings("evaluate")(job)]
-    assert not any("<" in text for text in texts)
-    queries, names, evaluate = map(json.loads, texts)
-    assert (queries, names) == ([hostile], {"default": hostile})
-    assert evaluate["canonical"] == [hostile]
-    with pytest.raises(SettingsError, match="data_root"):
-        plan(tmp_path, data_root=hostile)

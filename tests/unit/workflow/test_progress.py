@@ -13,10 +13,10 @@ import pytest
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.progress import LOG_FORMAT, last_progress, warnings_in
 from hilsplat.workflow import progress
-from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.progress import LOOPS, Estimates, ProgressDisplay, RunProgress, duration
 from hilsplat.workflow.resources import JobResources
 from hilsplat.workflow.stages import STAGES
+from tests.unit.workflow.plans import BENCHMARK, plan_of
 
 ROOT = Path(__file__).resolve().parents[3]
 JOBS = {"gaussians": 1, "semantic_tree": 1, "field": 1, "all": 1, "total": 4}
@@ -216,19 +216,6 @@ def test_a_long_last_job_is_not_divided_among_the_cores(run, clock):
     assert run.seconds_left() == 600
 
 
-def test_a_redraw_costs_the_same_for_any_number_of_jobs(run, monkeypatch):
-    estimated = []
-    seconds = Estimates.seconds
-    monkeypatch.setattr(
-        Estimates, "seconds", lambda self, rule: estimated.append(rule) or seconds(self, rule)
-    )
-    run.begin({"masks": 1000, "field": 20_000})
-    start(display(run, io.StringIO()), 1, "masks")
-    estimated.clear()
-    run.line()
-    assert sorted(estimated) == ["field", "masks", "masks"]
-
-
 @pytest.mark.parametrize("rule", LOOPS)
 def test_the_loop_of_a_rule_is_one_that_its_stage_runs(rule):
     module = STAGES[rule].partition(":")[0]
@@ -248,16 +235,13 @@ def test_durations_are_rounded_to_the_accuracy_of_an_estimate(seconds, text):
 
 def test_benchmark_files_of_earlier_runs_correct_the_estimates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("scenes.tsv").write_text(
-        "dataset\tscene\tgroup\tsource\tunit\nsynthetic\tone\tbenchmark\tworld:tabletop:1\tmetre\n"
-    )
     folder = Path("results/synthetic/one")
     for part in ("scene", "benchmarks", "default/benchmarks"):
         (folder / part).mkdir(parents=True)
     np.savez(folder / "scene/cameras.npz", size_hw=np.array([(500, 1000)] * 2, np.int32))
     (folder / "benchmarks/poses.jsonl").write_text(json.dumps({"s": 82.0, "cpu_time": 90.0}) + "\n")
     (folder / "default/benchmarks/clip.jsonl").write_text('{"s": 5')
-    resources = JobResources(Plan({"scenes": "scenes.tsv"}))
+    resources = JobResources(plan_of(tmp_path, BENCHMARK[:1]))
     estimates = Estimates(resources)
     estimates.learn_from_benchmarks()
     assert estimates.seconds("poses") == pytest.approx(90)

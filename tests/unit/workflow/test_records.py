@@ -11,9 +11,9 @@ from hilsplat.base.artifacts import lock_path, output_lock, provenance_path
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.models.store import model_digest
-from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import Expected, Records, expected_artifacts, outdated, verify
 from hilsplat.workflow.stages import stage_code
+from tests.unit.workflow.plans import BENCHMARK, plan_of
 
 MASKS = Path("results/d/s/default/masks")
 TREE = Path("results/d/s/default/coverage_tree")
@@ -138,15 +138,12 @@ def test_another_model_in_the_same_folder_is_found(results):
 
 def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("scenes.tsv").write_text(
-        "dataset\tscene\tgroup\tsource\tunit\nsynthetic\tone\tbenchmark\tworld:tabletop:1\tmetre\n"
-    )
     variants = {
         "lifted": {"method": {"name": "lifted"}},
         "truth": {"masks": {"segmenter": "truth-perturbed"}},
     }
-    config = {"scenes": "scenes.tsv", "main_variants": ["default", *variants], "variants": variants}
-    found = expected_artifacts(Plan(config))
+    plan = plan_of(tmp_path, BENCHMARK[:1], variants=variants)
+    found = expected_artifacts(plan)
     folder = "results/synthetic/one"
     assert found[f"{folder}/world"].output == f"{folder}/world/images"
     assert found[f"{folder}/lifted/field.safetensors"].stage == "method"
@@ -154,9 +151,9 @@ def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
     assert set(found[f"{folder}/truth/masks"].settings) == {"masks", "perturb"}
     assert f"{folder}/lifted/masks" not in found, "it shares those of the default variant"
     assert "results/tables/lerf.csv" in found
-    assert outdated(Plan(config)) == {}, "nothing has been made"
+    assert outdated(plan) == {}, "nothing has been made"
     Path(folder, "default/masks").mkdir(parents=True)
-    assert outdated(Plan(config)) == {f"{folder}/default/masks": "it has no provenance"}
+    assert outdated(plan) == {f"{folder}/default/masks": "it has no provenance"}
 
 
 def test_a_moved_folder_is_still_whole(results, tmp_path):

@@ -16,24 +16,18 @@ from hilsplat.workflow.records import expected_artifacts
 from hilsplat.workflow.resources import COSTS, RUNNER_MB, JobResources, Size
 from hilsplat.workflow.stages import STAGES
 from tests.conftest import PROJECT
+from tests.unit.workflow.plans import Job, plan_of
 
-SHEET = "dataset\tscene\tgroup\tsource\tunit\n"
 RECORDS = [
     line.split("\t") for line in (Path(__file__).parent / "peak_memory.tsv").read_text().splitlines()[1:]
 ]
+JOB = Job(scene="0")
 VARIANTS = {"theta": {"coverage_tree": {"theta": 0.6}}, "lifted": {"method": {"name": "lifted"}}}
 
 
 def plan(folder: Path, scenes: int = 1, **config: object) -> Plan:
-    sheet = folder / "scenes.tsv"
-    rows = [f"synthetic\t{i}\tbenchmark\tworld:tabletop:{i}\tmetre\n" for i in range(scenes)]
-    sheet.write_text(SHEET + "".join(rows))
-    more = {"main_variants": ["default", *VARIANTS], "variants": VARIANTS}
-    return Plan({"scenes": str(sheet), **more, **config})
-
-
-def wildcards(scene: int = 0, variant: str = "default") -> SimpleNamespace:
-    return SimpleNamespace(dataset="synthetic", scene=str(scene), variant=variant)
+    rows = (f"synthetic {number} benchmark world:tabletop:{number} metre" for number in range(scenes))
+    return plan_of(folder, tuple(rows), variants=VARIANTS, **config)
 
 
 @pytest.mark.parametrize(("rule", "views", "view_mp", "gaussians", "peak_mb"), RECORDS)
@@ -43,7 +37,7 @@ def test_requested_memory_exceeds_every_measured_peak(
     found = JobResources(plan(tmp_path))
     monkeypatch.setattr(found, "size", lambda row: Size(int(views), float(view_mp)))
     monkeypatch.setattr(found, "gaussians", lambda row: int(gaussians))
-    job = wildcards() if int(views) else SimpleNamespace(table="lerf")
+    job = JOB if int(views) else SimpleNamespace(table="lerf")
     asked = found.memory_mb(rule)(job, threads=2, attempt=1) - RUNNER_MB
     assert 1.1 * float(peak_mb) <= asked
     assert asked <= 6 * float(peak_mb) + 1000  # a node has room for others
@@ -60,8 +54,8 @@ def test_a_retry_requests_twice_as_much(tmp_path):
     found = JobResources(plan(tmp_path))
     for rule in COSTS:
         for of in (found.memory_mb(rule), found.minutes(rule)):
-            first = of(wildcards(), threads=1, attempt=1)
-            assert [of(wildcards(), threads=1, attempt=n) for n in (2, 3)] == [2 * first, 4 * first]
+            first = of(JOB, threads=1, attempt=1)
+            assert [of(JOB, threads=1, attempt=n) for n in (2, 3)] == [2 * first, 4 * first]
 
 
 def test_memory_and_minutes_grow_with_the_work(tmp_path):
@@ -72,33 +66,33 @@ def test_memory_and_minutes_grow_with_the_work(tmp_path):
     )
     for rule in ("contributions", "semantic_tree", "field", "gaussians", "poses", "evaluate"):
         for name in ("memory_mb", "minutes"):
-            less, more = (getattr(each, name)(rule)(wildcards(), 1, 1) for each in (small, large))
+            less, more = (getattr(each, name)(rule)(JOB, 1, 1) for each in (small, large))
             assert more > less, (rule, name)
 
 
 def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
     scene = plan(tmp_path, world={"views": 40, "image_px": 384})  # 5.9 megapixels keep three threads busy
-    assert JobResources(scene).threads(wildcards()) == 3
+    assert JobResources(scene).threads(JOB) == 3
     tiny = plan(tmp_path, world={"views": 12, "image_px": 128})
-    assert JobResources(tiny).threads(wildcards()) == 1
+    assert JobResources(tiny).threads(JOB) == 1
 
 
 def test_cores_go_to_jobs_before_threads(tmp_path):
     scene = plan(tmp_path, world={"views": 40, "image_px": 384})
-    threads = {cores: JobResources(scene, cores).threads(wildcards()) for cores in (1, 2, 8)}
+    threads = {cores: JobResources(scene, cores).threads(JOB) for cores in (1, 2, 8)}
     assert threads == {1: 1, 2: 2, 8: 3}
     variants = len(scene.run.variant_names())
-    assert JobResources(scene, variants).variant_threads(wildcards()) == 1
+    assert JobResources(scene, variants).variant_threads(JOB) == 1
     few = JobResources(scene, variants + 1)
-    assert few.variant_threads(wildcards()) == few.threads(wildcards())
+    assert few.variant_threads(JOB) == few.threads(JOB)
     many = plan(tmp_path, scenes=2, world={"views": 40, "image_px": 384})
-    assert JobResources(many, 2).threads(wildcards()) == 1
-    assert JobResources(many).threads(wildcards()) == 3, "a cluster doesn't know the cores of its nodes"
+    assert JobResources(many, 2).threads(JOB) == 1
+    assert JobResources(many).threads(JOB) == 3, "a cluster doesn't know the cores of its nodes"
 
 
 def test_a_gpu_is_requested_where_the_settings_say_so(tmp_path):
     found = JobResources(plan(tmp_path, gaussians={"device": "cuda"}))
-    assert [found.gpus(section)(wildcards()) for section in ("gaussians", "contributions")] == [1, 0]
+    assert [found.gpus(section)(JOB) for section in ("gaussians", "contributions")] == [1, 0]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +104,7 @@ def test_networks_request_a_gpu_with_onnxruntimes_gpu_build(
 ):
     monkeypatch.setattr("hilsplat.workflow.resources.is_installed", lambda name: build)
     found = JobResources(plan(tmp_path, masks={"segmenter": segmenter}))
-    assert [found.gpus(section)(wildcards()) for section in ("masks", "clip")] == expected
+    assert [found.gpus(section)(JOB) for section in ("masks", "clip")] == expected
 
 
 def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):
@@ -129,13 +123,13 @@ def test_memory_grows_with_the_model_and_with_views_at_once(tmp_path):
     chosen = plan(tmp_path, masks={"model": str(folder)})
 
     def masks(threads: int) -> int:
-        return JobResources(chosen).memory_mb("masks")(wildcards(), threads, attempt=1)
+        return JobResources(chosen).memory_mb("masks")(JOB, threads, attempt=1)
 
     # 35 arrays of 64 x 64 patches with 768 channels, 12 MiB each; attention of a row 42; decoder at 384 px 35
     assert masks(2) - masks(1) == pytest.approx((35 * 12 + 42 + 35) * 2**20 / 1e6, abs=100)
     for without in ({"segmenter": "graph", "model": str(folder)}, {"model": str(tmp_path / "nowhere")}):
         small = JobResources(plan(tmp_path, masks=without))
-        assert small.memory_mb("masks")(wildcards(), 32, 1) < 1000 + RUNNER_MB
+        assert small.memory_mb("masks")(JOB, 32, 1) < 1000 + RUNNER_MB
 
 
 def test_reads_and_validations_do_not_grow_with_the_number_of_scenes(tmp_path, monkeypatch):
@@ -173,7 +167,7 @@ def ask_everything(chosen: Plan, scenes: int) -> None:
     asked = JobResources(chosen)
     for scene in range(scenes):
         for variant in ("default", *VARIANTS):
-            job = wildcards(scene, variant)
+            job = Job(scene=str(scene), variant=variant)
             for rule in set(COSTS) & set(STAGES) - {"table", "source"}:
                 threads = asked.threads(job)
                 asked.memory_mb(rule)(job, threads, 1), asked.minutes(rule)(job, threads, 1)

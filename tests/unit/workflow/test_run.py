@@ -10,7 +10,8 @@ import pytest
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.workflow import run as runs
-from hilsplat.workflow.run import STATE, prepare_process
+from hilsplat.workflow.run import STATE
+from tests.unit.workflow.plans import write_sheet
 
 HOLD = """
 import sys, time
@@ -21,18 +22,13 @@ if "marked" in sys.argv:
 print("held", flush=True)
 time.sleep(60)
 """
-SHEET = "dataset\tscene\tgroup\tsource\tunit\n" + "".join(
-    f"synthetic\t{name}\tbenchmark\tworld:tabletop:{number}\tmetre\n"
-    for number, name in enumerate(["one", "two"])
-)
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """A project with two scenes."""
     monkeypatch.chdir(tmp_path)
-    Path("config").mkdir()
-    Path("config/scenes.tsv").write_text(SHEET)
+    write_sheet(tmp_path / "config/scenes.tsv")
     Path("config/config.yaml").write_text("variants: {}\n")
     Path("Snakefile").write_text("")
     return tmp_path
@@ -156,12 +152,6 @@ def test_the_locks_of_another_machine_stay(folder, started, unlocked, caplog):
     leave_marker("elsewhere")
     runs.run([], [], [])
     assert unlocked == [] and "another machine may be running" in caplog.text
-
-
-def test_the_process_that_unlocks_does_not_wait_for_itself(folder, monkeypatch):
-    monkeypatch.setenv(runs.UNREGISTERED, "1")
-    with runs._locked("processes.lock", runs.fcntl.LOCK_EX):
-        assert prepare_process() is None
 
 
 def test_the_snakefile_is_beside_the_configuration_or_the_installed_one(
