@@ -24,7 +24,6 @@ from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
-from hilsplat.semantic_tree.boxes import node_boxes
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.nodes import (
     MIN_VISIBLE_PX,
@@ -37,7 +36,7 @@ from hilsplat.semantic_tree.nodes import (
     renumbered_without_empty,
     without_strays,
 )
-from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.tree import SemanticTree, node_boxes
 from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
 

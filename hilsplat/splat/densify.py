@@ -12,7 +12,6 @@ Gaussians. Two regularisers make unneeded Gaussians transparent and small.
 """
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int32
@@ -45,7 +44,6 @@ LEAST_GATE = 1e-6
 
 
 @compiled
-@no_type_check
 def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
     """Add the lengths of the rows of `means_px`, in half images, to `total`, and count the rows in `seen`."""
     for i in range(len(total)):
@@ -147,7 +145,6 @@ def scale_factor(
 
 
 @compiled(error_model="numpy")
-@no_type_check
 def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
     """Add noise to rows begin..end: weight x gate x covariance x normal, in units of the extent.
 

@@ -1,7 +1,6 @@
 """Fused Adam for the Gaussians' parameters, with the step sizes of 3DGS."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 
@@ -24,7 +23,6 @@ def means_rate(settings: GaussiansSettings, progress: float) -> float:
 
 
 @compiled
-@no_type_check
 def _adam_chunks(begin, end, values, gradients, first, second, rates, root_of_rest2):
     """Take an Adam step for chunks begin..end of 16 numbers, in place.
 

@@ -4,8 +4,6 @@ SSIM is computed as in 3DGS: an 11x11 Gaussian window of sigma 1.5 px, applied a
 channel, with zeros beyond the border and the constants 0.01^2 and 0.03^2 for values in [0, 1].
 """
 
-from typing import no_type_check
-
 import numpy as np
 from jaxtyping import Float32
 
@@ -24,7 +22,6 @@ _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 
 
 @compiled
-@no_type_check
 def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
     """Compute SSIM and L1 sums of padded rows begin..end and, in `slopes`, SSIM's derivatives.
 
@@ -98,7 +95,6 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
 
 
 @compiled
-@no_type_check
 def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ssim_weight, gradient):
     """Compute dL/dimage of rows begin..end: slopes spread over their windows, and the sign for L1."""
     groups = (num + _LANES - 1) // _LANES

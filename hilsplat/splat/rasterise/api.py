@@ -9,8 +9,15 @@ from scipy.sparse import csr_matrix
 from hilsplat.base.errors import HilsplatError
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
-from hilsplat.splat.rasterise import cpu
-from hilsplat.splat.rasterise.cpu import Drawn, project_gaussians, sparse_weights, weight_matrix
+from hilsplat.splat.rasterise.cpu import (
+    Drawn,
+    Gradients,
+    blend_forward,
+    blend_gradients,
+    project_gaussians,
+    sparse_weights,
+    weight_matrix,
+)
 from hilsplat.splat.rasterise.device import Device
 
 
@@ -86,7 +93,16 @@ def draw(
         from hilsplat.splat.rasterise import cuda
 
         return cuda.draw(gaussians, camera, degree, features)
-    return cpu.draw(gaussians, camera, degree, features, threads)
+    view = project_gaussians(gaussians, camera, degree, threads)
+    channels = view.colours
+    if features is not None:
+        channels = np.concatenate([channels, features], axis=1)
+    image, alpha = blend_forward(view, channels, threads)
+
+    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
+        return blend_gradients(gaussians, view, channels, image, alpha, grad_image, grad_alpha, threads)
+
+    return Drawn(image, alpha, view.box[:, 1] >= view.box[:, 0], gradients)
 
 
 def pixel_weights(

@@ -1,7 +1,6 @@
 """Depth order and tile lists of a view: the Gaussians that each 16x16 tile blends, front to back."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Int32, Int64
@@ -57,7 +56,6 @@ class Tiles:
 
 
 @compiled
-@no_type_check
 def _depth_order(rows, keys):
     """Return rows by ascending uint32 keys: stable least-significant-digit radix sort, 3 x 11 bits."""
     n = len(rows)
@@ -83,7 +81,6 @@ def _depth_order(rows, keys):
 
 
 @compiled
-@no_type_check
 def _count(box, keys, tiles_x, tiles_y):
     """Return the depth order of drawn Gaussians and each tile's list start (summed from corners of boxes)."""
     corners = np.zeros((tiles_y + 1, tiles_x + 1), np.int64)
@@ -111,7 +108,6 @@ def _count(box, keys, tiles_x, tiles_y):
 
 
 @compiled(inline="always")
-@no_type_check
 def _least(a, b, c, u, v):
     """Return a u^2 + b u v + c v^2, lowered to a bound that is safe against rounding."""
     uu, vv = a * u * u, c * v * v
@@ -119,7 +115,6 @@ def _least(a, b, c, u, v):
 
 
 @compiled(inline="always")
-@no_type_check
 def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
     """Return the bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
 
@@ -139,7 +134,6 @@ def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
 
 
 @compiled
-@no_type_check
 def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaussian, reach, tile_end):
     """Write the lists of tiles begin..end and their ends; entry e is written to gaussian[e - base].
 

@@ -11,14 +11,13 @@ the forward's. It keeps one number per pixel, R = sum over channels of (contribu
 Gaussians) x (gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each list entry has
 its own slot for the sums, so the result does not depend on the distribution of tiles over threads.
 
-Alpha is an additional channel with colour 1: the image's alpha is the sum of the weights.
+Alpha is an additional channel with colour 1: the image's alpha is the sum of the weights. Sparse rows of
+weights take two passes: the first counts the entries of each row, the second writes them.
 
 Arguments shared by the kernels: tiles begin..end of a row-major grid with `tiles_x` per row; the list
 of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geometry as written by
 `project`.
 """
-
-from typing import no_type_check
 
 import numpy as np
 
@@ -70,7 +69,6 @@ _Y = np.repeat(BLOCK_Y, LANES) + np.tile(_NUMBERS // 4, BLOCKS)
 
 
 @compiled(inline="always")
-@no_type_check
 def start_tile(tile, tiles_x, height, width, transmittance):
     """Set full transmittance for the pixels inside the image, and return the tile's corner."""
     x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -82,7 +80,6 @@ def start_tile(tile, tiles_x, height, width, transmittance):
 
 
 @compiled(inline="always")
-@no_type_check
 def unfinished(transmittance):
     """Return a bit for each unfinished block."""
     bits = 0
@@ -93,7 +90,6 @@ def unfinished(transmittance):
 
 
 @compiled(inline="always")
-@no_type_check
 def gather(first, count, x0, y0, gaussian, geometry, records):
     """Copy the Gaussians of entries first..first + count of the band to contiguous records."""
     for k in range(count):
@@ -107,7 +103,6 @@ def gather(first, count, x0, y0, gaussian, geometry, records):
 
 
 @compiled(inline="always")
-@no_type_check
 def _exponent(records, at, px, py):
     """Return the offsets of a copied Gaussian from pixel centres, and log2 of its unclipped alpha there."""
     dx, dy = load_same(records, at) - px, load_same(records, at + 1) - py
@@ -117,7 +112,6 @@ def _exponent(records, at, px, py):
 
 
 @compiled(inline="always")
-@no_type_check
 def _shine(exponent, light):
     """Return a Gaussian's unclipped alpha, alpha and weight at transmittance `light`, and the light left."""
     uncut = exp2_negative(exponent)
@@ -128,7 +122,6 @@ def _shine(exponent, light):
 
 
 @compiled(inline="always")
-@no_type_check
 def weigh(block, first, count, reach, records, shades, width, transmittance, entries, weights):
     """Compute the weights of a chunk's Gaussians that reach a block, front to back.
 
@@ -168,7 +161,6 @@ def weigh(block, first, count, reach, records, shades, width, transmittance, ent
 
 
 @compiled(inline="always")
-@no_type_check
 def _add_group(sums, at, one, two, three, four):
     """Add to the sums of 4 channels."""
     store(sums, at, load(sums, at) + one)
@@ -178,7 +170,6 @@ def _add_group(sums, at, one, two, three, four):
 
 
 @compiled
-@no_type_check
 def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geometry, colours, image, alpha):
     """Blend tiles: write premultiplied channels to image (H, W, C) and coverage to alpha (H, W)."""
     height, width, channels = image.shape
@@ -199,25 +190,17 @@ def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geom
             if alive == 0:
                 break
             count = min(tile_end[tile] - chunk, CHUNK)
-            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
+            first = chunk - base
+            gather(first, count, x0, y0, gaussian, geometry, records)
             for k in range(count):
-                i = gaussian[chunk - base + k]
+                i = gaussian[first + k]
                 for channel in range(channels):
                     shades[k * per_gaussian + 1 + channel] = colours[i, channel]
             for block in range(BLOCKS):
                 if not (alive >> block) & 1:
                     continue
                 done, one, two, three, four = weigh(
-                    block,
-                    chunk - base,
-                    count,
-                    reach,
-                    records,
-                    shades,
-                    per_gaussian,
-                    transmittance,
-                    entries,
-                    weights,
+                    block, first, count, reach, records, shades, per_gaussian, transmittance, entries, weights
                 )
                 _add_group(sums, block * stride, one, two, three, four)
                 for group in range(GROUP, per_gaussian, GROUP):
@@ -244,7 +227,6 @@ def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geom
 
 
 @compiled(inline="always")
-@no_type_check
 def _load_gradients(x0, y0, stride, size, flats, grads, to_come):
     """Load the gradients of a tile's pixels by block and channel, and compute R before the first Gaussian."""
     height, width, channels = size
@@ -269,7 +251,6 @@ def _load_gradients(x0, y0, stride, size, flats, grads, to_come):
 
 
 @compiled
-@no_type_check
 def blend_backward(
     begin,
     end,
@@ -281,18 +262,16 @@ def blend_backward(
     reach,
     geometry,
     colours,
-    image,
-    alpha,
-    grad_image,
-    grad_alpha,
+    pixels,
     slots,
     columns,
 ):
     """Compute the gradient of `blend`, in one slot of `columns` numbers per list entry.
 
     A slot contains the moments of v = alpha dL/dalpha (see MOMENTS), then dL/dcolour per channel; slots
-    behind finished pixels are zero.
+    behind finished pixels are zero. `pixels` contains image and alpha, and the gradients of both.
     """
+    image, alpha, grad_image, grad_alpha = pixels
     height, width, channels = image.shape
     transmittance = aligned(PIXELS)
     to_come = aligned(PIXELS)
@@ -372,7 +351,6 @@ def blend_backward(
 
 
 @compiled
-@no_type_check
 def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, columns, sums):
     """Add the slots of Gaussians begin..end to their sums, in the order of the entries.
 
@@ -387,3 +365,102 @@ def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, co
                 for k in range(0, width, LANES):
                     added = load(flat_sums, i * width + k) + load(slots, entry * columns + k)
                     store(flat_sums, i * width + k, added)
+
+
+@compiled(inline="always")
+def _place(pixel):
+    """Return the column and row of a tile's pixel, relative to the tile's corner."""
+    block, lane = pixel // LANES, pixel % LANES
+    return (block & 3) * 4 + (lane & 3), (block >> 2) * 4 + (lane >> 2)
+
+
+@compiled
+def count_weights(
+    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts
+):
+    """Count the weights >= `least` of each pixel (row-major) of tiles begin..end."""
+    height, width = size_hw
+    transmittance, found = aligned(PIXELS), np.empty(PIXELS, np.int64)
+    records = aligned(CHUNK * RECORD)
+    entries, by_lane = np.empty(CHUNK, np.int64), aligned(CHUNK * LANES)
+    for tile in range(begin, end):
+        x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
+        found[:] = 0
+        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
+            if unfinished(transmittance) == 0:
+                break
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
+            for block in range(BLOCKS):
+                done = weigh(
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
+                )[0]
+                for n in range(done):
+                    for lane in range(LANES):
+                        weight = by_lane[n * LANES + lane]
+                        found[block * LANES + lane] += (weight > _ZERO) & (weight >= least)
+        for pixel in range(PIXELS):
+            x, y = _place(pixel)
+            if x0 + x < width and y0 + y < height:
+                counts[(y0 + y) * width + x0 + x] = found[pixel]
+
+
+@compiled
+def write_weights(
+    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, longest, out
+):
+    """Write the columns and weights of rows counted by `count_weights`, at most `longest` in each.
+
+    `out` contains the row starts of the sparse matrix, and arrays for its columns (ascending) and weights.
+    """
+    row_start, columns, weights = out
+    height, width = size_hw
+    transmittance, size_of = aligned(PIXELS), np.empty(PIXELS, np.int64)
+    records = aligned(CHUNK * RECORD)
+    entries, rows = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int32)
+    by_lane = aligned(CHUNK * LANES)
+    room = (longest // LANES + 1) * LANES  # a pixel's row and at least one more entry
+    held, held_weights = np.empty(PIXELS * room, np.float32), np.empty(PIXELS * room, np.float32)
+    held_columns, rank = held.view(np.int32), np.empty(room, np.float32)
+    for tile in range(begin, end):
+        x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
+        size_of[:] = 0
+        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
+            if unfinished(transmittance) == 0:
+                break
+            count = min(tile_end[tile] - chunk, CHUNK)
+            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
+            for block in range(BLOCKS):
+                done = weigh(
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
+                )[0]
+                for n in range(done):
+                    rows[n] = gaussian[chunk - base + entries[n]]
+                for lane in range(LANES if done else 0):
+                    pixel = block * LANES + lane
+                    at = pixel * room + size_of[pixel]
+                    for n in range(done):  # branch-free, because a branch would be unpredictable
+                        weight = by_lane[n * LANES + lane]
+                        held_columns[at], held_weights[at] = rows[n], weight
+                        at += np.int64((weight > _ZERO) & (weight >= least))
+                    size_of[pixel] = at - pixel * room
+        for pixel in range(PIXELS):
+            x, y = _place(pixel)
+            if x0 + x >= width or y0 + y >= height:
+                continue
+            first, size = pixel * room, size_of[pixel]
+            _rank(held, first, size, rank)
+            start = row_start[(y0 + y) * width + x0 + x]
+            for k in range(size):
+                at = start + np.int64(rank[k])
+                columns[at], weights[at] = held_columns[first + k], held_weights[first + k]
+
+
+@compiled(inline="always")
+def _rank(held, first, size, rank):
+    """Count the smaller columns of each entry of a row; their bits keep their order as floats."""
+    for begin in range(0, size, LANES):
+        own, smaller = load(held, first + begin), lanes(_ZERO)
+        for k in range(first, first + size):
+            smaller = smaller + keep_gt(own, lanes(held[k]), lanes(_ONE))
+        store(rank, begin, smaller)

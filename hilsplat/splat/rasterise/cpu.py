@@ -20,9 +20,8 @@ from hilsplat.base.lanes import WIDTH, aligned
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
-from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward
+from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, count_weights, write_weights
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
-from hilsplat.splat.rasterise.weights import count_weights, write_weights
 
 RANGES_PER_THREAD = 4
 """Number of work ranges per thread; several ranges balance the load."""
@@ -124,8 +123,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, degree: int, threads
     box = np.empty((n, 4), np.int32)
     colours = np.zeros((n, 3), np.float32)
     row = pack_camera(camera)
-    p = gaussians
-    tables = map(np.ascontiguousarray, (p.means, p.log_scales, p.quats, p.opacity_logits, p.sh))
+    tables = (np.ascontiguousarray(getattr(gaussians, name)) for name in FIELDS)
     known = (*tables, degree, row)
     refuse_broken(sum(over_ranges(project, groups, threads, *known, geometry, box, colours)), n)
     tiles = bin_gaussians(box, geometry[:n, 6], camera.size_hw)
@@ -198,11 +196,11 @@ def blend_gradients(
     width = (columns + WIDTH - 1) // WIDTH * WIDTH
     sums = aligned(len(view.geometry) * width).reshape(-1, width)
     sums[:] = 0.0
-    blended = (view.geometry, channels, image, alpha, grad_image, grad_alpha)
+    pixels = (image, alpha, grad_image, grad_alpha)
     for band in tile_lists(view, threads):
         base, _, tile_start, tile_end, gaussian, _ = band.lists
         slots = aligned(len(gaussian) * columns + WIDTH)
-        band.over_tiles(blend_backward, threads, *blended, slots, columns)
+        band.over_tiles(blend_backward, threads, view.geometry, channels, pixels, slots, columns)
         # every range reads all entries: use one range per thread
         edges = np.linspace(0, n, max(threads, 1) + 1).astype(int).tolist()
         listed = ((band.begin, band.end), base, tile_start, tile_end, gaussian)
@@ -212,31 +210,12 @@ def blend_gradients(
         features=sums[:n, MOMENTS + 3 : columns].copy(),
         means_px=np.empty((n, 2), np.float32),
     )
-    tables = map(np.ascontiguousarray, (p.means, p.log_scales, p.quats, p.sh))
-    known = (*tables, view.degree, view.camera, view.geometry, sums)
-    outputs = (out.means, out.log_scales, out.quats, out.opacity_logits, out.sh, out.means_px)
-    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, *outputs)
+    tables = tuple(np.ravel(table) for table in (p.means, p.log_scales, p.quats, p.sh))
+    known = (p.sh.shape[1], tables, view.degree, view.camera, view.geometry, sums)
+    by_table = (out.means, out.log_scales, out.quats, out.sh, out.opacity_logits, out.means_px)
+    grads = tuple(grad.reshape(-1) for grad in by_table)
+    over_ranges(project_backward, len(view.geometry) // WIDTH, threads, *known, grads)
     return out
-
-
-def draw(
-    gaussians: Gaussians,
-    camera: Camera,
-    degree: int,
-    features: Float32[np.ndarray, "N D"] | None,
-    threads: int,
-) -> Drawn:
-    """Draw image and alpha, and compute gradients on demand; see `api.draw`."""
-    view = project_gaussians(gaussians, camera, degree, threads)
-    channels = view.colours
-    if features is not None:
-        channels = np.concatenate([channels, features], axis=1)
-    image, alpha = blend_forward(view, channels, threads)
-
-    def gradients(grad_image: np.ndarray, grad_alpha: np.ndarray) -> Gradients:
-        return blend_gradients(gaussians, view, channels, image, alpha, grad_image, grad_alpha, threads)
-
-    return Drawn(image, alpha, view.box[:, 1] >= view.box[:, 0], gradients)
 
 
 def sparse_weights(
@@ -256,7 +235,7 @@ def sparse_weights(
     row_start = np.concatenate([[0], np.cumsum(counts)])
     columns, weights = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.float32)
     if len(columns):
-        over_bands(write_weights, int(counts.max()), row_start, columns, weights)
+        over_bands(write_weights, int(counts.max()), (row_start, columns, weights))
     return row_start, columns, weights
 
 

@@ -9,7 +9,6 @@ log2 alpha = peak - (a dx^2 + b dx dy + c dy^2), where (dx, dy) = mean - pixel c
 """
 
 import math
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -91,7 +90,6 @@ def pack_camera(camera: Camera) -> Float[np.ndarray, " 25"]:
 
 
 @compiled(inline="always")
-@no_type_check
 def _sh_basis(x, y, z, degree, basis):
     """Store real spherical harmonics of unit directions up to `degree` (at most 3), as in 3DGS."""
     one = lanes(np.float32(1))
@@ -118,7 +116,6 @@ def _sh_basis(x, y, z, degree, basis):
 
 
 @compiled(inline="always")
-@no_type_check
 def _sh_pull(x, y, z, degree, w):
     """Return the gradient of the sum of w[k] times `_sh_basis` with respect to independent x, y and z."""
     w1, w2, w3 = load(w, 1 * LANES), load(w, 2 * LANES), load(w, 3 * LANES)
@@ -145,7 +142,6 @@ def _sh_pull(x, y, z, degree, w):
 
 
 @compiled(inline="always")
-@no_type_check
 def _read(table, width, first, count, rows, columns, column):
     """Transpose rows first..first + count of a flat table to columns of 16 lanes.
 
@@ -164,7 +160,6 @@ def _read(table, width, first, count, rows, columns, column):
 
 
 @compiled(inline="always")
-@no_type_check
 def _write(columns, column, width, rows, table, first, count, last):
     """Invert `_read`, for rows below `last`.
 
@@ -183,7 +178,6 @@ def _write(columns, column, width, rows, table, first, count, last):
 
 
 @compiled(inline="always")
-@no_type_check
 def _exp(value):
     """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible beside the low-pass."""
     exponent = wide(smaller(larger(value, lanes(_LEAST_LOG)), lanes(MAX_LOG_SCALE))) * LOG2_E - 32.0
@@ -192,7 +186,6 @@ def _exp(value):
 
 
 @compiled(inline="always")
-@no_type_check
 def _log2_sigmoid(logit):
     """Return log2 of 1 / (1 + exp(-logit)) of float32 lanes, with an absolute error below 1e-6."""
     zero = lanes(np.float32(0))
@@ -204,13 +197,11 @@ def _log2_sigmoid(logit):
 
 
 @compiled(inline="always")
-@no_type_check
 def _wide_column(columns, k):
     return wide(load(columns, k * LANES))
 
 
 @compiled(inline="always")
-@no_type_check
 def _place(columns, camera):
     """Return means in camera space, unit quaternions, unit directions, and the inverse lengths of both."""
     mx, my, mz = _wide_column(columns, 0), _wide_column(columns, 1), _wide_column(columns, 2)
@@ -227,7 +218,6 @@ def _place(columns, camera):
 
 
 @compiled(inline="always")
-@no_type_check
 def _axis(camera, scale, i, j, k):
     """Return an axis (i, j, k) of Gaussians in camera space, times their scale along it."""
     return (
@@ -238,13 +228,11 @@ def _axis(camera, scale, i, j, k):
 
 
 @compiled(inline="always")
-@no_type_check
 def _clamped(value, low, high):
     return smaller(larger(value, value * 0.0 + low), value * 0.0 + high)
 
 
 @compiled
-@no_type_check
 def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, camera, geometry, box, colours):
     """Project Gaussians of groups begin..end of 16 into a view.
 
@@ -353,13 +341,11 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
 
 
 @compiled(inline="always")
-@no_type_check
 def _where_equal(left, right, value):
     return keep_ge(left, right, keep_ge(right, left, value))
 
 
 @compiled(inline="always")
-@no_type_check
 def _axis_backward(camera, scale, i, j, k, shared):
     """Backpropagate through a column of cov = U U' + low pass, U = J factor, factor = cam_R rot scales.
 
@@ -383,42 +369,25 @@ def _axis_backward(camera, scale, i, j, k, shared):
 
 
 @compiled
-@no_type_check
-def project_backward(
-    begin,
-    end,
-    means,
-    log_scales,
-    quats,
-    sh,
-    degree,
-    camera,
-    geometry,
-    sums,
-    grad_means,
-    grad_log_scales,
-    grad_quats,
-    grad_opacity_logits,
-    grad_sh,
-    grad_means_px,
-):
+def project_backward(begin, end, num_bases, tables, degree, camera, geometry, sums, grads):
     """Compute gradients of groups begin..end of 16 Gaussians from rows of `sums`: moments and dL/dcolours.
 
-    The outputs are overwritten, with zeros for Gaussians that are not drawn. `grad_means_px` is
-    dL/d(projected mean), per pixel.
+    Args:
+        num_bases: number of harmonics per Gaussian and channel.
+        tables: flat means, log scales, quaternions and harmonics.
+        grads: flat outputs: gradients of the tables in the same order, of the opacity logits, and of the
+            projected means (px). They are overwritten, with zeros for Gaussians that are not drawn.
     """
     fx, fy = camera[12], camera[13]
     rows, columns = aligned(LANES * ROW), aligned(LANES * ROW)
     basis, pulls = aligned(16 * LANES), aligned(16 * LANES)
     rows[:] = 0.0
-    zero, numbers, bases = lanes(np.float32(0)), 3 * sh.shape[1], (degree + 1) * (degree + 1)
-    tables = means.reshape(-1), log_scales.reshape(-1), quats.reshape(-1), sh.reshape(-1)
-    grads = grad_means.reshape(-1), grad_log_scales.reshape(-1), grad_quats.reshape(-1), grad_sh.reshape(-1)
-    flat_geometry, flat_sums, flat_px = geometry.reshape(-1), sums.reshape(-1), grad_means_px.reshape(-1)
-    last = min(end * LANES, len(means))
+    zero, numbers, bases = lanes(np.float32(0)), 3 * num_bases, (degree + 1) * (degree + 1)
+    flat_geometry, flat_sums, num_gaussians = geometry.reshape(-1), sums.reshape(-1), len(tables[0]) // 3
+    last = min(end * LANES, num_gaussians)
     for group in range(begin, end):
         first = group * LANES
-        count = min(LANES, len(means) - first)
+        count = min(LANES, num_gaussians - first)
         _read(tables[0], 3, first, count, rows, columns, 0)
         _read(tables[1], 3, first, count, rows, columns, 3)
         _read(tables[2], 4, first, count, rows, columns, 6)
@@ -515,6 +484,6 @@ def project_backward(
         _write(columns, 0, 3, rows, grads[0], first, count, last)
         _write(columns, 3, 3, rows, grads[1], first, count, last)
         _write(columns, 6, 4, rows, grads[2], first, count, last)
-        _write(columns, 10, 1, rows, grad_opacity_logits, first, count, last)
-        _write(columns, 11, 2, rows, flat_px, first, count, last)
+        _write(columns, 10, 1, rows, grads[4], first, count, last)
+        _write(columns, 11, 2, rows, grads[5], first, count, last)
         _write(columns, SH_COLUMN, numbers, rows, grads[3], first, count, last)

@@ -9,11 +9,11 @@ from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.segment.sam import point_grid
-from hilsplat.semantic_tree.boxes import OrientedBox, oriented_box
 from hilsplat.semantic_tree.build import RANKED, crop_ranks
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
 from hilsplat.semantic_tree.guided_masks import guided_points
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
+from hilsplat.semantic_tree.tree import OrientedBox, oriented_box
 from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.splat.ply import load_ply, save_ply
 from tests.unit.evaluate.plain_tree import plain_tree
