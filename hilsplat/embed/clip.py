@@ -27,10 +27,7 @@ MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # of model folders in `mo
 
 
 class ClipModel:
-    """A loaded CLIP model.
-
-    In the prompt template, each text replaces `{}`.
-    """
+    """A loaded CLIP model; each text replaces `{}` in the prompt template."""
 
     precision: str = "fp32"  # or "int8", of the vision network
 
@@ -103,9 +100,9 @@ class ClipModel:
         return int(named or 0)
 
     @staticmethod
-    def load(folder: Path, template: str = "{}", variant: str = "") -> "ClipModel":
+    def load(folder: Path, variant: str = "") -> "ClipModel":
         """Open a model folder and its vision network; errors as in `open_model_folder`."""
-        model = ClipModel(open_model_folder(folder, "clip", variant=variant), template)
+        model = ClipModel(open_model_folder(folder, "clip", variant=variant))
         _ = model.vision  # open and check it now
         return model
 

@@ -121,11 +121,8 @@ class SamModel:
             self.previewer = model.network(PREVIEW)
         preprocessing = model.preprocessing
         self.longest_edge = side_px(preprocessing.get("size"), 1024)
-        padded = preprocessing.get("pad_size")
-        if isinstance(padded, dict) and {"height", "width"} <= padded.keys():
-            self.padded_hw = (int(padded["height"]), int(padded["width"]))
-        else:
-            self.padded_hw = (side_px(padded, self.longest_edge),) * 2
+        padded_px = side_px(preprocessing.get("pad_size"), self.longest_edge)
+        self.padded_hw = (padded_px, padded_px)
         self.resample = Image.Resampling(preprocessing.get("resample", Image.Resampling.BILINEAR))
         # defaults of transformers for missing keys: ImageNet statistics, values in 0..1
         self.mean = np.array(preprocessing.get("image_mean", (0.485, 0.456, 0.406)), dtype=np.float32)
