@@ -11,6 +11,7 @@ from hilsplat.datasets.registry import open_labelled
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.figures import panel
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
+from hilsplat.evaluate.stage import time_queries
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 from tests.unit.evaluate.builders import box, region_of
 
@@ -32,6 +33,11 @@ def test_a_scene_is_opened_with_the_settings_of_the_stage(opened, tmp_path):
     panel.run_figures(opened.parts, tmp_path / "panel.png", FiguresSettings(), other, queries=["bear"])
     assert opened.asked["settings"] is other
     assert opened.asked["parts"] is opened.parts
+
+
+def test_queries_of_every_method_are_timed(block_world):
+    seconds = time_queries(block_world.answers, "001.png", ["bear", "chest"], EvaluateSettings())
+    assert list(seconds) == ["field", "tree"] and min(seconds.values()) > 0
 
 
 def test_a_scene_without_annotations_gives_only_a_header(opened, tmp_path):
@@ -135,9 +141,7 @@ def test_a_region_with_a_broken_chain_is_queried_but_belongs_to_no_family():
 
 
 def test_a_label_smaller_than_its_view_is_enlarged():
-    mask = np.zeros((4, 6), bool)
-    mask[2, 3] = True
-    (dot,) = ViewTruth.of_regions([region_of(mask, "dot")], (8, 12)).categories
+    (dot,) = ViewTruth.of_regions([region_of(box((2, 3), (3, 4), (4, 6)), "dot")], (8, 12)).categories
     assert np.argwhere(dot.truth).tolist() == [[4, 6], [4, 7], [5, 6], [5, 7]]
 
 

@@ -40,14 +40,14 @@ WALL = np.full((HEIGHT, WIDTH), 4.0, np.float32)
 
 
 def test_points_of_a_wall_move_by_its_disparity():
-    points = shared_points(A, WALL, B, WALL)
-    y, x = np.divmod(points.pixel_a, WIDTH)
-    assert np.array_equal(points.pixel_b, y * WIDTH + x - 2)
+    pixel_a, pixel_b = shared_points(A, WALL, B, WALL)
+    y, x = np.divmod(pixel_a, WIDTH)
+    assert np.array_equal(pixel_b, y * WIDTH + x - 2)
     # columns 0 and 1 leave B; the last row has no row below, between which and itself B is read
     assert set(x) == set(range(2, WIDTH))
-    assert len(points) == (HEIGHT - 1) * 8 == 40
-    few = shared_points(A, WALL, B, WALL, most=4)  # evenly spaced
-    assert few.pixel_a.tolist() == points.pixel_a[[0, 13, 26, 39]].tolist()
+    assert len(pixel_a) == (HEIGHT - 1) * 8 == 40
+    few, _ = shared_points(A, WALL, B, WALL, most=4)  # evenly spaced
+    assert few.tolist() == pixel_a[[0, 13, 26, 39]].tolist()
 
 
 def test_a_slanted_wall_keeps_its_points():
@@ -56,30 +56,28 @@ def test_a_slanted_wall_keeps_its_points():
         slope = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL
         return np.tile((4 + step) / (1 - slope), (HEIGHT, 1)).astype(np.float32)
 
-    points = shared_points(A, depth(0.0), B, depth(1.0), tolerance=1e-5)
-    assert len(points) > 20
-    x = points.pixel_a % WIDTH
-    slope = (x + 0.5 - WIDTH / 2) / FOCAL
+    pixel_a, pixel_b = shared_points(A, depth(0.0), B, depth(1.0), tolerance=1e-5)
+    assert len(pixel_a) > 20
+    slope = (pixel_a % WIDTH + 0.5 - WIDTH / 2) / FOCAL
     z = 4 / (1 - slope)
     expected = np.floor(FOCAL * (slope * z - 1) / z + WIDTH / 2)
-    assert np.array_equal(points.pixel_b % WIDTH, expected)
+    assert np.array_equal(pixel_b % WIDTH, expected)
 
 
 def test_hidden_points_are_not_shared():
     # in B something nearer (depth 2) covers columns 3 to 5 and hides the wall there
     hidden = WALL.copy()
     hidden[:, 3:6] = 2.0
-    points = shared_points(A, WALL, B, hidden)
+    _, pixel_b = shared_points(A, WALL, B, hidden)
     # A's pixels are projected to pixel centres, where no neighbour counts
-    assert set(points.pixel_b % WIDTH) == {0, 1, 2, 6, 7}
+    assert set(pixel_b % WIDTH) == {0, 1, 2, 6, 7}
 
 
 def test_the_sky_and_surfaces_behind_the_camera_are_not_shared():
     sky = np.full((HEIGHT, WIDTH), np.inf, np.float32)
-    assert len(shared_points(A, sky, B, WALL)) == 0
-    assert len(shared_points(A, WALL, B, sky)) == 0
-    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
-    assert len(shared_points(A, WALL, Camera("back", turned, A.K, A.size_hw), WALL)) == 0
+    back = Camera("back", np.diag([-1.0, 1.0, -1.0, 1.0]), A.K, A.size_hw)
+    for views in ((A, sky, B, WALL), (A, WALL, B, sky), (A, WALL, back, WALL)):
+        assert len(shared_points(*views)[0]) == 0
 
 
 def columns(left: int, right: int) -> np.ndarray:
@@ -87,26 +85,22 @@ def columns(left: int, right: int) -> np.ndarray:
 
 
 def test_two_views_by_hand():
-    points = shared_points(A, WALL, B, WALL)  # columns 2 to 9 of A are columns 0 to 7 of B, 5 rows
+    pixels = shared_points(A, WALL, B, WALL)  # columns 2 to 9 of A are columns 0 to 7 of B, 5 rows
     masks_a = np.stack([columns(2, 6), columns(6, 10)])  # 20 points each
-    same = view_agreement(masks_a, np.stack([columns(0, 4), columns(4, 10)]), points)
-    assert (same.masks, len(points)) == (2, 40)
-    assert (same.best_iou, same.disagreement, same.joined_disagreement) == (1, 0, 0)
+    none = np.zeros((0, HEIGHT, WIDTH), bool)
+    same = view_agreement(masks_a, np.stack([columns(0, 4), columns(4, 10)]), *pixels)
+    assert same == Agreement(2, 1, 0, 0)
     # B's border lies one column further right: 25 and 15 points. IoU 20/25 and 15/20
-    moved = view_agreement(masks_a, np.stack([columns(0, 5), columns(5, 10)]), points)
-    assert moved.best_iou == pytest.approx((0.8 + 0.75) / 2)
+    moved = view_agreement(masks_a, np.stack([columns(0, 5), columns(5, 10)]), *pixels)
     # together in A: 2 * 190 = 380; in B: 300 + 105 = 405; in both: 190 + 10 + 105 = 305; of 780 pairs
-    assert moved.disagreement == pytest.approx((380 + 405 - 2 * 305) / 780)
-    assert moved.joined_disagreement == pytest.approx(175 / 480)
-    merged = view_agreement(masks_a, columns(0, 10)[None], points)
-    assert merged.best_iou == pytest.approx(0.5)
-    assert merged.disagreement == pytest.approx((780 - 380) / 780)
-    absent = view_agreement(masks_a, np.zeros((0, HEIGHT, WIDTH), bool), points)
-    assert (absent.best_iou, absent.masks) == (0, 2)
-    assert absent.joined_disagreement == 1
-    nothing = view_agreement(np.zeros((0, HEIGHT, WIDTH), bool), masks_a, points)
-    assert np.isnan(nothing.best_iou)
-    assert nothing.masks == 0
+    expected = [2, (0.8 + 0.75) / 2, (380 + 405 - 2 * 305) / 780, 175 / 480]
+    assert list(vars(moved).values()) == pytest.approx(expected)
+    merged = view_agreement(masks_a, columns(0, 10)[None], *pixels)
+    assert list(vars(merged).values())[:3] == pytest.approx([2, 0.5, (780 - 380) / 780])
+    absent = view_agreement(masks_a, none, *pixels)
+    assert (absent.best_iou, absent.masks, absent.joined_disagreement) == (0, 2, 1)
+    nothing = view_agreement(none, masks_a, *pixels)
+    assert np.isnan(nothing.best_iou) and nothing.masks == 0
 
 
 def test_pairs_agree_with_counting_them_one_by_one():

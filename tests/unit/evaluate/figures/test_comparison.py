@@ -16,7 +16,7 @@ from hilsplat.evaluate.figures.comparison import (
     over_views,
     run_comparison,
 )
-from hilsplat.evaluate.figures.panel import annotated_rows, truths_of
+from hilsplat.evaluate.figures.panel import annotated_rows, shown_truths
 from hilsplat.evaluate.figures.sweep_plot import read_lines, run_sweep_plot
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
@@ -25,7 +25,7 @@ EVALUATE = EvaluateSettings()
 
 @pytest.fixture
 def rows(block_world):
-    truths = truths_of(block_world.scene, block_world.folder / "truth", "", Path(), EVALUATE)
+    truths = shown_truths(block_world.scene, block_world.folder / "truth", "", Path(), EVALUATE)
     return truths, annotated_rows(truths, FiguresSettings(queries_per_level=1))
 
 

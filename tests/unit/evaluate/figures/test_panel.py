@@ -12,22 +12,21 @@ from PIL import Image
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, truths_of
+from hilsplat.evaluate.figures.panel import annotated_rows, draw_panel, free_rows, shown_truths
 from hilsplat.models.store import meaningless
 from hilsplat.query.answer import file_name, report, views_of
 from hilsplat.query.pictures import ANSWER_RGB, TRUTH_RGB, outline, paint_answer, save_figure
 from hilsplat.query.query_panel import query_panel
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
-from tests.unit.artifact_changes import write_record
+from tests.unit.evaluate.builders import box
 
 EVALUATE = EvaluateSettings()
 
 
 def test_answer_is_filled_and_truth_outlined():
     image = np.full((20, 20, 3), 100, np.uint8)
-    answer, truth = np.zeros((2, 20, 20), dtype=bool)
-    answer[:, :8], truth[:, 12:18] = True, True
+    answer, truth = box((0, 20), (0, 8), (20, 20)), box((0, 20), (12, 18), (20, 20))
     painted = paint_answer(image, answer, truth)
     inside = (0.4 * 100 + 0.6 * np.array(ANSWER_RGB)).astype(np.uint8)
     assert painted[10, 4].tolist() == inside.tolist()
@@ -36,17 +35,17 @@ def test_answer_is_filled_and_truth_outlined():
 
 
 def test_outline_runs_inside_the_mask_but_not_along_the_image_border():
-    mask = np.zeros((6, 6), dtype=bool)
-    mask[:, 2:] = True
+    mask = box((0, 6), (2, 6), (6, 6))
     assert np.argwhere(outline(mask, 1)).tolist() == [[row, 2] for row in range(6)]
 
 
-def truths_of_blocks(block_world):
-    return truths_of(block_world.scene, block_world.folder / "truth", "", Path(), EVALUATE)
+def rows_of(block_world, **settings):
+    truths = shown_truths(block_world.scene, block_world.folder / "truth", "", Path(), EVALUATE)
+    return annotated_rows(truths, FiguresSettings(**settings))
 
 
 def test_largest_text_of_each_level_is_shown_first(block_world):
-    rows = annotated_rows(truths_of_blocks(block_world), FiguresSettings(queries_per_level=1))
+    rows = rows_of(block_world, queries_per_level=1)
     assert [(row.text, row.level) for row in rows] == [
         ("bear", Level.WHOLE),
         ("head", Level.PART),
@@ -56,7 +55,7 @@ def test_largest_text_of_each_level_is_shown_first(block_world):
 
 
 def test_panel_with_annotations_is_drawn(block_world, tmp_path):
-    rows = annotated_rows(truths_of_blocks(block_world), FiguresSettings())
+    rows = rows_of(block_world)
     assert len(rows) == 5  # two of whole and part, the only one of subpart
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
     save_figure(figure, tmp_path / "panel.png", dpi=60)
@@ -103,18 +102,18 @@ def test_a_query_is_reported_and_drawn(block_world, tmp_path):
 def test_reports_state_what_was_not_found(block_world):
     answers = block_world.answers
     empty = replace(answers.select("bear"), ids=np.zeros(0, np.int64), values=np.zeros(0))
-    expected = "nothing in synthetic/blocks answers to 'unicorn' at level whole; try --level part"
+    expected = "nothing in synthetic/blocks matches 'unicorn' at level whole; try --level part"
     assert report(answers, "unicorn", empty).startswith(expected)
-    expected = "nothing in what 000.png shows of synthetic/blocks answers to 'unicorn'"
+    expected = "nothing in view 000.png of synthetic/blocks matches 'unicorn'"
     assert report(answers, "unicorn", empty, "000.png").startswith(expected)
     found = answers.select("bear > head")
     assert "the whole scene was searched" not in report(answers, "bear > head", found)
     outside = report(answers, "bear > head", replace(found, route="fallback"))
-    assert "no answer is part of anything that answers to 'bear'" in outside
+    assert "no answer is part of a match for 'bear'" in outside
     found = answers.select("unicorn > head")
     assert found.route == "child"
     last = report(answers, "unicorn > head", found).splitlines()[-1]
-    assert last.startswith("doubtful: nothing here answers to 'unicorn' better than to a generic word")
+    assert last.startswith("doubtful: no node is closer to 'unicorn' than to a generic word")
 
 
 def test_file_names_have_no_separators():
@@ -122,34 +121,6 @@ def test_file_names_have_no_separators():
     assert re.fullmatch("query-[0-9a-f]{8}", file_name(" > "))
 
 
-def finished_scene(folder, variant="default"):
-    (folder / "scene").mkdir(parents=True, exist_ok=True)
-    (folder / "gaussians.ply").touch()
-    for part in ("semantic_tree", "autoencoder", "clip", "masks"):
-        (folder / variant / part).mkdir(parents=True, exist_ok=True)
-    (folder / variant / "field.safetensors").touch()
-    return folder
-
-
-def test_parts_of_a_variant_are_found_through_provenance(tmp_path):
-    folder = finished_scene(tmp_path / "results" / "photos" / "bear")
-    field = folder / "omega-2" / "field.safetensors"
-    field.parent.mkdir()
-    field.touch()
-    path = "results/photos/bear/default/autoencoder"
-    write_record(field, inputs={"autoencoder": {"path": path, "sha256": ""}})
-    parts = FinishedScene.locate(folder, "omega-2").parts
-    assert parts.field == field
-    assert parts.autoencoder == folder / "default" / "autoencoder"
-    assert parts.semantic_tree == folder / "default" / "semantic_tree"
-
-
-def test_missing_parts_of_a_scene_are_named(tmp_path):
+def test_a_missing_scene_is_named(tmp_path):
     with pytest.raises(ArtifactError, match=r"scene folder .*photos/desk is missing"):
         FinishedScene.locate(tmp_path / "photos/desk")
-    folder = finished_scene(tmp_path)
-    with pytest.raises(ArtifactError, match="one of default"):
-        FinishedScene.locate(folder, "leftover")
-    (folder / "gaussians.ply").unlink()
-    with pytest.raises(ArtifactError, match=r"hilsplat run .*gaussians\.ply"):
-        FinishedScene.locate(folder, "default")

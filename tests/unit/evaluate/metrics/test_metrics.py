@@ -14,7 +14,6 @@ from hilsplat.evaluate.metrics.masks import (
     boundary,
     boundary_iou,
     boundary_width_px,
-    box_of,
     exceeds,
     hits_a_box,
     hits_the_mask,
@@ -32,7 +31,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     relevancy_mask,
     threshold_mask,
 )
-from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.builders import box, region_of
 
 # --- threshold and filter of LangSplat's LERF rule ------------------------------------------------
 
@@ -73,9 +72,7 @@ def test_filter_reflects_at_the_border_or_averages_what_is_inside():
 
 
 def test_filter_scales_with_the_height_unless_it_is_set():
-    assert filter_side_px(0, 730) == 30
-    assert filter_side_px(0, 256) == 11  # 10.52
-    assert filter_side_px(0, 10) == 1
+    assert [filter_side_px(0, height) for height in (730, 256, 10)] == [30, 11, 1]  # 256: 10.52
     assert filter_side_px(20, 256) == 20
 
 
@@ -231,8 +228,9 @@ def test_any_of_several_maxima_may_hit_and_borders_count():
 def test_mask_hit_is_stricter_than_box_hit():
     truth = box((0, 1), (0, 5)) | box((0, 5), (0, 1))  # an L; its box holds (3, 3)
     point = np.array([[3, 3]])
-    assert box_of(truth).tolist() == [0, 0, 4, 4]
-    assert hits_a_box(point, box_of(truth)[None])
+    boxes = region_of(truth, "L").boxes()
+    assert boxes.tolist() == [[0, 0, 4, 4]]
+    assert hits_a_box(point, boxes)
     assert not hits_the_mask(point, truth)
 
 
@@ -243,21 +241,23 @@ def test_children_of_a_parent_share_its_weight_unless_counted_alone():
     left, right = box((0, 10), (0, 5)), box((0, 10), (5, 10))
     inside = Family(left, (box((0, 2), (0, 2)),), left)
     outside = Family(right, tuple(box((row, row + 2), (0, 2)) for row in (2, 4, 6)), right)
-    assert hierarchical_consistency([[inside, outside]]) == 0.5
+    assert hierarchical_consistency([[inside, outside]]) == (0.5, 0.5)
     assert consistency_per_child([[inside, outside]]) == 0.25
 
 
 def test_perfect_nesting_in_a_view_without_subparts_scores_half():
     whole = box((0, 10), (0, 10))
     transitions = [[Family(whole, (box((0, 2), (0, 2)),), whole)], []]
-    assert hierarchical_consistency(transitions) == consistency_per_child(transitions) == 0.5
+    assert hierarchical_consistency(transitions) == (0.5, 1)  # pooled, the missing parents don't count
+    assert consistency_per_child(transitions) == 0.5
 
 
 def test_whole_image_fools_all_readings_but_the_anchored_one():
     full = np.ones((10, 10), dtype=bool)
     a, b, a1 = box((0, 10), (0, 5)), box((0, 5), (5, 10)), box((0, 4), (0, 5))
     fooled = [[Family(full, (full, full), a), Family(full, (full,), b)], [Family(full, (full,), a1)]]
-    assert hierarchical_consistency(fooled, "containment") == 1
-    assert hierarchical_consistency(fooled, "literal") == 1
+    assert hierarchical_consistency(fooled, "containment") == (1, 1)
+    assert hierarchical_consistency(fooled, "literal") == (1, 1)
     # area of the true parents: A 50, B 25, a1 20 of 100 px
-    assert hierarchical_consistency(fooled, "anchored") == pytest.approx((0.375 + 0.2) / 2)
+    expected = (0.375 + 0.2) / 2, (0.5 + 0.25 + 0.2) / 3
+    assert hierarchical_consistency(fooled, "anchored") == pytest.approx(expected)

@@ -17,6 +17,7 @@ from hilsplat.evaluate.metrics.hierarchy import (
 )
 from hilsplat.evaluate.metrics.point_classes import ClassCounts
 from hilsplat.evaluate.protocols.cards import CARDS
+from tests.unit.evaluate.builders import region_of
 
 # Every metric as a function of two label images with labels 0 .. 3; the second is the ground truth.
 # Masks are where a label is 1; families are label 1 or 2 (parent) with its part of label 2 (child).
@@ -70,6 +71,10 @@ def pixel_accuracy(prediction, truth):
     return masks.pixel_accuracy(*(np.stack([each == n for n in (1, 2, 3)]) for each in (prediction, truth)))
 
 
+def consistency(transitions, reading, which):
+    return hierarchical_consistency(transitions, reading)[which]
+
+
 def first_class_occurring(counts):
     return point_classes.miou_over_occurring(counts, np.array([True, False, False]))
 
@@ -80,15 +85,15 @@ CASES = {
     "acc_25": of_masks(partial(masks.exceeds, threshold=0.25)),
     "acc_50": of_masks(partial(masks.exceeds, threshold=0.5)),
     "best_threshold_iou": of_masks(lambda mask, truth: masks.best_threshold_iou(mask / 1.0, truth)),
-    "localization_box": of_points(lambda points, truth: masks.hits_a_box(points, masks.box_of(truth)[None])),
+    "localization_box": of_points(
+        lambda points, truth: masks.hits_a_box(points, region_of(truth, "").boxes())
+    ),
     "localization_mask": of_points(masks.hits_the_mask),
     "pixel_accuracy": pixel_accuracy,
     **{
-        f"hc_{reading}{suffix}": of_families(
-            partial(hierarchical_consistency, reading=reading, pooled=bool(suffix))
-        )
+        f"hc_{reading}{suffix}": of_families(partial(consistency, reading=reading, which=which))
         for reading in READINGS
-        for suffix in ("", "_pooled")
+        for which, suffix in enumerate(("", "_pooled"))
     },
     "hc_containment_per_child": of_families(consistency_per_child),
     "view_consistency": of_masks(masks.iou),  # of two views' masks over the points that both show

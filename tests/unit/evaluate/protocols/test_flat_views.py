@@ -1,5 +1,8 @@
 """Protocols for images without levels: 3D-OVS by argmax and by the rule of LangSplatV2, and LERF-Mask."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -7,23 +10,16 @@ from PIL import Image
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
 from hilsplat.datasets.images.ovs3d import FOREGROUND
-from hilsplat.datasets.labelled import LabelledRegion, read_mask_file
+from hilsplat.datasets.labelled import mask_region
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
-from hilsplat.evaluate.protocols.answers import ViewMaps, mask_rows
+from hilsplat.evaluate.protocols.answers import mask_rows
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_LANGSPLAT_V2, OVS_NODES, card_named
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.view_truth import Query, ViewTruth, eighth_of, kept_by_pillow
+from hilsplat.evaluate.protocols.view_truth import ViewTruth, eighth_of, kept_by_pillow
 from hilsplat.query.relevancy import relevancy_of_margins
-from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.builders import box, region_of
 
 SIZE = (16, 32)
-
-
-def unasked(texts, *_):
-    raise AssertionError(f"maps of {texts} were not to be asked for")
-
-
-NO_MORE = ViewMaps(unasked, unasked)
 
 
 def region(columns):
@@ -31,8 +27,11 @@ def region(columns):
 
 
 def query(text, columns, level=Level.WHOLE):
-    box = np.array([[columns[0], 0, columns[1] - 1, 15]])
-    return Query(text, level, ((text,),), region(columns), box)
+    """A text whose region is a range of columns."""
+    mask = region(columns)
+    truth = ViewTruth.of_regions([region_of(mask, text)], SIZE)
+    (found,) = truth.categories or truth.absent
+    return replace(found, level=level)
 
 
 def maps(columns, value=0.9):
@@ -41,13 +40,18 @@ def maps(columns, value=0.9):
     return found
 
 
-def cosines(**of_text):
-    """Cosines with each text, from maps (3, H, W)."""
+def flat_of(cards, level=Level.WHOLE, **cosines):
+    """The protocols in a scene whose cosines with texts are given as maps (3, H, W)."""
 
-    def cosine(texts, pixels):
-        return np.stack([of_text[text].reshape(3, -1)[:, pixels] for text in texts])
+    def field_cosine(texts, view, pixels):
+        return np.stack([cosines[text].reshape(3, -1)[:, pixels] for text in texts])
 
-    return ViewMaps(unasked, cosine)
+    return FlatProtocols(SimpleNamespace(field_cosine=field_cosine), "v.png", cards, level)
+
+
+def added(flat, found, text, method="field", nodes_mask=None):
+    """Rows of a text, labelled at its own level, whose relevancy is given."""
+    return list(flat.add(method, found, nodes_mask, text, [text]))
 
 
 def test_an_eighth_takes_the_pixels_that_pillow_takes():
@@ -63,10 +67,9 @@ def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():
     # cup: columns 0 to 15, plate: 16 to 23; the rest has no text. The plate's map is right, the cup's is
     # right on its left half, and the plate wins on the right half.
     cup, plate = query("cup", (0, 16)), query("plate", (16, 24))
-    flat = FlatProtocols([OVS_ARGMAX], Level.WHOLE)
-    found = cosines(cup=maps((0, 8)), plate=np.maximum(maps((16, 24)), maps((8, 16), 0.5)))
-    assert list(flat.add("field", maps((0, 1)), None, plate, [plate], found)) == []
-    assert list(flat.add("field", maps((0, 1)), None, cup, [cup], found)) == []
+    flat = flat_of([OVS_ARGMAX], cup=maps((0, 8)), plate=np.maximum(maps((16, 24)), maps((8, 16), 0.5)))
+    for each in (plate, cup):
+        assert added(flat, maps((0, 1)), each) == []
     rows = {(row.metric, row.query): row for row in flat.finish()}
     # an eighth: cup has columns 0, 1, plate column 2; predicted cup: 0, plate: 1, 2
     assert rows["iou", "cup"].value == 0.5
@@ -86,20 +89,19 @@ def test_canonical_phrases_do_not_choose_the_level():
     generic = np.array([0.28, 0.18, 0.0], np.float32)[:, None, None]
     relevancy = {text: relevancy_of_margins(values - generic, 10.0) for text, values in cosine.items()}
     assert relevancy["two"].max() > relevancy["one"].max()
-    flat = FlatProtocols([OVS_ARGMAX], None)
+    flat = flat_of([OVS_ARGMAX], None, **cosine)
     for each in (one, two):
-        list(flat.add("field", relevancy[each.text], None, each, [], cosines(**cosine)))
+        added(flat, relevancy[each.text], each)
     rows = {(row.metric, row.query): row.value for row in flat.finish()}
     assert rows == {("iou", "one"): 1.0, ("iou", "two"): 0.0, ("pixel_accuracy", ""): 1.0}
 
 
 def test_a_text_that_the_view_lacks_competes_and_counts_zero():
     cup, fork = query("cup", (0, 16), level=None), query("fork", (0, 0), level=None)
-    flat = FlatProtocols([OVS_ARGMAX, card_named("3d-ovs/langsplat")], None)
-    found = cosines(cup=maps((0, 16)), fork=maps((8, 32), 0.95))
-    rows = list(flat.add("field", maps((0, 16)), None, cup, [], found))
-    assert {row.query for row in rows} == {"cup"}
-    assert not list(flat.add("field", maps((8, 32)), None, fork, [], found))
+    cosines = {"cup": maps((0, 16)), "fork": maps((8, 32), 0.95)}
+    flat = flat_of([OVS_ARGMAX, card_named("3d-ovs/langsplat")], None, **cosines)
+    assert {row.query for row in added(flat, maps((0, 16)), cup)} == {"cup"}
+    assert not added(flat, maps((8, 32)), fork)
     rows = {(row.metric, row.query): row for row in flat.finish()}
     values = {key: row.value for key, row in rows.items()}
     assert values == {("iou", "cup"): 0.5, ("iou", "fork"): 0.0, ("pixel_accuracy", ""): 0.25}
@@ -109,9 +111,8 @@ def test_a_text_that_the_view_lacks_competes_and_counts_zero():
 def test_a_pixel_that_no_level_answers_is_a_miss():
     found = np.full((3, *SIZE), -np.inf, np.float32)
     found[1, :, 8:] = 0.2
-    flat = FlatProtocols([OVS_ARGMAX], None)
-    cup = query("cup", (0, 32), level=None)
-    list(flat.add("field", found, None, cup, [], cosines(cup=found)))
+    flat = flat_of([OVS_ARGMAX], None, cup=found)
+    added(flat, found, query("cup", (0, 32), level=None))
     assert {row.metric: row.value for row in flat.finish()} == {"iou": 0.75, "pixel_accuracy": 0.75}
 
 
@@ -123,17 +124,16 @@ def test_a_pixel_that_no_level_answers_is_a_miss():
     ],
 )
 def test_parts_of_a_stand_in_and_protocols_without_a_map_rule_have_no_rows(text, level, cards):
-    one, flat = query(text, (0, 4), level), FlatProtocols(cards, Level.WHOLE)
-    assert list(flat.add("field", maps((0, 4)), None, one, [one], NO_MORE)) == []
+    flat = flat_of(cards)
+    assert added(flat, maps((0, 4)), query(text, (0, 4), level)) == []
     assert list(flat.finish()) == []
 
 
 @pytest.mark.parametrize("card", [LERF_MASK, OVS_NODES])
 def test_a_tree_answers_with_its_own_nodes_and_a_field_with_its_mask_or_not_at_all(card):
-    cup = query("cup", (0, 16))
-    flat = FlatProtocols([card], Level.WHOLE)
-    tree = list(flat.add("tree", maps((0, 16)), region((0, 8)), cup, [cup], NO_MORE))
-    field = list(flat.add("field", maps((0, 16)), None, cup, [cup], NO_MORE))
+    cup, flat = query("cup", (0, 16)), flat_of([card])
+    tree = added(flat, maps((0, 16)), cup, "tree", region((0, 8)))
+    field = added(flat, maps((0, 16)), cup)
     assert {row.metric: row.value for row in tree}["iou"] == 0.5
     assert [row.value > 0.9 for row in field if row.metric == "iou"] == [True] * (card is LERF_MASK)
     assert {row.protocol for row in tree + field} == {f"{card.full_name} (wholes)"}
@@ -215,36 +215,28 @@ def test_an_empty_mask_wins_the_level():
     assert not mask.any()
 
 
-def halves(rows):
-    maps = np.full((3, 40, 40), 0.1, np.float32)
-    maps[:, slice(*rows)] = 0.9
-    return maps
-
-
 @pytest.mark.parametrize(
     ("text", "others", "score"), [("wood wall", ["wood table"], 1), ("rabbit", [], 2 / 3)]
 )
 def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path, text, others, score):
     grey = np.zeros((40, 40), np.uint8)  # the upper half of the label is 255 and its third quarter grey
     grey[:20], grey[20:30] = 255, 1
-    path = tmp_path / "label.png"
+    path = tmp_path / f"{text}.png"
     write_png(path, grey)
-    region = LabelledRegion(
-        text,
-        grey.shape,
-        lambda: read_mask_file(path, FOREGROUND),
-        path=(text,),
-        any_grey=lambda: read_mask_file(path, 1),
-    )
-    (query,) = ViewTruth.of_regions([region], grey.shape).categories
+    label = mask_region(path, FOREGROUND, grey.shape, [], least_grey=1)
+    (query,) = ViewTruth.of_regions([label], grey.shape).categories
     asked = []
 
-    def more(texts, *_):
-        asked.extend(texts)
-        return halves((20, 30))[None]
+    def high_in(rows):
+        return np.where(box(rows, (0, 40), (40, 40)), 0.9, 0.1).astype(np.float32)[None].repeat(3, axis=0)
 
-    flat = FlatProtocols([OVS_LANGSPLAT_V2, card_named("3d-ovs/langsplat")], None)
-    rows = list(flat.add("field", halves((0, 20)), None, query, [], ViewMaps(more, more)))
+    def field_relevancy(texts, _):
+        asked.extend(texts)
+        return high_in((20, 30))[None]
+
+    scene = SimpleNamespace(field_relevancy=field_relevancy)
+    flat = FlatProtocols(scene, "v.png", [OVS_LANGSPLAT_V2, card_named("3d-ovs/langsplat")], None)
+    rows = added(flat, high_in((0, 20)), query)
     found = {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
     assert asked == others
     assert found == {"3d-ovs/langsplat-v2": pytest.approx(score), "3d-ovs/langsplat": 1.0}

@@ -15,7 +15,6 @@ from hilsplat.datasets.classes import (
 )
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.evaluate.diagnostics.alignment import camera_error, scene_from_true
 from hilsplat.evaluate.extra_protocols import STAND_INS, ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_named
@@ -29,6 +28,7 @@ from hilsplat.evaluate.protocols.points import (
     pooled_points,
 )
 from hilsplat.evaluate.scores import Measured, read_instances, read_scores, write_instances, write_scores
+from hilsplat.evaluate.stage import scene_from_true
 from hilsplat.scene.cameras import Cameras
 from tests.unit.evaluate.builders import score
 
@@ -181,35 +181,30 @@ def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_worl
     assert {row.method: row.value for row in rows if row.metric == "miou_present"} == {"tree": 1, "field": 1}
 
 
-def turned(angle, axis_centres):
-    """Cameras at places, all turned about the vertical by an angle."""
-    c, s = np.cos(angle), np.sin(angle)
-    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-    poses = np.tile(np.eye(4), (len(axis_centres), 1, 1))
+def cameras_at(centres, rotation):
+    """Cameras with given centres, all with the same rotation."""
+    poses = np.tile(np.eye(4), (len(centres), 1, 1))
     poses[:, :3, :3] = rotation
-    poses[:, :3, 3] = -(rotation @ np.asarray(axis_centres, dtype=float).T).T
-    names = tuple(f"{row}.png" for row in range(len(axis_centres)))
+    poses[:, :3, 3] = -np.asarray(centres, dtype=float) @ rotation.T
+    names = tuple(f"{row}.png" for row in range(len(centres)))
     K = np.tile(np.eye(3), (len(names), 1, 1))
     return Cameras(names, poses, K, np.full((len(names), 2), 8, np.int32))
 
 
-def test_cameras_on_a_line_still_fix_the_similarity():
-    true = turned(0.3, [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    # the scene is the truth turned by 90 degrees, three times as large and moved
+@pytest.mark.parametrize(("moved", "error"), [((0, 0, 0), 0), ((1, -2, 1), 1)])
+def test_cameras_on_a_line_still_fix_the_similarity(moved, error):
+    c, s = np.cos(0.3), np.sin(0.3)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    # The scene is the truth turned by 90 degrees, three times as large and shifted. Its cameras are off the
+    # line, which changes neither scale nor offset: the median of 1, 2 and 1 in the units of the truth.
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    poses = true.cam_from_world.copy()
-    for row, name in enumerate(true.names):
-        centre = 3 * turn @ true[name].centre + [5, 0, 1]
-        poses[row, :3, :3] = true[name].cam_from_world[:3, :3] @ turn.T
-        poses[row, :3, 3] = -poses[row, :3, :3] @ centre
-    found = Cameras(true.names, poses, true.K, true.size_hw)
+    found = cameras_at(3 * (line + np.outer(moved, [0, 0, 1])) @ turn.T + [5, 0, 1], rotation @ turn.T)
     expected = np.eye(4)
     expected[:3, :3], expected[:3, 3] = 3 * turn, [5, 0, 1]
-    assert np.allclose(scene_from_true(true, found), expected)
-    assert camera_error(true, found, expected) == pytest.approx(0, abs=1e-9)
-    off = expected.copy()
-    off[0, 3] += 6  # six units of the scene are two of the truth
-    assert camera_error(true, found, off) == pytest.approx(2)
+    transform, median = scene_from_true(cameras_at(line, rotation), found)
+    assert np.allclose(transform, expected)
+    assert median == pytest.approx(error, abs=1e-9)
 
 
 def test_stand_ins_and_data_sets_name_protocols_that_exist():

@@ -8,7 +8,7 @@ import pytest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
-from hilsplat.evaluate.protocols.answers import Selections
+from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
@@ -19,14 +19,18 @@ from tests.unit.evaluate.builders import box, region_of
 SIZE = (10, 10)
 
 
-def annotations_of(folder, nodes, regions, view="v.png", listed=None):
-    """Annotations from (text, level, parent) and half-open (rows, columns)."""
+def annotations_of(folder, nodes, regions):
+    """Annotations of one view from (text, level, parent) and half-open (rows, columns)."""
     labels = {level: np.full(SIZE, -1, np.int32) for level in LEVELS}
     for node, ((_, level, _), (rows, columns)) in enumerate(zip(nodes, regions, strict=True)):
         labels[Level(level)][slice(*rows), slice(*columns)] = node
     records = [AnnotatedNode(node, level, parent, text) for node, (text, level, parent) in enumerate(nodes)]
-    write_hierarchy(folder, records, {view: labels}, {view: listed or range(len(nodes))})
+    write_hierarchy(folder, records, {"v.png": labels}, {"v.png": range(len(nodes))})
     return HierarchyAnnotations.load(folder)
+
+
+def truth_of(folder, nodes, regions):
+    return ViewTruth.of(annotations_of(folder, nodes, regions), "v.png", SIZE, 1)
 
 
 class HandMade:
@@ -35,19 +39,13 @@ class HandMade:
     `scene_wide` has those that differ where not this view is given.
     """
 
-    def __init__(self, masks, answers, relevancy=None, scene_wide=None):
-        self.masks, self.answers, self.relevancy = masks, answers, relevancy or {}
-        self.scene_wide = scene_wide or {}
+    def __init__(self, masks, answers, relevancy=None):
+        self.masks, self.answers, self.relevancy, self.scene_wide = masks, answers, relevancy or {}, {}
 
     def field_relevancy(self, texts, view):
         return np.stack([self.relevancy.get(text, np.zeros((3, *SIZE), np.float32)) for text in texts])
 
     node_relevancy_map = field_relevancy
-
-    def field_cosine(self, texts, view, pixels):
-        return self.field_relevancy(texts, view).reshape(len(texts), 3, -1)[:, :, pixels]
-
-    node_cosine = field_cosine
 
     def select(self, path, *, level=None, view=None):
         answers = self.answers if view == "v.png" else self.answers | self.scene_wide
@@ -61,23 +59,8 @@ class HandMade:
 def measured(scene, truth, **settings):
     """{(method, protocol, query, level, metric): value} of one view."""
     section = EvaluateSettings(min_region_px=1, **settings)
-    rows = measure_view(scene, Selections(scene), truth, "v.png", SIZE, section)
+    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section)
     return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
-
-
-def test_a_union_of_nodes_is_rendered_once_in_each_view():
-    masks, asked = [box((0, 3), (0, 5)), box((2, 4), (1, 9))], []
-
-    class Counted(HandMade):
-        def node_masks(self, view, ids):
-            asked.append((view, ids.tolist()))
-            return super().node_masks(view, ids)
-
-    selections = Selections(Counted(masks, {}))
-    for _ in range(2):
-        assert np.array_equal(selections.mask("v.png", np.array([0, 1]), SIZE), masks[0] | masks[1])
-        assert np.array_equal(selections.mask("w.png", np.array([1]), SIZE), masks[1])
-    assert asked == [("v.png", [0, 1]), ("w.png", [1])]
 
 
 # the worked example of hierarchical consistency: A holds a1 and half of a2, B holds b1, a1 holds x
@@ -141,8 +124,7 @@ def test_scene_wide_answers_do_not_depend_on_the_view(tmp_path):
 
 def test_regions_with_the_same_text_are_merged(tmp_path):
     nodes = [("cup", 1, -1), ("cup", 1, -1)]
-    annotations = annotations_of(tmp_path, nodes, [((0, 4), (0, 4)), ((6, 10), (6, 10))])
-    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    truth = truth_of(tmp_path, nodes, [((0, 4), (0, 4)), ((6, 10), (6, 10))])
     assert len(truth.queries) == 1
     assert truth.queries[0].truth.sum() == 32
     assert truth.queries[0].boxes_xyxy.tolist() == [[0, 0, 3, 3], [6, 6, 9, 9]]
@@ -154,8 +136,7 @@ def test_regions_with_the_same_text_are_merged(tmp_path):
 
 def test_text_at_two_levels_is_one_category_and_two_queries(tmp_path):
     nodes = [("wheel", 1, -1), ("cart", 1, -1), ("wheel", 2, 1)]
-    annotations = annotations_of(tmp_path, nodes, [((0, 2), (0, 10)), ((4, 10), (0, 10)), ((8, 10), (0, 5))])
-    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    truth = truth_of(tmp_path, nodes, [((0, 2), (0, 10)), ((4, 10), (0, 10)), ((8, 10), (0, 5))])
     queries = [(query.text, query.level) for query in truth.queries]
     assert queries == [("wheel", Level.WHOLE), ("cart", Level.WHOLE), ("wheel", Level.PART)]
     category = next(query for query in truth.categories if query.text == "wheel")
@@ -172,8 +153,7 @@ def test_small_regions_are_not_scored_and_labels_of_another_size_are_refused(tmp
 
 
 def test_automatic_level_of_the_field_follows_the_highest_value(tmp_path):
-    annotations = annotations_of(tmp_path, [("cup", 1, -1)], [((2, 6), (2, 6))])
-    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    truth = truth_of(tmp_path, [("cup", 1, -1)], [((2, 6), (2, 6))])
     relevancy = np.full((3, *SIZE), 0.4, np.float32)
     relevancy[0, 2:6, 2:6] = 0.8  # right place, at the level of the annotation
     relevancy[2, 8, 8] = 0.9  # wrong place, finest level, higher
@@ -199,8 +179,8 @@ def test_other_protocols_are_measured_with_their_own_rules():
     scene = HandMade([], {}, {"cup": relevancy})
     cards = [PROTOCOLS["3d-ovs/langsplat@2"], PROTOCOLS["3d-ovs/langsplat-raw@2"]]
     settings = EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5)
-    flat = FlatProtocols(cards, None, ["relevancy scale 5"])
-    rows = list(measure_view(scene, Selections(scene), truth, "v.png", SIZE, settings, flat))
+    flat = FlatProtocols(scene, "v.png", cards, None, ["relevancy scale 5"])
+    rows = list(measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), settings, flat))
     ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
     assert ious == {
         "lerf/langsplat@2 (filter 1, no mix, no majority, relevancy scale 5)": 0,
@@ -222,7 +202,7 @@ def test_a_relevancy_that_is_not_a_number_is_an_error():
 def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
     nodes = [("chair", 1, -1), ("table", 1, -1), ("leg", 2, 0), ("leg", 2, 1)]
     regions = [((0, 10), (0, 5)), ((0, 10), (5, 10)), ((8, 10), (0, 5)), ((8, 10), (5, 10))]
-    truth = ViewTruth.of(annotations_of(tmp_path, nodes, regions), "v.png", SIZE, 1)
+    truth = truth_of(tmp_path, nodes, regions)
     answers = {("chair", None): [0], ("table", None): [1], ("leg", None): [2, 3]}
     answers |= {("chair", Level.WHOLE): [0], ("table", Level.WHOLE): [1], ("leg", Level.PART): [2, 3]}
     values = measured(HandMade([box(*each) for each in regions], answers), truth, methods=("tree",))
@@ -234,8 +214,7 @@ def test_a_repeated_text_nests_in_each_of_its_wholes(tmp_path):
 def test_path_localization_searches_the_parent(tmp_path):
     nodes = [("bear", 1, -1), ("nose", 2, 0)]
     regions = [((0, 10), (0, 5)), ((2, 4), (2, 4))]
-    annotations = annotations_of(tmp_path, nodes, regions)
-    truth = ViewTruth.of(annotations, "v.png", SIZE, 1)
+    truth = truth_of(tmp_path, nodes, regions)
     relevancy = np.full((3, *SIZE), 0.4, np.float32)
     relevancy[1, 2:4, 2:4], relevancy[1, 7, 8] = 0.7, 0.9  # the nose, and something beside the bear
     answers = {("bear",): [0], ("bear", "nose"): [1], ("nose", Level.PART): [1]}
@@ -246,11 +225,10 @@ def test_path_localization_searches_the_parent(tmp_path):
 
 
 def test_perfect_tree_of_the_block_world_scores_one(block_world):
-    view, size_hw = "001.png", (64, 64)
-    settings = EvaluateSettings()
+    view, size_hw, settings = "001.png", (64, 64), EvaluateSettings()
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers)
-    rows = list(measure_view(block_world.answers, selections, truth, view, size_hw, settings))
+    rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings))
     given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@5"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)

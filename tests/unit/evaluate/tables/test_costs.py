@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-from types import SimpleNamespace
 
 import pytest
 
@@ -11,7 +10,7 @@ from hilsplat.base.artifacts import provenance_path, read_json
 from hilsplat.base.errors import ArtifactError
 from hilsplat.evaluate.scores import write_scores
 from hilsplat.evaluate.tables.build import published_values, run_table
-from hilsplat.evaluate.tables.costs import read_costs, run_efficiency, time_queries, write_times
+from hilsplat.evaluate.tables.costs import read_costs, run_efficiency, write_times
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import write_record
 from tests.unit.evaluate.builders import score
@@ -24,26 +23,26 @@ def record(folder, stage, seconds, mib, cpu_time=None):
     path.write_text(json.dumps({"s": seconds, "cpu_time": cpu_time or seconds, "max_rss": mib}) + "\n")
 
 
+STAGES = {"masks": 60, "coverage_tree": 6, "clip": 54, "contributions": 30, "semantic_tree": 6}
+STAGES |= {"autoencoder": 12}
+
+
 @pytest.fixture
 def scene(tmp_path):
     """Scores of two variants; the second has a field of its own and shares the rest."""
     folder = tmp_path / "results" / "synthetic" / "table-1"
     default, other = folder / "default", folder / "omega-2"
-    stages = {"masks": 60, "coverage_tree": 6, "clip": 54, "contributions": 30, "semantic_tree": 6}
-    stages["autoencoder"] = 12
-    for stage, seconds in stages.items():
+    for stage, seconds in STAGES.items():
         record(default, stage, seconds, 512)
-    for variant, seconds in ((default, 12), (other, 72)):
-        record(variant, "field", seconds, 1024 if variant is default else 2048)
-        read = ("masks", "clip", "semantic_tree", "autoencoder")
-        inputs = {name: {"path": str(default / name)} for name in read}
-        inputs["field"] = {"path": str(variant / "field.safetensors")}
-        scores = variant / "scores.csv"
+    shared = {name: {"path": str(default / name)} for name in STAGES}
+    for variant, seconds, mib in ((default, 12, 1024), (other, 72, 2048)):
+        record(variant, "field", seconds, mib)
+        scores, field = variant / "scores.csv", variant / "field.safetensors"
         write_scores(scores, [score("iou", 0.5, scene="table-1", variant=variant.name, method="field")])
-        write_record(scores, inputs=inputs)
-        of_field = ("coverage_tree", "contributions", "autoencoder")
-        own = {name: {"path": str(default / name)} for name in of_field}
-        write_record(variant / "field.safetensors", inputs=own)
+        read = {name: shared[name] for name in ("masks", "clip", "semantic_tree", "autoencoder")}
+        write_record(scores, inputs={**read, "field": {"path": str(field)}})
+        of_field = {name: shared[name] for name in ("coverage_tree", "contributions", "autoencoder")}
+        write_record(field, inputs=of_field)
         write_times(scores, "synthetic", "table-1", variant.name, {"field": 0.25})
     return [default / "scores.csv", other / "scores.csv"]
 
@@ -109,14 +108,6 @@ def test_tables_of_numbers_are_the_same_bytes_whatever_the_jobs_took(scene, tmp_
     rows = csv.DictReader(before[".csv"].decode().splitlines())
     quality = [row["Hi-LERF mIoU"] for row in rows if row["kind"] != "reported"]
     assert quality == ([] if table == "cost" else ["50.00", "50.00"])
-
-
-def test_query_times_include_text_weights_and_answer():
-    asked = []
-    scene = SimpleNamespace(encode_texts=asked.append, pixel_weights=asked.append)
-    seconds = time_queries(scene, {"tree": asked.append}, "v.png", ["cup", "mug"])
-    assert seconds["tree"] > 0
-    assert asked == [["cup"], "v.png", "cup", "cup", "mug"]
 
 
 def test_stages_follow_the_order_of_the_workflow_with_a_total(tmp_path):
