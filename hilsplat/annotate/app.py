@@ -1,6 +1,6 @@
 """HTTP server of the annotation page: `hilsplat annotate`.
 
-All geometry is computed here, with the polygon filling that evaluation uses; the page only displays it.
+All geometry is computed here, with evaluation's polygon filling; the page only displays it.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,8 +16,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hilsplat.annotate.exporting import Kind, exported
-from hilsplat.annotate.importing import imported, merged
+from hilsplat.annotate.exchange import Kind, exported, imported, merged
 from hilsplat.annotate.labels import (
     Label,
     Place,
@@ -54,7 +53,7 @@ class Stroke(Message):
 
 
 class Shape(Message):
-    """A region composed of polygons and a stroke, inside its parent."""
+    """A region: the union of polygons, plus or minus a stroke, cut to `inside`."""
 
     view: int
     add: Rings
@@ -109,8 +108,8 @@ class OpenedScene(ShownScene):
 
     Args:
         folder: the scene's folder, such as results/photos/desk.
-        labels: folder of its label files; created when the first one is written.
-        variant: variant whose masks and tree are proposed.
+        labels: folder of its label files; created with the first one.
+        variant: variant whose masks and nodes are proposed.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.
@@ -136,7 +135,7 @@ class OpenedScene(ShownScene):
         return OpenedScene(self.folder, self.labels, self.variant, self.threads)
 
     def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard photographs and drawing: as `unchanged`, but parts other than photographs may change."""
+        """Guard reads of photographs, and drawing on them; other parts may change."""
         return self.unchanged(self.photographs)
 
     def described(self) -> dict[str, Any]:
@@ -169,7 +168,7 @@ class Annotator:
     def __init__(self, opened: OpenedScene) -> None:
         self.thread = SceneThread(opened)
         self.pages = Pages("annotate.html", "hilsplat.annotate")
-        self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so saving does not wait for it
+        self.drawing = ThreadPoolExecutor(1, thread_name_prefix="drawing")  # so that saving doesn't wait
 
     def app(self, token: str) -> Guard:
         """Return the guarded application."""
@@ -271,7 +270,7 @@ def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
     """Return all annotations in the format of another program."""
     kind = of["kind"]
     if kind not in get_args(Kind):
-        raise SettingsError(f"{kind!r} cannot be written", expected=", ".join(get_args(Kind)))
+        raise SettingsError(f"format {kind!r} is unknown", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)
     return plain(data, "application/json" if kind == "coco" else BYTES)
 
@@ -288,7 +287,7 @@ def run_annotate(
 ) -> None:
     """Serve the annotation page of a scene on this machine until Ctrl-C.
 
-    Arguments as in `OpenedScene` and `serve`.
+    Arguments are those of `OpenedScene` and `serve`.
 
     Raises:
         ArtifactError: the scene has no photographs with poses yet.
@@ -298,6 +297,6 @@ def run_annotate(
     opened = OpenedScene(folder, labels, variant, threads)
     annotator, annotated = Annotator(opened), len(opened.known())
     first = opened.scene.cameras.names[0]
-    annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles loops
+    annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles its loops before the first click
     about = f"{opened.scene.name}: {annotated} photographs annotated in {labels}, the page"
     serve(annotator.app, about, port=port, browser=browser, on_ready=on_ready)

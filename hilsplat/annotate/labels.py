@@ -40,7 +40,7 @@ class Label(Message):
     """One thing in one view.
 
     Attributes:
-        id: the same in all views that show the thing.
+        id: identifies the thing in all views.
         level: 1 whole, 2 part, 3 subpart.
         parent: id of a thing one level up in the same view; None if it has none.
         polygons: vertices in whole pixels; the region is the union of the filled polygons.
@@ -57,7 +57,7 @@ class Label(Message):
 
     @staticmethod
     def read(where: str, **values: object) -> "Label":
-        """Create a label from values in a file, named by `where`; raise SceneError if one is invalid."""
+        """Create a label from values of the file `where`; raise SceneError if one is invalid."""
         try:
             return Label.model_validate(values)
         except ValidationError as error:
@@ -99,11 +99,11 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
             continue
         parent = own.get(label.parent)
         if parent is None or parent.level != label.level - 1:
-            nothing = "nothing of this photograph"
+            missing = "no thing in this photograph"
             raise SettingsError(
                 f"the parent of {label.text!r} cannot be its parent",
                 expected=f"a {Level(label.level - 1).label}" if label.level > 1 else "none: it is a whole",
-                found=f"{parent.text!r}, a {Level(parent.level).label}" if parent else nothing,
+                found=f"{parent.text!r}, a {Level(parent.level).label}" if parent else missing,
                 fix="choose another parent or level",
             )
         inside = mask & masks[parent.id]

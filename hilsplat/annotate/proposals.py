@@ -1,7 +1,7 @@
-"""Outlines that the user can accept or correct: nodes, masks, things of other views, SAM's at clicks.
+"""Outlines that the user can accept or correct: of nodes, masks, things of other views, or SAM at clicks.
 
-A proposal becomes an annotation only when the user accepts it: ground truth copied from a prediction would
-measure nothing.
+A proposal becomes an annotation only when the user accepts it, because ground truth copied from a prediction
+measures nothing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,15 +38,15 @@ SMOOTH_PX = 1.0
 """Maximum deviation of a proposal's outline from its pixels, so that there are fewer vertices to correct."""
 MOST_MASKS = 6
 LEAST_SEEN = 0.25
-"""Share of a pixel that must be Gaussians seen by annotated views for the pixel to join a thing."""
+"""Minimum share of a transferred thing's pixel that belongs to Gaussians seen in its annotated views."""
 VIEWS_MIB = 512.0
 KEPT_VIEWS = 3
-"""Number of photographs whose features are cached: 4 MB each for SAM ViT-B, up to 40 MB for SAM 2."""
+"""Number of photographs whose SAM features are cached: 4 MB each for ViT-B, up to 40 MB for SAM 2."""
 BOX_GRID = 4
 """Prompt points along each side of a box, because not all SAM exports accept boxes."""
 OFFERED = 3
 SAME_IOU = 0.9
-"""Masks with at least this IoU count as the same mask."""
+"""Minimum IoU of masks that count as the same."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Proposal:
 
 
 class Proposals:
-    """Proposals in the views of a scene, from the parts that its run has made. Not thread-safe."""
+    """Proposals in the views of a scene, from the existing parts of its folder. Not thread-safe."""
 
     def __init__(self, scene: Scene, folder: Path, variant: str, threads: int) -> None:
         self.scene, self.threads = scene, threads
@@ -75,11 +75,11 @@ class Proposals:
 
     @property
     def of(self) -> str:
-        """Source of the proposals at a pixel: "nodes", "masks", or "" if there is none."""
+        """Source of the proposals at a pixel: "nodes", "masks", or "" if there are none."""
         return "nodes" if self.tree is not None else "masks" if (self.masks / "index.json").is_file() else ""
 
     def at(self, view: str, x: int, y: int) -> list[Proposal]:
-        """Return the outlines of the nodes or masks that contain a pixel, large ones first.
+        """Return the outlines of the nodes or masks that contain a pixel, the largest first.
 
         Raises:
             SettingsError: the pixel is outside the photograph.
@@ -130,17 +130,17 @@ class Proposals:
 
         Args:
             known: annotations by view; unaccepted proposals are ignored.
-            ids: things to transfer; those that the view already has are not changed.
+            ids: things to transfer; those with a label in this view are skipped.
 
         Returns:
-            a label of each thing in another view, and its polygons in this view.
+            each thing's label in another view, and its polygons in this view.
 
         Raises:
             SettingsError: the scene has no Gaussians yet.
         """
         if self.gaussians is None:
             raise SettingsError(
-                "the scene has no Gaussians yet to transfer annotations with", fix="wait for the run"
+                "annotations cannot be transferred before the scene has Gaussians", fix="wait for the run"
             )
         size_hw = self.scene.cameras[view].size_hw
         masks = {label.id: label.mask(size_hw) for label in known.get(view, ())}
@@ -168,7 +168,7 @@ class Proposals:
         return found
 
     def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return which Gaussians belong to a thing, and which any of its views sees, as 0 and 1."""
+        """Return whether each Gaussian belongs to a thing, and whether any of its views sees it (0 or 1)."""
         assert self.gaussians is not None
         inside = np.zeros(len(self.gaussians), np.float64)
         total = np.zeros(len(self.gaussians), np.float64)
@@ -226,7 +226,7 @@ def cleaned(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 
 
 class Clicks:
-    """The SAM model named in the index of a scene's masks, opened at the first click. Not thread-safe."""
+    """The SAM model that made a scene's masks, opened at the first click. Not thread-safe."""
 
     def __init__(self, scene: Scene, masks: Path) -> None:
         self.scene = scene
@@ -241,7 +241,7 @@ class Clicks:
 
     @cached_property
     def model(self) -> SamModel:
-        """The model."""
+        """The opened model; raises SettingsError if the scene's masks were made without SAM."""
         if not self.folder:
             raise SettingsError(
                 "the masks of this scene were made without SAM", fix="draw, or compute masks with SAM"
@@ -253,15 +253,15 @@ class Clicks:
     ) -> list[Proposal]:
         """Return the outlines of the thing at clicks or in a box, best first.
 
-        Masks are ranked by the number of clicks that they satisfy, then by SAM's predicted IoU, times the
-        IoU of their box with the given box.
+        Masks are ranked by the number of clicks that they satisfy, then by SAM's predicted IoU (with a box,
+        times the IoU of the mask's box and the given one).
 
         Args:
             clicks: x, y, and whether the pixel is inside the thing.
             box: left, top, right, bottom, inclusive; only without clicks.
 
         Raises:
-            SettingsError: nothing is clicked inside the photograph, or the scene has no SAM.
+            SettingsError: no click is inside the thing and the photograph, or the scene has no SAM.
         """
         height, width = self.scene.cameras[view].size_hw
         points = np.array([[x + 0.5, y + 0.5] for x, y, _ in clicks]).reshape(-1, 2)

@@ -200,7 +200,7 @@ def _write(form: Form, folder: Path, out: Path, variant: str, data_root: Path, t
         parts = FinishedScene.locate(folder, variant).parts
         export_langsplat(opened, parts.masks, parts.clip, parts.gaussians, out)
         return f"wrote images, sparse/0, point_cloud.ply and language_features of {views} views to {out}"
-    from hilsplat.annotate.exporting import export_labels
+    from hilsplat.annotate.exchange import export_labels
 
     return f"wrote labels of {export_labels(opened, folder, data_root, out)} views to {out}"
 

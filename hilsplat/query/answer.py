@@ -38,10 +38,10 @@ def answer(
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
 
     The answer takes milliseconds, the picture one to two seconds, including imports and rendering. Other
-    arguments and errors as in `LanguageScene.open` and `LanguageScene.query`.
+    arguments and errors are those of `LanguageScene.open` and `LanguageScene.query`.
 
     Args:
-        views: number of views in the panel; a given `view` is the first.
+        views: number of views in the panel; `view`, if given, is the first.
         out: folder of both files; by default `queries/<text>` in the scene's folder.
     """
     found = FinishedScene.locate(Path(folder), variant)
@@ -60,14 +60,14 @@ def answer(
     if out is not None:
         require_own_picture(panel, beside=selection)
     shown = list(dict.fromkeys([*([view] if view else []), *views_of(scene, hits, views)]))[:views]
-    asked = "" if view is None else f", of what {view} shows"
-    query_panel(scene, text, nodes, shown, panel, note=asked + note, answerer=answerer)
+    restriction = "" if view is None else f", in view {view}"
+    query_panel(scene, text, nodes, shown, panel, note=restriction + note, answerer=answerer)
     write_selection_ply(found.parts.gaussians, scene.gaussians_of(nodes.ids), selection)
     yield f"wrote {panel} and {selection.name}"
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
-    """Return the views that show the best answers largest, without repeats, then others across the scene."""
+    """Return the views in which the best answers are largest, then others, evenly spaced over the scene."""
     best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
     every = scene.scene.views()
     spread = [every[number * len(every) // count] for number in range(count)]
@@ -76,12 +76,12 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 
 def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
     """Return the answers as text, with doubts; `view` is the view that the query was restricted to."""
-    place = scene.scene.name if view is None else f"what {view} shows of {scene.scene.name}"
+    place = scene.scene.name if view is None else f"view {view} of {scene.scene.name}"
     hits, doubts = scene.hits_of(found, LISTED), doubts_of(found)
     if not hits:
         levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
         other = "" if view is None else ", or leave out --view"
-        return f"nothing in {place} answers to {text!r} at level {found.level.label}; try {levels}{other}"
+        return f"nothing in {place} matches {text!r} at level {found.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
     width = max(len(hit.name or "?") for hit in hits)
     lines = [
@@ -98,20 +98,18 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
             f"{hit.name or '?':<{width}}  {views}"
         )
     if more := len(found.ids) - len(hits):
-        lines.append(f"and {counted(more, 'weaker answer')}, which the pictures show too")
+        lines.append(f"and {counted(more, 'weaker answer')}, also shown in the pictures")
     lines.append('a score of 0.5 is no better than a generic word such as "object"')
     if hits[0].route == "fallback":
         first = path_of(text)[0]
-        lines.append(
-            f"no answer is part of anything that answers to {first!r}: the whole scene was searched instead"
-        )
+        lines.append(f"no answer is part of a match for {first!r}: the whole scene was searched instead")
     return "\n".join([*lines, *(f"doubtful: {doubt}" for doubt in doubts)])
 
 
 def file_name(text: str) -> str:
     """Return a folder name for a query that is valid on every system, such as `bear--nose`.
 
-    For texts that are long or contain other characters, the name ends in part of their digest to be unique.
+    The name of a text that is long or contains other characters ends in part of its digest, to be unique.
     """
     parts = [part.split() for part in text.split(PATH_SEPARATOR)]
     if all(parts) and all(re.fullmatch(r"[\w.]*\w", word) for part in parts for word in part):

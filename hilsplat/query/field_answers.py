@@ -1,4 +1,4 @@
-"""Answers from a scene's decoded language field, as in the paper."""
+"""Relevancy from a scene's decoded language field, as in the paper."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,8 +11,7 @@ from hilsplat.base.errors import ArtifactError
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import rendered_latents
-from hilsplat.field.code import Code
-from hilsplat.field.language_field import LanguageField
+from hilsplat.field.code import Code, LanguageField
 from hilsplat.query.relevancy import LatentRelevancy
 from hilsplat.query.relevancy_kernels import fill_maps
 from hilsplat.query.scene_views import SceneViews
@@ -66,8 +65,8 @@ class FieldScene(SceneViews):
         Pixels that show mostly Gaussians without a latent at the level get the lowest value of the others.
 
         Args:
-            exact: whether a network decodes every pixel at every call; otherwise a view is decoded once, and
-                results differ by at most 2e-3 (see `LatentRelevancy`). No difference for a linear code.
+            exact: if true, a network decodes every pixel at every call; otherwise it decodes a view once, and
+                results differ by at most 2e-3 (see `LatentRelevancy`). It has no effect for a linear code.
         """
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)

@@ -1,4 +1,4 @@
-"""Human-readable answers: the node, its position, its best views and any doubts."""
+"""Answers as users see them: the node, its position, its best views and any doubts."""
 
 from dataclasses import dataclass, field
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int64
 from hilsplat.base.levels import Level
 from hilsplat.query.node_search import NodeHits
 from hilsplat.query.scene_views import SceneViews
-from hilsplat.semantic_tree.boxes import OrientedBox
+from hilsplat.semantic_tree.tree import OrientedBox
 
 LIKELY_CHANCE = 0.05
 """An answer is doubtful if more than this share of the words for absent things score as high."""
@@ -20,8 +20,8 @@ class Doubt:
 
     Attributes:
         level: the level that was searched, if a node of any level matches the text; otherwise None.
-        chance: share of words for absent things whose best score is as high; None if unknown, in which case
-            no node matches the text better than a generic word.
+        chance: share of words for absent things whose best score is as high; None if the reason for the doubt
+            is another.
         unknown: words of the text that are not in the model's vocabulary.
     """
 
@@ -32,12 +32,12 @@ class Doubt:
 
     def __str__(self) -> str:
         """Return the doubt as a sentence."""
-        who = "nothing" if self.level is None else f"no {self.level.label}"
+        kind = "node" if self.level is None else self.level.label
         if self.unknown:
             words = ", ".join(map(repr, self.unknown))
-            return f"{self.text!r} may not be in the scene: the model does not know {words}"
+            return f"{self.text!r} may not be in the scene: the model's vocabulary lacks {words}"
         if self.chance is None:
-            return f"{who} here answers to {self.text!r} better than to a generic word"
+            return f"no {kind} is closer to {self.text!r} than to a generic word"
         share = f"{max(self.chance, 0.01):.0%} of words for absent things"
         return f"{self.text!r} may not be in the scene: {share} score as high"
 
@@ -49,13 +49,14 @@ class Hit:
     Attributes:
         node: row of the semantic tree.
         score: relevancy in (0, 1) of the node and, with a lower weight, of its ancestors; answers are sorted
-            by it, and 0.5 is no better than a generic word. With route "like", the cosine with a node or
+            by it, and 0.5 is no better than a generic word. For route "like", the cosine with a node or
             picture.
         box: axis-aligned, lower and upper corner.
         oriented_box: the box along the node's own axes.
-        best_views: up to three training views that show it largest.
+        best_views: up to three training views in which it is largest.
         route: as in `NodeHits`, or "like".
-        doubts: texts of the query that may match nothing; a path is no better than its first text.
+        doubts: texts of the query that may match nothing; if the first text of a path is doubtful, so are
+            all answers.
         name: the user's name for the node, otherwise its vocabulary name; empty if nothing fits.
     """
 

@@ -1,7 +1,7 @@
-"""A finished scene that accepts text queries, on its semantic tree or on its decoded language field.
+"""A finished scene that accepts text queries of its semantic tree or of its decoded language field.
 
-`hilsplat.open` opens it; docs/python.md shows how to query it. From text to Gaussians: `query` parses the
-text, `select` searches the tree by cosine margins (`node_search.search`), and each `Hit` has its Gaussians.
+docs/python.md describes its use. From text to Gaussians: `query` parses the text, `select` searches the tree
+by cosine margins (`node_search.search`), and each `Hit` has its Gaussians.
 """
 
 import logging
@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import ArtifactError, ModelError, SettingsError
 from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.field.code import autoencoder_file, load_code
-from hilsplat.field.language_field import LanguageField
+from hilsplat.field.code import LanguageField, autoencoder_file, load_code
 from hilsplat.models.store import is_embedded, meaningless
 from hilsplat.query.field_answers import FieldScene
 from hilsplat.query.hits import Doubt, Hit, doubts_of
@@ -28,8 +27,7 @@ from hilsplat.query.relevancy import margin_of_relevancy, margins, relevancy_of_
 from hilsplat.query.scene_views import Opened
 from hilsplat.scene.finished import FinishedScene, SceneParts, is_drawn, require_made_for
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.boxes import OrientedBox
-from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.settings import EvaluateSettings
 
 if TYPE_CHECKING:
@@ -51,7 +49,7 @@ class LanguageScene(FieldScene):
     """A finished scene that accepts text queries.
 
     Attributes:
-        caution: sentence that explains why CLIP's answers are meaningless here; empty if they are not.
+        caution: sentence that explains why CLIP's answers are meaningless for this scene, or empty.
         names: the user's names for nodes, which are matched first.
         naming: vocabulary names of the nodes, and words for absent things; None if the stage has not run.
         unknown_words: returns the words of a text that are not in the text model's vocabulary.
@@ -112,7 +110,7 @@ class LanguageScene(FieldScene):
 
         Args:
             opened: artifacts that other variants of the scene have already opened.
-            names, naming: None in evaluation, which scores only the models and reports no chance.
+            names, naming: None in evaluation, which scores only the models and doesn't estimate chance.
 
         Raises:
             MisalignedArtifactError: the tree or field was made for other Gaussians or cameras, or the field
@@ -166,9 +164,10 @@ class LanguageScene(FieldScene):
         """Show the scene in a notebook: the page of `hilsplat view` in a frame, served by this process.
 
         Args:
+            text: query to run when the page opens.
             height: px.
-            proxy: address, containing `{port}`, under which the browser reaches a port of this machine, if
-                the browser runs on another machine: "/user/me/proxy/{port}/" on a JupyterHub.
+            proxy: address, containing `{port}`, at which a browser on another machine reaches a port of this
+                machine: "/user/me/proxy/{port}/" on a JupyterHub.
 
         Raises:
             ArtifactError: the scene was assembled from parts, or has too many Gaussians to show.
@@ -191,7 +190,7 @@ class LanguageScene(FieldScene):
         threshold: float | None = None,
         limit: int = 10,
     ) -> list[Hit]:
-        """Return ranked answers to a text, or to a path such as "bear > head > nose"; several for "mugs".
+        """Return ranked answers to a text, or to a path such as "bear > head > nose".
 
         Args:
             text: words, or words separated by ">".
@@ -199,9 +198,9 @@ class LanguageScene(FieldScene):
             answerer: "tree" compares the nodes' averaged CLIP vectors with the text; "field" compares the
                 decoded mean of the paper's field over their Gaussians.
             view: name of a view, to find only nodes that it shows; None: the whole scene.
-            threshold: minimum score of an answer, in (0, 1); None: answers near the best, whose margin is at
-                most (1 - `node_select`) times the range of the level's margins below it, or three times that
-                if they look like it.
+            threshold: minimum score of an answer, in (0, 1); None: the best answer, and those whose margin is
+                lower by at most (1 - `node_select`) times the range of the level's margins, or three times
+                that if they look like the best.
             limit: maximum number of answers.
 
         Raises:
@@ -212,7 +211,7 @@ class LanguageScene(FieldScene):
         return self.hits_of(found, limit)
 
     def like_node(self, node: int, *, limit: int = 10) -> list[Hit]:
-        """Return the nodes of a node's own level that look most like it, best first; scores are cosines.
+        """Return the nodes of a node's level that look most like it, best first; scores are cosines.
 
         Raises:
             SettingsError: there is no such node.
@@ -276,7 +275,7 @@ class LanguageScene(FieldScene):
     ) -> NodeHits:
         """Return the answers of `query` as rows of the tree; the path may also be a sequence of texts.
 
-        Arguments and errors as in `query`; a level of None is "auto".
+        Arguments and errors are those of `query`; a level of None is "auto".
         """
         path = path_of(path) if isinstance(path, str) else tuple(path)
         if answerer not in ANSWERERS:
@@ -307,7 +306,7 @@ class LanguageScene(FieldScene):
         return replace(found, texts=tuple(self._doubted(each, answerer, shown) for each in found.texts))
 
     def _doubted(self, answer: TextAnswer, answerer: str, shown: Bool[np.ndarray, " n"] | None) -> TextAnswer:
-        """Return a text's answer with the share of words for absent things that score as high."""
+        """Return a text's answer, completed by the share of words for absent things that score as high."""
         if self.names.nodes_of(answer.text):
             return answer
         chance = None
@@ -356,7 +355,7 @@ class LanguageScene(FieldScene):
         return found
 
     def caution_about(self, text: str) -> str:
-        """Return `caution`, or "" if every text of a query is a user-given name, so that CLIP is not used."""
+        """Return `caution`, or "" if every text of a query is a user-given name, which needs no CLIP."""
         return "" if all(self.names.nodes_of(part) for part in path_of(text)) else self.caution
 
     def node_relevancy(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
@@ -368,13 +367,13 @@ class LanguageScene(FieldScene):
         return self.tree.clip if answerer == "tree" else self._decoded_nodes
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
-        """Blend the relevancy of the nodes that each pixel shows, as `SceneViews.blended`."""
+        """Average the nodes' relevancy in each pixel (see `SceneViews.blended`)."""
         return self.blended(view, self.node_relevancy(texts))
 
     def node_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Blend the cosines of texts with the nodes that pixels show by their weights, at each level.
+        """Average the cosines of texts and nodes over the Gaussians of pixels, weighted by W, at each level.
 
         Gaussians without a node have the lowest cosine of the level; uncovered pixels have -inf. User-given
         names are ignored. A pixel's number is row * width + column.

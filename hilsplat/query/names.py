@@ -1,4 +1,4 @@
-"""Names that the user gave to nodes; they are matched before CLIP and need no model.
+"""Names that the user gave to nodes; they are matched first, without a model.
 
 `names.json` in a scene's folder stores them under the digest of `tree.npz`, because rows of one tree mean
 nothing in another. If a tree is rebuilt, the names of the previous tree are kept but not used.
@@ -76,7 +76,7 @@ def write_names(
         if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
             raise SettingsError(
                 f"{name!r} cannot be a name",
-                expected=f"at most {LONGEST} letters, without {PATH_SEPARATOR!r}, which separates a path",
+                expected=f"at most {LONGEST} characters, without {PATH_SEPARATOR!r}, which separates paths",
             )
     with replacing(path, version, f"the names in {path}"):
         found = _kept(path)

@@ -1,4 +1,4 @@
-"""The stage `names`: the best word of a vocabulary for each node, and words for absent things."""
+"""Stage `names`: the best vocabulary word for each node, and vectors of words for absent things."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,14 +42,13 @@ STANDS_OUT = 0.5
 standard deviations of the vocabulary's margins. Chosen on development scenes (docs/experiments.md)."""
 
 FEWEST_ABSENT = 100
-"""Minimum number of known words for absent things. Below it, words that are no node's nearest replace them;
-if those are too few as well, chance is not estimated."""
-
+"""Minimum number of known words for absent things. If there are fewer, vocabulary words that are not the
+nearest word of any node replace them; if those are too few as well, chance is not estimated."""
 
 THINGS, PARTS, SURFACES = range(3)
 
 VOCABULARY = "vocabulary.txt"
-"""Vocabulary of a model if it is in the model's folder; the file in this package is for all other models."""
+"""File of a model's own vocabulary in its folder; the file in this package is for all other models."""
 
 COMMON = Path(str(files("hilsplat.query") / VOCABULARY))
 AUTO = "auto"
@@ -58,7 +57,7 @@ SECTIONS = ("things", "parts", "surfaces", "absent")
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Distinct texts by kind; `absent` has words for things that few scenes contain, or is empty."""
+    """Distinct texts by kind; `absent` has words for things that few scenes contain, and may be empty."""
 
     things: tuple[str, ...]
     parts: tuple[str, ...] = ()
@@ -123,7 +122,7 @@ class NodeNaming:
 
     @staticmethod
     def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":
-        """Read the artifact; return None if there is none for this tree and these vectors.
+        """Read the artifact; return None if it is missing or was made for another tree or other vectors.
 
         Raises:
             ArtifactError: the artifact is damaged.
@@ -160,12 +159,11 @@ def run_names(
     settings: QuerySettings,
     evaluate: EvaluateSettings,
 ) -> None:
-    """Name the nodes of a tree.
+    """Name the nodes of a tree; write `names.json`, `rivals.npy` and an index to `out`.
 
     Args:
         clip_folder: CLIP vectors of the masks.
-        out: folder to write: `names.json`, `rivals.npy` and an index.
-        cache: cache folder of text vectors, shared by all scenes of a model.
+        cache: folder of text vectors, shared by all scenes of a model.
 
     Raises:
         SettingsError: the vocabulary cannot be read.
@@ -231,8 +229,8 @@ def named(
         margin: the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order.
 
     Returns:
-        for each node: its `name`, whether it is a `surface`, and its `candidates`: the nearest texts with
-        their margins, best first.
+        for each node, its `name`, whether this is a `surface`, and the nearest texts with their margins, best
+        first, as `candidates`.
     """
     groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
     words = [word for group in groups for word in group]

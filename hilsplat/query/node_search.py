@@ -1,4 +1,4 @@
-"""Selection of semantic tree nodes by cosine margins: level, multiple hits and paths."""
+"""Selection of semantic tree nodes by cosine margins: level, number of answers, paths."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -23,10 +23,10 @@ ANCESTORS_SHARE = 0.5
 
 PLAUSIBLE = 0.25
 """A node competes on a path only if its ancestor is at most this share of the range below the best answer to
-the first text: the nose of something other than a bear is no answer to "bear > nose"."""
+the first text: only the nose of a plausible bear is an answer to "bear > nose"."""
 
 WITHOUT_ANCESTOR = 0.1
-"""A missing ancestor counts as this share of the range below the best."""
+"""Share of the range by which a missing ancestor counts as below the best."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _search_path(
     part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are
     therefore searched. Those whose best answer has an ancestor for every text are preferred, and among these
     the one with the largest sum of margins. Ancestors need not be shown; they compete with nodes that are
-    shown or that hold a shown node.
+    shown or have a shown descendant.
     """
     ways = [way for way in combinations(LEVELS, len(path)) if way and level in (None, way[-1])]
     if not ways:
@@ -261,7 +261,7 @@ def _search_way(
     for text, (of_text, level) in enumerate(zip(margin[:-1], levels[:-1], strict=True)):
         holder, of_level = ancestors[:, level.index], tree.nodes_of(level)
         rivals = of_level
-        if shown is not None:  # an ancestor may be hidden by a shown node that it holds
+        if shown is not None:  # an ancestor may be hidden behind a descendant
             rivals = of_level[shown[of_level] | np.isin(of_level, holder[may])]
         margins.append(float(of_text[rivals].max(initial=-np.inf)))
         best = margins[-1] if len(rivals) else 0.0

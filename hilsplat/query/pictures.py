@@ -1,4 +1,4 @@
-"""Building blocks of figures: overlays of answers, relevancy colours, a map of the scene from above."""
+"""Parts of figures: overlays of answers, relevancy colours, a map of the scene from above."""
 
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H
 
 
 def line_px(image: UInt8[np.ndarray, "H W 3"]) -> int:
-    """Return a width of outlines that is visible at any image size."""
+    """Return an outline width that is visible at any image size."""
     return max(1, round(max(image.shape[:2]) / 256))
 
 
@@ -54,7 +54,7 @@ def paint_answer(
     answer: Bool[np.ndarray, "H W"] | None,
     truth: Bool[np.ndarray, "H W"] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Paint an answer in orange over the dimmed photograph, and outline the true region in cyan."""
+    """Paint an answer in orange over the dimmed photograph, and outline the ground-truth region in cyan."""
     if answer is None:
         painted = image.astype(float)
     else:
@@ -84,12 +84,12 @@ def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold:
     for spine in axes.spines.values():
         spine.set_linewidth(2.0 if bold else 0.5)
         spine.set_color("#ff7a00" if bold else "#888888")
-    # Titles contain queries and user-given names, in which a dollar sign does not start mathematics.
+    # Titles contain queries and user-given names; a dollar sign in these must not start a formula.
     axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal", parse_math=False)
 
 
 def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
-    """Write the name of a row of pictures along its left side."""
+    """Write the name of a row of pictures along the left side of its first one."""
     axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8, parse_math=False)
 
 

@@ -40,7 +40,8 @@ def query_panel(
 ) -> None:
     """Draw a query: photograph, answer and relevancy at three levels per view, and the scene from above.
 
-    `note` is appended to the title, with doubts below. With the answerer "field", relevancy is the field's.
+    `note` is appended to the title; doubts are written below it. The answerer "field" draws the field's
+    relevancy.
     """
     last = path_of(text)[-1]
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
@@ -82,7 +83,7 @@ def query_panel(
 
 
 class _Page:
-    """A figure addressed in pixels from its upper left corner.
+    """A figure with pixel coordinates from its upper left corner.
 
     Pictures are scaled and placed directly. One `Axes` per picture, with a layout computed by drawing
     everything twice, would take most of the time of a query.

@@ -1,18 +1,18 @@
-"""How well an embedding matches a text: its cosine margin, and LERF's relevancy, computed from it.
+"""Match between embeddings and texts: cosine margins, and LERF's relevancy, computed from them.
 
 `LatentRelevancy` computes relevancy for every pixel of a view from its rendered latents:
 
 - Linear code (PCA): the length of a decoded latent and its nearest canonical phrase do not depend on the
   text, so they are found once per view. A text then costs d products per pixel, without decoding.
 - Network: every pixel of a view is decoded once. The decoded vectors are close to a subspace of few
-  directions (about 65 of 128, 105 of 512). Each is stored as its coordinates there, in 16 bits, with the
-  cosine of its nearest canonical phrase, computed from the full vector. A text then costs one product per
-  pixel and direction. The directions are computed from a sample of the pixels. Every pixel is then checked:
-  pixels that lose too much for the error bound (`lost_for_error`), such as a small unsampled object, get
-  additional directions.
+  directions (about 65 of 128, 105 of 512). Each vector is stored as its coordinates in the subspace, in 16
+  bits, with the cosine of its nearest canonical phrase, computed from the full vector. A text then costs one
+  product per pixel and direction. The directions are computed from a sample of the pixels. Every pixel is
+  then checked: pixels whose loss exceeds the error bound (`lost_for_error`), such as those of a small
+  unsampled object, get additional directions.
 
-Both are stored channel by channel, which lets the compiler process eight or sixteen pixels at once. Memory
-bandwidth is the limit: three levels of a 986 x 728 view at d = 16 are 138 MB.
+Both forms are stored channel by channel, so that the compiler can process eight or sixteen pixels at once.
+Memory bandwidth is the limit: three levels of a 986 x 728 view at d = 16 are 138 MB.
 """
 
 from collections.abc import Callable
@@ -56,8 +56,8 @@ def margins(
 ) -> Float32[np.ndarray, "T B"]:
     """Return the cosine with each text minus the cosine with the nearest canonical phrase, in [-2, 2].
 
-    0 means as close to the text as to the nearest generic phrase. Embeddings are ranked and compared by
-    margins, because relevancies saturate and margins do not. All vectors have unit length.
+    At margin 0, an embedding is as close to the text as to the nearest canonical phrase. Embeddings are
+    compared by margins because relevancies saturate. All vectors have unit length.
     """
     found = np.empty((len(texts), len(embeddings)), np.float32)
     for start in range(0, len(embeddings), EMBEDDINGS_AT_A_TIME):
@@ -68,7 +68,7 @@ def margins(
 
 
 def relevancy_of_margins(margin: Float[np.ndarray, "*n"], scale: float) -> Float[np.ndarray, "*n"]:
-    """Return the score that users and protocols see: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
+    """Return the displayed and evaluated score: 1 / (1 + exp(-scale * margin)), 0.5 at margin 0."""
     return 1 / (1 + np.exp(-scale * margin))
 
 
@@ -91,8 +91,7 @@ def relevancy(
 ) -> Float32[np.ndarray, "T B"]:
     """Return the lowest softmax score of a text against each canonical phrase, in (0, 1).
 
-    rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)), which is the logistic function of the
-    scaled margin: an embedding at margin 0 scores exactly 0.5, no better than generic.
+    rel = min over k of exp(s e.q) / (exp(s e.q) + exp(s e.c_k)), the logistic function of the scaled margin.
 
     Source: LERF; LangSplat, `eval/openclip_encoder.py`; both use a scale of 10.
 
@@ -134,7 +133,7 @@ class ProjectedView:
 
 
 class LatentRelevancy:
-    """Relevancy of latents to texts, against fixed canonical phrases; it does not depend on `threads`."""
+    """Relevancy of latents to texts, with fixed canonical phrases; results do not depend on `threads`."""
 
     def __init__(
         self, code: Code, canonical: Float32[np.ndarray, "K C"], scale: float, threads: int = 1
@@ -199,12 +198,12 @@ class LatentRelevancy:
         return LinearView(channels, length, generic)
 
     def _prepare_projected(self, latents: Float32[np.ndarray, "P D"]) -> ProjectedView:
-        """Decode pixels, and those that lose too much again.
+        """Decode all pixels, and add directions until no pixel's loss exceeds the limit.
 
         The directions computed from a sample lose `RESIDUAL` on that sample. Pixels whose loss exceeds the
         limit get additional directions in the same way, orthogonal to all previous ones. The other pixels
-        have 0 along these, so their loss does not change. Each round uses at least one of the C directions,
-        so the loop ends.
+        have coordinate 0 along these, so their loss does not change. Each round uses at least one of the C
+        directions, so the loop ends.
         """
         may_lose = lost_for_error(self._scale, self._code.channels)
         directions, others = self._directions(latents, np.eye(self._code.channels))
@@ -239,7 +238,7 @@ class LatentRelevancy:
             generic[span] = (vectors @ self._canonical.T).max(axis=1)
             along = directions @ vectors.T
             coordinates[:, span] = np.rint(along * STEPS)
-            # 1 minus the squared coordinates is too inexact: its error of 1e-7 is the square of 3e-4.
+            # 1 minus the sum of squared coordinates is too inexact: its error of 1e-7 is the square of 3e-4.
             rest = vectors - along.T @ directions
             lost[span] = np.sqrt(np.einsum("pc,pc->p", rest, rest))
 
@@ -257,7 +256,7 @@ class LatentRelevancy:
 
 
 def lost_for_error(scale: float, channels: int) -> float:
-    """Return how much of a decoded unit vector the directions may lose for a relevancy error of `ERROR`.
+    """Return the loss outside the directions at which a relevancy error cannot exceed `ERROR`.
 
     Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. The nearest phrase's g is computed from the
     full vector, so only e.q has an error: at most |q| = 1 times the distance of e from its stored form. This
@@ -278,7 +277,7 @@ def lost_for_error(scale: float, channels: int) -> float:
 def main_directions(
     vectors: Float32[np.ndarray, "P C"], among: Float64[np.ndarray, "A C"]
 ) -> tuple[Float64[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-    """Return the fewest directions (at least one) that lose at most `RESIDUAL`, and the others (A = R + B).
+    """Return the minimum number of directions that lose at most `RESIDUAL`, and the others (A = R + B).
 
     Args:
         vectors: only their components in the span of `among` are used.

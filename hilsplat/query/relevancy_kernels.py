@@ -1,12 +1,12 @@
-"""Compiled loops of the look-ups: weighted sums of channels, and the resulting relevancy."""
+"""Compiled loops of relevancy look-ups."""
 
 import numpy as np
 
 from hilsplat.base.compiled import compiled
 
 BLOCK = 2048
-"""Pixels to process at once: their sums fit in the L1 cache, and each channel's part is long enough for
-prefetching."""
+"""Pixels to process at once: their sums fit in the L1 cache, and each channel's part is long enough to be
+prefetched."""
 
 TRANSPOSED = 16
 """Rows to transpose at once: their part of a channel fills a cache line."""
@@ -27,7 +27,7 @@ def by_channel(rows):
 
 @compiled
 def _dots_of_block(channels, begin, end, offset, slope, out):
-    """Write the offset plus weighted channel sum of pixels begin..end to the start of `out`.
+    """Write the offset plus the weighted channel sum of pixels begin..end to the start of `out`.
 
     Eight channels are summed at a time, so that sums are read and written an eighth as often.
     """

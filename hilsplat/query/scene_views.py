@@ -19,7 +19,7 @@ from hilsplat.semantic_tree.view_nodes import ViewNodes
 from hilsplat.splat.gaussians import Gaussians
 
 MIN_SHOWN_SHARE = 1e-4
-"""Minimum share of a view that shows a node: 14 px of 384 x 384 are too few."""
+"""Minimum share of a view's pixels that a shown node covers; 14 px of 384 x 384 are too few."""
 
 VIEW_CACHE_MIB = 1024.0
 
@@ -75,7 +75,10 @@ def _nbytes(value: Any) -> int:
 
 @dataclass(frozen=True)
 class SceneViews:
-    """The views of a scene with a semantic tree; `pixel_weights` returns W of a view (pixels x Gaussians)."""
+    """The views of a scene with a semantic tree.
+
+    `pixel_weights` returns a view's weight matrix W (pixels x Gaussians).
+    """
 
     scene: Scene
     gaussians: Gaussians
@@ -99,7 +102,7 @@ class SceneViews:
         return self.scene.cameras[view]
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Return a view's undistorted photograph; it is cached and read-only, so copy it to draw on it."""
+        """Return a view's undistorted photograph; the cached array is read-only: copy it to change pixels."""
         self.camera(view)
 
         def read() -> np.ndarray:
@@ -114,7 +117,7 @@ class SceneViews:
         self._views.forget(view)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
-        """Return W of a view with rows divided by alpha; rows with an alpha below 0.5 are empty."""
+        """Return W with rows divided by alpha; rows with an alpha below 0.5 are empty."""
         return self._views.get(("weights", view), lambda: normalised_weights(self.pixel_weights(view)))
 
     def view_nodes(self, view: str, level: Level) -> ViewNodes:
@@ -125,7 +128,7 @@ class SceneViews:
         )
 
     def nodes_shown(self, view: str) -> Bool[np.ndarray, " n"]:
-        """Return which nodes have a mask of at least `MIN_SHOWN_SHARE` of a view."""
+        """Return whether each node's mask covers at least `MIN_SHOWN_SHARE` of a view."""
         height, width = self.camera(view).size_hw
 
         def measure() -> np.ndarray:
@@ -140,7 +143,7 @@ class SceneViews:
         return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
 
     def node_masks(self, view: str, ids: Nodes) -> Bool[np.ndarray, "H W"]:
-        """Return the pixels in which the nodes' Gaussians have a share above 0.5."""
+        """Return the pixels in which the nodes' Gaussians have a total share above 0.5."""
         ids = np.asarray(ids, np.int64)
         size_hw = self.camera(view).size_hw
         if not len(ids):
@@ -155,10 +158,10 @@ class SceneViews:
         return (self.view_weights(view) @ member > 0.5).reshape(size_hw)
 
     def blended(self, view: str, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
-        """Blend the scores of the nodes that each pixel shows by its weights, at each level.
+        """Average node scores over each pixel's Gaussians, weighted by W, at each level.
 
-        Gaussians without a node get the lowest node score of the level. Uncovered pixels get the lowest value
-        of the covered ones, so that they are never selected and do not stretch the range.
+        Gaussians without a node have the lowest node score of the level. Uncovered pixels get the lowest
+        value of the covered ones, so that they are never selected and do not extend the range.
         """
         height, width = self.camera(view).size_hw
         maps = np.zeros((len(scores), len(LEVELS), height * width), np.float32)

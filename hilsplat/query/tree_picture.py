@@ -49,9 +49,9 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
 
 
 def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the tree: one row of crops per level, one block per whole and its descendants, side by side.
+    """Draw the tree: one row of crops per level, and side by side one block per whole with its descendants.
 
-    Orphans of finer levels have their own blocks at their level. A crop shows the node in the view in which
+    Nodes of finer levels without a parent have their own blocks. A crop shows the node in the view in which
     it is largest, with the rest of that view dimmed, above the node's name and number.
     """
     tree = scene.tree
@@ -69,7 +69,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     placed: list[tuple[int, int, int]] = []
 
     def place(node: int, left: int, top: int) -> tuple[int, int]:
-        """Place a node and its descendants, draw their lines, and return its middle and the width used."""
+        """Place a node and its descendants, draw their lines, and return the node's middle and the width."""
         index = Level(int(tree.level[node])).index
         y = top + index * ROW_PX
         kids, used, middles = tree.children_of(np.array([node])), 0, []

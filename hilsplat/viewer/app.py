@@ -18,10 +18,9 @@ from starlette.routing import Route
 from hilsplat.base.errors import SettingsError
 from hilsplat.query.names import write_names
 from hilsplat.scene.finished import FinishedScene
-from hilsplat.viewer import answers, exports, wire
+from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.openapi import description
-from hilsplat.viewer.payload import packed_nodes
 from hilsplat.viewer.saved_files import SavedFiles, node_of
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.guard import Guard
@@ -48,7 +47,7 @@ class Viewer:
         self.pages = Pages("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
-        """Return the guarded application, for a page of its own or a frame in another page."""
+        """Return the guarded application, for a separate page or a frame in another page."""
         get, post = self.thread.get, self.thread.post
         routes = [
             *self.pages.routes(),
@@ -84,7 +83,7 @@ class Viewer:
         def write(shown: ViewerScene) -> dict[str, Any]:
             scene = shown.answering(asked.variant)
             tree, version = shown.parts(asked.variant).semantic_tree, version_sent(request)
-            with shown.unchanged():  # otherwise the names could be assigned to nodes of a rebuilt tree
+            with shown.unchanged():  # otherwise nodes of a rebuilt tree could get the names
                 names = write_names(shown.folder, tree, asked.names, len(scene.tree), version)
             shown.rename(tree, names)
             return {"version": names.version, "names": dict(names.of_node)}
@@ -93,7 +92,7 @@ class Viewer:
 
 
 def _nodes(shown: ViewerScene, of: Mapping[str, Any]) -> bytes:
-    return packed_nodes(shown.answering(of["variant"]).tree, shown.order)
+    return payload.packed_nodes(shown.answering(of["variant"]).tree, shown.order)
 
 
 def _crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
@@ -103,18 +102,18 @@ def _crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
         return plain(encoded(exports.crop(scene, node, shown.threads)), "image/jpeg", cached=True)
 
 
-def _query(shown: ViewerScene, asked: wire.Query) -> answers.Answer:
-    return answers.answer(shown.answering(asked.variant), asked, asked.answerer)
+def _query(shown: ViewerScene, asked: wire.Query) -> payload.Answer:
+    return payload.answer(shown.answering(asked.variant), asked, asked.answerer)
 
 
-def _like(shown: ViewerScene, asked: wire.Like) -> answers.Answer:
+def _like(shown: ViewerScene, asked: wire.Like) -> payload.Answer:
     scene = shown.answering(asked.variant)
     if asked.node is not None:
-        hits = scene.like_node(asked.node, limit=answers.LISTED)
+        hits = scene.like_node(asked.node, limit=payload.LISTED)
         what = scene.name_of(asked.node) or f"node {asked.node}"
-        return answers.alike(scene, hits, f"like {what}", [asked.node])
-    hits = scene.like_picture(_picture(asked.picture), limit=answers.LISTED)
-    return answers.alike(scene, hits, "like the picture")
+        return payload.alike(scene, hits, f"like {what}", [asked.node])
+    hits = scene.like_picture(_picture(asked.picture), limit=payload.LISTED)
+    return payload.alike(scene, hits, "like the picture")
 
 
 def _field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
@@ -154,7 +153,7 @@ def run_view(
 ) -> None:
     """Serve the page of a scene on this machine until Ctrl-C.
 
-    Arguments as in `ViewerScene` and `serve`.
+    Arguments are those of `ViewerScene` and `serve`.
 
     Raises:
         ArtifactError: the scene has no Gaussians yet.
@@ -170,10 +169,7 @@ def run_view(
 class EmbeddedViewer:
     """A notebook frame with the page of a scene; `close` stops its server.
 
-    Args:
-        found: the finished scene.
-        text, height, proxy: as in `LanguageScene.show`.
-        threads: number of threads for rasterising and look-ups.
+    Arguments are those of `LanguageScene.show`.
     """
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:

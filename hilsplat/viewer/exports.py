@@ -1,4 +1,4 @@
-"""Files that the page can export: Gaussians, masks of all views, films, crops."""
+"""Content of exported files: Gaussians, masks of all views, films; crops of nodes."""
 
 import io
 import json
@@ -25,25 +25,22 @@ from hilsplat.web.coco import coco_content, coco_region
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
-"""Frame step of each format: a GIF has every second frame, or it would be far larger than the MP4."""
+"""Frame step of each format: a GIF has every second frame; with all, it would be far larger than the MP4."""
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
-"""Lower bound of alpha when a crop's pixels are assigned to the node; enlarging small things opens gaps."""
+"""Lower bound of alpha when a crop's pixels are assigned to the node: enlarged Gaussians leave gaps."""
 DIMMED, GROUND = 0.2, 110.0
 """Weight of the photograph outside the node of a crop, and the grey value that it is blended with."""
 
 Steps = Generator[tuple[int, int], None, bytes]
-"""A file made in steps: yields (steps done, total), starting with 0, and finally returns the file.
-
-Between steps, the scene thread can handle interactive requests.
-"""
+"""A file made in steps: yields (steps done, total), starting with 0, and finally returns the file."""
 
 
 def labelled(
     scene: LanguageScene, groups: Sequence[Group]
 ) -> tuple[Int64[np.ndarray, " g"], Int32[np.ndarray, " g"]]:
-    """Return the rows of the Gaussians of any group, ascending, and the group of each, counted from 1.
+    """Return the rows of all groups' Gaussians, ascending, and the group of each, numbered from 1.
 
     A Gaussian of several groups belongs to the one with the fewest Gaussians.
     """
@@ -70,7 +67,7 @@ def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Gr
 def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
     """Make a ZIP with masks of nodes in all views: a PNG per node and view that shows it, and one COCO file.
 
-    Groups are the COCO categories; a node of several groups has an annotation in each.
+    Groups are the COCO categories; a node of several groups has an annotation for each.
     """
     nodes = sorted({node for group in groups for node in group.nodes})
     yield 0, len(scene.views)
@@ -101,7 +98,7 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
 
 
 def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
-    """Return a square crop of the photograph that shows a node largest, with the rest dimmed towards grey.
+    """Return a square crop of the photograph in which a node is largest, with the rest dimmed towards grey.
 
     To find the node's pixels, only the square is rendered, with a camera whose image is the square.
     """
@@ -155,7 +152,7 @@ def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, fl
 
 
 def flight(asked: Film, scene: Scene) -> list[Camera]:
-    """Return one camera per frame of a film: along its path, or around what the training cameras saw."""
+    """Return one camera per frame: along the film's path, or along a tour of the training cameras."""
     if len(asked.path) > 1:
         path = open_path([camera.camera() for camera in asked.path], asked.frames)
     else:
@@ -172,16 +169,15 @@ def film(
     cameras: Sequence[Camera],
     paint: Paint | None,
     *,
-    kind: str = "mp4",
-    threads: int = 1,
-    on_frame: Callable[[int], None] = lambda drawn: None,
+    kind: str,
+    threads: int,
+    on_frame: Callable[[int], None],
 ) -> bytes:
-    """Render a film in the colours of a style.
+    """Render a film in the colours of a style; None: the scene's own colours.
 
     Args:
         cameras: one per frame, of even sizes; a GIF has every second one.
-        paint: the style; None: the scene's own colours.
-        on_frame: called after each frame with the frames so far; an exception from it ends the film.
+        on_frame: called after each frame with the number of frames so far; its exceptions end the film.
     """
 
     def pictures() -> Iterator[np.ndarray]:
@@ -199,7 +195,7 @@ def film(
 
 
 def write_gif(path: Path, frames: Iterator[np.ndarray]) -> None:
-    """Write a repeating GIF with 256 colours chosen from the whole film.
+    """Write a looping GIF with 256 colours chosen from the whole film.
 
     Dithering is off: on a synthetic table (128 colours) it lowered the quality from 41 dB to 35 dB, increased
     the size from 2.5 MB to 3.6 MB, and scattered dots over the answer.

@@ -16,15 +16,14 @@ from hilsplat.viewer.wire import Style
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 TINT = np.float32(0.35)
-"""Brightness of the grey of unselected Gaussians in `tint`. The page's shader has the same numbers."""
+"""Factor of unselected Gaussians' luminance in `tint`. The page's shader has the same numbers."""
 GHOST = np.float32(0.08)
-"""Share of their opacity that `ghost` leaves to unselected Gaussians."""
-
+"""Factor of unselected Gaussians' opacity in `ghost`."""
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
 SEEN = 0.05
-"""Minimum alpha of a pixel that shows something."""
+"""Minimum alpha of a pixel that can be picked."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,8 @@ def painted(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Render a view over black, as `render` does, in the colours of a style.
 
-    A selected Gaussian's colour c becomes c (1 - share) + rgb share. Unselected ones are unchanged with
-    `plain`, dark grey with `tint`, nearly transparent with `ghost`, and invisible with `isolate`.
+    A selected Gaussian's colour c becomes c (1 - share) + rgb share. Unselected Gaussians are unchanged in
+    mode `plain`, dark grey in `tint`, nearly transparent in `ghost`, and invisible in `isolate`.
     """
     degree = min(gaussians.sh_degree, 3)
     if paint is None:
@@ -95,8 +94,8 @@ def weights_at(
 ) -> tuple[Int64[np.ndarray, " g"], Float64[np.ndarray, " g"]]:
     """Return the Gaussians of one pixel, nearest first, and their blending weights: a row of `pixel_weights`.
 
-    The whole view is projected, because the Jacobian depends on the picture's borders; only this pixel is
-    blended.
+    The whole view is projected, because the Jacobian depends on the picture's borders, but only this pixel
+    is blended.
     """
     view = project_gaussians(gaussians, camera, 0, threads)
     first_x, last_x, first_y, last_y = view.box.T

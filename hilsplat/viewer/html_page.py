@@ -1,7 +1,7 @@
 """A scene with answers to some queries as one HTML file that needs no server, for papers and talks.
 
-The file is the page itself: its scripts are data URLs in an import map, with `offline.js` instead of
-`api.js`. Gaussians, nodes, crops and small photographs are text. It sends no network requests.
+The file is the viewer page: its scripts are data URLs in an import map, with `offline.js` instead of
+`api.js`. Gaussians, nodes, crops and small photographs are embedded as base64. It sends no network requests.
 """
 
 import base64
@@ -9,15 +9,14 @@ import re
 from typing import Any
 
 from hilsplat.base.images import resize_to_fit
-from hilsplat.viewer import answers, exports
-from hilsplat.viewer.payload import packed_nodes
+from hilsplat.viewer import exports, payload
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.viewer.wire import Page
 from hilsplat.web.server import as_json, encoded
 
 PHOTO_PX = 320
 MAX_CROPS = 400
-"""Maximum number of nodes for crops of all nodes; a larger tree gets crops of its wholes and the answers."""
+"""Maximum number of nodes with a crop each; in a larger tree, only wholes and answers have crops."""
 
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data: blob:; style-src 'unsafe-inline'; "
@@ -40,7 +39,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         "scene": {**shown.described(), "variants": [asked.variant], "chunk": len(shown.gaussians)},
         "variant": shown.described_variant(asked.variant),
         "asked": [question.model_dump(exclude_none=True) for question in questions],
-        "answers": [answers.answer(scene, question) for question in questions],
+        "answers": [payload.answer(scene, question) for question in questions],
         "kept": len(asked.kept),
         "photos": [_text(photo) for photo in photos],
         "opening": asked.start,
@@ -66,7 +65,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         "data": as_json(described).decode(),
         "sorter": sorter,
         "splats": _text(shown.spz(shown.order)),
-        "nodes": _text(packed_nodes(scene.tree, shown.order)),
+        "nodes": _text(payload.packed_nodes(scene.tree, shown.order)),
     }
     held = "\n".join(
         f'<script type="text/plain" id="{name}">{_inert(text)}</script>' for name, text in parts.items()
@@ -89,7 +88,7 @@ def _by_name(script: str) -> str:
 
 
 def _inert(text: str) -> str:
-    """Escape a text so that it cannot end the element that contains it; as JSON it stays the same."""
+    """Escape a text so that it cannot end the element that contains it; its JSON value does not change."""
     return text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
 
 

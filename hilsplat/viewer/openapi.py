@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import BaseModel, TypeAdapter
 
 from hilsplat.viewer import wire
-from hilsplat.viewer.answers import Answer
+from hilsplat.viewer.payload import Answer
 
 IMAGE = "image/jpeg"
 JSON = "application/json"
@@ -16,10 +16,10 @@ SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
     ("get", "/api/scene", "Views with their cameras, number of Gaussians, queryable variants", None, JSON),
     ("get", "/api/variant/{variant}", "The nodes of a variant's semantic tree, in row order", None, JSON),
     ("get", "/api/photo/{number}", "An undistorted photograph", None, IMAGE),
-    ("get", "/api/crop/{variant}/{node}", "A node in the photograph that shows it largest", None, IMAGE),
+    ("get", "/api/crop/{variant}/{node}", "A node in the photograph in which it is largest", None, IMAGE),
     ("post", "/api/query", "Answers to a text or a path", wire.Query, JSON),
     ("post", "/api/like", "Nodes similar to a node or a picture", wire.Like, JSON),
-    ("post", "/api/pick", "The nodes that a pixel of a camera shows, with their shares", wire.Pick, JSON),
+    ("post", "/api/pick", "The nodes at a pixel of a camera, with their shares", wire.Pick, JSON),
     ("post", "/api/frame", "A picture of the scene", wire.Frame, IMAGE),
     ("post", "/api/field", "The field's relevancy of every Gaussian in 1/255", wire.FieldRelevancy, BYTES),
     ("post", "/api/export/ply", "The Gaussians of nodes as a 3DGS PLY, with labels", wire.Selection, BYTES),
@@ -65,7 +65,7 @@ def description() -> dict[str, Any]:
                 "200": {"description": summary, "content": {given: content}},
                 "400": {"description": "the request is malformed: {error}"},
                 "403": {"description": "the cookie, the host or the origin is missing or wrong"},
-                "422": {"description": "the request cannot be answered: {error}"},
+                "422": {"description": "the request cannot be fulfilled: {error}"},
             },
         }
     return {
@@ -74,7 +74,7 @@ def description() -> dict[str, Any]:
             "title": "hilsplat view",
             "version": "1",
             "description": "Open the printed address first: it sets the cookie that every request needs. A "
-            "POST also needs the header Origin: http:// and the host of the address.",
+            "POST request also needs the header Origin: http://HOST, with the host of the address.",
         },
         "paths": paths,
         "components": {"schemas": schemas},

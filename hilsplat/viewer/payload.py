@@ -1,30 +1,38 @@
-"""Data that the page loads once: the scene as JSON, Gaussians in chunks, and their nodes."""
+"""Data of the page: scene, nodes, answers and boxes as JSON, and the order and nodes of the Gaussians."""
 
 import gzip
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.query.language_scene import LanguageScene
+from hilsplat.query.hits import Hit, doubts_of
+from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.boxes import OrientedBox
-from hilsplat.semantic_tree.tree import SemanticTree
+from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
 from hilsplat.splat.gaussians import Gaussians, morton_order
+from hilsplat.viewer.wire import Group, Question
+from hilsplat.web.server import view_name
 
 CHUNK = 65_536
 """Gaussians per chunk: 32 rows of the page's textures."""
 
 MAX_NODES = 65_534
-"""Maximum number of nodes, which are numbered from 1 in 16 bits; 0 is none."""
+"""Maximum number of nodes: they are numbered from 1 in 16 bits, and 0 is none."""
+
+LISTED = 24
+"""Maximum number of answers in the list."""
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
-    """Return the order in which the page loads Gaussians: most visible first, chunks in Morton order.
+    """Return the order in which the page loads Gaussians: most visible first, each chunk in Morton order.
 
-    The first chunk alone shows the outline of the scene.
+    The first chunk alone gives an impression of the scene.
     """
     scales = np.sort(gaussians.log_scales, axis=1)
     shows = np.argsort(-(scales[:, 1] + scales[:, 2] + np.log(gaussians.opacities + 1e-12)), kind="stable")
@@ -41,7 +49,7 @@ def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
 
 
 def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
-    """Describe the scene: views with their cameras, the initial focus point and the up direction."""
+    """Describe the scene: views with their cameras, initial focus point, up direction."""
     cameras = scene.cameras
     up, focus = upright(cameras), crossing(cameras)
     centres = np.stack([cameras[name].centre for name in cameras.names])
@@ -68,7 +76,7 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
 
 
 def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
-    """Return the mean up direction of the photographs."""
+    """Return the mean up direction of the cameras."""
     up = -cameras.cam_from_world[:, 1, :3].mean(axis=0)
     length = np.linalg.norm(up)
     return up / length if length > 1e-6 else -cameras.cam_from_world[0, 1, :3]
@@ -77,7 +85,7 @@ def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
 def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
     """Return the point nearest to all optical axes (least squares), in front of the first camera.
 
-    Parallel axes have no such point, so a small pull towards a point ahead of the mean camera decides.
+    A small pull towards a point in front of the mean camera makes it unique for parallel axes.
     """
     rotation, translation = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centres = -np.einsum("vji,vj->vi", rotation, translation)
@@ -122,3 +130,121 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
 def box_corners(rows: np.ndarray) -> list[list[float]]:
     """Return the eight corners of a stored oriented box."""
     return np.round(OrientedBox.from_array(rows).corners(), 5).tolist()
+
+
+# -- answers --------------------------------------------------------------------------------------
+
+
+class FoundNode(TypedDict):
+    """One answer; `node` is a row of the semantic tree, and views are numbered in camera order."""
+
+    node: int
+    level: str
+    score: float
+    name: str
+    best_views: list[int]
+
+
+class Answer(TypedDict):
+    """Answers to a text, or nodes that look like a node or a picture.
+
+    `relevancy` has one value per node, `total` counts all answers, `hits` lists the best, and `route` is that
+    of `hilsplat.Hit`.
+    """
+
+    text: str
+    level: str
+    hits: list[FoundNode]
+    total: int
+    relevancy: list[float]
+    doubts: list[str]
+    caution: str
+    route: str
+    ms: float
+
+
+def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
+    """Query a scene, and return hits, each node's relevancy to the last text, and doubts.
+
+    Raises:
+        SettingsError: the text is empty, or the view does not exist.
+    """
+    begin = time.perf_counter()
+    view = None if asked.view is None else view_name(scene.scene, asked.view)
+    found = scene.select(
+        asked.text, level=asked.level, answerer=answerer, view=view, threshold=asked.threshold
+    )
+    hits, path = scene.hits_of(found, LISTED), path_of(asked.text)
+    relevancy = scene.node_relevancy([path[-1]], answerer)[0]
+    made = _answer(scene, asked.text, hits, relevancy)
+    return {
+        **made,
+        "level": found.level.label,
+        "total": len(found.ids),
+        "doubts": [str(doubt) for doubt in doubts_of(found)],
+        "caution": scene.caution_about(asked.text),
+        "route": found.route,
+        "ms": round(1e3 * (time.perf_counter() - begin), 2),
+    }
+
+
+def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> Answer:
+    """Return nodes that look like a node or a picture as an answer; nodes in `also` have relevancy 1."""
+    relevancy = np.zeros(len(scene.tree))
+    relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
+    relevancy[list(also)] = 1
+    return _answer(scene, what, hits, relevancy)
+
+
+def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.ndarray) -> Answer:
+    found: list[FoundNode] = [
+        {
+            "node": hit.node,
+            "level": hit.level.label,
+            "score": round(hit.score, 4),
+            "name": hit.name,
+            "best_views": [scene.views.index(view) for view in hit.best_views],
+        }
+        for hit in hits
+    ]
+    return {
+        "text": text,
+        "level": hits[0].level.label if hits else "",
+        "hits": found,
+        "total": len(hits),
+        "relevancy": np.round(relevancy, 4).tolist(),
+        "doubts": [],
+        "caution": "",
+        "route": "like",
+        "ms": 0,
+    }
+
+
+def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
+    """Return the boxes of nodes for other programs; a node of several groups has a box for each."""
+    tree = scene.tree
+    return {
+        "format": "hilsplat-boxes-1",
+        "scene": scene.scene.name,
+        "unit": scene.scene.unit,
+        "axes": "right-handed; cameras in OpenCV axes (x right, y down, z forward)",
+        "scene_from_source": scene.scene.scene_from_source.tolist(),
+        "boxes": [
+            {
+                "group": group.name,
+                "node": node,
+                "name": scene.name_of(node),
+                "level": int(tree.level[node]),
+                "parent": int(tree.parent[node]),
+                "centre": tree.oriented_box[node][0].tolist(),
+                "axes": tree.oriented_box[node][1:4].tolist(),
+                "size": tree.oriented_box[node][4].tolist(),
+                "corners": box_corners(tree.oriented_box[node]),
+                "lower": tree.box[node][0].tolist(),
+                "upper": tree.box[node][1].tolist(),
+                "centroid": tree.centroid[node].tolist(),
+            }
+            for group in groups
+            for node in group.nodes
+        ],
+    }

@@ -1,8 +1,8 @@
 """Files that users can save from the page.
 
 Films take long and read only arrays, so they have their own thread. Other slow files are made in steps on the
-scene thread, so that the page stays usable. All of these are sent as lines of JSON, then the file:
-`{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
+scene thread, which runs other requests between the steps. All of these are sent as lines of JSON, then the
+file: `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 
 import asyncio
@@ -19,22 +19,24 @@ from starlette.routing import Route
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.splat.gaussians import morton_order
-from hilsplat.viewer import answers, exports, wire
+from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.scene_thread import SceneThread
 from hilsplat.web.server import as_json, read
 
+NOT_STORED = {"cache-control": "no-store"}
+
 
 class SavedFiles:
-    """Request handlers that make these files."""
+    """Handlers of requests for files; `static` holds the page's own files by name."""
 
     def __init__(self, thread: SceneThread, static: dict[str, bytes]) -> None:
         self.thread, self.static = thread, static
         self.films = ThreadPoolExecutor(1, thread_name_prefix="film")
 
     def routes(self) -> list[Route]:
-        """Return the routes of the files."""
+        """Return the routes of all files."""
         post = self.thread.post
         return [
             Route("/api/export/ply", post(wire.Selection, _ply), methods=["POST"]),
@@ -67,7 +69,9 @@ class SavedFiles:
             )
 
         of = -(-asked.frames // exports.STEP[asked.format])
-        return _streamed(self._filmed(await self.thread.do(request, prepared), of))
+        return StreamingResponse(
+            self._filmed(await self.thread.do(request, prepared), of), headers=NOT_STORED
+        )
 
     async def _filmed(self, film: Callable[..., bytes], of: int) -> AsyncIterator[bytes]:
         loop, made, left = asyncio.get_running_loop(), asyncio.Queue[int | None](), Event()
@@ -90,7 +94,7 @@ class SavedFiles:
                 return
             yield _line(bytes=len(data))
             yield data
-        finally:  # also if the user left the page or cancelled the film
+        finally:  # also if the user closed the page or cancelled the film
             left.set()
             making.cancel()
 
@@ -99,7 +103,8 @@ class SavedFiles:
             steps = begin(shown)
             return steps, next(steps)  # raises errors before the response starts
 
-        return _streamed(self._stepped(*await self.thread.do(request, first)))
+        begun = await self.thread.do(request, first)
+        return StreamingResponse(self._stepped(*begun), headers=NOT_STORED)
 
     async def _stepped(self, steps: exports.Steps, first: tuple[int, int]) -> AsyncIterator[bytes]:
         found: tuple[int, int] | bytes = first
@@ -126,11 +131,11 @@ def _spz(shown: ViewerScene, asked: wire.Selection) -> bytes:
 
 
 def _boxes(shown: ViewerScene, asked: wire.Selection) -> dict[str, Any]:
-    return answers.boxes(*_selected(shown, asked))
+    return payload.boxes(*_selected(shown, asked))
 
 
 def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene, list[wire.Group]]:
-    """Return the variant and the groups of nodes, or raise SettingsError if a node does not exist."""
+    """Return the variant and the groups; raise SettingsError if a node does not exist."""
     scene = shown.answering(asked.variant)
     for group in asked.groups:
         for node in group.nodes:
@@ -147,16 +152,12 @@ def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
         return data
 
 
-def _streamed(parts: AsyncIterator[bytes]) -> Response:
-    return StreamingResponse(parts, headers={"cache-control": "no-store"})
-
-
 def _line(**values: int | str) -> bytes:
     return as_json(values) + b"\n"
 
 
 def node_of(scene: LanguageScene, node: int) -> int:
-    """Return a node that the page requested; raise SettingsError if it does not exist."""
+    """Return a requested node; raise SettingsError if it does not exist."""
     if node >= len(scene.tree):
         raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
     return node

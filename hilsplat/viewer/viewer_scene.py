@@ -1,4 +1,4 @@
-"""A scene's folder as the page shows it: Gaussians at once, and each variant once it can be queried."""
+"""A scene as the viewer page shows it: its Gaussians, and each variant once it accepts queries."""
 
 import logging
 from dataclasses import replace
@@ -44,7 +44,7 @@ class ViewerScene(ShownScene):
 
     Args:
         folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
-        variant: the initially selected variant; it may not exist yet.
+        variant: the initially selected variant, which may not exist yet.
 
     Raises:
         ArtifactError: the scene has no poses or no Gaussians yet, or too many to show.
@@ -90,7 +90,7 @@ class ViewerScene(ShownScene):
 
     @property
     def variants(self) -> list[str]:
-        """Variants that can be queried now, the initially selected one first."""
+        """Variants that accept queries now, the initially selected one first."""
         names = finished_variants(self.folder)
         return sorted(names, key=lambda name: (name != self.first, name != "default", name))
 
@@ -99,8 +99,8 @@ class ViewerScene(ShownScene):
 
         Raises:
             SettingsError: the variant does not exist (yet).
-            StaleSceneError: the variant must be opened, but a part opened before was rewritten.
-            HilsplatError: its parts cannot be opened.
+            StaleSceneError: the variant must be opened, but a previously opened part was rewritten.
+            HilsplatError: a part cannot be opened.
         """
         before = self._variants.get(variant)
         field = self.folder / variant / "field.safetensors"
@@ -128,7 +128,7 @@ class ViewerScene(ShownScene):
     def rename(self, semantic_tree: Path, names: NodeNames) -> None:
         """Use new names in every variant with this tree."""
         for variant, opened in list(self._variants.items()):
-            # as opened: opening a part again could fail after the names are written
+            # Don't use `answering`: reopening a variant could fail after the names are written.
             if opened.finished and opened.finished.parts.semantic_tree.resolve() == semantic_tree.resolve():
                 self._variants[variant] = replace(opened, names=names)
 
@@ -139,7 +139,7 @@ class ViewerScene(ShownScene):
         return payload.described_scene(self.scene, self.gaussians) | own
 
     def described_variant(self, variant: str) -> dict[str, Any]:
-        """Describe the outline of a variant, and the models of its masks and vectors."""
+        """Describe a variant: its nodes, and the models of its masks and vectors."""
         scene, parts = self.answering(variant), self.parts(variant)
         with self.unchanged():
             models = {"clip": Path(read_index(parts.clip)["model"]).name, "masks": masks_label(parts.masks)}
@@ -176,10 +176,7 @@ class ViewerScene(ShownScene):
     # -- painting ---------------------------------------------------------------------------------
 
     def field_relevancy(self, variant: str, text: str, level: str) -> np.ndarray:
-        """Return each Gaussian's field relevancy to a text as bytes; level "auto" is the maximum over levels.
-
-        Gaussians without a latent get 0.
-        """
+        """Return each Gaussian's field relevancy in steps of 1/255, as `FieldScene.gaussian_relevancy`."""
         key = (variant, text, level)
         if key not in self._relevancy:
             found = self.answering(variant).gaussian_relevancy(text, level)
@@ -189,7 +186,7 @@ class ViewerScene(ShownScene):
         return self._relevancy[key]
 
     def paint(self, variant: str, style: Style) -> Paint | None:
-        """Resolve a style for each Gaussian; None for the scene's own colours. The last result is cached.
+        """Resolve a style for each Gaussian; None: the scene's own colours. The last result is cached.
 
         Raises:
             SettingsError: the style does not fit the tree.
@@ -218,5 +215,5 @@ class ViewerScene(ShownScene):
         if self.first in self.variants:
             try:
                 self.answering(self.first)
-            except HilsplatError as error:  # the page can still show the Gaussians, and the error
-                logger.warning("no answers: %s", error)
+            except HilsplatError as error:  # the page can still show the Gaussians
+                logger.warning("the scene accepts no queries: %s", error)

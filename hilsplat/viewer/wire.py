@@ -1,4 +1,4 @@
-"""Request models of the page; shapes, sizes and finiteness are checked here, before any computation."""
+"""Request models of the page, which check shapes, sizes and finiteness."""
 
 import base64
 import binascii
@@ -18,7 +18,7 @@ Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
 
 
 class WireCamera(Message):
-    """hilsplat's own camera: OpenCV axes, centre of the top-left pixel at (0.5, 0.5)."""
+    """A camera: OpenCV axes, centre of the top-left pixel at (0.5, 0.5)."""
 
     cam_from_world: tuple[Row4, Row4, Row4, Row4]
     K: tuple[Row3, Row3, Row3]
@@ -40,7 +40,7 @@ class WireCamera(Message):
         return value
 
     def camera(self) -> Camera:
-        """Return the camera."""
+        """Return the camera as the package's type."""
         return Camera("page", np.array(self.cam_from_world), np.array(self.K), self.size_hw)
 
 
@@ -49,8 +49,8 @@ class Style(Message):
 
     Attributes:
         table: base64 of RGBA bytes, row 0 for Gaussians without a node, row n + 1 for node n.
-        use: levels that are used; the finest with an alpha above 0 sets the colour.
-        mode: how Gaussians whose alpha is 0 are painted.
+        use: whether each level is used; the finest used one with an alpha above 0 sets the colour.
+        mode: style of Gaussians whose alpha is 0.
         ramp: base64 of 256 RGB colours; if given, Gaussians are painted by the field's relevancy to `text` at
             `level` instead.
     """
@@ -65,11 +65,11 @@ class Style(Message):
     @model_validator(mode="after")
     def _ramp_has_text(self) -> "Style":
         if self.ramp and not self.text:
-            raise ValueError("a ramp shows the relevancy to a text, and there is none")
+            raise ValueError("a ramp shows the relevancy to a text, but the text is empty")
         return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
-        """Return the table; an empty one leaves every Gaussian unchanged."""
+        """Return the table; with an empty one, every Gaussian is unchanged."""
         return _rows(self.table, 4, num_nodes + 1)
 
     def colours(self) -> UInt8[np.ndarray, "256 3"]:
@@ -96,7 +96,7 @@ class Asked(Message):
 
 
 class Question(Message):
-    """A text or a path, optionally with a minimum score, and limited to what a photograph shows."""
+    """A text or a path, optionally with a minimum score or restricted to the nodes that a view shows."""
 
     text: Text
     level: LevelName = "auto"
@@ -118,7 +118,7 @@ class Like(Asked):
 
 
 class FieldRelevancy(Asked):
-    """The field's relevancy of each Gaussian to a text, in the order of the PLY or of the page's chunks."""
+    """A query for each Gaussian's field relevancy, in the order of the PLY file or of the page's chunks."""
 
     text: Text
     level: LevelName = "auto"
@@ -143,7 +143,7 @@ class Frame(Asked):
 
 
 class Film(Asked):
-    """A film: around what the cameras saw, or along a path of cameras."""
+    """A film along a tour of the training cameras, or along a path of cameras."""
 
     style: Style = Style()
     format: Literal["mp4", "gif"] = "mp4"
@@ -153,7 +153,7 @@ class Film(Asked):
 
 
 class Group(Message):
-    """Nodes that belong together: the answers to a query, or a selection."""
+    """Named nodes: the answers to a query, or a selection."""
 
     name: Annotated[str, Field(max_length=MAX_TEXT)]
     nodes: Nodes
@@ -166,13 +166,13 @@ class Selection(Asked):
 
 
 class Names(Asked):
-    """All names of a tree's nodes."""
+    """The names of a tree's nodes, which replace all previous names."""
 
     names: dict[int, Annotated[str, Field(max_length=200)]]
 
 
 class Page(Asked):
-    """A scene as one HTML file with the answers to kept queries, each in its colour, and the last query."""
+    """A page as one HTML file, with the answers to kept queries and to the last query."""
 
     kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
     last: Question | None = None

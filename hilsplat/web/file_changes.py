@@ -1,4 +1,4 @@
-"""Errors of files that changed on disk since they were opened or read, and versions of saved files."""
+"""Errors about files that changed since they were opened or read; versions of saved files."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +27,7 @@ def version_of(path: Path) -> str:
 
 @contextmanager
 def replacing(path: Path, version: str, what: str) -> Iterator[None]:
-    """Lock a file while its user-given content, named by `what`, is replaced.
+    """Lock a file while its content is replaced; `what` describes the content in errors (plural).
 
     Raises:
         StaleFileError: the file changed since `version` was read.

@@ -1,4 +1,4 @@
-"""Access control of the page's server: only a browser on this machine that opened the printed address.
+"""Access control of the page's server: only the browser that opened the printed address has access.
 
 Loopback alone is no protection: other users of the machine can reach it, and so can any web page open in the
 same browser. Every request therefore needs a cookie that only the printed address sets and a Host that names
@@ -37,9 +37,9 @@ class Guard:
     Args:
         token: secret in the printed address.
         max_body: maximum size of a request body, bytes.
-        embedded: the page is a frame in another page, such as a notebook, possibly behind a proxy. Browsers
-            send no cookie for it, so each of its requests has the token, which no other site has, in its
-            address. Host and Origin are those of the other page. Scripts and styles need no token.
+        embedded: whether the page is a frame in another page, such as a notebook, possibly behind a proxy.
+            Browsers then send no cookie, so each request contains the token in its address, and Host and
+            Origin are those of the other page. Scripts and styles need no token.
     """
 
     def __init__(

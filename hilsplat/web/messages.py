@@ -1,4 +1,4 @@
-"""Base of the pages' request models, and limits that both pages use."""
+"""Base of the request models of both pages, and their common limits."""
 
 from typing import Annotated
 

@@ -1,8 +1,7 @@
 """A scene that a page shows, and the thread that accesses it.
 
 The caches of an opened scene are not thread-safe, so all code that uses them runs on one worker. Its loops
-release the GIL, so the server stays responsive. The annotator's proposals have a worker and caches of their
-own.
+release the GIL, so the server stays responsive. The annotator's proposals have their own worker and caches.
 """
 
 import asyncio
@@ -79,7 +78,7 @@ class ShownScene:
         return {"of": self.state, "changed": self.changed()}
 
     def opened_again(self) -> Any:
-        """Open the scene as it is on disk now."""
+        """Reopen the scene as it is on disk now."""
         raise NotImplementedError
 
     def described(self) -> dict[str, Any]:
@@ -110,7 +109,7 @@ class SceneThread(Generic[Shown]):
         self.behind = asyncio.Lock()
 
     def routes(self) -> list[Route]:
-        """Return the routes that all pages of scenes have."""
+        """Return the routes that both pages have."""
         return [
             Route("/api/scene", self._opened_anew),
             Route("/api/changes", self._changes),
@@ -135,7 +134,7 @@ class SceneThread(Generic[Shown]):
     ) -> Handler:
         """Return a handler that sends the result of `work`, called with the scene and the validated body.
 
-        `worker` runs it instead of the scene thread, for work that has caches of its own.
+        `worker`, if given, runs it instead of the scene thread; its work must have its own caches.
         """
 
         async def handle(request: Request) -> Response:
@@ -145,9 +144,9 @@ class SceneThread(Generic[Shown]):
         return handle
 
     async def do_behind(self, request: Request, work: Callable[[Shown], Made]) -> Made:
-        """Run as `do`, but one at a time, so that interactive requests wait for at most one of these.
+        """Run as `do`, but one at a time: other requests then wait for at most one of these.
 
-        For example, the outline requests a hundred crops when the page opens.
+        The outline requests a hundred crops when the page opens.
         """
         async with self.behind:
             return await self.do(request, work)

@@ -1,4 +1,4 @@
-"""Shared code of the page servers: static files, responses, errors, a local socket."""
+"""Code of both page servers: static files, responses, errors, a local socket."""
 
 import json
 import secrets
@@ -29,7 +29,7 @@ Sent = TypeVar("Sent", bound=BaseModel)
 
 
 class Pages:
-    """A page's HTML file and the static files of its package and of `hilsplat.web`; no others are sent."""
+    """A page's HTML file, and the static files of its package and of `hilsplat.web`."""
 
     def __init__(self, page: str, package: str) -> None:
         found = [*(files("hilsplat.web") / "static").iterdir(), *(files(package) / "static").iterdir()]
@@ -74,7 +74,7 @@ async def read(request: Request, kind: type[Sent]) -> Sent:
 
 
 def version_sent(request: Request) -> str:
-    """Return the version of a file that the page has read and wants to replace."""
+    """Return the version of the file that the page has read and replaces."""
     return request.headers.get("if-match", "").strip('"')
 
 
@@ -106,7 +106,7 @@ def _told(status: int) -> Callable[[Request, Exception], Awaitable[Response]]:
 
 
 def view_name(scene: Scene, number: int) -> str:
-    """Return a view by its number, which the page sends instead of a name; raise SettingsError if none."""
+    """Return a view's name by its number; raise SettingsError if there is no such view."""
     names = scene.cameras.names
     if not 0 <= number < len(names):
         raise SettingsError(f"view {number} does not exist", expected=f"0 to {len(names) - 1}")
@@ -130,7 +130,7 @@ def listening_at(port: int) -> socket.socket:
     Raises:
         SettingsError: the port is taken.
     """
-    # Without IPPROTO_TCP, asyncio leaves Nagle's algorithm on, which delays responses by 40 ms.
+    # Without IPPROTO_TCP, asyncio doesn't turn off Nagle's algorithm, which delays responses by 40 ms.
     made = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -144,7 +144,7 @@ def listening_at(port: int) -> socket.socket:
 
 
 def configured(app: Guard) -> uvicorn.Config:
-    """Return the configuration of a server that prints warnings only."""
+    """Return the configuration of a server that prints only warnings."""
     return uvicorn.Config(app, log_level="warning", access_log=False, server_header=False)
 
 

@@ -65,7 +65,7 @@ def test_doubts_are_reported(opened, desk_address, painter):
     page = opened(desk_address, painter)
     ask_and_wait(page, "unicorn")
     status = page.get_by_role("status").inner_text()
-    assert "'unicorn' may not be in the scene: the model does not know 'unicorn'." in status
+    assert "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'." in status
 
 
 @both

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_masks
 
-from hilsplat.annotate.exporting import exported
-from hilsplat.annotate.importing import imported, merged, unpacked_counts
+from hilsplat.annotate.exchange import exported, imported, merged, unpacked_counts
 from hilsplat.annotate.labels import Label
 from hilsplat.base.errors import SceneError
 from hilsplat.scene.cameras import Cameras
@@ -118,8 +117,8 @@ def shapes(shape: str) -> str:
     ("content", "message"),
     [
         ("{", "cannot be read"),
-        ("[]", "of no known format"),
-        ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "belongs to no photograph"),
+        ("[]", "has an unknown format"),
+        ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "names no photograph"),
         ('{"shapes": [], "imagePath": "DSC_1.jpg", "imageHeight": 60, "imageWidth": 80}', "80 x 60 px"),
         (shapes('{"label": "a", "points": [[1, 1]], "shape_type": "circle"}'), "circle"),
         (shapes('{"label": "", "points": [[1, 1], [5, 5]]}'), "text: "),

@@ -61,7 +61,7 @@ def test_a_child_around_a_hole_of_its_parent_is_cut_exactly():
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 2, 1, box(6, 6, 9, 9))], "entirely outside 'thing 1'"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 3, 1, box(0, 0, 4, 4))], "expected  a part"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 1, 1, box(0, 0, 4, 4))], "none: it is a whole"),
-        ([label(2, 2, 7, box(0, 0, 4, 4))], "nothing of this photograph"),
+        ([label(2, 2, 7, box(0, 0, 4, 4))], "no thing in this photograph"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(1, 1, None, box(0, 0, 4, 4))], "id 1 occurs twice"),
         ([label(1, 1, None, box(50, 50, 60, 60))], "no pixel inside the photograph"),
     ],

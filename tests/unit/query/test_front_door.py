@@ -171,7 +171,7 @@ def test_the_example_of_the_docs_runs(desk, project, monkeypatch, capsys):
     assert names["mask"].shape == names["photograph"].shape[:2]
     assert names["best"].keys() == {"desk"}
     printed = capsys.readouterr().out
-    assert "'unicorn' may not be in the scene: the model does not know 'unicorn'" in printed
+    assert "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'" in printed
     assert "has no view 'no such view'" in printed
 
 

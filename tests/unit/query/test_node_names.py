@@ -118,7 +118,7 @@ def test_a_word_missing_from_the_vocabulary_of_the_model_is_doubted(desk):
     scene = hilsplat.open(desk)
     assert open_clip_of(desk / "default/clip").unknown_words("mug zebra, book") == ["zebra"]
     (doubt,) = scene.query("zebra")[0].doubts
-    assert str(doubt) == "'zebra' may not be in the scene: the model does not know 'zebra'"
+    assert str(doubt) == "'zebra' may not be in the scene: the model's vocabulary lacks 'zebra'"
     assert scene.query("mug > handle")[0].doubts == ()
 
 

@@ -107,7 +107,7 @@ def test_a_text_without_a_match_is_doubtful(three_mugs):
     (doubt,) = three_mugs.query("unicorn", "whole")[0].doubts
     # cosine 0 with the text and 0.1 with the nearest phrase
     assert (doubt.text, doubt.level) == ("unicorn", None)
-    assert str(doubt) == "nothing here answers to 'unicorn' better than to a generic word"
+    assert str(doubt) == "no node is closer to 'unicorn' than to a generic word"
     assert three_mugs.query("mug")[0].doubts == ()
 
 
@@ -122,7 +122,7 @@ def test_the_first_text_of_a_path_is_doubted_even_if_the_last_has_a_good_match()
     # a part does answer to "unicorn", but it was searched among wholes
     (doubt,) = doubts_of(hits)
     assert (doubt.text, doubt.level) == ("unicorn", Level.WHOLE)
-    assert str(doubt).startswith("no whole here answers to 'unicorn' better than to a generic word")
+    assert str(doubt) == "no whole is closer to 'unicorn' than to a generic word"
 
 
 def test_doubts_consider_only_nodes_shown_in_the_view():

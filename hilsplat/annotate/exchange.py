@@ -1,51 +1,181 @@
-"""Import of annotations: ISAT (the labels of LERF-OVS), labelme, COCO and our own format.
+"""Annotations in the formats of other programs: ISAT (the labels of LERF-OVS), labelme and COCO.
 
-Things without our keys for level and parent are imported as wholes.
+In these formats, levels and parents are extra keys, which other programs ignore or keep. Objects without
+these keys are imported as wholes.
 """
 
+import io
+import json
+import shutil
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool
 
-from hilsplat.annotate.labels import Label, labels_of, whole_pixels
-from hilsplat.base.artifacts import parse_json
+from hilsplat.annotate.labels import Label, as_file, known_labels, labels_of, traced, whole_pixels
+from hilsplat.base.artifacts import atomic_folder, parse_json, write_text
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.images.isat import parse_isat, trace_polygons
+from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.scene import Scene
+from hilsplat.web.coco import coco_content, coco_region
+
+Kind = Literal["hilsplat", "isat", "labelme", "coco"]
+OURS = ("level", "parent", "origin")
+
+
+def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
+    """Return all annotations as a ZIP with one file per view, or, for COCO, as one JSON file."""
+    if kind == "coco":
+        return _json(_coco(known, cameras)).encode()
+    write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+        for view, labels in known.items():
+            archive.writestr(f"{Path(view).stem}.json", write(view, cameras[view].size_hw, labels))
+    return held.getvalue()
+
+
+def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
+    """Write a scene's annotations, or a synthetic scene's ground truth, in the layout of LERF-OVS's labels.
+
+    `out`, such as `label/teatime`, is replaced; it gets `<view>.json` and the image of each labelled view.
+    Each polygon is an object, as LangSplat's evaluation requires; the keys for levels and parents are ignored
+    there. Annotations are read from `annotated/<dataset>/<scene>` below `data_root`. Return the number of
+    labelled views.
+
+    Raises:
+        SceneError: the scene has no labels.
+    """
+    annotated, truth = data_root / "annotated" / scene.name, folder / "world" / "truth"
+    views = scene.views()
+    if truth.is_dir():
+        known = labels_of_truth(HierarchyAnnotations.load(truth), views)
+    else:
+        known = known_labels(annotated, scene.cameras, views)
+    if not known:
+        raise SceneError(
+            f"{scene.name} has no labels", expected=f"files in {annotated}", fix=f"hilsplat annotate {folder}"
+        )
+    with atomic_folder(out) as temporary:
+        for view, labels in known.items():
+            text = _isat(view, scene.cameras[view].size_hw, labels)
+            write_text(temporary / f"{Path(view).stem}.json", text + "\n")
+            shutil.copyfile(scene.image_path(view), temporary / view)
+    return len(known)
+
+
+def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[str, list[Label]]:
+    """Return the ground-truth labels of a synthetic scene as annotations, in views that have any."""
+    known: dict[str, list[Label]] = {}
+    for view in views:
+        nodes = [truth.nodes[number] for number in truth.views.get(view, ())]
+        labels = [
+            Label(
+                id=node.id + 1,
+                level=node.level,
+                parent=node.parent + 1 if node.parent in truth.views[view] else None,
+                text=node.text,
+                polygons=traced(truth.mask(view, [node.id])),
+                origin="accepted",
+            )
+            for node in nodes
+        ]
+        if labels:
+            known[view] = labels
+    return known
+
+
+def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
+    """Format labels as ISAT, with one polygon per object; pieces of a thing have the same group."""
+    size = {"width": size_hw[1], "height": size_hw[0]}
+    info = {"description": "ISAT", "folder": "", "name": view, **size, "depth": 3, "note": ""}
+    objects = []
+    for label in labels:
+        for ring in label.polygons:
+            points = np.array(ring)
+            described = {
+                "category": label.text,
+                "group": label.id,
+                "segmentation": ring,
+                "area": int(label.model_copy(update={"polygons": [ring]}).mask(size_hw).sum()),
+                "layer": float(label.level),
+                "bbox": [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()],
+                "iscrowd": 0,
+                "note": "",
+            }
+            objects.append({**described, **_ours(label)})
+    return _json({"info": info, "objects": objects})
+
+
+def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
+    shapes = []
+    for label in labels:
+        about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **_ours(label)}
+        shapes += [{"label": label.text, "points": ring, **about} for ring in label.polygons]
+    image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
+    return _json({"version": "5.5.0", "flags": {}, "shapes": shapes, **image})
+
+
+def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
+    """Format labels as COCO, with run lengths because COCO fills polygons in another way."""
+    texts = sorted({label.text for labels in known.values() for label in labels})
+    content = coco_content("annotations by hilsplat", known, cameras, texts)
+    for number, (view, labels) in enumerate(known.items()):
+        for label in labels:
+            described = {
+                "id": len(content["annotations"]) + 1,
+                "image_id": number,
+                "category_id": 1 + texts.index(label.text),
+                **coco_region(label.mask(cameras[view].size_hw)),
+                "thing": label.id,
+            }
+            content["annotations"].append({**described, **_ours(label)})
+    return content
+
+
+def _ours(label: Label) -> dict[str, object]:
+    return {name: getattr(label, name) for name in OURS}
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+# -- import ---------------------------------------------------------------------------------------
 
 
 def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
     """Read the annotations in a file of any of the four formats, by view.
 
-    Ids count from 1 unless the file has its own. The file's name identifies the photograph if the content
-    does not.
+    Ids are counted from 1 unless the file has its own. The file's name identifies the photograph if the
+    content does not.
 
     Raises:
-        SceneError: the format is none of these, or the file does not fit the scene.
+        SceneError: the format is unknown, or the file does not fit the scene.
     """
+    readers = {"shapes": _from_labelme, "annotations": _from_coco, "objects": _from_isat}
     try:
         content = parse_json(text)
-        if isinstance(content, dict) and isinstance(content.get("shapes"), list):
-            return _from_labelme(name, content, cameras)
-        if isinstance(content, dict) and isinstance(content.get("annotations"), list):
-            return _from_coco(name, content, cameras)
-        if isinstance(content, dict) and isinstance(content.get("objects"), list):
-            return _from_isat(name, content, cameras)
+        for key, read in readers.items():
+            if isinstance(content, dict) and isinstance(content.get(key), list):
+                return read(name, content, cameras)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
         # Any value may have an unexpected type or be invalid: a list for an id, an infinite number.
         raise SceneError(f"{name} cannot be read: {error}", expected="a whole JSON file") from error
     raise SceneError(
-        f"{name} is of no known format",
+        f"{name} has an unknown format",
         expected="objects (ISAT, LERF-OVS, hilsplat), shapes (labelme) or annotations (COCO)",
         found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
     )
 
 
 Piece = tuple[str, Any, np.ndarray, Mapping[str, Any]]
-"""Text, identifier of its thing or None, vertices, and the keys in the file."""
+"""Text, identifier of the thing (or None), vertices, and the keys in the file."""
 
 
 def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
@@ -79,7 +209,7 @@ def _from_isat(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
         return {view: labels_of(labels)}
     pieces: list[Piece] = []
     for thing in labels.objects:
-        # Without our keys, groups are ignored: in LERF's files they repeat and identify nothing.
+        # Without our keys, groups are ignored: in LERF-OVS's files, they repeat and identify nothing.
         group = thing.keys.get("group") if "level" in thing.keys else None
         pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
     return {view: _joined(name, pieces)}
@@ -148,7 +278,7 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
 def unpacked_counts(text: str) -> list[int]:
     """Decode COCO's compressed run lengths.
 
-    Each character has five bits, low bits first; the fourth and later runs are relative to the last but one.
+    Each character has five bits, low bits first; from the fourth on, a run is relative to the last but one.
     """
     runs: list[int] = []
     value = shift = 0
@@ -171,7 +301,7 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
     view = next((each for each in cameras.names if Path(each).stem == stem), None)
     if view is None:
         raise SceneError(
-            f"{name} belongs to no photograph of this scene",
+            f"{name} names no photograph of this scene",
             expected=f"such as {cameras.names[0]}",
             found=image,
         )
@@ -185,10 +315,8 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
     return view
 
 
-# -- merging with existing annotations ------------------------------------------------------------
-
 SAME_THING = 0.5
-"""Labels of a photograph with the same text and level are the same thing if their IoU is at least this."""
+"""Minimum IoU of labels of one photograph, with the same text and level, that are the same thing."""
 
 
 def merged(
@@ -198,14 +326,14 @@ def merged(
 ) -> tuple[dict[str, list[Label]], int, int]:
     """Add the labels of files to those of a scene.
 
-    A file's ids are used only together with text and level, because programs without ids number the shapes
-    of every photograph from 1. Among the scene's things with the same text and level, a label is matched to
-    the one that it overlaps, else to the one with its id, else to one that the photograph does not show yet;
-    otherwise it is a new thing.
+    Ids are compared only among things with the same text and level, because shapes without ids are numbered
+    from 1 in every photograph. Among the scene's things with its text and level, a label is matched to the
+    one that it overlaps, else to the one with its id, else to one without a label in the photograph. If there
+    is none, it is a new thing.
 
     Returns:
-        all labels of each photograph that changes; the number of labels that are new or have another region;
-        and the number of labels that already existed.
+        all labels of each changed photograph; the number of labels that are new or have another region; and
+        the number of labels that already existed.
     """
     views = {view: list(labels) for view, labels in known.items()}
     things = {label.id: _kind(label) for labels in views.values() for label in labels}
