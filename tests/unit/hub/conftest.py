@@ -24,7 +24,7 @@ PADDING_BYTES = 600_000
 
 
 def pad(network: Path) -> None:
-    """Make a network's file large, by a constant that it does not use."""
+    """Enlarge a network's file by a constant that the network does not use."""
     model = onnx.load(network)
     noise = np.random.default_rng(0).integers(0, 255, PADDING_BYTES, dtype=np.uint8)
     model.graph.initializer.append(numpy_helper.from_array(noise, "unused"))

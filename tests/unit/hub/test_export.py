@@ -19,7 +19,7 @@ REPOSITORY = next(release.repository for release in RELEASES if release.name == 
 
 
 def get_by_command(endpoint: str) -> subprocess.CompletedProcess[str]:
-    """`hilsplat models get`, as a user runs it who set HF_ENDPOINT."""
+    """Run `hilsplat models get` as a user with HF_ENDPOINT set."""
     environment = {key: value for key, value in os.environ.items() if key != "HF_HUB_OFFLINE"}
     environment |= {"HF_ENDPOINT": endpoint, "HF_HOME": str(Path.cwd() / "home")}
     code = "from hilsplat.cli.main import main; main()"

@@ -19,6 +19,7 @@ from hilsplat.hub.get import get_models
 from hilsplat.models.store import models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
 from tests.unit.hub.conftest import CLIP, SAM, point_at
+from tests.unit.segment.handmade import move_weights
 
 ENCODER = "vision_encoder.onnx"
 TARGET = Path("models/sam-vit-base")
@@ -26,7 +27,7 @@ STAGING = Path("models/.sam-vit-base.part")
 
 
 def visible() -> list[str]:
-    """Names in `models/` that a reader looks at."""
+    """Names of the non-hidden entries of `models/`."""
     return sorted(path.name for path in Path("models").glob("[!.]*"))
 
 
@@ -147,7 +148,7 @@ def test_a_disk_that_is_too_small_is_reported_before_the_transfer(hub, monkeypat
     assert hub.ranges(ENCODER) == []
 
 
-def test_a_full_disk_keeps_what_was_downloaded(hub, monkeypatch):
+def test_a_full_disk_keeps_downloaded_files(hub, monkeypatch):
     whole = huggingface_hub.hf_hub_download
 
     def fill(repository, path, **where):
@@ -214,7 +215,7 @@ def test_a_repository_of_another_kind_or_without_networks_is_refused(hub, tmp_pa
     assert visible() == []
 
 
-def test_a_variant_gets_a_folder_of_its_own_and_the_plain_names(hub):
+def test_a_variant_is_installed_in_a_separate_folder_under_the_plain_names(hub):
     get_models(["sam-vit-base"], variant="quantized")
     assert visible() == ["sam-vit-base-quantized"]
     folder, quantized = Path("models/sam-vit-base-quantized"), "onnx/vision_encoder_quantized.onnx"
@@ -241,14 +242,9 @@ def test_a_model_that_does_not_work_is_not_installed(hub, repositories, tmp_path
 
 
 def test_external_weights_keep_their_names(hub, repositories, tmp_path):
-    import onnx
-
     external = tmp_path / "external"
     shutil.copytree(repositories[SAM], external)
-    model, place = onnx.load(external / "onnx" / ENCODER), f"{ENCODER}_data"
-    onnx.save(
-        model, external / "onnx" / ENCODER, save_as_external_data=True, location=place, size_threshold=0
-    )
+    move_weights(external / "onnx" / ENCODER, f"{ENCODER}_data")
     hub.repositories["some/large"] = external
     get_models(["some/large"])
     assert f"onnx/{ENCODER}_data" in files_of(Path("models/large"))
@@ -284,9 +280,9 @@ def set_offline(monkeypatch) -> None:
 
 def test_offline_the_error_lists_the_files_to_copy(hub, monkeypatch):
     set_offline(monkeypatch)
-    with pytest.raises(DownloadError) as told:
+    with pytest.raises(DownloadError) as error:
         get_models(["clip-vit-base-patch16"])
-    message = str(told.value)
+    message = str(error.value)
     assert "HF_HUB_OFFLINE is set" in message
     assert "put these files into models/clip-vit-base-patch16 by hand" in message
     assert "config.json, preprocessor_config.json, tokenizer.json, onnx/vision_model.onnx" in message

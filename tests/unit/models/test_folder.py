@@ -13,7 +13,7 @@ from hilsplat.models.folder import external_weights, open_model_folder, variants
 from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
-from tests.unit.segment.handmade import save_network, tensor
+from tests.unit.segment.handmade import move_weights, save_network, tensor
 
 TINY = PROJECT / "models/sam-tiny"
 
@@ -22,14 +22,6 @@ TINY = PROJECT / "models/sam-tiny"
 def sam(tmp_path):
     shutil.copytree(TINY, tmp_path / "sam")
     return tmp_path / "sam"
-
-
-def move_weights(path, location: str) -> None:
-    """Move a network's weights and constants to a separate file."""
-    model = onnx.load(path)
-    path.unlink()
-    options = {"size_threshold": 64, "convert_attribute": True}
-    onnx.save(model, path, save_as_external_data=True, location=location, **options)
 
 
 @pytest.mark.parametrize("location", ["vision_encoder.onnx_data", "weights.bin", "onnx__MatMul_7"])

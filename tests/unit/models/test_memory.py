@@ -25,7 +25,7 @@ def test_views_at_once_by_hand():
     assert needs.total_mib(4) == PROCESS_MIB + 500 + 12000
 
 
-def test_a_view_of_sam_vit_b_takes_what_was_measured(tmp_path):
+def test_the_estimate_for_sam_vit_b_agrees_with_the_measurement(tmp_path):
     # a picture 475 MiB row by row and 2615 as exported, 8 prompts as exported 507, open weights 417
     model = folder(tmp_path, "sam", {"vision_config": {}}, 1024, 357)
     assert needs_of(model, batch=8).view_mib == pytest.approx(475 + 250, rel=0.05)
@@ -37,7 +37,7 @@ def test_a_view_of_sam_vit_b_takes_what_was_measured(tmp_path):
     assert view_mib - 512 == pytest.approx((exported.view_mib - 512) * 16 / 12)
 
 
-def test_a_batch_of_clip_vit_b_16_takes_what_was_measured(tmp_path):
+def test_the_estimate_for_clip_vit_b_16_agrees_with_the_measurement(tmp_path):
     needs = needs_of(folder(tmp_path, "clip", {"vision_config": {}}, 224), batch=64)
     assert needs.view_mib == pytest.approx(521, rel=0.25)
 

@@ -12,7 +12,7 @@ from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 AUTO = MasksSettings(segmenter="auto", model="auto")
 
 
-def lay(folder: Path, kind: str, embedded: bool = False, network: str = "onnx/a.onnx") -> Path:
+def write_model(folder: Path, kind: str, embedded: bool = False, network: str = "onnx/a.onnx") -> Path:
     (folder / network).parent.mkdir(parents=True, exist_ok=True)
     (folder / network).touch()
     (folder / "config.json").write_text(json.dumps({"model_type": kind, "world_only": embedded}))
@@ -23,8 +23,8 @@ def lay(folder: Path, kind: str, embedded: bool = False, network: str = "onnx/a.
 def models(tmp_path, monkeypatch) -> Path:
     """The models of a fresh checkout, in the working directory."""
     monkeypatch.chdir(tmp_path)
-    lay(Path("models/sam-tiny"), "sam", embedded=True)
-    lay(Path("models/clip-tiny"), "clip", embedded=True)
+    write_model(Path("models/sam-tiny"), "sam", embedded=True)
+    write_model(Path("models/clip-tiny"), "clip", embedded=True)
     return Path("models")
 
 
@@ -32,20 +32,20 @@ def test_embedded_models_are_recognised(project):
     assert all(read_model(project / folder).embedded for folder in EMBEDDED.values())
 
 
-def test_without_a_real_model_photographs_get_the_graph_segmenter_and_the_embedded_clip(models):
+def test_without_a_pretrained_model_photographs_use_the_graph_segmenter_and_the_embedded_clip(models):
     assert with_models(AUTO) == MasksSettings(segmenter="graph", model="models/sam-tiny")
     assert with_models(ClipSettings(model="auto")).model == "models/clip-tiny"
     assert with_models(MasksSettings(segmenter="sam", model="auto")).model == "models/sam-tiny"
 
 
-def test_a_real_model_is_used_and_the_best_one_of_several(models):
-    lay(models / "zebra-sam", "sam", network="vision_encoder.onnx")
+def test_the_best_pretrained_model_is_used(models):
+    write_model(models / "zebra-sam", "sam", network="vision_encoder.onnx")
     assert with_models(AUTO) == MasksSettings(segmenter="sam", model="models/zebra-sam")
     for name in ("slimsam-77", "sam-vit-base"):
-        lay(models / name, "sam")
+        write_model(models / name, "sam")
     assert with_models(AUTO).model == "models/sam-vit-base"
-    lay(models / "clip-vit-base-patch16", "clip")
-    lay(models / "clip-vit-b-16-laion2b", "clip")
+    write_model(models / "clip-vit-base-patch16", "clip")
+    write_model(models / "clip-vit-b-16-laion2b", "clip")
     assert with_models(ClipSettings(model="auto")).model == "models/clip-vit-b-16-laion2b"
     released = ["sam-vit-base", "slimsam-77", "clip-vit-b-16-laion2b", "clip-vit-base-patch16"]
     names = [model.folder.name for model in present_models()]
@@ -53,21 +53,21 @@ def test_a_real_model_is_used_and_the_best_one_of_several(models):
 
 
 def test_named_models_take_precedence(models):
-    lay(models / "sam-vit-huge", "sam")
+    write_model(models / "sam-vit-huge", "sam")
     for section in (MasksSettings(), MasksSettings(segmenter="graph"), ClipSettings(), FieldSettings()):
         assert with_models(section) == section
-    lay(models / "mine", "sam")
+    write_model(models / "mine", "sam")
     named = MasksSettings(segmenter="auto", model="models/mine")
     assert with_models(named) == MasksSettings(segmenter="sam", model="models/mine")
     embedded = MasksSettings(segmenter="auto", model="models/sam-tiny")
     assert with_models(embedded) == MasksSettings(segmenter="graph", model="models/sam-tiny")
-    lost = MasksSettings(segmenter="auto", model="models/lost")  # the stage says that it is missing
+    lost = MasksSettings(segmenter="auto", model="models/lost")  # the stage reports that it is missing
     assert with_models(lost).segmenter == "sam"
 
 
 def test_incomplete_and_unsupported_models_are_ignored(models):
-    lay(models / ".sam-vit-base.part", "sam")
-    lay(models / "bert", "bert")
+    write_model(models / ".sam-vit-base.part", "sam")
+    write_model(models / "bert", "bert")
     for name, config in {"weights": '{"model_type": "sam"}', "list": "[]", "broken": "{"}.items():
         (models / name).mkdir()
         (models / name / "config.json").write_text(config)
@@ -81,9 +81,9 @@ def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project
 ):
     of_user = tmp_path / "shared"
     monkeypatch.setenv("HILSPLAT_MODELS", str(of_user))
-    lay(of_user / "sam-vit-base", "sam")
-    lay(of_user / "sam-vit-huge", "sam")
-    lay(models / "sam-vit-base", "sam")
+    write_model(of_user / "sam-vit-base", "sam")
+    write_model(of_user / "sam-vit-huge", "sam")
+    write_model(models / "sam-vit-base", "sam")
     assert real_model("sam") == of_user / "sam-vit-huge"
     folders = [model.folder for model in present_models()]
     assert folders[:2] == [of_user / "sam-vit-huge", Path("models/sam-vit-base")]
@@ -92,7 +92,7 @@ def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project
     assert model_path("models/none") == Path("models/none")
 
 
-def test_without_a_variable_fetched_models_are_in_the_data_folder_of_the_user(monkeypatch, tmp_path):
+def test_by_default_models_are_in_the_data_folder_of_the_user(monkeypatch, tmp_path):
     monkeypatch.delenv("HILSPLAT_MODELS")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     monkeypatch.setattr("sys.platform", "linux")

@@ -19,7 +19,7 @@ from hilsplat.settings import MasksSettings
 
 FRAME, LOW = 32, 16
 RADII = (3.0, 6.0, 10.0)
-"""Radius in px of the 32-px frame that the disc decoder answers with: subpart, part, whole."""
+"""Radii of the disc decoder's masks (subpart, part, whole), px of the 32 px input."""
 SCORES = (0.9, 0.8, 0.7)
 
 
@@ -70,12 +70,20 @@ def save_network(
     path.write_bytes(model.SerializeToString())
 
 
+def move_weights(path: Path, location: str) -> None:
+    """Move a network's weights and constants to a separate file."""
+    model = onnx.load(path)
+    path.unlink()
+    options = {"size_threshold": 64, "convert_attribute": True}
+    onnx.save(model, path, save_as_external_data=True, location=location, **options)
+
+
 def tensor(name: str, shape: list, kind: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, kind, shape)
 
 
 def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, cell_px: float) -> None:
-    """The decoder of `write_disc_sam`, with those rows and columns of the masks that `every` takes."""
+    """Write the decoder of `write_disc_sam`; masks contain only the rows and columns in `every`."""
     centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
     low = len(centres)
     x, y = np.meshgrid(centres, centres)
@@ -124,9 +132,9 @@ def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, 
 def write_disc_sam(
     folder: Path, points_name: str = "input_points", heads: int = 3, cell_px: float = 0
 ) -> Path:
-    """A SAM whose answer to a point is three discs around it: logit = radius - distance, px of the frame.
+    """Write a SAM that returns three discs around each point: logit = radius - distance, px of the input.
 
-    With `cell_px`, discs are around the middle of the point's cell of a grid, and the model has a preview.
+    With `cell_px`, discs are centred in the point's grid cell, and the model has a preview.
     """
     save_network(
         folder / "onnx" / "vision_encoder.onnx",

@@ -1,4 +1,4 @@
-"""Candidates give the same masks as the decoder's whole output."""
+"""Candidates produce the same masks as the decoder's whole output."""
 
 import numpy as np
 import pytest

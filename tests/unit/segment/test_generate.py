@@ -39,7 +39,7 @@ def model(disc_sam) -> SamModel:
     return SamModel.load(disc_sam)
 
 
-def test_every_prompt_gives_a_disc_at_every_level(model):
+def test_every_prompt_produces_a_disc_at_every_level(model):
     masks = generate(model, SETTINGS, IMAGE)
     for level, radius, score in ((Level.WHOLE, 10, 0.7), (Level.PART, 6, 0.8), (Level.SUBPART, 3, 0.9)):
         rows = masks.rows_of(level)
@@ -89,7 +89,7 @@ def test_crops_by_hand():
     assert layers.tolist() == [0, 1, 1, 1, 1]
 
 
-def test_crops_find_finer_masks_and_drop_those_they_cut(model):
+def test_crops_find_finer_masks_and_truncated_ones_are_dropped(model):
     image = np.zeros((128, 128, 3), dtype=np.uint8)
     settings = changed(crop_layers=1, nms_inner=0.0)
     candidates = decode_candidates(image, model, settings)

@@ -55,7 +55,7 @@ def test_full_stability_counts_pixels_of_the_enlarged_logits(original_hw):
     assert np.abs(found - read_logits(logits, 1.0, frame)[1]).max() > 0.003
 
 
-def test_end_exclusive_boxes_give_another_iou_than_official_ones():
+def test_end_exclusive_boxes_have_a_different_iou_than_official_ones():
     # 4 and 3 columns: IoU 3 / 4; ending at the last one inside, 2 / 3
     boxes = np.array([[0, 0, 4, 9], [0, 0, 3, 9]])
     score = np.array([0.9, 0.8])
