@@ -8,22 +8,8 @@ from hypothesis import strategies as st
 
 ODD_VALUES = (None, True, -1, 0, 0.5, 1e308, np.inf, np.nan, 2**70, "", "x", "a/../b", [], {}, [[1]])
 ODD_TEXTS = (
-    "",
-    "{",
-    "]",
-    "\t",
-    ": ",
-    "- ",
-    "&a ",
-    "*a",
-    "!!binary ",
-    "1e999",
-    ".nan",
-    "null",
-    "yes",
-    "\0",
-    "é",
-    "'",
+    *("", "{", "]", "\t", ": ", "- ", "&a ", "*a", "!!binary "),
+    *("1e999", ".nan", "null", "yes", "\0", "é", "'"),
 )
 
 

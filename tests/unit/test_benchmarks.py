@@ -11,17 +11,11 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_every_benchmark_runs():
     """Run them untimed, so that a changed interface is noticed."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-c",
-        "benchmarks/pytest.ini",
-        "benchmarks",
-        "--benchmark-disable",
-    ]
+    command = ["-m", "pytest", "-c", "benchmarks/pytest.ini", "benchmarks", "--benchmark-disable"]
     heavy = "not (two_threads or suppression or linkage or memory or 100k or 800x600)"
-    done = subprocess.run([*command, "-k", heavy], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, *command, "-k", heavy], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
     assert done.returncode == 0, done.stdout
 
 

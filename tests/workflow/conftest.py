@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,10 +140,3 @@ def copy_of_finished(finished: Project, tmp_path: Path) -> Project:
 def plain(project: Path, tmp_path: Path) -> Project:
     """A fresh copy of the project without results, to edit."""
     return copy_project(project, tmp_path / "project", results=False)
-
-
-@pytest.fixture
-def fresh(project: Path, tmp_path: Path) -> Callable[[], Project]:
-    """Makes copies of the project without results."""
-    numbers = iter(range(100))
-    return lambda: copy_project(project, tmp_path / f"fresh-{next(numbers)}", results=False)

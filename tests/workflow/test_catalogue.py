@@ -9,8 +9,7 @@ def test_the_catalogue_finds_settings_and_manual(project):
     assert (project / "config/README.md").is_file()
 
 
-def test_the_snakefile_under_workflow_plans_what_the_one_at_the_root_plans(fresh):
-    copy = fresh()
-    planned = copy.planned()
+def test_the_snakefile_under_workflow_plans_what_the_one_at_the_root_plans(plain):
+    planned = plain.planned()
     assert "evaluate" in planned
-    assert copy.planned("--snakefile", "workflow/Snakefile") == planned | {"everything"}
+    assert plain.planned("--snakefile", "workflow/Snakefile") == planned | {"everything"}

@@ -88,10 +88,3 @@ def test_a_dry_run_ends_with_the_estimate_table(planned):
     assert [row.split()[0] for row in table[1:6]] == ["3d_ovs", "lerf", "scannet", "tables", "all"]
     counted = re.search(r"^total +(\d+)$", planned, re.M)
     assert table[5].split()[1:3] == ["3", counted[1]]
-
-
-def test_tables_without_data_list_the_absent_scenes(project, tmp_path):
-    copy = copy_project(project, tmp_path / "project", results=False)
-    printed = copy.snakemake("-n", "-p", "results/tables/replica.csv").stdout
-    assert " table replica --published" in printed
-    assert "--absent 'replica (office_0, office_1, office_2 and 5 more): data_root is not set.'" in printed

@@ -27,12 +27,9 @@ def test_only_documented_interfaces_of_snakemake_are_used(project: Path) -> None
 
 
 @pytest.fixture
-def clone(fresh) -> Project:
+def clone(plain: Project) -> Project:
     """A copy of the project in a folder with a space and a non-ASCII letter."""
-    copy = fresh()
-    moved = copy.root.with_name("my scènes")
-    copy.root.rename(moved)
-    return Project(moved)
+    return Project(plain.root.rename(plain.root.with_name("my scènes")))
 
 
 def plan_of(project: Project, folder: Path, *words: str) -> str:

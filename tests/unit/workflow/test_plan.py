@@ -28,6 +28,7 @@ VARIANTS = {
     "network": {"autoencoder": NETWORK},
     "lifted": {"method": {"name": "lifted"}},
     "truth": {"masks": {"segmenter": "truth-perturbed"}},
+    "own": {"autoencoder": {"targets": "mask"}},
 }
 
 
@@ -105,11 +106,13 @@ def test_photographs_that_you_annotated_are_scored_without_replacing_the_tables(
         ("field", "lifted", "lifted"),
         ("autoencoder", "lifted", "default"),
         ("masks", "truth", "truth"),
+        ("semantic_tree", "own", "default"),
+        ("clip", "own", "own"),
     ],
 )
 def test_a_variant_shares_stages_up_to_the_first_that_it_changes(tmp_path, stage, variant, owner):
-    job = Job(variant=variant)
-    assert plan(tmp_path, seeds=2).shared(stage, "file")(job) == f"results/synthetic/one/{owner}/file"
+    found = plan(tmp_path, seeds=2)
+    assert found.shared(stage, "file")(Job(variant=variant)) == f"results/synthetic/one/{owner}/file"
 
 
 def test_shared_files_keep_their_path_when_the_tables_change(tmp_path):
@@ -171,7 +174,7 @@ def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
 def test_variants_have_our_field_or_a_baselines(tmp_path):
     found = plan(tmp_path)
     assert found.variants(by_baseline=True) == "lifted"
-    assert found.variants(by_baseline=False) == "default|network|theta|truth"
+    assert found.variants(by_baseline=False) == "default|network|own|theta|truth"
     assert found.baseline(Job(variant="lifted")) == ("hilsplat.methods.lifted:fit",)
 
 
@@ -216,12 +219,9 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
 
 
 def test_a_vector_per_mask_is_made_only_for_variants_whose_targets_are_masks(tmp_path):
-    found = plan(tmp_path, variants={"own": {"autoencoder": {"targets": "mask"}}}, main_variants=["default"])
-    default, own = Job(), Job(variant="own")
-    assert found.crops_tree(default) == ["results/synthetic/one/default/semantic_tree"]
-    assert found.crops_tree(own) == []
-    assert found.shared_variant("semantic_tree", own) == "default"
-    assert found.shared_variant("clip", own) == "own"
+    found = plan(tmp_path)
+    assert found.crops_tree(Job()) == ["results/synthetic/one/default/semantic_tree"]
+    assert found.crops_tree(Job(variant="own")) == []
 
 
 def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
