@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilsplat.base.levels import LEVELS, Level
 from hilsplat.evaluate.protocols.cards import (
     CARDS,
     LERF_LANGSPLAT,
@@ -18,10 +17,7 @@ from hilsplat.evaluate.protocols.cards import (
 )
 from hilsplat.evaluate.tables.measured import (
     level_averages_of_scenes,
-    level_values,
-    mean_over_levels,
     scene_values,
-    share_above,
     table_value,
 )
 
@@ -73,26 +69,6 @@ def test_the_order_of_rows_does_not_matter(order, card):
     rows = rows_of(card, values)
     # a sum in another order may differ in its last bit
     assert table_value(rows.iloc[order], "iou") == pytest.approx(table_value(rows, "iou"), rel=1e-14)
-
-
-def test_levels_weigh_equally_and_those_without_rows_are_left_out():
-    of_level = {Level.WHOLE: [0.8, 0.6], Level.PART: [0.5], Level.SUBPART: [0.2, 0.0, 0.1]}
-    rows = pd.concat(
-        rows_of(LEVEL_GIVEN, {("f", str(n)): v for n, v in enumerate(values)}, level=level.label)
-        for level, values in of_level.items()
-    )
-    found = level_values(rows, "iou")
-    assert [found[level] for level in LEVELS] == pytest.approx([0.7, 0.5, 0.1])
-    assert mean_over_levels(found.values()) == pytest.approx(1.3 / 3)
-    without = level_values(rows[rows["level"] != "part"], "iou")
-    assert math.isnan(without[Level.PART])
-    assert mean_over_levels(without.values()) == pytest.approx(0.4)
-    assert math.isnan(mean_over_levels([math.nan] * 3))
-
-
-def test_only_values_above_the_threshold_count():
-    rows = rows_of(LERF_LANGSPLAT, {("f", str(n)): v for n, v in enumerate((0.25, 0.26, 0.9, 0.0))})
-    assert share_above(rows, "iou", 0.25) == pytest.approx(0.5)
 
 
 def test_scenes_are_paired_by_their_levels_over_all_seeds():
