@@ -23,8 +23,15 @@ from huggingface_hub import constants
 from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RepositoryNotFoundError
 from huggingface_hub.utils import disable_progress_bars
 
-from hilsplat.base.artifacts import explain_full_disk, output_lock, read_json, work_folder, write_json
-from hilsplat.base.errors import DiskSpaceError, DownloadError, HilsplatError, ModelError
+from hilsplat.base.artifacts import (
+    explain_full_disk,
+    output_lock,
+    read_json,
+    require_free_space,
+    work_folder,
+    write_json,
+)
+from hilsplat.base.errors import DownloadError, HilsplatError, ModelError
 from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.catalogue import (
@@ -178,13 +185,7 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
     made = sum(each.num_bytes() * (EXPORT_FACTOR - 1) for each in prepared if each.choice.exported)
     free = shutil.disk_usage(models).free
     logger.info("%.1f MB to download; %.1f GB free on the disk of %s", fetched / 1e6, free / 1e9, models)
-    if free < fetched + made + SPARE_BYTES:
-        raise DiskSpaceError(
-            f"too little space on the disk of {models}",
-            expected=f"{(fetched + made + SPARE_BYTES) / 1e9:.1f} GB free",
-            found=f"{free / 1e9:.1f} GB",
-            fix="free space, or make this folder a symbolic link to another disk",
-        )
+    require_free_space(models, (fetched + made + SPARE_BYTES) / 2**20)
 
 
 def _install(found: Prepared) -> str:

@@ -142,7 +142,7 @@ def test_files_with_another_digest_are_refused_and_deleted(hub, repositories):
 
 def test_a_disk_that_is_too_small_is_reported_before_the_transfer(hub, monkeypatch):
     monkeypatch.setattr(get.shutil, "disk_usage", lambda folder: type("Usage", (), {"free": 100_000_000})())
-    message = r"disk of models\n  expected  0\.2 GB free\n  found     0\.1 GB"
+    message = r"disk of models\n  expected  at least 191 MiB free\n  found     95 MiB free"
     with pytest.raises(DiskSpaceError, match=message):
         get_models(["sam-vit-base"])
     assert hub.ranges(ENCODER) == []
