@@ -1,21 +1,16 @@
 """Label of the source of a scene's masks, for table rows and titles."""
 
 from pathlib import Path
-from typing import Any
 
 from hilsplat.base.artifacts import read_index
 
 
 def masks_label(masks_folder: Path) -> str:
-    """Return the label of the masks' source (`label_of_index`)."""
-    return label_of_index(read_index(masks_folder))
-
-
-def label_of_index(index: dict[str, Any]) -> str:
     """Return the label in the masks' index, or else the name of the model or, without one, the segmenter.
 
     The label of masks made from ground-truth labels lists their simulated faults.
     """
+    index = read_index(masks_folder)
     if "label" in index:
         return str(index["label"])
     return Path(index["model"]).name if index["model"] else index["segmenter"]

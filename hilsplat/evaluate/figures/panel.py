@@ -31,7 +31,7 @@ from hilsplat.query.pictures import (
 from hilsplat.scene.finished import SceneParts
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.origin import label_of_index, made_from_truth
+from hilsplat.segment.origin import made_from_truth, masks_label
 from hilsplat.segment.pictures import paint_level
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
@@ -154,8 +154,7 @@ def draw_panel(
 ) -> Figure:
     """Draw masks of a training view, the field in a held-out view, then one row per query."""
     scene = answers.scene
-    index = read_index(masks_folder)
-    masked = next(iter(index["views"]))
+    masked = next(iter(read_index(masks_folder)["views"]))
     held_out = rows[0].view if rows else (scene.views("test") or scene.views("train"))[0]
     height, width = scene.cameras[held_out].size_hw
     aspect = height / width
@@ -164,7 +163,7 @@ def draw_panel(
     row_in = WIDTH_IN / columns * aspect + 0.1
     queries_in = len(rows) * row_in + (0.2 if rows else 0)
     figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
-    label = label_of_index(index)
+    label = masks_label(masks_folder)
     warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
     title = [scene.name + warning, *textwrap.wrap(answers.caution, TITLE_LETTERS)]
     figure.suptitle("\n".join(title), fontsize=12, fontweight="bold", parse_math=False)
@@ -197,8 +196,7 @@ def draw_queries(
 ) -> None:
     """Draw one row per query: ground truth, answers of tree and field, field relevancy at three levels.
 
-    Titles contain the IoU with the ground truth and the highest relevancy; the level of the answer is framed.
-    A ring marks the field's localization point.
+    The level of the answer is framed. A ring marks the field's localization point.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)
