@@ -103,8 +103,6 @@ def write_provenance(
     """Write an artifact's provenance record: how and from what it was made, and the digests of the outputs.
 
     Args:
-        stage: key of `STAGES`.
-        code: digest of the stage's code.
         beside: further outputs.
         plugins: import paths of the readers or baselines that the stage used.
         device: device that the setting `device` resolves to, if the stage has this setting.

@@ -12,9 +12,10 @@ import typer
 
 from hilsplat.base.artifacts import output_lock, parse_json, provenance_path, require_free_space
 from hilsplat.base.errors import HilsplatError, SettingsError, system_error
+from hilsplat.base.plugins import load
 from hilsplat.base.progress import LOG_FORMAT
 from hilsplat.models.store import model_path
-from hilsplat.workflow.stages import stage_code, stage_function
+from hilsplat.workflow.stages import STAGES, stage_code
 
 app = typer.Typer(
     help="Turn photographs into a 3D Gaussian scene that answers text queries at three semantic levels.",
@@ -90,14 +91,12 @@ def stage(
     """Yield a stage's function, to be called with a log, lock, disk space check and provenance record.
 
     Args:
-        name: key of `STAGES`.
         out: output; its provenance is written next to it.
         settings: the section that the stage uses, or several sections by name. If it has the setting
             `device`, provenance records the device that `auto` resolves to.
         seed: None if nothing is random.
         inputs: files and folders that the stage reads, or lists of files, by name; None for those not given.
         plugins: import paths of the readers or baselines that it uses (`base.plugins`).
-        beside: further outputs.
 
     Raises:
         ArtifactError: an output would replace something other than an earlier output of the stage.
@@ -111,11 +110,14 @@ def stage(
     os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
     given = {key: paths for key, paths in (inputs or {}).items() if paths is not None}
     try:
-        require_replaceable((out, *beside), name, _each(given))
+        paths: list[Path] = []
+        for each in given.values():
+            paths += [each] if isinstance(each, Path) else each
+        require_replaceable((out, *beside), name, paths)
         require_free_space(out.parent, MIN_FREE_MIB)
         with output_lock(out):
             read, code = Inputs(name, given), stage_code(name, plugins)
-            yield stage_function(name)
+            yield load(STAGES[name])
             try:
                 read.require_unchanged()
             except HilsplatError:
@@ -142,11 +144,6 @@ def stage(
             raise
         logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
         sys.exit(1)
-
-
-def _each(inputs: Mapping[str, Path | Sequence[Path]]) -> Iterator[Path]:
-    for path in inputs.values():
-        yield from [path] if isinstance(path, Path) else path
 
 
 def _command() -> list[str]:

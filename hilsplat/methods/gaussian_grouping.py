@@ -25,11 +25,10 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 from torch.nn.functional import cross_entropy, log_softmax
 
-from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import features_of_groups, group_means, nearest
-from hilsplat.methods.common.training import product, train
+from hilsplat.methods.common.training import one_torch_thread, product, train
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.semantic_tree.nodes import MIN_VISIBLE_PX, level_nodes
 from hilsplat.settings import MethodSettings, SemanticTreeSettings

@@ -30,10 +30,9 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
-from hilsplat.base.device import one_torch_thread
 from hilsplat.base.levels import LEVELS
 from hilsplat.methods.common.groups import kmeans, standardised
-from hilsplat.methods.common.training import alike, of_seen, product, train, unit
+from hilsplat.methods.common.training import alike, of_seen, one_torch_thread, product, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 

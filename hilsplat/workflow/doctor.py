@@ -14,13 +14,12 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from hilsplat.base.artifacts import existing_folder
-from hilsplat.base.device import is_installed
 from hilsplat.base.errors import HilsplatError
 from hilsplat.configuration import merged_config
 from hilsplat.models.memory import machine_mib
 from hilsplat.models.store import RECOMMENDED, broken_models, present_models, user_models
 from hilsplat.workflow.plan import Plan
-from hilsplat.workflow.resources import JobResources
+from hilsplat.workflow.resources import JobResources, is_installed
 
 PACKAGE = "hilsplat"
 

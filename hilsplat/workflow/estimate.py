@@ -61,12 +61,11 @@ class RunEstimate:
         if not self._jobs:
             return []
         cores = self.resources.cores or 1
-        rows: list[tuple[str, ...]] = []
-        rows.append(("", "scenes", "jobs", "disk", "memory", f"hours, {cores} cores", "hours, GPU"))
-        for name, jobs in sorted(self._jobs.items(), key=lambda each: (each[0] == OTHERS, each[0])):
-            rows.append(_row(name, jobs, cores))
-        rows.append(_row("all", [job for jobs in self._jobs.values() for job in jobs], cores))
-        return ["This run would take about:", *_aligned(rows), *NOTES]
+        head = ("", "scenes", "jobs", "disk", "memory", f"hours, {cores} cores", "hours, GPU")
+        names = sorted(self._jobs, key=lambda name: (name == OTHERS, name))
+        rows = [_row(name, self._jobs[name], cores) for name in names]
+        total = _row("all", [job for name in names for job in self._jobs[name]], cores)
+        return ["This run would take about:", *_aligned([head, *rows, total]), *NOTES]
 
 
 def _row(name: str, jobs: Sequence[JobEstimate], cores: int) -> tuple[str, ...]:

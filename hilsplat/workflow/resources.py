@@ -11,6 +11,7 @@ three elsewhere. A killed job is retried with twice the memory and time limit.
 
 import csv
 import functools
+import importlib.metadata
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -19,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
 from hilsplat.base.levels import LEVELS
 from hilsplat.models.store import model_path, read_model
@@ -248,3 +248,12 @@ def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int)
     except ModelError:
         return 0
     return round(needs_of(model, prompts).total_mib(threads) * MIB / 1e6)
+
+
+@functools.cache
+def is_installed(distribution: str) -> bool:
+    try:
+        importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True

@@ -1,10 +1,7 @@
 """Registry of the function of each stage."""
 
-from typing import Any
-
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.identity import code_digest
-from hilsplat.base.plugins import load
 
 STAGES: dict[str, str] = {
     "world": "hilsplat.world.stage:run_world",
@@ -45,8 +42,3 @@ def stage_code(stage: str, plugins: tuple[str, ...] = ()) -> str:
     if stage not in STAGES:
         raise HilsplatError(f"unknown stage {stage!r}", expected=f"one of {', '.join(STAGES)}")
     return code_digest(STAGES[stage], *plugins)
-
-
-def stage_function(stage: str) -> Any:
-    """Import the function of a stage, or the module if `STAGES` names one."""
-    return load(STAGES[stage])

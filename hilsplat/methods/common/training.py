@@ -4,7 +4,8 @@ A step renders random labelled pixels of one random view: a product with composi
 once per view. Losses are written in torch and differentiated automatically.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from hilsplat.base.device import one_torch_thread
 from hilsplat.base.progress import track
 from hilsplat.field.adam import in_random_order
 from hilsplat.methods.method import LabelledView
@@ -21,6 +21,20 @@ from hilsplat.settings import MethodSettings
 
 PIXELS = 4096  # maximum per step; published: VCH 4096, OmniSeg3D 32,768, others whole views
 START_NOISE = 0.1  # standard deviation of initial features about their common value
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Make torch sum in a fixed order, so that results do not depend on the stage's number of threads.
+
+    torch stores its thread count per thread, so each thread of a pool must enter this context itself.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class _Product(torch.autograd.Function):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hilsplat.base.device import is_installed
 from hilsplat.base.errors import ModelError
 from hilsplat.cli.main import app
 from hilsplat.models.folder import ModelFolder
 from hilsplat.splat.rasterise import api
 from hilsplat.workflow import doctor
+from hilsplat.workflow.resources import is_installed
 from tests.unit.models.test_store import lay
 
 CPU = "CPUExecutionProvider"
