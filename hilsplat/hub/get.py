@@ -312,7 +312,7 @@ def _refused(
         fix = f"accept them at {place}, run `hf auth login` or set HF_TOKEN, and run the command again"
     elif isinstance(error, RepositoryNotFoundError):
         problem = f"the hub has no repository {repository}, or it is private {status}"
-        fix = f"correct the name (hilsplat models list; {place}); if private, `hf auth login` or set HF_TOKEN"
+        fix = f"correct the name (hilsplat models list), or log in (`hf auth login`, HF_TOKEN) to use {place}"
     elif response.status_code == requests.codes.too_many_requests:
         problem = f"the hub received too many requests to serve {repository} {status}"
         found = f"Retry-After: {response.headers.get('Retry-After', 'not stated')}"
