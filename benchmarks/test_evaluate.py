@@ -1,4 +1,4 @@
-"""Time to score a view: 20 annotated texts at 986 x 728 px, with given relevancy maps and node masks."""
+"""Time to score a view: 20 annotated texts at 986 x 728 px, with precomputed relevancies and node masks."""
 
 import time
 from functools import cache, partial
@@ -10,6 +10,7 @@ import pytest
 from benchmarks.goals import Goal
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.labelled import LabelledRegion
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
@@ -72,7 +73,7 @@ def test_scoring_a_view(benchmark, method):
     settings = EvaluateSettings(methods=(method,))
     selections, masks = Selections(answers), PackedMasks(SIZE_HW)
     benchmark.extra_info |= {"case": scoring(method), "count": len(truth.queries), "of": "queries"}
-    assert benchmark(lambda: list(measure_view(selections, truth, VIEW, masks, settings)))
+    assert benchmark(lambda: list(measure_view(selections, truth, VIEW, masks, settings, ExtraProtocols())))
 
 
 def scoring(method: str) -> str:

@@ -18,10 +18,9 @@ from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
-from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.points import measure_scene_points
 from hilsplat.evaluate.protocols.view_truth import truths_of
-from hilsplat.evaluate.protocols.views import measure_view, relevancy_departures, rule_of
+from hilsplat.evaluate.protocols.views import measure_view, rule_of
 from hilsplat.evaluate.scores import Measured, Score, write_instances, write_scores
 from hilsplat.evaluate.tables.costs import write_times
 from hilsplat.query.language_scene import LanguageScene
@@ -105,12 +104,8 @@ def run_evaluate(
                 kept: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
                     of_view, size_hw = truths[view](), posed.cameras[view].size_hw
-                    words = relevancy_departures(settings)
-                    also = None
-                    if protocols.flat:
-                        also = FlatProtocols(answers, view, protocols.flat, protocols.level, words)
                     kept[view] = PackedMasks(size_hw)
-                    for row in measure_view(selections, of_view, view, kept[view], settings, also):
+                    for row in measure_view(selections, of_view, view, kept[view], settings, protocols):
                         keep(data, view, row)
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]

@@ -59,13 +59,10 @@ class FlatProtocols:
         category: Query,
         queries: Sequence[Query],
     ) -> Iterator[Measured]:
-        """Yield the rows of one text and method.
+        """Yield the rows of one text, merged over levels (`category`) or at one of its levels (`queries`).
 
-        Args:
-            nodes_mask: the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`; if None, LERF-Mask uses the
-                mask from the relevancy maps.
-            category: the text, merged over levels.
-            queries: the text at each level.
+        `nodes_mask` is the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`; if it is None, LERF-Mask uses
+        the mask from the relevancy maps.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:

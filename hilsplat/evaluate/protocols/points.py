@@ -6,7 +6,7 @@
 | `field` | the class text with the highest cosine to the latent transferred to the point at level whole |
 
 Instances (ScanNet200) are the tree's nodes at level whole; a field has none. `carry` transfers predictions
-from Gaussians to points; those of other programs are read from files. Every row names the mode.
+from Gaussians to points. Every row names the mode.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,18 +1,10 @@
 """Score a scene's answers in one view: LERF-OVS, 3D-OVS, Hi-LERF and Hi-3DOVS.
 
-| protocol | queries | answer |
-|---|---|---|
-| `lerf/langsplat` | every distinct text, regions merged over levels | field; level chosen by the rule |
-| `lerf/tree-nodes` | the same | tree; level chosen by the tree |
-| `hierarchy/level-given` | every (text, level) | field or tree, at the annotation's level |
-| `hierarchy/level-auto` | every (text, level) | field or tree, level chosen by the method |
-| `hierarchy/path` | every (text, level), as a chain of texts from the whole down | tree |
-| `hierarchy/scene-wide` | every (text, level) | tree, at the annotation's level, one answer for all views |
-| `hierarchy/annotations` | - | the annotations themselves, HC only: the score of perfect masks |
-
-A path contains more information than a flat query and is not part of the paper's protocol. A missing or empty
-prediction counts as 0. Only Gaussians and nodes visible in the view compete, except for nodes under
-`hierarchy/scene-wide`.
+The protocols `lerf/*` query every distinct text, with its regions merged over levels, and `hierarchy/*` every
+(text, level); their cards state how a method answers. `hierarchy/annotations` has only the HC of the
+annotations themselves, the score of perfect masks. `hierarchy/path` queries the chain of texts from the whole
+down, which contains more information than the paper's protocol. A missing or empty prediction counts as 0.
+Only Gaussians and nodes visible in the view compete, except for nodes under `hierarchy/scene-wide`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from hilsplat.base.levels import LEVELS, Level
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics import hierarchy
 from hilsplat.evaluate.metrics.masks import best_threshold_iou, peak_points
 from hilsplat.evaluate.metrics.relevancy_rule import (
@@ -94,15 +87,11 @@ def measure_view(
     view: str,
     masks: PackedMasks,
     settings: EvaluateSettings,
-    also: FlatProtocols | None = None,
+    extra: ExtraProtocols,
 ) -> Iterator[Measured]:
-    """Yield all rows of one view, in no particular order.
-
-    Args:
-        masks: stores the answers, for measures between views.
-        also: further protocols for texts without levels, such as `3d-ovs/langsplat`.
-    """
+    """Yield all rows of one view, in no particular order; store the answers in `masks`."""
     answers, scene = _ViewAnswers(selections, view, settings, masks), selections.scene
+    flat_views = FlatProtocols(scene, view, extra.flat, extra.level, relevancy_departures(settings))
     rule = rule_of(settings)
 
     def by_map(smoothed: SmoothedRelevancy, level: Level | None) -> np.ndarray:
@@ -112,7 +101,7 @@ def measure_view(
         return answers.of_nodes((text,), level)
 
     needs_nodes = "tree" in settings.methods or "tree-path" in settings.methods
-    categories = [*truth.categories, *(truth.absent if also else ())]
+    categories = [*truth.categories, *(truth.absent if extra.flat else ())]
     height, width = masks.size_hw
     per_chunk = max(1, int(RELEVANCY_CHUNK_MIB * 2**20 / (2 * 3 * 4 * height * width)))
     for start in range(0, len(categories), per_chunk):
@@ -132,14 +121,12 @@ def measure_view(
                     if method == "tree":
                         flat, answer = cards.TREE_NODES, partial(by_nodes, category.text)
                         yield from answers.scene_wide_rows(queries)
-                        mask = by_nodes(category.text, None) if also is not None else None
+                        mask = by_nodes(category.text, None)
                     yield from answers.rows(method, flat, smoothed, answer, category, queries)
-                if also is not None:
-                    yield from also.add(method, found[row], mask, category, queries)
+                yield from flat_views.add(method, found[row], mask, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
                 yield from answers.path_rows(nodes[row], queries)
-    if also is not None:
-        yield from also.finish()
+    yield from flat_views.finish()
     yield from answers.consistency_rows(truth)
 
 
@@ -166,12 +153,9 @@ class _ViewAnswers:
         category: Query,
         queries: Sequence[Query],
     ) -> Iterator[Measured]:
-        """Yield the rows of one text, answered by field or tree.
+        """Yield the rows of one text, merged over levels (`category`, under the protocol `flat`) and at each.
 
-        Args:
-            flat: protocol for texts merged over levels, like `category`.
-            answer: maps a level, or None if the method chooses it, to the mask of the text.
-            queries: the text at each level.
+        `answer` maps a level, or None if the method chooses it, to the mask of the text.
         """
         united, given, auto = (
             label_of(card, method, self.settings) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)

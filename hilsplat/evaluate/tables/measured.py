@@ -60,9 +60,8 @@ def measured_blocks(
 
     Args:
         protocols: prefixes of the protocols that have rows.
-        cells_of: computes a row's values from the scores of one variant, method, masks, protocol and seed.
+        cells_of: computes a row's values from the scores of one seed, `over_seeds` from those of all seeds.
         columns_of: returns the value columns, from the scores of a data set.
-        over_seeds: computes further values of a row from the scores of all its seeds.
         label_of: maps protocols to labels; those with the same label share a row.
     """
     if sources.scores.empty:
@@ -138,10 +137,9 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
-    """Return the name of a row, from its variant and method.
+    """Return the name of a row: `hilsplat (field)` and `hilsplat (tree)` for the default variant.
 
-    The default variant has rows for field and tree, `hilsplat (field)` and `hilsplat (tree)`; the label of
-    any other variant refers to its field. Predictions from files are named after their program.
+    The label of any other variant refers to its field. Predictions from files are named after their program.
     """
     if method == "truth":
         return "annotations"

@@ -32,7 +32,7 @@ def write_answers(folder, world, packed=False):
     """Write the tree's answers in the view, at levels and one per text, and return the rows of a run."""
     truth = ViewTruth.of(world.annotations, VIEW, (64, 64), SETTINGS.min_region_px)
     kept, selections = PackedMasks((64, 64)), Selections(world.answers)
-    rows = list(measure_view(selections, truth, VIEW, kept, SETTINGS))
+    rows = list(measure_view(selections, truth, VIEW, kept, SETTINGS, ExtraProtocols()))
     auto, given = (label_of(card, "tree", SETTINGS) for card in (LEVEL_AUTO, LEVEL_GIVEN))
     masks = {query.text: kept.get(("tree", auto, query.text)) for query in truth.categories}
     for query in truth.queries:

@@ -8,9 +8,9 @@ import pytest
 from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
+from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
-from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.settings import EvaluateSettings
@@ -59,7 +59,7 @@ class HandMade:
 def measured(scene, truth, **settings):
     """{(method, protocol, query, level, metric): value} of one view."""
     section = EvaluateSettings(min_region_px=1, **settings)
-    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section)
+    rows = measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), section, ExtraProtocols())
     return {(row.method, row.protocol, row.query, row.level, row.metric): row.value for row in rows}
 
 
@@ -179,8 +179,8 @@ def test_other_protocols_are_measured_with_their_own_rules():
     scene = HandMade([], {}, {"cup": relevancy})
     cards = [PROTOCOLS["3d-ovs/langsplat@2"], PROTOCOLS["3d-ovs/langsplat-raw@2"]]
     settings = EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5)
-    flat = FlatProtocols(scene, "v.png", cards, None, ["relevancy scale 5"])
-    rows = list(measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), settings, flat))
+    extra = ExtraProtocols(tuple(cards))
+    rows = list(measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), settings, extra))
     ious = {row.protocol: row.value for row in rows if row.metric == "iou"}
     assert ious == {
         "lerf/langsplat@2 (filter 1, no mix, no majority, relevancy scale 5)": 0,
@@ -228,7 +228,7 @@ def test_perfect_tree_of_the_block_world_scores_one(block_world):
     view, size_hw, settings = "001.png", (64, 64), EvaluateSettings()
     truth = ViewTruth.of(block_world.annotations, view, size_hw, settings.min_region_px)
     selections = Selections(block_world.answers)
-    rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings))
+    rows = list(measure_view(selections, truth, view, PackedMasks(size_hw), settings, ExtraProtocols()))
     given = [row for row in rows if row.method == "tree" and row.protocol == "hierarchy/level-given@5"]
     ious = {row.query: row.value for row in given if row.metric == "iou"}
     assert ious == dict.fromkeys(("bear", "chest", "head", "lid", "nose"), 1.0)
