@@ -1,4 +1,4 @@
-"""Graph segmenter masks that replace the outputs of a SAM with random weights after its networks ran."""
+"""Graph segmenter masks that replace the outputs of a SAM with random weights after its networks have run."""
 
 from typing import Any
 
@@ -9,11 +9,10 @@ from hilsplat.base.levels import Level
 from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.sam import HEADS, Encoded, Frame, SamModel, in_input
 
-SCALES = (0.07, 0.02, 0.004)
-"""Scales that give about 300 masks per photograph."""
-
-LOW_PX, SLOPE, REACH_PX = 256, 5.0, 8.0
-"""Side of SAM's masks; slope of the logits at a border per pixel; distance at which they saturate."""
+SCALES = (0.07, 0.02, 0.004)  # scales that give about 300 masks per photograph
+LOW_PX = 256  # side of SAM's masks
+SLOPE = 5.0  # slope of the logits at a border, per pixel
+REACH_PX = 8.0  # distance from a border at which the logits saturate
 
 
 def labels_of(image: np.ndarray, frame: Frame) -> list[np.ndarray]:
@@ -65,7 +64,7 @@ class Regions:
 def replace_outputs(model: type[SamModel]) -> None:
     """Patch a `SamModel` so that it runs its networks but returns canned masks."""
     encode, decode, preview, finish = model.encode, model.decode, model.preview, model.finish
-    known: dict[int, list[np.ndarray]] = {}  # the check of int8 encodes an image twice
+    known: dict[int, list[np.ndarray]] = {}  # because the int8 check encodes an image twice
 
     def canned_encode(self: Any, image: np.ndarray, *encoder: Any) -> Encoded:
         encoded, digest = encode(self, image, *encoder), hash(image.tobytes())

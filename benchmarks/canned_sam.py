@@ -1,4 +1,4 @@
-"""A SAM whose network is replaced by a table of blobs, so that timings exclude the network."""
+"""A SAM whose network is replaced by a table of blobs, for timings without the network."""
 
 import time
 
@@ -9,8 +9,8 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.sam import Encoded, SamModel
 
 LOW_PX = 256
+# number and mean radius (low-resolution px) of the blobs of each head: subpart, part, whole
 REGIONS = ((260, 9.0), (80, 19.0), (25, 38.0))
-"""Number and mean radius (low-resolution px) of the blobs of each head: subpart, part, whole."""
 
 
 class NetworkClock:
@@ -72,7 +72,7 @@ class CannedSam(SamModel):
             self.heads.append((centres, blob_logits(centres, radii, (LOW_PX, LOW_PX), rng)))
 
     def prompts_per_call(self, limit: int, prompts: int) -> int:
-        """Return the smaller of the wanted and the requested number."""
+        """Return the number of prompts, at most the limit."""
         return min(limit, prompts)
 
     def encode(self, image: np.ndarray) -> Encoded:
@@ -81,7 +81,7 @@ class CannedSam(SamModel):
         return Encoded({}, frame)
 
     def decode(self, encoded: Encoded, points_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return scores and logits of the blobs nearest to each point, without counting the time."""
+        """Return scores and logits of the blobs nearest to each point; the clock excludes this time."""
         start = time.process_time()
         scale = encoded.frame.resized_hw[0] / encoded.frame.original_hw[0] * LOW_PX / self.padded_hw[0]
         low = points_xy * scale

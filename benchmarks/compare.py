@@ -21,28 +21,18 @@ from pathlib import Path
 
 from benchmarks.table import markdown_table
 
-NOISE = 1.08
-"""Median ratio of times up to which a case counts as equal, because runs of the same code differ as much."""
-
-Run = Mapping[str, float]
-"""Name of a case -> its minimum time, ms."""
+NOISE = 1.08  # median ratio of times up to which a case counts as equal; runs of the same code differ as much
+Run = Mapping[str, float]  # name of a case -> its minimum time, ms
 
 
 @dataclass(frozen=True)
 class Paired:
-    """Timings of a case in all pairs.
+    """Timings of a case in all pairs."""
 
-    Attributes:
-        case: its name.
-        before_ms: minimum time with the other commit.
-        now_ms: minimum time with the working tree.
-        ratios: time now over time before, one per pair.
-    """
-
-    case: str
-    before_ms: float
-    now_ms: float
-    ratios: tuple[float, ...]
+    case: str  # its name
+    before_ms: float  # minimum time with the other commit
+    now_ms: float  # minimum time with the working tree
+    ratios: tuple[float, ...]  # time now divided by time before, one per pair
 
     @property
     def verdict(self) -> str:
@@ -62,9 +52,7 @@ class Paired:
 def paired(before: Sequence[Run], now: Sequence[Run]) -> list[Paired]:
     """Compare the cases that are in every run of both versions, in the order of the first run.
 
-    Args:
-        before: runs of the other commit.
-        now: runs of the working tree, each paired with the run in `before` at the same position.
+    Runs of the other commit and of the working tree at the same position are a pair.
     """
     common = [case for case in now[0] if all(case in run for run in (*before, *now))]
     return [
@@ -105,18 +93,18 @@ def main() -> int:
     parser.add_argument("base", help="commit to compare the working tree with")
     parser.add_argument("-k", dest="select", default="", help="cases to run, as pytest selects them")
     parser.add_argument("--pairs", type=int, default=3, help="runs of each version")
-    asked = parser.parse_args()
-    options = ["-k", asked.select] if asked.select else []
+    given = parser.parse_args()
+    options = ["-k", given.select] if given.select else []
     runs: dict[str, list[Run]] = {"before": [], "now": []}
-    with tempfile.TemporaryDirectory() as scratch, checked_out(asked.base, Path(scratch, "tree")) as other:
+    with tempfile.TemporaryDirectory() as scratch, checked_out(given.base, Path(scratch, "tree")) as other:
         trees = {"before": other, "now": Path.cwd()}
-        for pair in range(asked.pairs):
-            for which in sorted(trees, reverse=pair % 2 == 1):  # the versions alternate in running first
-                print(f"pair {pair + 1} of {asked.pairs}: {which}", file=sys.stderr)
+        for pair in range(given.pairs):
+            for which in sorted(trees, reverse=pair % 2 == 1):  # each version runs first in every other pair
+                print(f"pair {pair + 1} of {given.pairs}: {which}", file=sys.stderr)
                 out = Path(scratch, f"{which}-{pair}")
                 runs[which].append(run_benchmarks(trees[which], out, options))
     found = paired(runs["before"], runs["now"])
-    head = ("case", f"{asked.base}, ms", "now, ms", "ratio: median pair (all)", "")
+    head = ("case", f"{given.base}, ms", "now, ms", "ratio: median pair (all)", "")
     print(markdown_table(head, [each.row() for each in found]))
     slower = [each.case for each in found if each.verdict == "slower"]
     print(f"\nslower: {', '.join(slower) or 'nothing'}")

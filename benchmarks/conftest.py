@@ -3,9 +3,9 @@
 The column "room" is the name of a module `test_<room>.py`. A case records in `benchmark.extra_info`:
     case: its name, such as "forward, 100k 800x600, D=3, 1 thread";
     count, of: number and kind of items that one call handles, for the rate (optional);
-    flop: useful floating-point operations of one call, for the share of the peak (optional);
-    peak_mib: peak memory beyond that held before (optional).
-The list GOALS of a module (see `goals.Goal`) gives the rows of the second table.
+    flop: useful floating-point operations of one call, for the share of the peak rate (optional);
+    peak_mib: peak memory beyond that in use before the call (optional).
+The second table contains the list GOALS of each module (see `goals.Goal`).
 """
 
 import datetime

@@ -3,7 +3,7 @@
     python -m benchmarks.devices                 # both devices; CUDA needs hilsplat[gpu]
     python -m benchmarks.devices --devices cpu
 
-Times include all copies between host and device, because callers pass and get NumPy arrays. Medians.
+Times are medians. They include all copies between host and device, because callers pass and get NumPy arrays.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def median_ms(work: Callable[[], object]) -> float:
 
 
 def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int) -> list[float]:
-    """Return the milliseconds of an image, its gradients, pixel weights and a step of a fit."""
+    """Return the times of an image, its gradients, pixel weights and a step of a fit, ms."""
     seen = draw(gaussians, camera, 3, threads=threads, device=device)
     slope, flat = np.ones_like(seen.image), np.zeros_like(seen.alpha)
 
@@ -69,17 +69,18 @@ def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int)
 
 
 def main() -> None:
+    """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--devices", nargs="+", choices=("cpu", "cuda"), default=("cpu", "cuda"))
     parser.add_argument("--threads", type=int, default=os.cpu_count())
-    asked = parser.parse_args()
-    if "cuda" in asked.devices:
+    given = parser.parse_args()
+    if "cuda" in given.devices:
         print("CUDA against the CPU:", disagreement("cpu", "cuda") or "equal up to rounding", flush=True)
     rows = []
     for name, (number, size_hw) in SIZES_TIMED.items():
         gaussians, camera = random_scene(number, size_hw)
-        for device in asked.devices:
-            times = times_of(gaussians, camera, device, asked.threads)
+        for device in given.devices:
+            times = times_of(gaussians, camera, device, given.threads)
             rows.append((name, device, *(f"{value:.1f}" for value in times)))
             print(*rows[-1], flush=True)
     head = ("scene", "device", "image", "image and gradients", "pixel weights", "step of a fit")

@@ -3,27 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-Times = dict[str, float]
-"""Name of a case, as in its row of the table -> its minimum time, ms."""
+Times = dict[str, float]  # name of a case, as in its row of the table -> its minimum time, ms
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One row of the table of goals.
+    """One row of the table of goals."""
 
-    Attributes:
-        what: name of the figure.
-        unit: its unit.
-        limit: the target: an upper limit, or a lower limit if `at_least` is set.
-        figure: computes the figure from the times of all cases; raises KeyError if a case was not run.
-        at_least: whether larger is better.
-    """
-
-    what: str
+    what: str  # name of the figure
     unit: str
-    limit: float
+    limit: float  # an upper limit, or a lower limit if `at_least` is set
+    # computes the figure from the times of all cases; raises KeyError if a case was not run
     figure: Callable[[Times], float]
-    at_least: bool = False
+    at_least: bool = False  # whether larger is better
 
     def row(self, times: Times) -> tuple[str, str, str, str] | None:
         """Return the row (what, figure, goal, whether it is met), or None if the cases were not run."""
@@ -33,9 +25,5 @@ class Goal:
             return None
         met = value >= self.limit if self.at_least else value <= self.limit
         sign = ">=" if self.at_least else "<="
-        return (
-            self.what,
-            f"{value:.2f} {self.unit}",
-            f"{sign} {self.limit:g} {self.unit}",
-            "yes" if met else "no",
-        )
+        target = f"{sign} {self.limit:g} {self.unit}"
+        return self.what, f"{value:.2f} {self.unit}", target, "yes" if met else "no"

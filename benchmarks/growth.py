@@ -2,9 +2,9 @@
 
     python -m benchmarks.growth FOLDER        # thirteen scenes, 4 minutes on two idle cores
 
-Each series makes the base scene of `large_scene` with one quantity at half, once, twice and four times its
-size, and runs every stage in its own process. It writes `growth.json` and `growth.png`, and prints
-exponents: the slopes of straight lines through the logarithms. Existing results are reused.
+Each series generates the base scene of `large_scene` with one quantity at half, once, twice and four times
+its size, and runs every stage in its own process. The script writes `growth.json` and `growth.png`, and
+prints exponents: the slopes of straight lines fitted to the logarithms. Existing results are reused.
 """
 
 import argparse
@@ -26,14 +26,14 @@ MEASURES = ("seconds", "MiB")
 LABELS = {
     "gaussians": "Gaussians",
     "views": "views",
-    "pixels": "pixels of a view",
-    "masks": "masks of a view",
+    "pixels": "pixels per view",
+    "masks": "masks per view",
 }
 
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a generated scene; pixels are per view, and masks are per view at all levels together."""
+    """Size of a generated scene; pixels and masks (of all levels) are per view."""
 
     gaussians: int = 50_000
     views: int = 24
@@ -66,7 +66,7 @@ def measured(size: Size, folder: Path) -> dict[str, list[float]]:
 
 
 def exponent(sizes: list[float], values: list[float]) -> float:
-    """Return the slope of the straight line through the logarithms; 1 is linear growth."""
+    """Return the slope of a straight line fitted to the logarithms; 1 is linear growth."""
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 

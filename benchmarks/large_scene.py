@@ -3,10 +3,10 @@
     python -m benchmarks.large_scene LARGE                             # 1M Gaussians, 250 views of 986 x 728
     python -m benchmarks.large_scene SMALL --gaussians 100000 --views 48 --width 800 --height 600
 
-The scene is a floor with 400 balls, a ring of cameras, and masks of each view at three levels (balls, halves,
+The scene is a floor with 400 balls and a ring of cameras. Each view has masks at three levels (balls, halves,
 eighths; the largest of each level) with a CLIP vector each. Coverage tree, contributions, semantic tree,
-autoencoder and field run in order, each in its own process. An existing scene is reused. Times and peaks are
-printed and written to `times.md` and `times.json`.
+autoencoder and field run in order, each in its own process. An existing scene is reused. Times and peak
+memory are printed and written to `times.md` and `times.json`.
 """
 
 import argparse
@@ -45,8 +45,7 @@ from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
-ROWS = 20
-"""Number of rows and of columns of balls, which are a metre apart."""
+ROWS = 20  # number of rows and of columns of balls, which are one metre apart
 RADIUS = 0.38
 CHANNELS = 512
 MIN_AREA_PX = 50
@@ -54,7 +53,7 @@ STAGES = ("coverage_tree", "contributions", "semantic_tree", "autoencoder", "fie
 
 
 def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
-    """Return Gaussians of the balls (seven tenths of all) and the floor, in the order of a fit's output.
+    """Return Gaussians of the balls (70 %) and of the floor, in the order of a fit's output.
 
     Returns:
         The Gaussians, and (N, 3) the ball, half and eighth of each, -1 on the floor.
@@ -139,7 +138,7 @@ def make(out: Path, number: int, views: int, size_hw: tuple[int, int], masks: in
             write_npy(clip_folder / f"{name}.npy", unit.astype(np.float16))
             index_of_masks[name] = index_entry(found)
             index_of_clip[name] = {MASKS_SHA256: digest_of(found), "masks": len(found)}
-        print(f"{nonzeros / views / size_hw[0] / size_hw[1]:.1f} Gaussians a pixel")
+        print(f"{nonzeros / views / size_hw[0] / size_hw[1]:.1f} Gaussians per pixel")
         write_index(masks_folder, index_of_masks, scene="made/large", segmenter="made", model="")
         write_index(clip_folder, index_of_clip, scene="made/large", dim=CHANNELS, model="")
 
@@ -194,33 +193,34 @@ def stages(out: Path, threads: int, device: str) -> dict[str, Callable[[], None]
 
 
 def main() -> None:
+    """Run one stage, or make the scene, run all stages and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
     parser.add_argument("--views", type=int, default=250)
     parser.add_argument("--width", type=int, default=986)
     parser.add_argument("--height", type=int, default=728)
-    parser.add_argument("--masks", type=int, default=300, help="masks of a view, all levels together")
+    parser.add_argument("--masks", type=int, default=300, help="masks per view, at all levels together")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument(
-        "--stage", choices=STAGES, help="run this stage in this process and print seconds and MiB"
+        "--stage", choices=STAGES, help="run this stage in this process, and print its seconds and MiB"
     )
-    asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
-    if asked.stage:
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    if given.stage:
         begun = time.perf_counter()
-        stages(asked.out, asked.threads, asked.device)[asked.stage]()
+        stages(given.out, given.threads, given.device)[given.stage]()
         print(f"{time.perf_counter() - begun:.1f} {status_mib('VmHWM'):.0f}")
         return
-    if not (asked.out / "clip").exists():
-        size_hw = (asked.height, asked.width)
-        make(asked.out, asked.gaussians, asked.views, size_hw, asked.masks, asked.threads)
+    if not (given.out / "clip").exists():
+        size_hw = (given.height, given.width)
+        make(given.out, given.gaussians, given.views, size_hw, given.masks, given.threads)
     rows = []
     for stage in STAGES:
-        command = [sys.executable, "-m", "benchmarks.large_scene", str(asked.out), "--stage", stage]
-        command += ["--threads", str(asked.threads), "--device", asked.device]
-        environment = {**os.environ, "NUMBA_NUM_THREADS": str(asked.threads)}
+        command = [sys.executable, "-m", "benchmarks.large_scene", str(given.out), "--stage", stage]
+        command += ["--threads", str(given.threads), "--device", given.device]
+        environment = {**os.environ, "NUMBA_NUM_THREADS": str(given.threads)}
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
         seconds, peak = done.stdout.split()[-2:]
         rows.append((stage, seconds, peak))
@@ -229,9 +229,9 @@ def main() -> None:
         ("all", f"{sum(float(row[1]) for row in rows):.1f}", max((row[2] for row in rows), key=float))
     )
     table = markdown_table(("stage", "s", "peak MiB"), rows, 1)
-    (asked.out / "times.md").write_text(table + "\n")
+    (given.out / "times.md").write_text(table + "\n")
     times = {stage: [float(seconds), float(peak)] for stage, seconds, peak in rows}
-    (asked.out / "times.json").write_text(json.dumps(times) + "\n")
+    (given.out / "times.json").write_text(json.dumps(times) + "\n")
     print(table)
 
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from hilsplat.base.lanes import lane_sum, lanes
 
-CHAINS = 12
-"""Number of independent sums, enough to hide a latency of 4 to 5 cycles on 2 units."""
+CHAINS = 12  # number of independent sums, enough to hide a latency of 4 to 5 cycles on 2 units
 
 
 @numba.njit

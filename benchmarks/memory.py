@@ -2,8 +2,9 @@
 
     python -m benchmarks.memory 1000000 2160 3840 3     # Gaussians, height, width, channels
 
-prints the peak of forward, and of forward and backward, in MiB beyond the scene itself. It includes image,
-alpha, all gradients and intermediate arrays, but not the gradients of the image, which are inputs.
+The script prints the peak of forward, and of forward and backward, in MiB beyond the scene itself. The peak
+includes image, alpha, all gradients and intermediate arrays, but not the gradients of the image, which are
+inputs.
 """
 
 import subprocess
@@ -44,6 +45,7 @@ def _measure(num_gaussians: int, size_hw: tuple[int, int], channels: int) -> tup
 
 
 def status_mib(name: str) -> float:
+    """Return a figure of this process's memory, such as "VmHWM", its peak."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(f"{name}:"):
             return int(line.split()[1]) / 1024

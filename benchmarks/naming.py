@@ -1,10 +1,11 @@
-"""Measure how often node names and doubts about queries are right, on finished synthetic scenes.
+"""Measure how often node names and doubts about queries are correct, on finished synthetic scenes.
 
     python -m benchmarks.naming results/synthetic/dev-1 results/synthetic-rooms/dev-room
 
-A node counts if it has an IoU above 0.5 with a true node; its name is right if it is the true text or a
-synonym. Present texts are those of the matched nodes. Absent texts are those of the vocabulary that name
-nothing in the scene. Words outside the model's vocabulary are always doubted and are not counted.
+Only nodes that have an IoU above 0.5 with a ground-truth node are counted. A name is correct if it is the
+ground-truth text or a synonym. Present texts are those of the matched nodes. Absent texts are those of the
+vocabulary that name nothing in the scene. Words outside the model's vocabulary are always doubted and are not
+counted.
 """
 
 import sys
@@ -19,13 +20,12 @@ from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.evaluate.diagnostics.tree_truth import measure_tree, true_votes
 from hilsplat.query.node_names import Vocabulary, vocabulary_file
 
-ABSENT = 200
-"""Maximum number of queries for absent texts, spread over the vocabulary."""
+ABSENT = 200  # maximum number of queries for absent texts, spread over the vocabulary
 
 
 @dataclass
 class Counts:
-    """Number of right cases, and of all cases."""
+    """Number of correct cases, and of all cases."""
 
     right: int = 0
     all: int = 0
@@ -40,25 +40,17 @@ class Counts:
 
 @dataclass
 class Naming:
-    """Counts of a level over scenes.
+    """Counts of a level over scenes."""
 
-    Attributes:
-        top1: the nearest text is right.
-        top5: one of the nearest five texts is right.
-        named: the node has a name.
-        right: the node's name is right.
-        doubted: the query for a present text raised a doubt.
-    """
-
-    top1: Counts = field(default_factory=Counts)
-    top5: Counts = field(default_factory=Counts)
-    named: Counts = field(default_factory=Counts)
-    right: Counts = field(default_factory=Counts)
-    doubted: Counts = field(default_factory=Counts)
+    top1: Counts = field(default_factory=Counts)  # the nearest text is correct
+    top5: Counts = field(default_factory=Counts)  # one of the nearest five texts is correct
+    named: Counts = field(default_factory=Counts)  # the node has a name
+    right: Counts = field(default_factory=Counts)  # the node's name is correct
+    doubted: Counts = field(default_factory=Counts)  # the query for a present text was doubted
 
 
 def measure(folder: Path, levels: dict[Level, Naming], missed: Counts) -> None:
-    """Add the counts of a scene; `missed` counts absent texts that were answered without a doubt."""
+    """Add the counts of a scene; `missed` counts absent texts that were not doubted."""
     scene = hilsplat.open(folder)
     assert scene.naming is not None, f"{folder} has no names: hilsplat run {folder}/default/names"
     rows = read_json(folder / "default/names/names.json")
@@ -96,7 +88,7 @@ def main() -> None:
     ]
     head = ("level", "top-1", "top-5", "named", "of the named, right", "present, doubted")
     print(markdown_table(head, rows, 1))
-    print(f"absent texts answered without a doubt: {missed}")
+    print(f"absent texts, not doubted: {missed}")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Time and memory per photograph of a released SAM and CLIP, measured on full-size networks.
 
     python -m benchmarks.real_size                              # SAM ViT-B and CLIP B/16 on three photographs
-    python -m benchmarks.real_size --sam sam2.1-small PHOTOS    # another SAM; a folder of your own
+    python -m benchmarks.real_size --sam sam2.1-small PHOTOS    # another SAM; your own folder
 
-Run it by hand. Random weights take as long as trained ones. Networks are exported once into --models (extra
-`export`; ViT-B needs 8 GB for that, ViT-H more). A random SAM predicts no confident mask, so the work on
-masks outside the network is excluded (`make bench` measures it), and CLIP embeds masks of the graph
-segmenter. Each step runs in its own process, on one core, and prints processor seconds and peak memory.
+Random weights take as long as trained ones. Networks are exported once into --models (extra `export`; ViT-B
+needs 8 GB for that, ViT-H more). A random SAM predicts no confident mask, so the work on masks outside the
+network is excluded (`make bench` measures it), and CLIP embeds masks of the graph segmenter. Each step runs
+in its own process, on one core, and prints processor seconds and peak memory.
 """
 
 import argparse
@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.memory import status_mib
+
 PHOTOGRAPHS = Path(__file__).resolve().parents[1].parent / "shared/data/plush_bedroom/images"
-KEPT = 0.3
-"""Share of the prompts whose masks are decoded after the preview (docs/experiments.md, "Masks")."""
+KEPT = 0.3  # share of the prompts whose masks are decoded after the preview (docs/experiments.md, "Masks")
+MAX_SIDE_PX = 800  # maximum image side in the configuration group `photos`
 
-MAX_SIDE_PX = 800
-"""Maximum image side in the configuration group `photos`, px."""
-
+# settings of a SAM's vision encoder that differ from ViT-B
 SIZES = {
     "base": {},
     "huge": {
@@ -36,7 +36,6 @@ SIZES = {
         "mlp_dim": 5120,
     },
 }
-"""Settings of a SAM's vision encoder that differ from ViT-B."""
 
 
 def export_sam(size: str, out: Path) -> None:
@@ -48,8 +47,8 @@ def export_sam(size: str, out: Path) -> None:
     torch.manual_seed(0)
     config = transformers.SamConfig(transformers.SamVisionConfig(**SIZES[size]).to_dict())
     model = transformers.SamModel(config)
-    # Zero-initialised positions and biases would give denormal numbers in the padding of an image, and
-    # arithmetic on these takes several times as long.
+    # Zero-initialised positions and biases would give denormal numbers in the padding of an image. Arithmetic
+    # on denormal numbers takes several times as long.
     with torch.no_grad():
         for parameter in model.parameters():
             if not parameter.any():
@@ -92,7 +91,7 @@ def export_sam2(out: Path) -> None:
 
     out.mkdir(parents=True, exist_ok=True)
     prompts = {1: "prompts", 2: "points"}
-    asked = {
+    prompted = {
         "input_points": torch.full((1, 3, 2, 2), 32.0),
         "input_labels": torch.ones((1, 3, 2), dtype=torch.int64),
         "input_boxes": torch.zeros(1, 0, 4),
@@ -101,7 +100,7 @@ def export_sam2(out: Path) -> None:
     dynamic = {"input_points": prompts, "input_labels": prompts, "input_boxes": {1: "boxes"}}
     for network, inputs, outputs, axes in (
         ("vision_encoder", {"pixel_values": pixels}, names, {}),
-        ("prompt_encoder_mask_decoder", asked, ["iou_scores", "pred_masks"], dynamic),
+        ("prompt_encoder_mask_decoder", prompted, ["iou_scores", "pred_masks"], dynamic),
     ):
         torch.onnx.export(
             Part(len(inputs) > 1),
@@ -181,18 +180,16 @@ def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str,
         encode = model.encode
         model.encode = lambda image: clocked("encode", lambda: encode(image))  # type: ignore[method-assign]
         clocked("view", lambda: decode_candidates(image, model, settings))
-    with Path("/proc/self/status").open() as status:
-        (peak,) = [line.split()[1] for line in status if line.startswith("VmHWM")]
-    return found | {"peak_mib": int(peak) / 1024}
+    return found | {"peak_mib": status_mib("VmHWM")}
 
 
 def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, float]:
     """Measure processor milliseconds per prompt of the plain and the factored decoder, in alternating rounds.
 
     The plain network decodes 64 prompts in calls of 8. The factored decoder previews and decodes all of them;
-    `mean_ms` counts the share `KEPT` of the decoding. A random SAM predicts no confident mask, so the preview
-    rule itself is not run. The masks of both are compared by pixel: `unequal_px` of `mask_px` differ, and no
-    absolute logit there exceeds `tie`. Random logits cluster around 0, where a trained SAM's are steep.
+    `mean_ms` includes only the share `KEPT` of the decoding. A random SAM predicts no confident mask, so the
+    preview rule itself is not run. The masks of both are compared by pixel: `unequal_px` of `mask_px` differ,
+    and no absolute logit there exceeds `tie`. Random logits cluster around 0; those of a trained SAM are steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
     from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid
@@ -234,11 +231,8 @@ def _picture_half(network):
 
     model = object.__new__(ClipModel)
     model.vision, model.side_px = network, 224
-    model.mean, model.std, model.rescale = (
-        np.zeros(3, np.float32),
-        np.ones(3, np.float32),
-        np.float32(1 / 255),
-    )
+    model.mean, model.std = np.zeros(3, np.float32), np.ones(3, np.float32)
+    model.rescale = np.float32(1 / 255)
     return model
 
 
@@ -251,38 +245,38 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=32, help="prompts per image side")
     parser.add_argument("--models", type=Path, default=Path("results/.cache/real-size"))
     parser.add_argument("--step", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.step == "export-clip":
-        export_clip(asked.models)
+    given = parser.parse_args()
+    if given.step == "export-clip":
+        export_clip(given.models)
         return
-    if asked.step == "export-sam2.1-small":
-        export_sam2(asked.models)
+    if given.step == "export-sam2.1-small":
+        export_sam2(given.models)
         return
-    if asked.step and asked.step.startswith("export-"):
-        export_sam(asked.step.removeprefix("export-"), asked.models)
+    if given.step and given.step.startswith("export-"):
+        export_sam(given.step.removeprefix("export-"), given.models)
         return
-    if asked.step == "decoders":
-        print(json.dumps(compare_decoders(asked.models, asked.photographs, asked.points)))
+    if given.step == "decoders":
+        print(json.dumps(compare_decoders(given.models, given.photographs, given.points)))
         return
-    if asked.step:
-        print(json.dumps(measure(asked.step, asked.models, asked.photographs, asked.points)))
+    if given.step:
+        print(json.dumps(measure(given.step, given.models, given.photographs, given.points)))
         return
-    if not asked.photographs.is_dir():
-        sys.exit(f"skipped: there are no photographs in {asked.photographs}; name a folder")
-    places = {"sam": asked.models / f"sam-{asked.sam}", "clip": asked.models / "clip"}
+    if not given.photographs.is_dir():
+        sys.exit(f"skipped: {given.photographs} does not exist; pass a folder of photographs")
+    places = {"sam": given.models / f"sam-{given.sam}", "clip": given.models / "clip"}
     for kind, step, done in (
-        ("sam", f"export-{asked.sam}", "vision_encoder.onnx"),
+        ("sam", f"export-{given.sam}", "vision_encoder.onnx"),
         ("clip", "export-clip", "vision_model.onnx"),
     ):
         if not (places[kind] / done).is_file():
-            _run(step, places[kind], asked.photographs)
-    photographs = sorted(asked.photographs.iterdir())[: asked.views]
+            _run(step, places[kind], given.photographs)
+    photographs = sorted(given.photographs.iterdir())[: given.views]
     steps = [(photograph, "sam", "decoders") for photograph in photographs]
     steps += [(photograph, kind, kind) for photograph in photographs for kind in ("sam", "clip")]
     for photograph, kind, step in steps:
-        line = json.loads(_run(step, places[kind], photograph, asked.points).splitlines()[-1])
-        told = ", ".join(f"{name} {value:.3g}" for name, value in line.items())
-        print(f"{photograph.name} {step}: {told}", flush=True)
+        line = json.loads(_run(step, places[kind], photograph, given.points).splitlines()[-1])
+        figures = ", ".join(f"{name} {value:.3g}" for name, value in line.items())
+        print(f"{photograph.name} {step}: {figures}", flush=True)
 
 
 def _run(step: str, models: Path, photograph: Path, points: int = 32) -> str:

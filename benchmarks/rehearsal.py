@@ -3,10 +3,10 @@
     python -m benchmarks.rehearsal FOLDER                       # SAM 2.1 small, CLIP B/16, default settings
     python -m benchmarks.rehearsal FOLDER --sam base --precision fp32
 
-Run it by hand. Full-size networks with random weights (`real_size`) take as long as trained ones, but a
-random SAM predicts no confident mask. Its networks therefore run in full, and their masks are replaced by
-the graph segmenter's regions at each prompt (`canned_outputs`), so that later stages do real work. FOLDER
-becomes a project with one scene. An existing FOLDER is refused, because its caches would be used.
+Full-size networks with random weights (`real_size`) take as long as trained ones, but a random SAM predicts
+no confident mask. Its networks therefore run in full, and their masks are replaced by the graph segmenter's
+regions at each prompt (`canned_outputs`), so that later stages process realistic masks. FOLDER becomes a
+project with one scene. An existing FOLDER is refused, because its caches would be used.
 """
 
 import argparse
@@ -134,20 +134,20 @@ def main() -> None:
     )
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--export", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.export:
-        export(asked.folder, asked.export)
+    given = parser.parse_args()
+    if given.export:
+        export(given.folder, given.export)
         return
-    if not asked.photographs.is_dir():
-        print(f"skipped: there are no photographs in {asked.photographs}; name a folder")
+    if not given.photographs.is_dir():
+        print(f"skipped: {given.photographs} does not exist; pass a folder of photographs")
         return
-    if asked.folder.exists():
-        sys.exit(f"{asked.folder} exists; name a new folder, since its caches would answer")
-    models = make_models(asked.models.resolve(), asked.sam)
-    asked.folder.mkdir(parents=True)
-    folder = asked.folder.resolve()
-    options = make_project(folder, models, asked.precision)
-    found = rehearse(folder, asked.photographs.resolve(), options, asked.cores)
+    if given.folder.exists():
+        sys.exit(f"{given.folder} exists, and its caches would shorten the run; pass a new folder")
+    models = make_models(given.models.resolve(), given.sam)
+    given.folder.mkdir(parents=True)
+    folder = given.folder.resolve()
+    options = make_project(folder, models, given.precision)
+    found = rehearse(folder, given.photographs.resolve(), options, given.cores)
     print(stage_table(folder))
     print(", ".join(f"{what} after {seconds:.0f} s" for what, seconds in found.items()))
 

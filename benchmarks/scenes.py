@@ -7,14 +7,12 @@ import numpy as np
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
 
+# name of a scene -> number of Gaussians, image height and width in px
 SIZES = {"20k 256x256": (20_000, (256, 256)), "100k 256x256": (100_000, (256, 256))}
 SIZES |= {"20k 800x600": (20_000, (600, 800)), "100k 800x600": (100_000, (600, 800))}
-"""Name of a scene -> number of Gaussians, image height and width in px."""
 
-WIDTH_SHARE = 1.15 / 256
-"""Median standard deviation of 20k Gaussians, as a share of the image's width."""
-SPREAD = 0.9
-"""Standard deviation of the log of a Gaussian's width along an axis."""
+WIDTH_SHARE = 1.15 / 256  # median standard deviation of 20k Gaussians, as a share of the image's width
+SPREAD = 0.9  # standard deviation of the log of a Gaussian's width along an axis
 
 
 def random_scene(

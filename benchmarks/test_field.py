@@ -1,8 +1,8 @@
 """Timings of queries on tree and field, mask linkage and the solver, on synthetic scenes of known size.
 
 Queries use a scene of 200,000 Gaussians in front of one camera of 986 x 728 px, divided into blocks that
-are the nodes of three levels, with CLIP vectors of 512 numbers. The scene is open: its view is rendered and
-the text embedded before the timing, because the text model's time depends on the model.
+are the nodes of three levels, with CLIP vectors of 512 numbers. The view is rendered and the text embedded
+before the timing, because the time to embed a text depends on the model.
 """
 
 import time
@@ -31,9 +31,7 @@ from hilsplat.settings import AutoencoderSettings
 from hilsplat.splat.rasterise.api import pixel_weights
 
 SIZE_HW = (728, 986)
-BLOCKS = ((6, 8), (12, 16), (24, 32))
-"""Rows and columns of nodes at each level: 48, 192 and 768 nodes."""
-
+BLOCKS = ((6, 8), (12, 16), (24, 32))  # rows and columns of nodes at each level: 48, 192 and 768 nodes
 CHANNELS = 512
 VIEW = "view"
 one_thread = pytest.mark.benchmark(timer=time.process_time, min_rounds=5, max_time=1.5)

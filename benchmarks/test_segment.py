@@ -1,4 +1,4 @@
-"""Time to make a view's masks without the network: reading logits, filters, suppression, tree, writing.
+"""Time to make a view's masks without the network: read logits, filter, suppress, build the tree, write.
 
 Timings are processor time of one thread, without that of the network (a table of blobs, `canned_sam`).
 Cases handle all 3 x 1024 outputs for a grid of 32 x 32 prompts.
@@ -18,10 +18,10 @@ from hilsplat.segment.graph import segment_graph
 from hilsplat.segment.suppression import suppress_masks
 from hilsplat.settings import MasksSettings
 
+# filters that drop nothing, so that the suppression gets 1024 candidates per level
 SETTINGS = MasksSettings(
     points_per_batch=64, predicted_iou_min=0.7, stability_min=0.5, nms_score=0, min_area_px=100
 )
-"""Filter settings that drop nothing, so that 1024 candidates per level reach the suppression."""
 
 VIEW_HW = (600, 800)
 LANGSPLAT_HW = (728, 986)

@@ -30,6 +30,7 @@ from hilsplat.splat.rasterise.cpu import (
 
 LARGE = "100k 800x600"
 HALF_WAY = 500_000
+# settings of the middle of a fit: all harmonics are on, gradients are accumulated, no density control
 SETTINGS = GaussiansSettings(
     iterations=2 * HALF_WAY,
     sh_degree=3,
@@ -38,7 +39,6 @@ SETTINGS = GaussiansSettings(
     opacity_reset_every=4 * HALF_WAY,
     device="cpu",
 )
-"""Settings of the middle of a fit: all harmonics are on, gradients are accumulated, no density control."""
 
 scenes = pytest.mark.parametrize("scene", SIZES)
 threads = pytest.mark.parametrize(

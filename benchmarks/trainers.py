@@ -3,9 +3,10 @@
     python -m benchmarks.trainers FOLDER                        # dev-1, 6000 iterations, two seeds
     python -m benchmarks.trainers FOLDER --scene tiny --iterations 1000 --seeds 1
 
-Run it by hand. Both minimise our reading of the paper's objective (variant `paper`) with equal masks, code
-and weights. FOLDER becomes a project; its results are kept. Losses are of the whole objective, over all
-views. The literal trainer's rate is constant, as in LangSplat; at LangSplat's 0.0025, noise adds 1.5 %.
+Both trainers minimise our reading of the paper's objective (variant `paper`) with equal masks, code and
+weights. FOLDER becomes a project, and its results are kept. Losses are those of the whole objective, over all
+views. The literal trainer's rate is constant, as in LangSplat; at LangSplat's 0.0025, noise increases the
+objective by 1.5 %.
 """
 
 import argparse

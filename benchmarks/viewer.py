@@ -2,8 +2,8 @@
 
     python -m benchmarks.viewer results/synthetic/table-1 1 5 17      # the scene, and 5 and 17 times as large
 
-In a larger scene, each Gaussian is split into several smaller ones around it, with the same nodes. Chromium
-first renders with WebGL in software (Mesa's llvmpipe); then the server renders.
+In a larger scene, each Gaussian is split into several smaller ones around it, in the same nodes. First,
+Chromium renders with WebGL in software (Mesa's llvmpipe); then the server renders.
 """
 
 import argparse
@@ -27,16 +27,9 @@ from tests.browser.conftest import ARGUMENTS, serving
 ROUNDS = 3
 TEXT = "car"
 COLUMNS = (
-    "Gaussians",
-    "painter",
-    "MB sent",
-    "bytes each",
-    "first picture, s",
-    "all here, s",
-    "drag, s",
-    "answer, s",
+    *("Gaussians", "renderer", "MB sent", "bytes per Gaussian", "first image, s", "all loaded, s"),
+    *("drag, s", "answer, s", "heap, MB", "server, MiB"),
 )
-COLUMNS += ("heap, MB", "server, MiB")
 
 
 def enlarged(folder: Path, times: int, out: Path) -> Path:
@@ -127,14 +120,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path, help="results/<dataset>/<scene> of a finished run")
     parser.add_argument("times", type=int, nargs="*", default=[1, 5, 17])
-    asked = parser.parse_args()
+    given = parser.parse_args()
     from playwright.sync_api import sync_playwright
 
     rows = []
     with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
-        for times in asked.times:
-            folder = enlarged(asked.folder, times, Path(scratch) / f"benchmark/x{times}")
+        for times in given.times:
+            folder = enlarged(given.folder, times, Path(scratch) / f"benchmark/x{times}")
             count = len(load_ply(folder / "gaussians.ply"))
             for painter in ("gl", "server"):
                 print(f"{count} Gaussians, {painter}", file=sys.stderr)

@@ -240,20 +240,6 @@ class Autoencoder:
                 arrays[f"{layer.name}.{name}"] = (2 * reach * share - reach).astype(np.float32)
         return Autoencoder(channels, latent, arrays)
 
-    @staticmethod
-    def from_arrays(channels: int, latent: int, arrays: dict[str, np.ndarray]) -> "Autoencoder":
-        """Build a trained network from its saved weights.
-
-        Raises:
-            ValueError: an array is missing or has the wrong shape.
-        """
-        model = Autoencoder.drawn(channels, latent, torch_generator(0))
-        for name, values in model.arrays.items():
-            if name not in arrays or arrays[name].shape != values.shape:
-                raise ValueError(f"{name} of shape {values.shape} is missing")
-            model.arrays[name] = arrays[name]
-        return model
-
     def save(self, path: Path) -> None:
         """Write a .safetensors file; equal weights give equal bytes."""
         write_tensors(path, self.arrays, channels=self.channels, latent=self.latent)
@@ -273,7 +259,12 @@ def load_code(folder: Path) -> Code:
     try:
         if about.get("code") == "pca":
             return LinearCode(state["mean"], state["basis"])
-        return Autoencoder.from_arrays(about["channels"], about["latent"], state)
+        model = Autoencoder.drawn(about["channels"], about["latent"], torch_generator(0))
+        for name, values in model.arrays.items():
+            if name not in state or state[name].shape != values.shape:
+                raise ValueError(f"{name} of shape {values.shape} is missing")
+            model.arrays[name] = state[name]
+        return model
     except (KeyError, ValueError) as error:
         raise ArtifactError(f"{path} is from another version: {error}", fix=remake(path)) from error
 

@@ -1,4 +1,4 @@
-"""The baselines by name. To add one, write a file with a function `fit` and add a line here."""
+"""The baselines by name. To add one, write a file with a function `fit` and add its name to `NAMES`."""
 
 from typing import TYPE_CHECKING
 
@@ -9,29 +9,18 @@ from hilsplat.settings import MethodSettings
 if TYPE_CHECKING:
     from hilsplat.methods.method import Fit
 
-METHODS: Plugins["Fit"] = Plugins(
-    {
-        "dr_splat": "hilsplat.methods.dr_splat:fit",
-        "gaussian_grouping": "hilsplat.methods.gaussian_grouping:fit",
-        "laga": "hilsplat.methods.laga:fit",
-        "langsplat": "hilsplat.methods.langsplat:fit",
-        "langsplat_v2": "hilsplat.methods.langsplat_v2:fit",
-        "legaussians": "hilsplat.methods.legaussians:fit",
-        "lifted": "hilsplat.methods.lifted:fit",
-        "occam": "hilsplat.methods.occam:fit",
-        "omniseg3d": "hilsplat.methods.omniseg3d:fit",
-        "opengaussian": "hilsplat.methods.opengaussian:fit",
-        "saga": "hilsplat.methods.saga:fit",
-        "vch": "hilsplat.methods.vch:fit",
-    }
+NAMES = (
+    *("dr_splat", "gaussian_grouping", "laga", "langsplat", "langsplat_v2", "legaussians"),
+    *("lifted", "occam", "omniseg3d", "opengaussian", "saga", "vch"),
 )
+METHODS: Plugins["Fit"] = Plugins({name: f"hilsplat.methods.{name}:fit" for name in NAMES})
 
 OURS: str = MethodSettings().name
 """The method of this repository; the stage `field` computes its field."""
 
 
 def require_method(name: str) -> None:
-    """Raise a `SettingsError` unless a name is that of our method or a baseline."""
+    """Raise a `SettingsError` unless the name is that of our method or a baseline."""
     if name != OURS and name not in METHODS:
         raise SettingsError(
             f"method.name: there is no method {name!r}",

@@ -203,12 +203,11 @@ def test_a_method_that_returns_no_field_is_refused(tmp_path, monkeypatch, featur
 def test_the_example_in_the_documentation_runs_as_written(monkeypatch):
     page = (PROJECT / "docs" / "extending.md").read_text()
     code = re.search(r"```python\n(# hilsplat/methods/nearest_mask\.py.*?)```", page, re.S)
-    line = re.search(r'```python\n(    "nearest_mask": .*?)\n```', page, re.S)
+    assert '`"nearest_mask"` to `NAMES` in `hilsplat/methods/registry.py`' in page
     module = types.ModuleType("hilsplat.methods.nearest_mask")
     exec(compile(code[1], "nearest_mask.py", "exec"), module.__dict__)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    name, place = (part.strip(' ",') for part in line[1].split(":", 1))
-    monkeypatch.setitem(registry.METHODS.places, name, place)
+    monkeypatch.setitem(registry.METHODS.places, "nearest_mask", "hilsplat.methods.nearest_mask:fit")
 
     contributions = types.SimpleNamespace(
         num_gaussians=2,
