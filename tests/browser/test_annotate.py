@@ -218,7 +218,7 @@ def test_files_are_exported_and_imported_again(page, root, tmp_path):
     saved(page)
     np.testing.assert_array_equal(kept(root)[0].mask(SIZE), before)
     page.get_by_label("Files to import").set_input_files(file)
-    page.get_by_text("0 labels imported into 0 photographs; here already: 1.").wait_for()
+    page.get_by_text("0 labels imported into 0 photographs; already present: 1.").wait_for()
     assert items(page).count() == 1
 
 
@@ -264,7 +264,7 @@ def test_a_subpart_proposed_below_a_whole_has_no_parent(page, root):
     page.mouse.click(*place(page, 6, 6))
     offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
     offers.get_by_text("subpart").first.click()
-    page.get_by_text("as part of nothing: a subpart needs a part above it, and mug is a whole").wait_for()
+    page.get_by_text("Proposed without a parent: the parent of a subpart is a part, but mug is a whole.").wait_for()
     saved(page)
     assert [label.parent for label in kept(root)] == [None, None]
 
@@ -303,14 +303,14 @@ def test_sam_outlines_clicked_things(opened, browser, desk, tmp_path):
         page = opened(address)
         page.locator("#view").press("s")
         page.mouse.click(*place(page, 28, 20))
-        page.get_by_text("Enter takes this outline").wait_for()
+        page.get_by_text("Enter accepts this outline").wait_for()
         assert page.locator("#drawing .inside").count() == 1
         assert page.locator("#drawing .offer").count() == 1
         page.keyboard.down("Alt")
         page.mouse.click(*place(page, 4, 20))
         page.keyboard.up("Alt")
         page.locator("#drawing .outside").wait_for(state="attached")
-        page.get_by_text("Enter takes this outline").wait_for()
+        page.get_by_text("Enter accepts this outline").wait_for()
         saved(page)
         page.locator("#view").press("Enter")
         saved(page)
@@ -318,7 +318,7 @@ def test_sam_outlines_clicked_things(opened, browser, desk, tmp_path):
         assert found.origin == "proposed" and found.mask(SIZE)[20, 28] and not found.mask(SIZE)[20, 4]
         page.locator("#view").press("s")
         drag(page, (1, 2), (14, 21))  # a box
-        page.get_by_text("Enter takes this outline").wait_for()
+        page.get_by_text("Enter accepts this outline").wait_for()
         page.keyboard.press("Escape")
         page.locator("#drawing .offer").wait_for(state="detached")
         page.close()

@@ -223,7 +223,7 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     (hit,) = scene.query("mug > handle")
     assert alone.locator("#answers li").get_attribute("data-node") == str(hit.node)
     ask(alone, "spoon")
-    alone.get_by_text("This page was made with the answers to: book, mug > handle").wait_for()
+    alone.get_by_text("This page contains only the answers to: book, mug > handle").wait_for()
     chips = alone.get_by_label("Kept queries").get_by_role("listitem")
     assert [chip.inner_text().split("\n")[0] for chip in chips.all()] == ["book"]
     assert alone.locator("#overlay path.kept").count() == 1

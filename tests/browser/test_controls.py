@@ -131,7 +131,7 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
     counts = []
     page.get_by_label("scores from").check()
     for least in ("0.5", "0.9"):
-        page.get_by_role("slider", name="Least score").fill(least)
+        page.get_by_role("slider", name="Minimum score").fill(least)
         page.wait_for_timeout(800)
         counts.append(int(scale.inner_text().split()[2].replace(",", "")))
     assert counts == [24 * 16, 0]  # the mug's, whose score is 0.79

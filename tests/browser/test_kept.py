@@ -56,16 +56,16 @@ def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
     page = opened(desk_address)
     keep(page, "mug")
     ask(page, "mug > handle")
-    page.get_by_text("1 answer inside another query's.").wait_for()
+    page.get_by_text("1 answer inside an answer to another query.").wait_for()
     ask(page, "mug")
-    page.get_by_text("White: 1 node of more than one query.").wait_for()
+    page.get_by_text("White: 1 node found by several queries.").wait_for()
     assert page.locator("#overlay text").first.text_content().startswith("mug + ")
 
 
 def test_a_kept_query_can_be_edited(opened, desk_address):
     page = opened(desk_address)
     page.get_by_role("checkbox", name="scores from").check()
-    page.get_by_label("Least score").fill("0.3")
+    page.get_by_label("Minimum score").fill("0.3")
     keep(page, "book")
     assert "from 0.30" in chips(page).first.inner_text()
     page.get_by_role("checkbox", name="scores from").uncheck()

@@ -60,7 +60,7 @@ def walk(page, desk, tmp_path) -> None:
     assert read_json(tmp_path / "boxes.json")
     tab_to(page, "#answers button")
     press(page, "Enter", "n", "Control+a", "Delete", "Enter")
-    page.get_by_text("The name is taken away.").wait_for()
+    page.get_by_text("The name was removed.").wait_for()
 
 
 def test_naming_drawing_and_saving_in_the_annotator(opened, desk, tmp_path):

@@ -68,7 +68,7 @@ def test_nothing_is_drawn_while_nothing_changes(opened, cloud_address):
 
 def test_an_unfinished_scene_is_reported(opened, cloud_address):
     page = opened(cloud_address)
-    assert "The run goes on" in page.get_by_role("status").inner_text()
+    assert "The run is not finished" in page.get_by_role("status").inner_text()
     assert not page.get_by_role("tree").is_visible()
 
 

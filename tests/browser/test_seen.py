@@ -52,7 +52,7 @@ def test_the_first_five_similar_nodes_are_painted(opened, desk_address, scene, t
     answers(page).first.wait_for()
     listed = {int(item.get_attribute("data-node")) for item in page.locator("#answers li").all()}
     assert len(listed) == 5 and painted_nodes(page) == listed
-    assert "The first 5 are painted." in page.get_by_role("status").inner_text()
+    assert "The first 5 are highlighted." in page.get_by_role("status").inner_text()
     answer = "{ route: ROUTE, hits: [9, 8, 7, 6, 5, 4, 3] }"
     shown = f"import('/static/styles.js').then((own) => own.shownHits({answer}))"
     assert page.evaluate(shown.replace("ROUTE", "'like'")) == [9, 8, 7, 6, 5]

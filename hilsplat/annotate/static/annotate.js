@@ -11,7 +11,7 @@ const UNNAMED = "unnamed", NEAR_PX = 8;
 const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
 let scene, number = 0, chosen = 0, next = { text: "", level: 1, parent: null };
 let draft = [], stroke = null, cross = null, offer = null, working = Promise.resolve();
-let clicks = [], frame = null, found = [], corner = null;   // of the tool that segments; the corner that is being moved
+let clicks = [], frame = null, found = [], corner = null;   // of the segment tool; the corner that is being moved
 
 function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
 const store = new Store({ told: tell, changed: refresh });
@@ -20,7 +20,7 @@ const own = () => labels().find((label) => label.id === chosen) ?? null;
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
 // Requests run one after the other, because each region is computed from the previous one.
-let waiting = 0;   // requests after which something may have to be saved
+let waiting = 0;   // pending requests whose result may have to be saved
 const soon = (work) => {
   waiting++;
   markSaved();
@@ -98,18 +98,18 @@ function idFor(thing) {
 function add(thing) {
   const label = { ...thing, id: idFor(thing) };
   chosen = label.id;
-  next = { ...next, text: "" };   // the next thing is another one
+  next = { ...next, text: "" };   // the next thing has another text
   store.change([[number, [...labels(), label]]]);
   if (label.text === UNNAMED) { $("text").focus(); $("text").select(); }
 }
 
 async function region(ring, brush) {
   const label = own(), view = number, parent = label ? label.parent : next.parent;
-  if (!label && brush?.erase) { tell("Choose what to erase from.", true); return; }
+  if (!label && brush?.erase) { tell("Select the thing to erase from.", true); return; }
   const made = await ask("/api/shape", { view, add: [...(label?.polygons ?? []), ...(ring ? [ring] : [])], stroke: brush, inside: parent ? ringsOf(parent) : null });
   if (view !== number) return;
   if (!made.polygons.length) {
-    if (label) remove(); else tell("Nothing of it is inside the photograph and its parent.", true);
+    if (label) remove(); else tell("The shape has no pixel inside the photograph and its parent.", true);
   } else if (label) store.change([[view, labels().map((each) => each.id === label.id ? { ...each, polygons: made.polygons, origin: edited(each) } : each)]]);
   else add({ ...next, text: next.text || UNNAMED, polygons: made.polygons, origin: "drawn" });
 }
@@ -132,21 +132,21 @@ async function propose([x, y]) {
   tell("Looking for outlines…");
   const found = await ask("/api/at", { view: number, x, y });
   listOffers(found);
-  tell(found.length ? "Choose an outline; it stays a proposal until you accept or correct it." : `No ${scene.proposes.slice(0, -1)} shows there.`);
+  tell(found.length ? "Choose an outline; it stays a proposal until you accept or correct it." : `There is no ${scene.proposes.slice(0, -1)} at this pixel.`);
   $("offers").querySelector("button")?.focus();
 }
 
 // Clicks of one thing: inside, or outside with Alt; or a box.
 async function segment() {
   if (!frame && !clicks.some(([, , inside]) => inside)) { draw(); return; }
-  tell(`${scene.segments} looks at the photograph…`);
+  tell(`${scene.segments} is computing the outline…`);
   const asked = { clicks, frame }, view = number;
   const outlines = await ask("/api/segment", { view, ...(frame ? { box: boxOf(frame) } : { clicks }) });
   if (view !== number || asked.clicks !== clicks || asked.frame !== frame) return;
   found = outlines;
   offer = found[0]?.polygons ?? null;
   listOffers(found, offer);
-  tell(found.length ? "Enter takes this outline, or choose another on the left. Click more of it, or with Alt what is not of it." : "Nothing found there.");
+  tell(found.length ? "Enter accepts this outline, or choose another on the left. Click to include more, Alt-click to exclude." : "No outline was found.");
   draw();
 }
 
@@ -199,17 +199,17 @@ function take(each) {
   drop();
   add({ text: each.text || next.text || UNNAMED, level: each.level, parent, polygons: each.polygons, origin: "proposed" });
   const orphan = above && above.level < each.level && !parent;
-  tell(orphan ? `Proposed, as part of nothing: a ${LEVEL(each)} needs a ${LEVELS[each.level - 2]} above it, and ${above.text} is a ${LEVEL(above)}.` : "Proposed: accept (A), correct or delete it.");
+  tell(orphan ? `Proposed without a parent: the parent of a ${LEVEL(each)} is a ${LEVELS[each.level - 2]}, but ${above.text} is a ${LEVEL(above)}.` : "Proposed: accept (A), correct or delete it.");
 }
 
 async function carry() {
-  tell("Looking at the other photographs…");
+  tell("Transferring the things of other photographs…");
   await store.saving;
   const view = number, ids = [...store.things.keys()].filter((id) => !store.has(view, id));
-  if (!ids.length) { tell("Everything that other photographs have is here already.", true); return; }
+  if (!ids.length) { tell("All things of other photographs are already in this one.", true); return; }
   const found = await ask("/api/carry", { ids, view });
   if (found.length) store.change([[view, [...store.labels(view), ...found]]]);
-  tell(found.length ? `${found.length} proposed: accept (A), correct or delete each.` : "The other photographs' things do not show here, or have not been accepted there.");
+  tell(found.length ? `${found.length} proposed: accept (A), correct or delete each.` : "No accepted thing of another photograph is visible here.");
 }
 
 // -- things ----------------------------------------------------------------------------------------
@@ -237,10 +237,10 @@ function accept() {
   const right = new Set();
   for (let label = own(); label; label = labels().find((each) => each.id === label.parent)) right.add(label.id);
   store.change([[number, labels().map((label) => right.has(label.id) && label.origin === "proposed" ? { ...label, origin: "accepted" } : label)]]);
-  tell(right.size > 1 ? "Accepted, with what it is part of." : "Accepted.");
+  tell(right.size > 1 ? "Accepted, with its ancestors." : "Accepted.");
 }
 
-function step(way) { tell(""); store[way](); }   // what was told is no longer so
+function step(way) { tell(""); store[way](); }   // the last message no longer applies
 
 function remove() {
   const gone = new Set([chosen, ...under(labels(), chosen)]);
@@ -257,12 +257,12 @@ function fresh(child = false) {
 }
 
 async function take_in(files) {
-  await store.saving;   // the server compares with what it has
+  await store.saving;   // the server compares the files with the saved annotations
   const given = await Promise.all(files.map(async (file) => ({ name: file.name, text: await file.text() })));
   const { views, added, known } = await ask("/api/import", { files: given });
   const after = Object.entries(views).map(([number, labels]) => [Number(number), labels]);
   if (after.length) store.change(after);
-  tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; here already: ${known}` : ""}.`);
+  tell(`${counted(added, "label")} imported into ${counted(after.length, "photograph")}${known ? `; already present: ${known}` : ""}.`);
 }
 
 // -- input -----------------------------------------------------------------------------------------
@@ -375,7 +375,7 @@ async function begin() {
   document.title = `Annotate ${name} · hilsplat`;
   $("propose-label").hidden = !scene.proposes;
   $("segment-label").hidden = !scene.segments;
-  $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", and what other photographs have" : ""}.`;
+  $("about").textContent = `${scene.name}${scene.proposes ? `. Proposals: ${scene.proposes}` : ""}${scene.carries ? ", things of other photographs" : ""}.`;
   makeStrip(scene.views, stand);
   await store.load();
   store.recall(scene.folder);
@@ -386,5 +386,5 @@ async function begin() {
   watch();
 }
 
-globalThis.hilsplat = { store, sheet };   // what tests read
+globalThis.hilsplat = { store, sheet };   // for tests
 begin().catch((error) => { tell(error.message, true); document.body.dataset.ready = "failed"; });

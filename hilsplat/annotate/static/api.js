@@ -28,8 +28,8 @@ export async function watch() {
     try {
       const now = await (await get("/api/changes")).json();
       if (now.of === state && !now.changed.length) continue;
-      $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to draw on it and for its proposals.`;
+      $("changed-what").textContent = `The scene has changed${now.changed.length ? ` (${now.changed.join(", ")})` : ""}. Reload to use the new files.`;
       $("changed").hidden = false;
-    } catch { /* the server has ended, which the next change tells */ }
+    } catch { /* the server has stopped; the next change reports it */ }
   }
 }

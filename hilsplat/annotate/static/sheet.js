@@ -4,7 +4,7 @@ import { photoUrl } from "./api.js";
 import { $ } from "./elements.js";
 import { colourOf } from "./styles.js";
 
-const MOST_CORNERS = 600;   // of an outline with more, none can be grabbed by sight
+const MOST_CORNERS = 600;   // corners of outlines with more are not drawn: they are too close together
 const NS = "http://www.w3.org/2000/svg";
 export const colour = (id) => `rgb(${colourOf(id).join(" ")})`;
 

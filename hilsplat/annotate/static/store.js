@@ -27,7 +27,7 @@ export class Store {
       try {
         sessionStorage.setItem(key, JSON.stringify({ versions: this.versions, past: steps(kept), future: steps(this.future) }));
         return;
-      } catch { if (!kept.length) { sessionStorage.removeItem(key); return; } }   // too much to keep: the latest half
+      } catch { if (!kept.length) { sessionStorage.removeItem(key); return; } }   // too large to store: keep only the latest half
     }
   }
 
@@ -74,7 +74,7 @@ export class Store {
   }
 
   async put(number) {
-    await null;   // until the change that this saves is in the history
+    await null;   // until the change being saved is in the history
     const view = this.views[number], sent = view.labels, entries = [...this.past, ...this.future];
     try {
       const kept = await api.save(number, sent, view.version);
@@ -95,7 +95,7 @@ export class Store {
     const refused = this.past.splice(first), touched = new Set();
     this.future = [];
     for (const { before } of refused.reverse()) for (const [other, labels] of before) { this.views[other].labels = labels; touched.add(other); }
-    touched.delete(number);   // the server has what it had
+    touched.delete(number);   // the server still has its previous labels
     for (const other of touched) this.save(other);
   }
 }

@@ -5,11 +5,11 @@ import { $, counted, make, nameOf } from "./elements.js";
 import { picture } from "./pictures.js";
 import { shownHits } from "./styles.js";
 
-// beside: {outline, answer, by} of the other side, or undefined.
+// beside: {outline, answer, by} of the right side, or undefined.
 export function showAnswers(outline, answer, acts, beside) {
   const theirs = beside?.answer?.hits ?? [], own = answer?.hits ?? [], sameTree = beside?.outline?.tree === outline?.tree;
   $("answers-section").hidden = !own.length && !theirs.length;
-  const caution = (answer ?? outline)?.caution ?? "";   // an answer by name or by likeness has none
+  const caution = (answer ?? outline)?.caution ?? "";   // answers by name or by similarity have none
   $("caution").hidden = !caution;
   $("caution").textContent = caution;
   const only = (hit, others) => sameTree && !others.some((other) => other.node === hit.node);
@@ -21,7 +21,7 @@ export function showAnswers(outline, answer, acts, beside) {
   $("answers-beside").replaceChildren(...theirs.map((hit, rank) => item(beside.outline, hit, rank, sameTree ? acts : null, only(hit, own) ? ", only on the right" : "")));
 }
 
-// Nodes of a tree other than the left one's cannot be chosen.
+// Nodes of another tree than the left side's cannot be chosen.
 function item(outline, hit, rank, acts, note) {
   const look = acts && { onclick: () => acts.choose(hit.node), onpointerenter: () => acts.hover(hit.node), onpointerleave: () => acts.hover(-1), onfocus: () => acts.hover(hit.node), onblur: () => acts.hover(-1) };
   return make("li", { "data-node": hit.node }, make("button", { type: "button", disabled: !acts, ...look },
@@ -37,14 +37,14 @@ function bar(score) {
 }
 
 export function summary(answer) {
-  if (!answer.hits.length) return `Nothing answers to “${answer.text}”.`;
+  if (!answer.hits.length) return `No node matches “${answer.text}”.`;
   const best = answer.hits[0], alike = answer.route === "like";
   const lines = [alike
-    ? `${counted(answer.hits.length, "node")}, most alike first; the best ${best.score.toFixed(2)}. The first ${shownHits(answer).length} are painted.`
+    ? `${counted(answer.hits.length, "node")}, most similar first, best ${best.score.toFixed(2)}. The first ${shownHits(answer).length} are highlighted.`
     : `${counted(answer.total, "answer")}, best ${best.score.toFixed(2)}, ${answer.level}`];
-  if (answer.route === "fallback") lines.push("No answer is part of anything that answers to the first text.");
+  if (answer.route === "fallback") lines.push("No answer is part of a match for the first text: the whole scene was searched.");
   const doubts = answer.doubts.map((doubt) => `${doubt}.`);
-  if (!alike && best.score < 0.5 && !doubts.length) doubts.push("Perhaps nothing of the kind: the best is below 0.5.");
+  if (!alike && best.score < 0.5 && !doubts.length) doubts.push("The object may be absent: the best score is below 0.5.");
   return [...lines, ...doubts].map((line) => line[0].toUpperCase() + line.slice(1)).join("\n");
 }
 

@@ -3,7 +3,7 @@
 import { get, send, streamed } from "./http.js";
 
 export const offline = false;
-export const texts = [], kept = [], first = "", opening = "";   // what an exported page can answer, and where its camera begins
+export const texts = [], kept = [], first = "", opening = "";   // answered queries and initial camera of an exported page
 
 // Each request names the state of the scene that this page was loaded with; the server refuses any other state.
 let state = "";

@@ -1,4 +1,4 @@
-// Queries by a text, a node, a picture or a part of the view; each is sent for every pane.
+// Queries with a text, a node, a picture or a part of the view; each is sent for every pane.
 
 import { markChosen, showAnswers, summary } from "./answers.js";
 import * as api from "./api.js";
@@ -69,26 +69,26 @@ export async function fillField(signal) {
 export async function ask(keepChoice = false) {
   const text = $("text").value.trim();
   if (!text) { clearAnswer(); return; }
-  if (!main()) {   // the nodes are still loading, or the run has not made them yet
+  if (!main()) {   // the nodes are still loading, or do not exist yet
     page.waiting = true;
     tell("Your query runs as soon as the semantic tree is loaded.");
     return;
   }
   const view = $("here").checked ? page.camera.view : -1;
-  if ($("here").checked && view < 0) { refused(new Error("Stand at a photograph first: choose one below.")); return; }
-  if (!keepChoice && page.chosen >= 0) choose(-1);   // nothing to take back: nothing to draw before the answer
+  if ($("here").checked && view < 0) { refused(new Error("Go to a photograph first: choose one below.")); return; }
+  if (!keepChoice && page.chosen >= 0) choose(-1);   // otherwise the view is drawn only with the answer
   const asked = asking(text);
   await askAll({ text, query: asked }, (pane, signal) => api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...asked }, signal));
 }
 
-// Keep the present answer in its own colour and empty the text box.
+// Keep the current answer in its own colour and empty the text box.
 export async function keepAnswer() {
   const asked = page.asked?.query;
-  if (!asked || !panes[0].answer?.hits.length) { tell("Ask something to keep its answer."); return; }
+  if (!asked || !panes[0].answer?.hits.length) { tell("Run a query to keep its answer."); return; }
   try {
     if (!await keep(asked)) return;
     clearAnswer();
-    tell(`Kept “${asked.text}”. Ask for something else.`);
+    tell(`Kept “${asked.text}”. You can run another query.`);
     $("text").focus();
   } catch (error) { failed(error); }
 }

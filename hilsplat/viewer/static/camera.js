@@ -12,14 +12,14 @@ export function turned(v, k, angle) {
   return [v[0] * c + x[0] * s + k[0] * d, v[1] * c + x[1] * s + k[1] * d, v[2] * c + x[2] * s + k[2] * d];
 }
 
-const FARTHEST = 20;   // times the mean distance of the photographs: what is seen is a few pixels then
+const FARTHEST = 20;   // in mean distances of the photographs; the scene then covers a few pixels
 
 export class Camera {
   constructor(scene) {
     this.up = scene.up;
     this.reach = scene.reach;
     this.focus = scene.focus;
-    this.view = 0;        // number of the photograph that it stands at, or -1
+    this.view = 0;        // number of the photograph with its pose, or -1
     this.first = Math.max(0, scene.views.findIndex((view) => view.split === "train"));
     this.standAt(scene.views[this.first], this.first);
   }
@@ -60,7 +60,7 @@ export class Camera {
     this.view = -1;
   }
 
-  // Move along its own axes, in shares of the distance to the target.
+  // Move along the camera's axes, in shares of the distance to the target.
   move(x, y, z) {
     const far = norm(add(this.c, this.target, -1));
     for (const [axis, by] of [[0, x], [1, y], [2, z]]) {
@@ -70,10 +70,10 @@ export class Camera {
     this.view = -1;
   }
 
-  // A camera that shows a ball of this diameter around a point, from the same side.
+  // Return a camera that shows a ball of this diameter around a point, from the same side.
   lookingAt(point, size) {
     const next = this.copy(), { fx, fy, w, h } = this.lens;
-    const back = Math.max(size * (0.5 + Math.max(fx / w, fy / h)), 0.02 * this.reach);   // its front is nearer than its middle
+    const back = Math.max(size * (0.5 + Math.max(fx / w, fy / h)), 0.02 * this.reach);   // the front of the ball is nearer than its centre
     next.target = point.slice();
     next.c = add(point, this.R[2], -back);
     next.view = -1;
@@ -91,7 +91,7 @@ export class Camera {
     return Object.assign(next, this, { R: this.R.map((r) => r.slice()), c: this.c.slice(), target: this.target.slice(), lens: { ...this.lens } });
   }
 
-  // Between two cameras, t in [0, 1]; the axes are mixed and made orthogonal again.
+  // Interpolate between two cameras, t in [0, 1]; the mixed axes are made orthogonal.
   between(to, t) {
     const next = to.copy(), mix = (a, b) => a.map((v, k) => v + t * (b[k] - v));
     next.c = mix(this.c, to.c);

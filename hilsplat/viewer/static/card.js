@@ -18,7 +18,7 @@ export function showCard(outline, node, unit, { choose, fly, like, name, hover }
   if (node < 0) { card.replaceChildren(); return; }
   const own = outline.nodes[node], above = parents(outline, node), below = children(outline, node);
   const go = (row) => make("button", { type: "button", onclick: () => choose(row) }, nameOf(outline, row));
-  const input = make("input", { class: "name", value: own.name, placeholder: nameOf(outline, node), maxlength: 80, "aria-label": "Name", title: "Name it: names answer questions", disabled: api.offline,
+  const input = make("input", { class: "name", value: own.name, placeholder: nameOf(outline, node), maxlength: 80, "aria-label": "Name", title: "Name this node: queries match its name", disabled: api.offline,
     onkeydown: (event) => { if (event.key === "Enter") event.target.blur(); if (event.key === "Escape") { event.target.value = own.name; event.target.blur(); event.stopPropagation(); } },
     onchange: (event) => name(node, event.target.value.trim()) });
   const fact = (term, text) => make("div", {}, make("dt", {}, term), make("dd", {}, text));

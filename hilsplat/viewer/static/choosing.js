@@ -17,7 +17,7 @@ export function choose(node) {
   page.hover = -1;
   markChosen(node);
   if (main()) showCard(main(), node, page.scene.unit === "metre" ? " m" : "", acts);
-  page.outline.select(node);   // after the card, which takes room from the outline
+  page.outline.select(node);   // after the card, which makes the outline smaller
   restyle();
 }
 
@@ -38,7 +38,7 @@ const exactPick = async (at, y) => {
 };
 export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));
 
-// A click chooses the whole; clicks on the chosen node go one level down, and from the finest back to the whole.
+// A click chooses the whole; a click on the chosen node goes one level down, and from the finest back to the whole.
 function deeper(nodes) {
   const fixed = LEVELS.indexOf(level());
   if (fixed >= 0) return [...nodes.slice(0, fixed + 1)].reverse().find((node) => node >= 0) ?? -1;
@@ -49,8 +49,8 @@ function deeper(nodes) {
 export async function tapped(x, y) {
   host.focus({ preventScroll: true });
   const at = paneAt(x);
-  if (!main()) { tell("Nothing to choose yet: the semantic tree is not loaded."); return; }
-  if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows another tree: choose on the left."); return; }
+  if (!main()) { tell("Nothing to select yet: the semantic tree is not loaded."); return; }
+  if (variantOf(panes[at.k]) !== variantOf(panes[0])) { tell("This side shows another tree: select nodes on the left."); return; }
   try { choose(deeper(api.offline ? quickPick(at, y) : await exactPick(at, y))); } catch (error) { failed(error); }
 }
 
@@ -79,10 +79,10 @@ async function rename(node, name) {
     }
     for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (hit.node === node) hit.name = name;
     page.outline.renamed(node);
-    tell(name ? `Named “${name}”. Ask for it, here or with hilsplat query.` : "The name is taken away.");
-    choose(node);   // after the words, which take room from the outline
+    tell(name ? `Named “${name}”. Queries match this name, here and with hilsplat query.` : "The name was removed.");
+    choose(node);   // after the message, which makes the outline smaller
     acts.list();
   } catch (error) {
-    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("Somebody else changed the names meanwhile; they are here now. Name it again.", true); } else failed(error);
+    if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);
   }
 }

@@ -27,7 +27,7 @@ function addToPath() {
   page.path.push(page.camera.copy());
   showPath();
   if (page.path.length > 1) $("path").value = "path";
-  tell(page.path.length < 2 ? "The path begins here. Add another view, and films fly along it." : `${counted(page.path.length, "view")} in the path. Save a film to fly along it.`);
+  tell(page.path.length < 2 ? "The path begins here. Add another view, and saved films follow the path." : `${counted(page.path.length, "view")} in the path. Saved films follow it.`);
 }
 
 const MODES = ["tint", "ghost", "isolate", "plain"];
@@ -79,7 +79,7 @@ export function attachHands() {
   host.addEventListener("dragover", (event) => event.preventDefault());
   host.addEventListener("drop", (event) => { event.preventDefault(); const file = event.dataTransfer.files[0]; if (file?.type.startsWith("image/")) askPicture(file); });
   new ResizeObserver(redraw).observe(host);
-  window.addEventListener("popstate", () => {   // Back and Forward: the query of that time
+  window.addEventListener("popstate", () => {   // Back and Forward restore the query of that entry
     const kept = new URLSearchParams(location.hash.slice(1)), text = kept.get("q") ?? "";
     clearAnswer();
     rememberedAs(text);
@@ -91,7 +91,7 @@ export function attachHands() {
   const selected = () => page.chosen >= 0 ? [{ name: nameOf(main(), page.chosen), nodes: [page.chosen] }] : groups();
   $("save").addEventListener("toggle", () => {
     const chosen = selected(), count = chosen.reduce((sum, group) => sum + group.nodes.length, 0);
-    $("save-what").textContent = page.chosen >= 0 ? `Of ${chosen[0].name}` : chosen.length ? `Of ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Ask or choose something to save its Gaussians, boxes and masks.";
+    $("save-what").textContent = page.chosen >= 0 ? `Of ${chosen[0].name}` : chosen.length ? `Of ${counted(count, "answer")} to ${chosen.map((group) => group.name).join(", ")}` : "Run a query or select a node to save its Gaussians, boxes and masks.";
     for (const button of $("save").querySelectorAll("[data-nodes]")) button.disabled = !count || ("long" in button.dataset && !$("saving").hidden);
   });
   $("save").addEventListener("click", async (event) => {
@@ -99,7 +99,7 @@ export function attachHands() {
     if (!kind) return;
     $("save").open = false;
     try {
-      if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("The link is copied. It opens this view while this viewer runs."); return; }
+      if (kind === "link") { await navigator.clipboard.writeText(location.href); tell("Link copied. It opens this view while the viewer is running."); return; }
       const side = Number($("still-side").value), scale = side ? side / Math.max(host.clientWidth, host.clientHeight) : devicePixelRatio, size = [host.clientWidth, host.clientHeight].map((px) => Math.round(px * scale));
       const flown = $("path").value === "path" ? { path: page.path.map((camera) => camera.wire(host.clientWidth, host.clientHeight)) } : {};
       await save(kind, { variant: variantOf(panes[0]), groups: selected(), style: currentStyles()[0], capture: () => page.painter.capture(page.camera, painted(), ...size), flown,

@@ -24,7 +24,7 @@ function freeColour() {
 }
 
 export async function keep(asked) {
-  if (page.kept.length >= MOST) { tell(`At most ${MOST} queries are kept: drop one first.`, true); return false; }
+  if (page.kept.length >= MOST) { tell(`At most ${MOST} queries can be kept: remove one first.`, true); return false; }
   const same = page.kept.findIndex((query) => JSON.stringify(query.asked) === JSON.stringify(asked)), query = same < 0 ? { asked, shown: true, colour: freeColour() } : page.kept[same];
   await answered(query);
   if (same < 0) page.kept.push(query);
@@ -77,7 +77,7 @@ function drop(query) {
   showKept();
 }
 
-// Count nodes in several queries, and nodes inside those of another query.
+// Report nodes found by several queries, and nodes inside those of another query.
 function overlaps() {
   const shown = [...keptIn(0).map(({ answer }) => answer), ...(page.kept.length && panes[0].answer ? [panes[0].answer] : [])], times = new Map();
   if (!main() || shown.length < 2) return "";
@@ -88,5 +88,5 @@ function overlaps() {
     for (let row = main().nodes[node].parent; row >= 0; row = main().nodes[row].parent) if (sets.some((other, j) => j !== k && other.has(row))) return true;
     return false;
   }).length, 0);
-  return [common ? `White: ${counted(common, "node")} of more than one query.` : "", inside ? `${counted(inside, "answer")} inside another query's.` : ""].filter(Boolean).join(" ");
+  return [common ? `White: ${counted(common, "node")} found by several queries.` : "", inside ? `${counted(inside, "answer")} inside an answer to another query.` : ""].filter(Boolean).join(" ");
 }

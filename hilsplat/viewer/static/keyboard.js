@@ -1,11 +1,11 @@
-// Keys: they don't act during typing, and don't override keys of the browser or of controls.
+// Keys, which are ignored during typing and don't override keys of the browser or of controls.
 
 const STEPS_PER_MS = 0.012, EASE_MS = 70;
 const ORBITS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0] };
 const MOVES = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
-// A held key moves evenly: it adds steps over time, and each frame takes a share of the remaining ones.
+// A held key moves evenly: it adds steps over time, and each frame performs a share of the remaining ones.
 class Glide {
   held = new Map();
   left = { move: [0, 0, 0], orbit: [0, 0, 0] };
@@ -56,7 +56,7 @@ export function attachKeys(act) {
       0: () => act.level("auto"), 1: () => act.level("whole"), 2: () => act.level("part"), 3: () => act.level("subpart"),
     };
     if (on("select")) return;
-    const free = on("#view") || event.target === document.body;   // lists and radios have their own arrows, and Home
+    const free = on("#view") || event.target === document.body;   // lists and radio buttons use the arrow keys and Home themselves
     if ((ORBITS[event.key] || event.key === "Home") && !free) return;
     if (event.key === "Home") act.home();
     else if (ORBITS[event.key] || MOVES[letter]) { if (!event.repeat) glide.press(letter, ORBITS[event.key] ? "orbit" : "move", ORBITS[event.key] ?? MOVES[letter]); }

@@ -31,7 +31,7 @@ async function begin() {
   $("loading").textContent = "Loading…";
   page.scene = await api.scene();
   document.title = `${page.scene.name} · hilsplat`;
-  $("title").textContent = `Ask ${page.scene.name.split("/").at(-1)}`;
+  $("title").textContent = `Query ${page.scene.name.split("/").at(-1)}`;
   page.camera = new Camera(page.scene);
   page.camera.fromText(start.get("c") ?? api.opening, page.scene.views);
   page.photos = new Photos(page.scene.views, stand);
@@ -44,7 +44,7 @@ async function begin() {
     try { await made.load(page.scene, api.splats, arriving); } catch (error) {
       if (api.offline) throw error;
       made.canvas.remove();
-      console.warn(error); tell(`${error.message}: the server draws instead.`);
+      console.warn(error); tell(`${error.message}: the server renders instead.`);
       made = serverPainter();
     }
   }
@@ -52,11 +52,11 @@ async function begin() {
   redraw();
   if (api.offline) onlyWhatIsHere();
   if (page.scene.variants.length) {
-    try { await useVariants(); } catch (error) { tell(`There are no answers: ${error.message}`, true); }   // the Gaussians can still be looked at
+    try { await useVariants(); } catch (error) { tell(`Queries are not possible: ${error.message}`, true); }   // the Gaussians can still be viewed
   } else {
     fillVariants();
     $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}.`;
-    tell("The run goes on: you can look around; questions will be answered when the semantic tree is there.");
+    tell("The run is not finished: queries are possible once the semantic tree exists.");
   }
   if (!api.offline) watch();
   await page.painter.loaded;
@@ -64,7 +64,7 @@ async function begin() {
 
 function arriving(here, chunks) { Object.assign($("arriving"), { value: here, max: chunks, hidden: here === chunks }); }
 
-// An exported page has no server, only the answers that it was made with.
+// Hide everything that needs a server: an exported page has only its stored answers.
 function onlyWhatIsHere() {
   for (const element of [$("picture-button"), $("here").parentElement, $("left").parentElement, $("right").parentElement]) element.hidden = true;
   for (const button of $("save").querySelectorAll("[data-save]:not([data-save=still])")) button.hidden = true;

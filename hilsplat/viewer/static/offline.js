@@ -26,7 +26,7 @@ export const sorter = () => new Worker(URL.createObjectURL(new Blob([held("sorte
 export async function query({ text, level, threshold }) {
   const same = data.asked.map((asked, k) => plain(asked.text) === plain(text) ? k : -1).filter((k) => k >= 0);
   const found = data.answers[same.find((k) => data.asked[k].level === level && data.asked[k].threshold === threshold) ?? same[0]];
-  if (!found) throw new Refused(`This page was made with the answers to: ${texts.join(", ") || "nothing"}.`);
+  if (!found) throw new Refused(`This page contains only the answers to: ${texts.join(", ") || "nothing"}.`);
   return found;
 }
 

@@ -10,7 +10,7 @@ function element(name, attributes, text) {
   return made;
 }
 
-// panes: [{boxes: [{corners, kind, label, node, stroke}]}], side by side in width x height CSS px, of which tools cover the uppermost `covered`.
+// panes: [{boxes: [{corners, kind, label, node, stroke}]}], side by side in width x height CSS px; tools cover the top `covered` px.
 export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
   const made = [], each = width / panes.length, k = camera.intrinsics(each, height);
@@ -19,8 +19,8 @@ export function drawOverlay(svg, camera, panes, width, height, covered = 0) {
     if (number) group.append(element("path", { class: "split", d: `M0 0V${height}` }));
     for (const { corners, kind, label, node, stroke = null } of pane.boxes) {
       const at = corners.map((corner) => camera.project(corner, k));
-      if (at.some((point) => !point)) continue;   // a corner behind the camera
-      if ([each, height].some((side, axis) => at.every((point) => point[axis] < 0) || at.every((point) => point[axis] > side))) continue;   // beside the picture
+      if (at.some((point) => !point)) continue;   // a corner is behind the camera
+      if ([each, height].some((side, axis) => at.every((point) => point[axis] < 0) || at.every((point) => point[axis] > side))) continue;   // outside the picture
       const d = EDGES.map(([a, b]) => `M${at[a][0].toFixed(1)} ${at[a][1].toFixed(1)}L${at[b][0].toFixed(1)} ${at[b][1].toFixed(1)}`).join("");
       group.append(element("path", { d, class: "shadow" }), element("path", { d, class: kind, "data-node": node, ...(stroke ? { stroke } : {}) }));
       const top = at.reduce((best, point) => point[1] < best[1] ? point : best);

@@ -1,5 +1,5 @@
 // Small pictures, loaded when visible and a few at a time: a browser has six connections to a server, and
-// the picture of the scene must not wait for a hundred crops.
+// rendered pictures must not wait for a hundred crops.
 
 import { make } from "./elements.js";
 

@@ -34,7 +34,7 @@ export class Renderer {
   // Gaussians arrive in chunks of whole rows of texels; received ones are drawn at once.
   async load({ gaussians, chunk }, chunkOf, told) {
     const gl = this.gl, first = await readChunk(await chunkOf(0)), { bases, texels } = first;
-    if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians do not fit the textures of this browser`);
+    if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians exceed the texture size of this browser`);
     this.count = gaussians;
     this.here = 0;
     this.program = this.link(vertex(bases, texels), fragment);

@@ -22,7 +22,7 @@ export async function save(kind, { variant, groups, style, capture, flown, kept,
     mp4: { variant, style: wireStyle(style), format: "mp4", side_px: Number($("mp4-side").value), ...flown },
     gif: { variant, style: wireStyle(style), format: "gif", side_px: Number($("gif-side").value), ...flown },
   }[kind];
-  told(asked ? "Saving: you can go on meanwhile." : "Saving…");
+  told(asked ? "Saving in the background." : "Saving…");
   const blob = kind === "still" ? await capture() : asked ? await inSteps(kind, asked, told) : await api.saved(kind, { variant, groups });
   if (!blob) return;
   download(blob, `${name}-${KINDS[kind]}`);
@@ -32,7 +32,7 @@ export async function save(kind, { variant, groups, style, capture, flown, kept,
 // Save one file at a time, with progress and Cancel; return null if cancelled.
 async function inSteps(kind, asked, told) {
   const ending = new AbortController(), buttons = $("save").querySelectorAll("[data-long]"), [what, things] = IN_STEPS[kind];
-  const progress = (made, of) => { Object.assign($("saving-made"), { value: made, max: of }); $("saving-told").textContent = made < of ? `${what}: ${made} of ${of} ${things}` : `${what}: packing`; };
+  const progress = (made, of) => { Object.assign($("saving-made"), { value: made, max: of }); $("saving-told").textContent = made < of ? `${what}: ${made} of ${of} ${things}` : `${what}: finishing`; };
   $("saving-made").removeAttribute("value");
   $("saving-made").setAttribute("aria-label", what);
   $("saving-told").textContent = what;

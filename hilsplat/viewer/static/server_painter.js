@@ -1,4 +1,4 @@
-// Server painter: JPEG frames from hilsplat's rasteriser, if WebGL runs in software or is missing.
+// Painter that shows JPEG frames rendered by the server, for browsers in which WebGL is missing or runs in software.
 
 import * as api from "./api.js";
 import { latest } from "./latest.js";
@@ -25,7 +25,7 @@ export class ServerPainter {
 
   async load() {}
   async loadNodes() {}
-  loadField() {}   // a frame names the text; the server looks it up
+  loadField() {}   // a frame request contains the text
   get settled() { return this.drawn === this.asked; }
 
   resize(width, height) {

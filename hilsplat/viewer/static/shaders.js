@@ -47,7 +47,7 @@ vec3 harmonic(vec3 d) {
 }
 
 void main() {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);   // outside, until proven visible
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);   // outside the view unless found visible
   place = vec2(0.0); paint = vec4(0.0); number = index + 1u;
   uvec4 first = texelFetch(geometry, at(index), 0);
   float opacity = float(first.w & 255u) / 255.0;

@@ -27,10 +27,10 @@ export const failed = (error) => {
   if (error.name !== "AbortError") tell(error.message, true);
 };
 
-// The page keeps showing the state that it was loaded with until a reload.
+// Until a reload, the page shows the state that it was loaded with.
 export function sceneChanged(parts = []) {
   $("changed").hidden = false;
-  $("changed-what").textContent = `The scene has changed${parts.length ? ` (${parts.join(", ")})` : ""}. You still see it as it was.`;
+  $("changed-what").textContent = `The scene has changed${parts.length ? ` (${parts.join(", ")})` : ""}. The page still shows the previous state.`;
 }
 
 export async function loadVariant(name, again = false) {

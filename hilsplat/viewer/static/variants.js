@@ -29,18 +29,18 @@ export async function useVariants() {
   for (const pane of panes) await loadVariant(variantOf(pane));
   fillVariants();
   showOutline();
-  const text = page.waiting ? $("text").value : start.get("q") ?? api.first;   // an exported page begins with its answer
+  const text = page.waiting ? $("text").value : start.get("q") ?? api.first;   // an exported page opens with its last query
   page.waiting = false;
   await keepFromStart();
   if (text) { $("text").value = text; await ask(); }
-  const [node, tree] = (start.get("node") ?? "").split(".");   // a row of another tree is another node
+  const [node, tree] = (start.get("node") ?? "").split(".");   // rows of another tree are other nodes
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
 }
 
 function showOutline() {
   page.outline.show(main());
   listAnswers();
-  $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks by ${main().masks}, words and pictures by ${main().clip}.`;
+  $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}. Masks: ${main().masks}. Text and image vectors: ${main().clip}.`;
   restyle();
 }
 
@@ -67,7 +67,7 @@ export async function watch() {
       const now = await api.changes();
       if (now.of !== page.scene.of || now.changed.length) sceneChanged(now.changed);
       else if (now.variants.join() !== page.scene.variants.join()) await moreAnswer(now.variants);
-    } catch (error) { if (error.status) failed(error); }   // without a status, the server has ended
+    } catch (error) { if (error.status) failed(error); }   // without a status, the server has stopped
   }
 }
 
@@ -75,6 +75,6 @@ async function moreAnswer(variants) {
   const first = !page.scene.variants.length;
   page.scene.variants = variants;
   if (!first) { fillVariants(); return; }
-  tell("Answers are ready.");
+  tell("Queries are possible now.");
   await useVariants();
 }

@@ -15,7 +15,7 @@ export function make(tag, attributes = {}, ...children) {
 
 export const counted = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
 export const LEVELS = ["whole", "part", "subpart"];
-// The user's name, else the vocabulary name, else "?".
+// Return the user's name, else the vocabulary name, else "?".
 export function nameOf(outline, node) {
   const { name, called, level } = outline.nodes[node], numbered = `${LEVELS[level]} ${node}`;
   return name || (called === "?" ? `? (${numbered})` : called || numbered);

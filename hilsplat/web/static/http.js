@@ -1,4 +1,4 @@
-// Requests to the page's server; a refused one throws the server's message.
+// Requests to the page's server; a refused request throws the server's message.
 
 export class Refused extends Error {
   constructor(message, status) { super(message); this.status = status; }
@@ -36,6 +36,6 @@ export async function streamed(response, told) {
       parts.push(head); got = head.length;
     } else { parts.push(value); got += value.length; }
   }
-  if (got !== wanted) throw new Refused("The file was cut off: the server has ended.");
+  if (got !== wanted) throw new Refused("The file is incomplete: the server has stopped.");
   return new Blob(parts);
 }

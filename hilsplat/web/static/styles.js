@@ -14,7 +14,7 @@ export const RAMP = (() => {
   return ramp;
 })();
 
-// The ramp, dark grey below a threshold.
+// The ramp with dark grey below a threshold.
 const cut = new Map();
 function rampFrom(threshold) {
   if (threshold === null) return RAMP;
@@ -31,15 +31,14 @@ export function colourOf(node) {
   return [value(0), value(8), value(4)];
 }
 
-// Hits that are painted and boxed; of similar nodes only the first, because their ranking has all nodes.
+// Hits that are painted and boxed; for a similarity query, only the first ones, because all nodes are ranked.
 const PAINTED_ALIKE = 5;
 export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slice(0, PAINTED_ALIKE) : answer?.hits ?? [];
 
 /*
- * kept: [{answer, rgb}] of queries that are painted too;
- * outline: the nodes of a variant; answer: what was found, or null; colour, mode: the choices of the page;
- * level: 0, 1, 2 for what is painted by level; chosen, hover: nodes, or -1; field: the {text, level} whose field
- * relevancy was asked for, or null; threshold: the least relevancy that is painted, or null.
+ * outline: the nodes of a variant; answer: the current answer, or null; kept: [{answer, rgb}] of kept queries;
+ * colour, mode: the page's settings; level: 0, 1 or 2, for colours by level; chosen, hover: nodes, or -1;
+ * field: the {text, level} of a field relevancy, or null; threshold: minimum relevancy to paint, or null.
  */
 export function styleOf({ outline, answer, colour, mode, level, chosen, hover, field, threshold = null, kept = [] }) {
   const nodes = outline?.nodes ?? [], table = new Uint8Array(4 * (nodes.length + 1));

@@ -56,7 +56,7 @@ def test_a_scene_is_shown_in_a_notebook(built_desk):
         address = re.search(r'<iframe src="([^"]+)"', html)[1].replace("&amp;", "&")
         assert address.endswith("#q=mug") and 'height="300"' in html
         with urllib.request.urlopen(address) as answered:
-            assert b"Ask the scene" in answered.read()
+            assert b"Query the scene" in answered.read()
     finally:
         shown.close()
     with pytest.raises(OSError):
