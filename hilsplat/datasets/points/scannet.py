@@ -19,9 +19,10 @@ from hilsplat.base.files import list_images
 from hilsplat.datasets.classes import SCANNET200
 from hilsplat.datasets.dataset import Dataset, listing
 from hilsplat.datasets.labelled import image_size_hw
-from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
-from hilsplat.datasets.points.point_files import (
+from hilsplat.datasets.points.labelled_points import (
     UNPACK_AGAIN,
+    LabelledPoints,
+    PointScene,
     by_number,
     ply_column,
     ply_faces,

@@ -10,8 +10,7 @@ from jaxtyping import Int32
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes import NYU40, REPLICA_NAMES, SCANNET200, WAYMO_22
-from hilsplat.datasets.points.labelled_points import LabelledPoints
-from hilsplat.datasets.points.point_files import ply_column, ply_places, read_ply
+from hilsplat.datasets.points.labelled_points import LabelledPoints, ply_column, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 
 OTHERPROP = 40

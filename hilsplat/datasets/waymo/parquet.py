@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.dataset import listing
-from hilsplat.datasets.points.point_files import UNPACK_AGAIN
+from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN
 from hilsplat.datasets.waymo.frames import (
     CAMERAS,
     TOP,

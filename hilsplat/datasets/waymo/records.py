@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 from jaxtyping import Float
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.points.point_files import UNPACK_AGAIN, require_file
+from hilsplat.datasets.points.labelled_points import UNPACK_AGAIN, require_file
 from hilsplat.datasets.waymo.frames import (
     CAMERAS,
     TOP,

@@ -44,11 +44,6 @@ def test_every_data_set_is_described(dataset):
     assert dataset.scenes or dataset.name in ("waymo", "annotated")  # all that are there
 
 
-def test_an_unknown_name_lists_the_known_ones():
-    with pytest.raises(SceneError, match=r"'lerf' is unknown\n.*lerf_ovs, lerf_mask, 3d_ovs, hi_lerf"):
-        dataset_of("lerf")
-
-
 def test_published_lists_have_the_published_counts():
     assert sum(map(len, FRAMES["lerf_ovs"].values())) == 22
     for name, num_scenes, num_frames in (("3d_ovs", 10, 5), ("hi_lerf", 4, 10), ("hi_3dovs", 10, 6)):
@@ -61,10 +56,9 @@ def test_published_lists_have_the_published_counts():
 
 
 def test_a_folder_one_level_too_deep_is_detected(data_root):
-    inner = data_root / "lerf_ovs" / "LERF-OVS"
-    (data_root / "lerf_ovs").rename(data_root / "moved")
-    inner.parent.mkdir()
-    (data_root / "moved").rename(inner)
+    moved = (data_root / "lerf_ovs").rename(data_root / "moved")
+    (data_root / "lerf_ovs").mkdir()
+    moved.rename(data_root / "lerf_ovs" / "LERF-OVS")
     with pytest.raises(SceneError, match=r"one level too deep.*\n.*\n.*its scenes in .*LERF-OVS\n.*move"):
         DATASETS["lerf_ovs"].locate(data_root)
 
@@ -75,17 +69,13 @@ def test_a_folder_one_level_too_deep_is_detected(data_root):
         ("lerf_ovs", "data/lerf_ovs", "is the folder of LERF-OVS itself"),
         ("lerf_ovs", ".", "set data_root to .*/data$"),
         ("lerf_mask", "data", r"LERF-Mask is not below .*\n.*\n.*lerf_ovs"),
+        ("hi_lerf", "data", "Hi-LERF is not below"),  # although its images, those of LERF-OVS, exist
     ],
 )
 def test_a_wrong_data_root_is_detected(data_root, dataset, place, message):
+    (data_root / "hi_lerf").mkdir()
     with pytest.raises(SceneError, match=message):
         DATASETS[dataset].locate(data_root.parent / place)
-
-
-def test_the_images_of_another_data_set_do_not_make_hi_lerf_present(data_root):
-    (data_root / "hi_lerf").mkdir()
-    with pytest.raises(SceneError, match="Hi-LERF is not below"):
-        DATASETS["hi_lerf"].locate(data_root)
 
 
 def run(*words):
@@ -95,12 +85,11 @@ def run(*words):
 
 
 def test_the_command_lists_data_sets_and_what_is_there(data_root):
-    code, output = run("list")
-    assert code == 0 and "found" not in output
-    for dataset in DATASETS.values():
-        assert f"{dataset.name}: {dataset.title}" in output and dataset.licence in output
+    assert "found" not in run("list")[1]
     code, output = run("list", "--data-root", data_root)
     assert code == 0
+    for dataset in DATASETS.values():
+        assert f"{dataset.name}: {dataset.title}" in output and dataset.licence in output
     assert f"found     figurines (in {data_root / 'lerf_ovs'})" in output
     assert "missing   ramen: ramen/images, ramen/sparse, label/ramen" in output
 
@@ -126,7 +115,7 @@ def touch(*paths: Path) -> None:
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """LERF-OVS and Hi-LERF of one scene, 3D-OVS of one, ScanNet of one."""
+    """One scene of LERF-OVS and Hi-LERF, and one of 3D-OVS; their files are not readable."""
     touch(
         tmp_path / "lerf_ovs/figurines/images/frame_00041.jpg",
         tmp_path / "lerf_ovs/figurines/sparse/0/cameras.bin",
@@ -140,14 +129,10 @@ def root(tmp_path) -> Path:
     return tmp_path
 
 
-def test_only_known_data_sets_are_published_ones():
-    assert published("data:lerf_ovs/figurines") == ("lerf_ovs", "figurines")
-    assert published("data:desk/mine") is None
-    assert published("world:tabletop:201") is None
-    assert published("lerf_ovs/figurines") is None
-
-
 def test_a_source_that_cannot_be_used_has_a_reason_in_one_line(root):
+    assert published("data:lerf_ovs/figurines") == ("lerf_ovs", "figurines")
+    for other in ("data:desk/mine", "world:tabletop:201", "lerf_ovs/figurines"):
+        assert published(other) is None
     for usable in ("data:lerf_ovs/figurines", "world:tabletop:201"):
         assert absence(usable, str(root)) is None
     assert absence("data:lerf_ovs/figurines", "") == "data_root is not set"
@@ -187,7 +172,9 @@ def test_scenes_with_labelled_points_are_exported_first(root):
     assert files == (scan / "color/0.jpg", scan / "pose/0.txt")  # labels are read by evaluation alone
 
 
-def test_images_in_a_folder_need_no_export_and_labels_need_a_scene(root, monkeypatch):
+def test_unknown_data_sets_missing_scene_names_and_needless_exports_are_refused(root, monkeypatch):
+    with pytest.raises(SceneError, match=r"'lerf' is unknown\n.*lerf_ovs, lerf_mask, 3d_ovs, hi_lerf"):
+        dataset_of("lerf")
     with pytest.raises(SceneError, match="does not contain a scene name"):
         open_labels("scannet", Path())
     monkeypatch.setattr("hilsplat.datasets.sources.open_labels", lambda *_: object())

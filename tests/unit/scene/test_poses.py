@@ -11,7 +11,6 @@ from PIL.TiffImagePlugin import IFDRational
 
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image, resize_to_fit
-from hilsplat.scene.assemble import stack_pictures
 from hilsplat.scene.colmap import pycolmap
 from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, camera_groups, exif_focal_px, prepare_images
 from hilsplat.scene.poses import MAX_ROWS, check_registration, name_neighbours, plot_lost, run_poses
@@ -221,37 +220,20 @@ def test_lost_views_belong_near_the_registered_ones_with_most_shared_matches(tmp
 def test_the_picture_has_a_row_for_each_lost_view(tmp_path):
     write_noise(tmp_path / "images", MAX_ROWS + 3)
 
-    def size_with(lost):
+    def height_with(lost):
+        entry = {"file": "a.jpg", "why_not": "too few matches: none"}
+        near = [{"view": "14.png", "matches": 20}]
         views = {
-            f"{number}.png": {
-                "file": f"{number}.jpg",
-                "registered": number >= lost,
-                "why_not": "too few matches: none",
-                "belongs_near": [{"view": "14.png", "matches": 20}][: number % 2],
-            }
+            f"{number}.png": {**entry, "registered": number >= lost, "belongs_near": near[: number % 2]}
             for number in range(MAX_ROWS + 3)
         }
-        path = tmp_path / "lost.png"
-        path.unlink(missing_ok=True)
-        if not plot_lost(path, tmp_path / "images", {"images": MAX_ROWS + 3, "views": views}):
-            assert not path.exists()
-            return None
-        return Image.open(path).size
+        report, path = {"images": MAX_ROWS + 3, "views": views}, tmp_path / f"{lost}.png"
+        assert plot_lost(path, tmp_path / "images", report) == path.exists() == (lost > 0)
+        return Image.open(path).size[1] if lost else 0
 
-    assert size_with(0) is None
-    width, height = size_with(1)
-    assert size_with(3) == (width, height + 2 * 210)  # 2.1 inches each, 100 dots per inch
-    assert size_with(MAX_ROWS + 2) == size_with(MAX_ROWS)
-
-
-def test_pictures_are_stacked_with_a_white_margin(tmp_path):
-    for name, size in (("upper", (6, 2)), ("lower", (4, 3))):
-        Image.new("RGB", size, (10, 20, 30)).save(tmp_path / f"{name}.png")
-    stack_pictures(tmp_path / "upper.png", tmp_path / "lower.png")
-    found = read_image(tmp_path / "upper.png")
-    assert found.shape == (5, 6, 3)
-    assert (found[2:, 4:] == 255).all()
-    assert (found[2:, :4] == (10, 20, 30)).all()
+    assert height_with(0) == 0
+    assert height_with(3) == height_with(1) + 2 * 210  # 2.1 inches each, 100 dots per inch
+    assert height_with(MAX_ROWS + 2) == height_with(MAX_ROWS)
 
 
 def test_an_unrelated_photograph_is_shown_in_the_report(tmp_path):
@@ -307,9 +289,9 @@ def test_it_is_scaled_with_a_picture_that_is_shrunk_and_rotated(tmp_path):
 @pytest.mark.parametrize(("unit", "resolution"), [(2, 2540.0), (3, 1000.0), (4, 100.0), (None, 2540.0)])
 def test_without_it_focal_length_and_sensor_resolution_are_used(tmp_path, unit, resolution):
     """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250, in a tenth-size copy 50."""
-    tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution))} | (
-        {"unit": unit} if unit else {}
-    )
+    tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution))}
+    if unit:
+        tags["unit"] = unit
     path = photograph(tmp_path / "a.jpg", stored=400, **tags)
     assert exif_focal_px(path, (300, 400)) == pytest.approx(500)
     assert exif_focal_px(path, (150, 200)) == pytest.approx(250)

@@ -121,13 +121,9 @@ def test_boxes_keep_the_whole_pixels_inside(tmp_path):
         assert found.box_xyxy.tolist() == whole
 
 
-@pytest.mark.parametrize("iscrowd", [0, 1, False, True])
-def test_iscrowd_may_be_number_or_boolean(tmp_path, iscrowd):
-    assert len(read_isat(label_file(tmp_path, [thing(iscrowd=iscrowd)])).objects) == 1
-
-
-def test_categories_differ_by_case(lerf):
-    label_file(lerf / "label" / "figurines", [thing("Pot"), thing("pot")], (40, 24), "frame_00001")
+def test_categories_differ_by_case_and_iscrowd_may_be_number_or_boolean(lerf):
+    objects = [thing("Pot"), thing("pot", iscrowd=1), thing("pot", iscrowd=False)]
+    label_file(lerf / "label" / "figurines", objects, (40, 24), "frame_00001")
     assert [r.text for r in open_scene(lerf, "figurines").views["frame_00001.png"]] == ["Pot", "pot"]
 
 
@@ -149,24 +145,12 @@ def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("content", "message"),
     [
         ('{"info": ', "cannot be read"),
         ("[]", "has no `objects` list"),
         ('{"shapes": []}', "has no `objects` list"),
         ('{"info": {}, "objects": []}', "does not state the size"),
-    ],
-)
-def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
-    path = tmp_path / "frame_00001.json"
-    path.write_text(text)
-    with pytest.raises(SceneError, match=rf"frame_00001.json .*{message}"):
-        read_isat(path)
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
         (thing(category=None), "has no category"),
         (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is not a polygon"),
         (thing(segmentation=[]), "segmentation is not a polygon"),
@@ -176,9 +160,13 @@ def test_malformed_label_files_are_refused_by_name(tmp_path, text, message):
         (thing(segmentation=[[4, 3], [8, 3], [8, 6]], bbox=[4, 3, 4, 3]), r"bbox is not \[x1, y1, x2, y2\]"),
     ],
 )
-def test_malformed_objects_are_refused_by_number(tmp_path, entry, message):
-    with pytest.raises(SceneError, match=rf"object 0.*{message}"):
-        read_isat(label_file(tmp_path, [entry]))
+def test_malformed_label_files_are_refused_by_name_and_objects_by_number(tmp_path, content, message):
+    path = label_file(tmp_path, [content])
+    if isinstance(content, str):
+        path.write_text(content)
+    where = "" if isinstance(content, str) else ", object 0"
+    with pytest.raises(SceneError, match=rf"frame_00001.json{where}.*{message}"):
+        read_isat(path)
 
 
 def test_a_label_of_a_scaled_copy_is_resized_and_reported(lerf):
@@ -244,7 +232,7 @@ def test_a_world_written_as_hi_lerf_is_read_back_equal(true_world, hi):
     assert not any("parent" in line for line in scene.warnings)
 
 
-def test_hi_3dovs_takes_images_of_3d_ovs(tmp_path, true_world):
+def test_hi_3dovs_uses_the_images_of_3d_ovs(tmp_path, true_world):
     write_hi(true_world, tmp_path / "hi_3dovs", tmp_path / "3d_ovs", "bed", ["001.png"], OVS_STEMS)
     scene = HI_3DOVS.open(tmp_path / "hi_3dovs", "bed")
     assert scene.images["01.png"] == tmp_path / "3d_ovs" / "bed" / "images" / "01.jpg"
@@ -252,14 +240,18 @@ def test_hi_3dovs_takes_images_of_3d_ovs(tmp_path, true_world):
     assert "published frames without label: 06.png, 11.png, 20.png, 28.png, 36.png" in scene.warnings
 
 
-def test_listed_frames_without_image_or_label_are_reported(hi):
-    (hi.parent / "lerf_ovs" / "ramen" / "images" / "frame_00004.jpg").unlink()
+def test_frames_without_image_or_label_are_reported(hi):
+    images = hi.parent / "lerf_ovs"
+    (images / "ramen" / "images" / "frame_00004.jpg").unlink()
     scene = HI_LERF.open(hi, "ramen")
     assert list(scene.views) == ["frame_00002.png"]
     reported = "; ".join(scene.warnings)
     assert "frame_00004.json has no image" in reported
     for what in ("image", "label"):
         assert f"published frames without {what}: frame_00006.png, frame_00024.png" in reported
+    images.rename(hi.parent / "lerf")
+    with pytest.raises(SceneError, match=r"also ../lerf_ovs/ramen/images"):
+        HI_LERF.open(hi, "ramen")
 
 
 def test_invalid_parents_and_children_outside_their_parent_are_reported(hi):
@@ -298,12 +290,6 @@ def test_invalid_parents_and_children_outside_their_parent_are_reported(hi):
 def test_unusable_ids_and_levels_are_refused(hi, key, value, message):
     edit(hi, lambda by_id, _: by_id[1].update({key: value}))
     with pytest.raises(SceneError, match=message):
-        HI_LERF.open(hi, "ramen")
-
-
-def test_missing_images_of_the_other_data_set_are_named(hi):
-    (hi.parent / "lerf_ovs").rename(hi.parent / "lerf")
-    with pytest.raises(SceneError, match=r"also ../lerf_ovs/ramen/images"):
         HI_LERF.open(hi, "ramen")
 
 

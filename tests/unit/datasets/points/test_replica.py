@@ -57,7 +57,7 @@ def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> P
     return folder
 
 
-def test_vertices_take_the_object_of_most_faces_and_the_smallest_id_on_ties(tmp_path):
+def test_a_vertex_belongs_to_the_object_of_most_faces_or_the_smallest_id_on_ties(tmp_path):
     points = read_semantic_mesh(make_habitat(tmp_path))
     # vertices 1 and 5 lie on objects 2 and 1, vertices 2 and 6 on 1 and 3: object 1 both times
     assert points.instance_id.tolist() == [3, 2, 2, 0, 3, 2, 2, 0]

@@ -10,8 +10,6 @@ from hilsplat.base.errors import MisalignedArtifactError, SceneError
 from hilsplat.datasets.classes import REPLICA_48, SCANNET200, SCANNET200_INSTANCES, SCANNET_10, SCANNET_19
 from hilsplat.datasets.points.scannet import LABEL_TABLE, open_scan, read_label_table
 from hilsplat.datasets.registry import DATASETS
-from hilsplat.scene.importers.known_views import read_transforms
-from hilsplat.scene.layouts import find_known_poses
 from hilsplat.scene.posed_images import write_posed_images
 from tests.unit.datasets.writers.labelled import flat_images
 from tests.unit.datasets.writers.points import write_label_table, write_ply, write_scan
@@ -151,28 +149,24 @@ def text_in(name: str, text: str):
     return lambda folder: (folder / name).write_text(text)
 
 
-def break_labels(folder: Path) -> None:
-    more = np.concatenate([XYZ, XYZ[:1]])  # the plain mesh gets a vertex more than its labels
-    write_ply(folder / f"{SCAN}_vh_clean_2.ply", {a: more[:, i] for i, a in enumerate("xyz")}, FACES, {})
+def mesh_of(xyz: np.ndarray):
+    """Return a change that replaces the unlabelled mesh."""
+    columns = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
+    return lambda folder: write_ply(folder / f"{SCAN}_vh_clean_2.ply", columns, FACES, {})
 
 
-def break_places(folder: Path) -> None:
-    moved = XYZ + np.float32([0.5, 0, 0])
-    write_ply(folder / f"{SCAN}_vh_clean_2.ply", {a: moved[:, i] for i, a in enumerate("xyz")}, FACES, {})
-
-
-def break_mesh(folder: Path) -> None:
+def truncate_labels(folder: Path) -> None:
     path = folder / f"{SCAN}_vh_clean_2.labels.ply"
     path.write_bytes(path.read_bytes()[:-20])
 
 
-def break_depth_of_folder(folder: Path) -> None:
-    folder.rename(folder.with_name("aside"))
+def nest(folder: Path) -> None:
+    aside = folder.rename(folder.with_name("aside"))
     folder.mkdir()
-    folder.with_name("aside").rename(folder / SCAN)
+    aside.rename(folder / SCAN)
 
 
-def break_sens(folder: Path) -> None:
+def keep_frames_in_archive(folder: Path) -> None:
     (folder / f"{SCAN}.sens").touch()
     (folder / "color").rename(folder / "colour")
 
@@ -185,9 +179,12 @@ OTHER_TABLE = text_in(f"../../{LABEL_TABLE}", "id,raw_category,nyu40id\n")
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (break_labels, "does not match.*expected  the same 6 vertices.*found     5 vertices"),
-        (break_places, "does not match.*found     vertices in other positions"),
-        (break_mesh, r"labels\.ply cannot be read.*found     a file of \d+ bytes.*fix "),
+        (
+            mesh_of(np.tile(XYZ, (2, 1))),
+            "does not match.*the same 10 vertices.*found     5 vertices",
+        ),
+        (mesh_of(XYZ + np.float32([0.5, 0, 0])), "does not match.*found     vertices in other positions"),
+        (truncate_labels, r"labels\.ply cannot be read.*found     a file of \d+ bytes.*fix "),
         (
             lambda folder: (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink(),
             r"scene0000_00 of ScanNet v2 is incomplete.*labels\.ply.*unpack",
@@ -196,12 +193,12 @@ OTHER_TABLE = text_in(f"../../{LABEL_TABLE}", "id,raw_category,nyu40id\n")
             lambda folder: (folder / "color/0.jpg").rename(folder / "color/first.jpg"),
             r"first\.jpg is not named like a frame\n  expected  <number>\.jpg",
         ),
-        (break_depth_of_folder, "wrong place.*fix       move .*scene0000_00/scene0000_00 to"),
+        (nest, "wrong place.*fix       move .*scene0000_00/scene0000_00 to"),
         (
             lambda folder: folder.rename(folder.parents[1] / SCAN),
             "wrong place.*fix       move .*scannet/scene0000_00 to .*scans",
         ),
-        (break_sens, r"still inside scene0000_00\.sens.*SensReader"),
+        (keep_frames_in_archive, r"still inside scene0000_00\.sens.*SensReader"),
         (text_in(GROUPS, '{"segGroups": ['), r"aggregation\.json is not valid JSON.*fix "),
         (text_in(GROUPS, STRANGER), r"group 0 \(wall\): none of its segments.*fix "),
         (
@@ -223,17 +220,7 @@ def test_unusable_scans_are_refused_with_a_fix(root, damage, message):
         open_scan(root, SCAN)
 
 
-def test_the_importer_reads_the_same_cameras(root, tmp_path):
-    images = open_scan(root, SCAN).images[:3]
-    folder = tmp_path / "posed"
-    write_posed_images(folder, images)
-    views, points = read_transforms(find_known_poses(folder))
-    assert points is None and len(views) == 3
-    for view, image in zip(views, images, strict=True):
-        assert view.image == folder / "images" / image.name
-        assert view.image.read_bytes() == image.image.read_bytes()
-        np.testing.assert_allclose(view.cam_from_source, image.cam_from_world, atol=1e-9)
-        np.testing.assert_allclose(view.camera.calibration_matrix(), image.K)
-        assert (view.camera.height, view.camera.width) == image.size_hw
+def test_two_images_of_one_name_are_refused(root, tmp_path):
+    image = open_scan(root, SCAN).images[0]
     with pytest.raises(SceneError, match=r"duplicate names: 0\.jpg"):
-        write_posed_images(folder, [images[0], images[0]])
+        write_posed_images(tmp_path / "posed", [image, image])

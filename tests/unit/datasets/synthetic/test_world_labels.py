@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points import replica, scannet
-from hilsplat.datasets.points.point_files import read_ply
+from hilsplat.datasets.points.labelled_points import read_ply
 from hilsplat.datasets.registry import open_labels
 from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -25,31 +26,39 @@ from tests.unit.datasets.writers.points import (
     write_street_as_waymo,
 )
 
+IDENTITY = np.eye(4)
 SETTINGS = WorldSettings(views=3, image_px=48, samples=1, objects=2)
+
+
+def make_world(kind, folder):
+    run_world(f"world:{kind}:100", SETTINGS, folder / "world", threads=1)
+    return folder / "world"
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("room") / "world"
-    run_world("world:room:100", SETTINGS, folder, threads=1)
-    return folder
+    return make_world("room", tmp_path_factory.mktemp("room"))
 
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("street") / "world"
-    run_world("world:street:100", SETTINGS, folder, threads=1)
-    return folder
+    return make_world("street", tmp_path_factory.mktemp("street"))
 
 
-def same_images(read, true):
-    assert len(read) == len(true)
+def same_images(read, true, read_from_true=IDENTITY):
     for image, view in zip(read, true, strict=True):
-        np.testing.assert_allclose(image.cam_from_world, view.cam_from_world, atol=1e-9)
+        np.testing.assert_allclose(image.cam_from_world @ read_from_true, view.cam_from_world, atol=1e-9)
         np.testing.assert_allclose(image.K, view.K)
         assert image.size_hw == view.size_hw
         if not isinstance(image.image, bytes):
             assert image.image.read_bytes() == view.image.read_bytes()
+
+
+def classes_of(mesh, seen=slice(None)):
+    """Expected class ids of vertices, by labelling."""
+    fine, broad = np.array([scannet_ids(text) for text in mesh.texts]).T
+    ids = {"scannet200": fine, "nyu40": broad, "replica": np.array([replica_id(text) for text in mesh.texts])}
+    return {labelling: of_text[mesh.whole[seen]] for labelling, of_text in ids.items()}
 
 
 def test_room_as_scannet_reads_back_equal(room, tmp_path):
@@ -58,9 +67,8 @@ def test_room_as_scannet_reads_back_equal(room, tmp_path):
     np.testing.assert_array_equal(scene.truth["nyu40"].xyz, mesh.xyz)
     np.testing.assert_array_equal(scene.truth["nyu40"].faces, mesh.faces)
     np.testing.assert_array_equal(scene.truth["nyu40"].instance_id, mesh.whole + 1)
-    for labelling, column in (("scannet200", 0), ("nyu40", 1)):
-        expected = np.array([scannet_ids(text)[column] for text in mesh.texts])[mesh.whole]
-        np.testing.assert_array_equal(scene.truth[labelling].class_id, expected)
+    for labelling, points in scene.truth.items():
+        np.testing.assert_array_equal(points.class_id, classes_of(mesh)[labelling])
     assert {1, 2, 8, 22} <= set(scene.truth["nyu40"].class_id.tolist())  # wall, floor, door, ceiling
     same_images(scene.images, posed_images(room))
 
@@ -82,8 +90,7 @@ def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(room, tmp_pat
 def test_room_as_replica_reads_back_equal(room, tmp_path):
     write_room_as_replica(room, tmp_path, "room_0")
     scene, mesh = replica.open_scene(tmp_path, "room_0"), LabelledMesh.open(room)
-    truth = scene.truth["replica"]
-    expected = np.array([replica_id(text) for text in mesh.texts])[mesh.whole]
+    truth, expected = scene.truth["replica"], classes_of(mesh)["replica"]
     np.testing.assert_array_equal(truth.xyz, mesh.xyz)
     np.testing.assert_array_equal(truth.class_id, expected)
     # objects count from 1 in the file, instances are the object's number + 1, none without a class
@@ -100,20 +107,16 @@ def test_street_as_waymo_reads_back_equal(street, tmp_path):
     assert len(truth) == len(scan["points"])
     # The segment's frame is that of the vehicle below its first scan, which heads along x.
     shift = scan["origins"][0] - np.array([1.4, 0.0, 2.2])
-    # Both are the same points, in another order: sorted by place, rounded to what float32 keeps.
-    from scipy.spatial import cKDTree
-
+    # Both are the same points in different orders, up to float32 rounding.
     distance, row = cKDTree(truth.xyz + shift).query(scan["points"])
     assert distance.max() < 2e-4
     labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
-    # Points of two things can coincide only where the things touch.
+    # Points of two objects can coincide only where the objects touch.
     assert (truth.class_id[row] == labels[:, 1]).mean() > 0.9999
     assert (np.bincount(truth.class_id, minlength=23) == np.bincount(labels[:, 1], minlength=23)).all()
-    moved = np.eye(4)
-    moved[:3, 3] = shift
-    for image, view in zip(scene.images, posed_images(street), strict=True):
-        np.testing.assert_allclose(image.cam_from_world, view.cam_from_world @ moved, atol=1e-9)
-        np.testing.assert_allclose(image.K, view.K)
+    segment_from_world = np.eye(4)
+    segment_from_world[:3, 3] = -shift
+    same_images(scene.images, posed_images(street), segment_from_world)
 
 
 def test_a_room_is_labelled_where_a_camera_sees_it(room):
@@ -122,12 +125,8 @@ def test_a_room_is_labelled_where_a_camera_sees_it(room):
     seen = np.asarray(views) > 0
     assert 0 < seen.sum() < len(seen)
     np.testing.assert_array_equal(found["nyu40"].xyz, mesh.xyz[seen])
-    for labelling, ids in (
-        ("nyu40", [scannet_ids(text)[1] for text in mesh.texts]),
-        ("scannet200", [scannet_ids(text)[0] for text in mesh.texts]),
-        ("replica", [replica_id(text) for text in mesh.texts]),
-    ):
-        np.testing.assert_array_equal(found[labelling].class_id, np.array(ids)[mesh.whole[seen]])
+    for labelling, expected in classes_of(mesh, seen).items():
+        np.testing.assert_array_equal(found[labelling].class_id, expected)
         assert found[labelling].labelling == labelling
     assert found["nyu40"].xyz is found["replica"].xyz  # one search for neighbours serves all labellings
 

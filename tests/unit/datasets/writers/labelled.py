@@ -17,7 +17,7 @@ from hilsplat.base.artifacts import write_json, write_text
 from hilsplat.base.images import read_image, write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.images.isat import trace_polygons
-from hilsplat.datasets.points.point_files import ply_column, ply_places, read_ply
+from hilsplat.datasets.points.labelled_points import ply_column, ply_places, read_ply
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.exporting import pinhole_model

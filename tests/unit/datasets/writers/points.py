@@ -17,7 +17,7 @@ from PIL import Image
 from hilsplat.base.artifacts import read_npz, write_json, write_text
 from hilsplat.base.images import read_image
 from hilsplat.datasets.classes import REPLICA_NAMES
-from hilsplat.datasets.points.point_files import ply_column, ply_faces, ply_places, read_ply
+from hilsplat.datasets.points.labelled_points import ply_column, ply_faces, ply_places, read_ply
 from hilsplat.datasets.points.scannet import LABEL_TABLE
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.synthetic.world_labels import replica_id, scannet_ids, waymo_labels
