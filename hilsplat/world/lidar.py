@@ -1,6 +1,6 @@
 """Simulated scan of a synthetic street by a spinning laser scanner on the roof of the car (metres).
 
-It replaces the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and 2.4 above.
+It simulates the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and 2.4 above.
 Rays are cast exactly; then noise is added to each range, and some returns are dropped. As in a logged drive,
 the scanner's positions are recorded and not estimated from the images.
 """
@@ -101,11 +101,5 @@ def scan_street(
         points = origin + measured[:, None] * directions[kept]
         rows.append((points, ids[kept], np.full(kept.sum(), pose), measured, beams[kept]))
     points, ids, pose_index, ranges, beam = (np.concatenate(column) for column in zip(*rows, strict=True))
-    return LidarScan(
-        points.astype(np.float32),
-        ids.astype(np.int32),
-        pose_index.astype(np.int32),
-        ranges.astype(np.float32),
-        beam.astype(np.int32),
-        origins,
-    )
+    ids, pose_index, beam = (column.astype(np.int32) for column in (ids, pose_index, beam))
+    return LidarScan(points.astype(np.float32), ids, pose_index, ranges.astype(np.float32), beam, origins)

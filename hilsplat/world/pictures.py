@@ -71,11 +71,11 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
     centre, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
     scale = min(RADIUS / radius, 2.7 * RADIUS / height)
-    assembly = Assembly()
+    assembly = Assembly(model.name, 0)
     assembly.add_object(model, scale, -centre * scale, 0.0)
     assembly.add_surroundings("ground", (), [(box((8, 8, 0.1), (0, 0, -0.05)), _GROUND)])
     style = Style(light_position=(1.2, -1.0, 3.6), exposure=1.3)
-    scene = assembly.finished(model.name, 0, 1, (), style)
+    scene = assembly.finished(1, (), style)
     middle = np.array([0, 0, 0.48 * height * scale])
     pose = looking_at(middle + on_sphere(AZIMUTH_DEG, ELEVATION_DEG, 1.9), middle)
     reach = max(0.90 * RADIUS, 0.60 * height * scale)
@@ -84,7 +84,7 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
 
 
 def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
-    """Draw a view of each of some scenes with its true labels by level, as PNG.
+    """Draw one view per scene with its ground-truth labels by level, as PNG.
 
     Raises:
         SceneError: if the kind is unknown.

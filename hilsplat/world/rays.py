@@ -54,11 +54,7 @@ class Hits:
 
 
 class RayCaster:
-    """Embree's acceleration structure over a copy of F triangles.
-
-    Args:
-        triangles: corner positions.
-    """
+    """Embree's acceleration structure over a copy of F triangles, given by their corners."""
 
     def __init__(self, triangles: Float32[np.ndarray, "F 3 3"]) -> None:
         embree, device = _embree()
@@ -79,7 +75,7 @@ class RayCaster:
         embree.rtcReleaseGeometry(geometry)
         embree.rtcCommitScene(self._scene)
         if error := embree.rtcGetDeviceError(device):
-            raise MemoryError(f"Embree could not take {len(corners)} triangles (its error {error})")
+            raise MemoryError(f"Embree could not load {len(corners)} triangles (Embree error {error})")
 
     def nearest(self, origins: Float32[np.ndarray, "O 3"], directions: Float32[np.ndarray, "R 3"]) -> Hits:
         """Return the first hit of each ray.

@@ -92,7 +92,6 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
     Args:
         size: lengths along x, y, z.
-        centre: middle of the box.
         bevel: length cut off each edge; 0 gives 12 triangles, else 44.
     """
     half = np.asarray(size, dtype=np.float64) / 2

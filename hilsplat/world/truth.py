@@ -82,10 +82,8 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
     unique, index = unique_rows(rows)
     id_fields = [(level.label, "<i4") for level in LEVELS]
     vertices = np.empty(len(unique), [*((axis, "<f4") for axis in "xyz"), *id_fields, ("views", "u1")])
-    for column, axis in enumerate("xyz"):
-        vertices[axis] = unique[:, 3 + column]
-    for level in LEVELS:
-        vertices[level.label] = unique[:, level.index]
+    for column, name in enumerate([*(level.label for level in LEVELS), *"xyz"]):
+        vertices[name] = unique[:, column]
     vertices["views"] = np.minimum(views_of_points(scene, cameras, np.ascontiguousarray(unique[:, 3:])), 255)
     faces = np.empty(len(triangles), [("count", "u1"), ("corners", "<i4", 3), *id_fields])
     faces["count"] = 3

@@ -1,47 +1,63 @@
-"""The diagnostic segmenter `truth-perturbed`: masks from the true labels of a synthetic scene.
+"""The diagnostic segmenter `truth-perturbed`: masks from a synthetic scene's ground truth, with faults.
 
 It separates errors of the method from errors of the small segmenter. It is the only code before `evaluate`
 that reads annotations, and it is never a default: the rule and the command pass the truth folder only if the
 settings request it, the index records the faults, and every row built on such masks has `SEGMENTER` in its
 masks column.
+
+Every decision about a fault uses a random number derived from a name (seed, scene, kind of fault, view,
+node), so it depends neither on the order of views nor on other kinds of faults. A higher probability keeps
+the faults of a lower one and adds more of the same kind, so the steps of a sweep over a setting are
+comparable.
 """
 
 import logging
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Bool, Float, Int32
 
-from hilsplat.base.artifacts import atomic_folder, read_index, read_json, write_index
+from hilsplat.base.artifacts import atomic_folder, read_index, read_json, sha256_of_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.base.levels import LEVELS
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
-from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.segment.stage import train_views
 from hilsplat.settings import PerturbSettings
-from hilsplat.world.mask_faults import Draws, TrueNodes, faulty_masks
 
 logger = logging.getLogger(__name__)
 
 SEGMENTER = "truth-perturbed"
 """Name of the segmenter, and prefix of its masks' label."""
 
-FAULTS = (
-    *("boundary_px", "merge", "split", "missing", "missing_level", "wrong_level", "dropped_views"),
-    *("systematic_merge", "systematic_missing"),
-)
-"""Settings of `PerturbSettings` that change masks; if all are 0, the masks are exact."""
+FAULTS = PerturbSettings.model_fields.keys() - {
+    *("seed", "background", "boundary_smooth_px", "systematic_share", "score_noise")
+}
+"""Settings that change masks; if all are 0, the masks are exact."""
+
+REACH = 3.0
+"""Maximum displacement of a boundary, standard deviations."""
+
+WAVES = 48
+"""Number of plane waves that are summed for a boundary's displacement."""
+
+Borders = dict[int, dict[int, int]]
+"""Node -> adjacent sibling -> length of their common border, px."""
 
 
 def run_truth_masks(
     scene_folder: Path, truth: Path, out: Path, settings: PerturbSettings, min_area_px: int, threads: int
 ) -> None:
-    """Write masks of every training view from the true labels, with faults (see `mask_faults.faulty_masks`).
+    """Write masks of every training view from its ground-truth labels, with faults (see `faulty_masks`).
 
     The index also contains the requested faults and, per view, the number of faults. The result does not
     depend on `threads`.
@@ -62,7 +78,7 @@ def run_truth_masks(
     label = faults_label(settings)
     with stage_log("masks", scene.name) as counts:
         logger.warning(
-            "masks %s: %s, made from the TRUE labels: a diagnostic, not a result", scene.name, label
+            "masks %s: %s, made from the ground truth: a diagnostic, not a result", scene.name, label
         )
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
@@ -108,3 +124,282 @@ def faults_label(settings: PerturbSettings) -> str:
         text = "/".join(f"{each:g}" for each in value) if isinstance(value, tuple) else f"{value}"
         changed.append(f"{name} {text}")
     return f"{SEGMENTER} ({', '.join(changed)})" if changed else SEGMENTER
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random numbers derived from names, independent of call order and number of threads."""
+
+    seed: int
+    scene: str
+
+    def generator(self, *name: str | int) -> np.random.Generator:
+        """Return a generator derived from a name."""
+        digest = sha256_of_json([self.seed, self.scene, *name])
+        return np.random.default_rng(int(digest[:32], 16))
+
+    def chance(self, *name: str | int) -> float:
+        """Return a number in [0, 1) derived from a name; an event of probability p happens below p."""
+        return int(sha256_of_json([self.seed, self.scene, *name])[:13], 16) / 16**13
+
+
+@dataclass(frozen=True)
+class TrueNodes:
+    """Scene-wide data that the faults depend on.
+
+    Attributes:
+        nodes: all nodes by id.
+        background: ids of the surroundings, which are never merged.
+        partner: for each node, the sibling with which it shares the longest border over all views; a
+            systematic merge joins the two. Nodes without an adjacent sibling are absent.
+    """
+
+    nodes: tuple[AnnotatedNode, ...]
+    background: frozenset[int]
+    partner: Mapping[int, int]
+
+    @staticmethod
+    def of(
+        nodes: tuple[AnnotatedNode, ...],
+        background: Collection[int],
+        labels: Iterable[Int32[np.ndarray, "3 H W"]],
+    ) -> "TrueNodes":
+        """Measure the borders in all views; `labels` has one image of node ids per view, -1 for none."""
+        total: Borders = defaultdict(lambda: defaultdict(int))
+        alone = TrueNodes(nodes, frozenset(background), {})
+        for view in labels:
+            for level in LEVELS:
+                for node, around in sibling_borders(view[level.index], alone).items():
+                    for other, length in around.items():
+                        total[node][other] += length
+        return replace(alone, partner={node: longest_border(total[node]) for node in sorted(total)})
+
+
+def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borders:
+    """Return the common borders of sibling nodes of one level, without the surroundings."""
+    borders: Borders = defaultdict(lambda: defaultdict(int))
+    for first, second in ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:])):
+        differ = (first != second) & (first != NONE) & (second != NONE)
+        pairs = np.stack([first[differ], second[differ]], axis=1)
+        for (a, b), length in zip(*np.unique(pairs, axis=0, return_counts=True), strict=True):
+            a, b = int(a), int(b)
+            siblings = truth.nodes[a].parent == truth.nodes[b].parent
+            if siblings and not {a, b} & truth.background:
+                borders[a][b] += int(length)
+                borders[b][a] += int(length)
+    return {node: dict(around) for node, around in borders.items()}
+
+
+def longest_border(around: Mapping[int, int]) -> int:
+    """Return the neighbour with the longest border, or the lower id on a tie."""
+    return min(around, key=lambda other: (-around[other], other))
+
+
+def merged_groups(
+    ids: Sequence[int], borders: Borders, truth: TrueNodes, view: str, draws: Draws, settings: PerturbSettings
+) -> list[tuple[int, ...]]:
+    """Group the nodes of one level into the masks of a view, each group in ascending order.
+
+    With probability `merge`, a node is merged with the sibling with which it shares the longest border in
+    the view. A node drawn for a systematic merge is merged with its `partner` in `systematic_share` of the
+    views in which the two are adjacent.
+    """
+    owner = {node: node for node in ids}
+
+    def find(node: int) -> int:
+        while owner[node] != node:
+            node = owner[node]
+        return node
+
+    for node in ids:
+        around = {other: length for other, length in borders.get(node, {}).items() if other in owner}
+        if not around:
+            continue
+        wrong = []
+        if draws.chance("merge", view, node) < settings.merge:
+            wrong.append(longest_border(around))
+        if truth.partner.get(node) in around and systematic("merge", node, view, draws, settings):
+            wrong.append(truth.partner[node])
+        for other in wrong:
+            low, high = sorted((find(node), find(other)))
+            owner[high] = low
+    groups: dict[int, list[int]] = defaultdict(list)
+    for node in ids:
+        groups[find(node)].append(node)
+    return [tuple(sorted(group)) for _, group in sorted(groups.items())]
+
+
+def systematic(fault: str, node: int, view: str, draws: Draws, settings: PerturbSettings) -> bool:
+    """Return whether a systematic fault ("merge" or "missing") of a node happens in a view."""
+    probability = getattr(settings, f"systematic_{fault}")
+    return (
+        draws.chance(f"systematic {fault}", node) < probability
+        and draws.chance(f"systematic {fault}", node, view) < settings.systematic_share
+    )
+
+
+def cut_in_two(
+    mask: Bool[np.ndarray, "H W"], generator: np.random.Generator
+) -> tuple[Bool[np.ndarray, "H W"], ...]:
+    """Cut a mask along a line that leaves 30 to 70 % on either side, or return it if it is too small."""
+    angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
+    y, x = np.nonzero(mask)
+    along = x * np.cos(angle) + y * np.sin(angle)
+    near = along <= np.quantile(along, share)
+    if near.all() or not near.any():
+        return (mask,)
+    first = np.zeros_like(mask)
+    first[y[near], x[near]] = True
+    return first, mask & ~first
+
+
+def displaced(
+    mask: Bool[np.ndarray, "H W"],
+    amplitude_px: float | int,
+    smooth_px: float | int,
+    generator: np.random.Generator,
+) -> Bool[np.ndarray, "H W"]:
+    """Move a mask's boundary along its normal by a smooth random amount.
+
+    A pixel is inside the new mask if its signed distance to the boundary (positive inside, half a pixel next
+    to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of plane waves, so
+    it depends only on the position: with the same generator, a larger amplitude changes all pixels that a
+    smaller one changes, and more.
+
+    The boundary moves inwards by at most half the distance to the innermost pixel, so thin regions become
+    thinner but do not vanish. Image borders are not boundaries.
+
+    Args:
+        mask: non-empty mask.
+        amplitude_px: standard deviation of the displacement; 0 returns the mask itself.
+        smooth_px: standard deviation of the field's Gaussian correlation function.
+    """
+    if amplitude_px == 0:
+        return mask
+    waves = generator.normal(0, 1 / smooth_px, (WAVES, 2))
+    phases = generator.uniform(0, 2 * np.pi, WAVES)
+    reach = REACH * amplitude_px
+    margin = int(np.ceil(reach)) + 1
+    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = max(0, ys[0] - margin), max(0, xs[0] - margin)
+    crop = np.s_[top : ys[-1] + 1 + margin, left : xs[-1] + 1 + margin]
+    inside = mask[crop]
+    if inside.all():
+        return mask  # the mask fills the view
+    distance = np.where(inside, _distance(inside) - 0.5, 0.5 - _distance(~inside))
+    y, x = np.nonzero(np.abs(distance) < reach)
+    field = np.cos((x + left)[:, None] * waves[:, 0] + (y + top)[:, None] * waves[:, 1] + phases).sum(axis=1)
+    shift = np.clip(amplitude_px * np.sqrt(2 / WAVES) * field, -reach, min(reach, float(distance.max()) / 2))
+    moved = inside.copy()
+    moved[y, x] = distance[y, x] > shift
+    result = mask.copy()
+    result[crop] = moved
+    return result
+
+
+def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return each inside pixel's distance to the nearest outside pixel, between centres, px; 0 outside."""
+    return cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def beside(level: Level, up: bool) -> Level:
+    """Return an adjacent level; `up` selects whole instead of subpart for a part."""
+    if level is not Level.PART:
+        return Level.PART
+    return Level.WHOLE if up else Level.SUBPART
+
+
+def faulty_masks(
+    labels: Int32[np.ndarray, "3 H W"],
+    truth: TrueNodes,
+    view: str,
+    draws: Draws,
+    settings: PerturbSettings,
+    min_area_px: int,
+) -> tuple[HierarchicalMasks, dict[str, int]]:
+    """Return one view's true regions as masks, with faults applied in this order.
+
+    1. Dropped views, missing levels.
+    2. Merges: a group of nodes becomes one mask (`merged_groups`).
+    3. Missing masks: the draw of a group's lowest node or a systematic fault of any of its nodes drops it.
+    4. Splits (`cut_in_two`), then boundaries (`displaced`). Each mask is changed separately, so masks may
+       then overlap or leave gaps.
+    5. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
+
+    `predicted_iou` is the mask's best IoU with the true region of one of its nodes, plus noise. `stability`
+    is the mean of that IoU and 1, plus noise. Both are clipped to [0, 1]. A systematic merge thus lowers the
+    scores as much as any other merge; a wrong level does not lower them. SAM's thresholds and suppressions
+    are not applied: the masks are written exactly as specified.
+
+    Args:
+        labels: node id per level and pixel, -1 for none.
+        min_area_px: smaller true regions give no mask.
+
+    Returns:
+        The masks in `content_order`, and the number of faults of each kind.
+    """
+    counts = dict.fromkeys(("missing_levels", "merged", "missing", "split", "wrong_level"), 0)
+    found: list[tuple[np.ndarray, Level, float, float]] = []
+    dropped = draws.chance("dropped view", view) < settings.dropped_views
+    for level in LEVELS if not dropped else ():
+        if draws.chance("missing level", view, level.label) < settings.missing_level[level.index]:
+            counts["missing_levels"] += 1
+            continue
+        of_level = labels[level.index]
+        ids = _visible(of_level, truth, settings, min_area_px)
+        borders = sibling_borders(of_level, truth)
+        for group in merged_groups(ids, borders, truth, view, draws, settings):
+            lead = group[0]
+            counts["merged"] += len(group) - 1
+            if draws.chance("missing", view, lead) < settings.missing[level.index] or any(
+                systematic("missing", node, view, draws, settings) for node in group
+            ):
+                counts["missing"] += 1
+                continue
+            pieces: tuple[np.ndarray, ...] = (np.isin(of_level, group),)
+            if draws.chance("split", view, lead) < settings.split:
+                pieces = cut_in_two(pieces[0], draws.generator("cut", view, lead))
+                counts["split"] += len(pieces) - 1
+            for number, piece in enumerate(pieces):
+                name = (view, lead, number)
+                mask = piece
+                if settings.boundary_px:
+                    field = draws.generator("boundary", *name)
+                    mask = displaced(piece, settings.boundary_px, settings.boundary_smooth_px, field)
+                stands_at = level
+                if draws.chance("wrong level", *name) < settings.wrong_level:
+                    stands_at = beside(level, up=draws.chance("which level", *name) < 0.5)
+                    counts["wrong_level"] += 1
+                quality = max(_iou(mask, of_level == node) for node in group)
+                found.append((mask, stands_at, *_scores(quality, draws, settings, name)))
+    masks = HierarchicalMasks.from_dense(
+        np.array([each[0] for each in found], bool).reshape(len(found), *labels.shape[1:]),
+        np.array([int(each[1]) for each in found], np.uint8),
+        np.array([each[2] for each in found], np.float32),
+        np.array([each[3] for each in found], np.float32),
+    )
+    return masks.take(masks.content_order()), {"dropped": int(dropped), **counts}
+
+
+def _visible(
+    of_level: Int32[np.ndarray, "H W"], truth: TrueNodes, settings: PerturbSettings, min_area_px: int
+) -> list[int]:
+    """Return the nodes of a level that are large enough in a view for a mask, in ascending order."""
+    areas = zip(*np.unique(of_level, return_counts=True), strict=True)
+    ids = [int(node) for node, area_px in areas if node != NONE and area_px >= min_area_px]
+    return [node for node in ids if settings.background or node not in truth.background]
+
+
+def _scores(
+    quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
+) -> tuple[float, float]:
+    """Return predicted IoU and stability of a mask whose true IoU is `quality`."""
+    predicted, stability = quality, (1 + quality) / 2
+    if settings.score_noise:
+        noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)
+        predicted, stability = predicted + noise[0], stability + noise[1]
+    return min(1.0, max(0.0, predicted)), min(1.0, max(0.0, stability))
+
+
+def _iou(mask: Bool[np.ndarray, "H W"], region: Bool[np.ndarray, "H W"]) -> float:
+    return np.count_nonzero(mask & region) / np.count_nonzero(mask | region)

@@ -1,9 +1,7 @@
-"""What a finished run of config/ci.yaml reaches, and how far it may be from what was recorded.
+"""Numbers of a finished run of config/ci.yaml, and their tolerances. To record them after an intended change:
 
-    snakemake --cores 1 --configfile config/ci.yaml
-    python -m tests.reference.tiny results/synthetic/tiny > tests/reference/tiny.json
-
-records the numbers of such a run, after a change that is meant to move them; its commit says which and why.
+snakemake --cores 1 --configfile config/ci.yaml
+python -m tests.reference.tiny results/synthetic/tiny > tests/reference/tiny.json
 """
 
 import hashlib
@@ -17,13 +15,12 @@ import pandas as pd
 
 METRICS = ("iou", "localization_box", "hc_containment", "view_consistency")
 SAME_FIT = {"iou": 0.01, "localization_box": 0.03, "hc_containment": 0.01, "view_consistency": 0.01}
-"""Tolerances if the Gaussians are the recorded ones to the byte, as they are on every processor of the kind
-that recorded them: what then moves a number by more than a hundredth, or the hits of localization by more
-than one of 32, is a change of code."""
+"""Tolerances if the Gaussians equal the recorded ones byte for byte, as on all processors of the same kind.
+A difference above 0.01, or more than one of 32 localization hits, is then caused by a change of code."""
 OTHER_FIT = {"iou": 0.12, "localization_box": 0.2, "hc_containment": 0.15, "view_consistency": 0.15}
-"""Tolerances if they are not. A fit of 600 steps amplifies the last bits that differ by processor. Measured:
-scales of the fit in float64 moved mIoU by up to 0.06, localization by 0.14, HC and consistency by 0.06 and
-the fit by 0.73 dB; all libraries held to SSE4 moved them by up to 0.09, 0.12, 0.08, 0.10 and 0.14 dB."""
+"""Tolerances for other Gaussians. A fit of 600 steps amplifies differences in the last bits between
+processors. Measured: float64 scales in the fit changed mIoU by up to 0.06, localization by 0.14, HC and
+consistency by 0.06 and the fit by 0.73 dB; SSE4 in all libraries by 0.09, 0.12, 0.08, 0.10 and 0.14 dB."""
 COUNTS = {
     "poses/registered views": 0,
     "poses/points": 5,
@@ -34,17 +31,13 @@ COUNTS = {
     "masks/best_iou": 0.02,
     "nodes": 4,
 }
-"""Tolerances of the stages before. The two moved neither poses nor masks, nodes by 1, Gaussians by 76."""
+"""Tolerances of the earlier stages. Both measurements changed nodes by 1, Gaussians by 76, and neither poses
+nor masks."""
 
 
 @dataclass(frozen=True)
 class Reached:
-    """Numbers of a run.
-
-    Attributes:
-        gaussians_sha256: of `gaussians.ply`.
-        numbers: by stage or metric, then what they are of, joined by slashes.
-    """
+    """Numbers of a run, by stage or metric and what they measure, joined by slashes."""
 
     gaussians_sha256: str
     numbers: dict[str, float]
@@ -52,15 +45,9 @@ class Reached:
 
 def measure(folder: Path) -> Reached:
     """Read the numbers of a finished scene, `results/synthetic/tiny`."""
-    poses, fit, masks, tree = (
-        json.loads((folder / path).read_text())
-        for path in (
-            "scene/registration.json",
-            "gaussians/report.json",
-            "default/masks/index.json",
-            "default/semantic_tree/index.json",
-        )
-    )
+    paths = ("scene/registration.json", "gaussians/report.json")
+    paths += ("default/masks/index.json", "default/semantic_tree/index.json")
+    poses, fit, masks, tree = (json.loads((folder / path).read_text()) for path in paths)
     numbers = {"poses/registered views": poses["registered"], "poses/points": poses["points"]}
     numbers |= {f"gaussians/{name}": fit[name] for name in ("psnr_db", "ssim", "gaussians")}
     fits = pd.read_csv(folder.parents[1] / "figures" / folder.parent.name / folder.name / "masks.csv")
@@ -82,12 +69,12 @@ def measure(folder: Path) -> Reached:
 
 
 def recorded() -> Reached:
-    """The recorded numbers."""
+    """Return the recorded numbers."""
     return Reached(**json.loads(Path(__file__).with_suffix(".json").read_text()))
 
 
 def differences(found: Reached, expected: Reached) -> Iterator[str]:
-    """A sentence for each number that is missing, new, or off the recorded one by more than its tolerance."""
+    """Yield a sentence for each number that is missing, new, or outside its tolerance."""
     for name in sorted(found.numbers.keys() ^ expected.numbers.keys()):
         yield f"{name} is {'new' if name in found.numbers else 'missing'}"
     same_fit = found.gaussians_sha256 == expected.gaussians_sha256

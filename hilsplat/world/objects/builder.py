@@ -70,7 +70,6 @@ class Node(NamedTuple):
 
     Attributes:
         word: its name without the object's.
-        aliases: other names.
         at: preposition before its parent, as in "knob on the kettle lid".
     """
 
@@ -222,9 +221,9 @@ class Builder:
             others += [f"{node.word} of the {alias}" for alias in whole.aliases]
         if node.level == 3:
             others.append(f"{node.word} {node.at} the {whole.word} {self.nodes[node.parent].word}")
-        least = 0.5 if node.level == 1 else 0.6
-        colour, coloured = _prevailing([(paint.colour, size) for paint, size in area.items()], least)
-        material, made = _prevailing([(paint.adjective, size) for paint, size in area.items()], least)
+        share = 0.5 if node.level == 1 else 0.6
+        colour, coloured = _prevailing([(paint.colour, size) for paint, size in area.items()], share)
+        material, made = _prevailing([(paint.adjective, size) for paint, size in area.items()], share)
         if coloured:
             others.append(f"{colour} {text}")
         if made and material is not None:
@@ -249,7 +248,7 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
 
     def short(candidate: Paint) -> float:
         """Return the largest shortfall of a candidate's distance to a rival, 0 if there is none."""
-        return max([0.0, *(least - difference(candidate, rival) for rival, least in rivals)])
+        return max([0.0, *(minimum - difference(candidate, rival) for rival, minimum in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
     allowed = paint.choices or tuple(COLOURS)
@@ -258,10 +257,10 @@ def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
     return min(tried or [paint], key=short)  # on a tie the first, which is the smallest change
 
 
-def _prevailing(sizes: list[tuple[Word, float]], least: float) -> tuple[Word, bool]:
-    """Return the word for most of a surface, and whether it covers at least the share `least`."""
+def _prevailing(sizes: list[tuple[Word, float]], share: float) -> tuple[Word, bool]:
+    """Return the word for most of a surface, and whether it covers at least a share of the surface."""
     per_word: dict[Word, float] = defaultdict(float)
     for word, size in sizes:
         per_word[word] += size
     word = max(per_word, key=per_word.__getitem__)
-    return word, per_word[word] >= least * sum(per_word.values())
+    return word, per_word[word] >= share * sum(per_word.values())

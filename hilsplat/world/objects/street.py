@@ -81,11 +81,6 @@ def plain(b: Builder, colour: str) -> Paint:
     return replace(b.paint(f"plain {colour}"), first=COLOURS[colour])
 
 
-def post(radius: Number, height: Number) -> Mesh:
-    """Return an upright pole."""
-    return cylinder(radius, 0.0, height, 14)
-
-
 def panel(thickness: Number, width: Number, height: Number, x: Number, y: Number, z: Number) -> Mesh:
     """Return a thin upright plate that faces x, with its centre at (x, y, z)."""
     return box((thickness, width, height), (x, y, z), min(0.02, 0.3 * thickness))
@@ -140,7 +135,7 @@ def bush(b: Builder) -> None:
 def sign(b: Builder) -> None:
     metal = b.paint("metal grey")
     tall = b.between(2.1, 2.4)
-    pole = b.part("pole, post", metal, post(0.055, tall))
+    pole = b.part("pole, post", metal, cylinder(0.055, 0, tall, 14))
     pole.subpart("base, foot", "stone grey beige", cylinder(0.16, 0, 0.2, 14, 0.02))
     plate = b.part("plate, panel, board")
     form = str(b.rng.choice(["round", "octagon", "triangle", "square"]))
@@ -170,7 +165,7 @@ def sign(b: Builder) -> None:
 
 def traffic_light(b: Builder) -> None:
     tall = b.between(2.5, 2.8)
-    pole = b.part("pole, post", "metal grey white", post(0.075, tall))
+    pole = b.part("pole, post", "metal grey white", cylinder(0.075, 0, tall, 14))
     pole.subpart("base, foot", "stone beige grey", box((0.36, 0.36, 0.42), (0, 0, 0.21), 0.03))
     z, dark = tall - 0.45, b.paint("plain yellow green black")
     housing = b.part("housing, signal head", dark, box((0.3, 0.42, 1.16), (0.14, 0, z), 0.05))

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from hilsplat.base.levels import NONE
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import ROOM_THINGS, build_object
+from hilsplat.world.objects.catalogue import ROOM_THINGS
 from hilsplat.world.paints import PaintBox
 from hilsplat.world.scenes.floorplan import WALL_GAP, FloorPlan, Room, Space, turned_space
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
@@ -85,16 +85,10 @@ class _Furnishing:
     """A room while it is being furnished: the scene so far, occupied space, and supports for things."""
 
     def __init__(self, seed: int, rng: np.random.Generator, plan: FloorPlan) -> None:
-        self.seed, self.rng, self.plan = seed, rng, plan
-        self.assembly = Assembly()
+        self.rng, self.plan = rng, plan
+        self.assembly = Assembly("room", seed)
         self.placed: list[PlacedObject] = []
         self.supports: list[Support] = []
-        self._drawn = 0
-
-    def model(self, name: str, kind: str = "room") -> ObjectModel:
-        """Draw the next object of a class."""
-        self._drawn += 1
-        return build_object(kind, name, np.random.default_rng([self.seed, 22, self._drawn]))
 
     def put(
         self, model: ObjectModel, spot: np.ndarray, yaw_deg: float, base_z: float = 0.0, scale: float = 1.0
@@ -176,14 +170,14 @@ def build_room(seed: int, objects: int) -> WorldScene:
     _add_shell(work.assembly, room, np.random.default_rng([seed, 23]))
     style = _style(room, np.random.default_rng([seed, 24]))
     asked = objects + 5  # with door, window, curtain and two pictures
-    return work.assembly.finished("room", seed, asked, work.placed, style)
+    return work.assembly.finished(asked, work.placed, style)
 
 
 def _add_fixtures(work: _Furnishing) -> None:
     """Add a door, and a window with a curtain on another wall."""
     room, plan = work.plan.room, work.plan
     door_wall, window_wall = (int(wall) for wall in work.rng.permutation(4)[:2])
-    model = work.model("door")
+    model = work.assembly.draw("door")
     size = size_of(model)
     reach = room.wall_length(door_wall) / 2 - size[1] / 2 - 0.12
     along = float(work.rng.choice([-1, 1]) * reach * work.rng.uniform(0.6, 1.0))
@@ -192,7 +186,7 @@ def _add_fixtures(work: _Furnishing) -> None:
     # The entrance and the swing of the door stay free.
     entrance = room.at_wall(door_wall, along, 0.4)
     plan.taken.append(turned_space(entrance, np.array([0.8, size[1], 2.1]), yaw, 0.0))
-    window, curtain = work.model("window"), work.model("curtain")
+    window, curtain = work.assembly.draw("window"), work.assembly.draw("curtain")
     yaw = 90.0 * window_wall
     along = float(work.rng.uniform(-0.3, 0.3))
     for model, base_z in ((window, 0.92), (curtain, 0.84)):
@@ -230,13 +224,15 @@ def _furnish(work: _Furnishing, count: int) -> int:
             if done < count:
                 done += _put_partner(work, owner, name, where)
     if done < count:
-        logger.warning("scene room:%d: no place left for %d pieces of furniture", work.seed, count - done)
+        logger.warning(
+            "scene room:%d: no place left for %d pieces of furniture", work.assembly.seed, count - done
+        )
     return done
 
 
 def _put_at_wall(work: _Furnishing, piece: Piece, base_z: float = 0.0, gap: float = WALL_GAP) -> bool:
     """Place a piece at a wall, and return whether it fits."""
-    model = work.model(piece.name)
+    model = work.assembly.draw(piece.name)
     size = size_of(model) + np.array([0, 0, piece.above])
     found = work.plan.wall_spot(work.rng, size, base_z, piece.clear, gap)
     if found is None:
@@ -252,7 +248,7 @@ ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
 
 def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bool:
     """Place a partner of a piece before it, beside it or on it; return whether it fits."""
-    model = work.model(name)
+    model = work.assembly.draw(name)
     size = size_of(model)
     owner = work.placed[owner_row]
     turn = rotation_about("z", owner.yaw_deg)[:2, :2]
@@ -282,7 +278,7 @@ def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bo
 
 def _put_table(work: _Furnishing, with_rug: bool) -> int:
     """Place a table near the middle of the room, optionally on a rug; return the number of pieces."""
-    model, rug = work.model("table"), work.model("rug")
+    model, rug = work.assembly.draw("table"), work.assembly.draw("rug")
     size = size_of(rug) if with_rug else size_of(model)
     base_z = float(size_of(rug)[2]) if with_rug else 0.0
     for attempt in range(80):
@@ -306,7 +302,7 @@ def _hang_pictures(work: _Furnishing) -> int:
 
 def _add_thing(work: _Furnishing, name: str) -> bool:
     """Place a thing on furniture or the floor, facing the middle of the room; return whether it fits."""
-    model = work.model(name, "tabletop")
+    model = work.assembly.draw(name, "tabletop")
     _, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
     target = float(work.rng.uniform(*THING_SIZES.get(name, TOY_SIZE)))
@@ -317,7 +313,7 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
     model = replace(model, materials=pattern)
     found = _thing_spot(work, radius, height * scale)
     if found is None:
-        logger.warning("scene room:%d: no place left for the %s", work.seed, name)
+        logger.warning("scene room:%d: no place left for the %s", work.assembly.seed, name)
         return False
     spot, base_z = found
     yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + work.rng.uniform(-50, 50))

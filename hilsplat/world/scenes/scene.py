@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int32
 from hilsplat.base.levels import NONE
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.world.objects.builder import ObjectModel
+from hilsplat.world.objects.catalogue import build_object
 from hilsplat.world.paints import Paint
 from hilsplat.world.rays import RayCaster
 from hilsplat.world.shapes import Mesh, rotation_about
@@ -83,10 +84,8 @@ class WorldScene:
     """A scene as triangles with their nodes. z is up.
 
     Attributes:
-        kind: kind of scene.
         seed: with the number of objects, determines everything random in the scene.
         asked: number of requested objects.
-        placed: objects that were placed.
         triangles: corner positions, scene units.
         normals: shading normals at the corners.
         coords: object coordinates of the corners, scene units; solid textures are evaluated at them.
@@ -128,12 +127,21 @@ class Assembly:
         scale: scene units per unit of the solid textures, as in `Style.scale`.
     """
 
-    def __init__(self, scale: float = 1.0) -> None:
-        self.scale = scale
+    def __init__(self, kind: str, seed: int, scale: float = 1.0) -> None:
+        self.kind, self.seed, self.scale = kind, seed, scale
+        self.drawn = 0
         self.pieces: list[tuple[np.ndarray, ...]] = []
         self.materials: list[np.ndarray] = []
         self.nodes: list[AnnotatedNode] = []
         self.background: list[int] = []
+
+    def draw(self, name: str, kind: str | None = None) -> ObjectModel:
+        """Draw the next object of a class of this kind of scene, or of another kind.
+
+        Its look depends on the seed and the number of objects drawn before.
+        """
+        self.drawn += 1
+        return build_object(kind or self.kind, name, np.random.default_rng([self.seed, 22, self.drawn]))
 
     def add_object(
         self, model: ObjectModel, scale: float, xy: np.ndarray, yaw_deg: float, base_z: float = 0.0
@@ -162,14 +170,11 @@ class Assembly:
         for mesh, paint in pieces:
             node_ids = np.tile(np.array([node, NONE, NONE], np.int32), (len(mesh), 1))
             material_ids = np.full(len(mesh), sum(len(rows) for rows in self.materials), np.int32)
-            self.pieces.append(
-                (mesh.triangles, mesh.normals, mesh.triangles / self.scale, node_ids, material_ids)
-            )
+            coords = mesh.triangles / self.scale
+            self.pieces.append((mesh.triangles, mesh.normals, coords, node_ids, material_ids))
             self.materials.append(paint.row()[None])
 
-    def finished(
-        self, kind: str, seed: int, asked: int, placed: Sequence[PlacedObject], style: Style
-    ) -> WorldScene:
+    def finished(self, asked: int, placed: Sequence[PlacedObject], style: Style) -> WorldScene:
         """Return the scene with everything added so far."""
         columns = [np.concatenate(column) for column in zip(*self.pieces, strict=True)]
         triangles, normals, coords = (column.astype(np.float32) for column in columns[:3])
@@ -177,7 +182,7 @@ class Assembly:
         materials = np.concatenate(self.materials).astype(np.float32)
         arrays = (triangles, normals, coords, node_ids, material_ids, materials)
         nodes, background = tuple(self.nodes), frozenset(self.background)
-        return WorldScene(kind, seed, asked, tuple(placed), *arrays, nodes, background, style)
+        return WorldScene(self.kind, self.seed, asked, tuple(placed), *arrays, nodes, background, style)
 
 
 def footprint_of(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, " 2"], float]:

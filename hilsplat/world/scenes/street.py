@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import ObjectModel
-from hilsplat.world.objects.catalogue import build_object
 from hilsplat.world.paints import Colour, Paint
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import Mesh, box, joined, lathe, rotation_about
@@ -87,16 +86,9 @@ class _Street:
     """A street while it is being filled."""
 
     def __init__(self, seed: int) -> None:
-        self.seed = seed
         self.rng = np.random.default_rng([seed, 21])
-        self.assembly = Assembly(SCALE)
+        self.assembly = Assembly("street", seed, SCALE)
         self.low, self.high = np.zeros((0, 3)), np.zeros((0, 3))  # boxes around the parts placed so far
-        self.drawn = 0
-
-    def draw(self, name: str) -> ObjectModel:
-        """Draw the next object of a class; its look depends on the seed and the number drawn before."""
-        self.drawn += 1
-        return build_object("street", name, np.random.default_rng([self.seed, 22, self.drawn]))
 
     def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
         """Place an object at a spot and return it, or return None if it would intersect another."""
@@ -114,7 +106,7 @@ class _Street:
 
     def try_spots(self, name: str, spot: Callable[[ObjectModel], _Spot]) -> PlacedObject | None:
         """Place an object at the first free one of `TRIES` random spots, or return None."""
-        model = self.draw(name)
+        model = self.assembly.draw(name)
         for _ in range(TRIES):
             placed = self.put(model, spot(model))
             if placed is not None:
@@ -203,7 +195,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
         seed, len(placed), objects, ", ".join(thing.name for thing in placed), furniture, houses,
     )  # fmt: skip
     style = _daylight(np.random.default_rng([seed, 24]))
-    return street.assembly.finished("street", seed, objects, placed, style)
+    return street.assembly.finished(objects, placed, style)
 
 
 def _add_buildings(street: _Street) -> int:
@@ -212,14 +204,14 @@ def _add_buildings(street: _Street) -> int:
     for side in (-1, 1):
         x = STREET_X[0] + float(rng.uniform(0, 2))
         while x < STREET_X[1] - 4:
-            model = street.draw("building")
+            model = street.assembly.draw("building")
             width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
             count += street.put(model, _Spot(x + width / 2, side * FRONT, 0.14, -90.0 * side)) is not None
             x += width + (float(rng.uniform(1.5, 3.0)) if rng.random() < 0.25 else 0.0)
     for x, yaw in ((STREET_X[1] + 8, 180.0), (STREET_X[0] - 8, 0.0)):
         y = -16.0
         while y < 12:
-            model = street.draw("building")
+            model = street.assembly.draw("building")
             width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
             count += street.put(model, _Spot(x, y + width / 2, 0.14, yaw)) is not None
             y += width

@@ -44,7 +44,7 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
     object is placed at random without overlap of footprints; objects that do not fit are omitted.
     """
     rng = np.random.default_rng([seed, 1])
-    assembly = Assembly()
+    assembly = Assembly("tabletop", seed)
     order = np.concatenate([rng.permutation(len(TABLETOP)) for _ in range(1 + objects // len(TABLETOP))])
     typical = min(MAX_FOOTPRINT, TABLE_RADIUS * float(np.sqrt(COVERED_SHARE / objects)))
     drawn = []
@@ -69,7 +69,7 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
     logger.info("scene tabletop:%d: %d of %d objects placed", seed, len(placed), objects)
     _add_room(assembly, np.random.default_rng([seed, 3]))
     style = Style.draw(np.random.default_rng([seed, 4]))
-    return assembly.finished("tabletop", seed, objects, placed, style)
+    return assembly.finished(objects, placed, style)
 
 
 def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:

@@ -1,4 +1,4 @@
-"""Scenes that several tests look at, built once."""
+"""Scenes shared by several tests."""
 
 import pytest
 

@@ -83,23 +83,20 @@ def test_every_class_has_two_parts_and_two_subparts_with_consistent_ids(kind, na
 
 
 def test_no_text_names_two_kinds_of_node():
-    models = [built(name, kind) for kind in ("tabletop", "room") for name in CLASSES[kind]]
     room = build_scene("room", 100, 1)
-    named: dict[str, set[str]] = {}
-    for nodes in (*(model.nodes for model in models), [room.nodes[node] for node in room.background]):
-        for node in nodes:
-            for text in (node.text, *node.synonyms):
-                named.setdefault(text, set()).add(node.text)
-    assert {text: nodes for text, nodes in named.items() if len(nodes) > 1} == {}
+    nodes = [room.nodes[node] for node in room.background]
+    for kind in ("tabletop", "room"):
+        nodes += [node for name in CLASSES[kind] for node in built(name, kind).nodes]
+    named: dict[str, str] = {}
+    for node in nodes:
+        for text in (node.text, *node.synonyms):
+            assert named.setdefault(text, node.text) == node.text
 
 
 def seen_lab(materials, rows):
     """L*a*b* from afar of materials, from the numbers that the shader gets."""
-    linear = []
-    for row in materials[rows]:
-        share = TEXTURES[KINDS[int(row[0])]].second_share
-        linear.append((1 - share) * row[1:4] + share * row[4:7])
-    values = np.array(linear)
+    share = np.array([[TEXTURES[KINDS[int(kind)]].second_share] for kind in materials[rows, 0]])
+    values = (1 - share) * materials[rows, 1:4] + share * materials[rows, 4:7]
     return lab_from_srgb(np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055))
 
 
@@ -135,10 +132,8 @@ def test_two_parts_of_one_paint_become_two_shades_where_they_touch():
     builder.part("right").put(paint, box((1, 1, 1), (0, 0.5, 0.5)))
     builder.part("far").put(paint, box((1, 1, 1), (0, 5.0, 0.5)))
     model = builder.build()
-    left, right, far = (
-        seen_lab(model.materials, [*main_materials(model, model.node_ids[:, 1] == row)])[0]
-        for row in (1, 2, 3)
-    )
+    rows = [main_materials(model, model.node_ids[:, 1] == row)[0] for row in (1, 2, 3)]
+    left, right, far = seen_lab(model.materials, rows)
     assert np.linalg.norm(left - right) >= NEIGHBOUR_CONTRAST
     assert np.linalg.norm(left - far) == pytest.approx(0, abs=1e-4)  # float32 in the shader's numbers
     assert {node.colour for node in model.nodes} == {"red"}

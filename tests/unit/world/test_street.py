@@ -25,9 +25,10 @@ from hilsplat.world.views import looking_at
 VEHICLES = {"car", "truck", "bus"}
 
 
-def things(scene: WorldScene) -> list[int]:
-    """Ids of all wholes but the surroundings."""
-    return sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
+def things(scene: WorldScene) -> dict[int, np.ndarray]:
+    """Corners of all wholes but the surroundings, by id."""
+    ids = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
+    return {node: scene.triangles[scene.node_ids[:, 0] == node].reshape(-1, 3) for node in ids}
 
 
 def test_boxes_of_parts_of_different_objects_do_not_intersect(street):
@@ -41,9 +42,8 @@ def test_boxes_of_parts_of_different_objects_do_not_intersect(street):
 
 
 def test_vehicles_are_on_the_road_and_pedestrians_on_the_sidewalk(street):
-    for node in things(street):
+    for node, points in things(street).items():
         text = street.nodes[node].text
-        points = street.triangles[street.node_ids[:, 0] == node].reshape(-1, 3)
         low, high = points.min(axis=0), points.max(axis=0)
         on_road = text in VEHICLES | {"cyclist"}
         assert low[2] == pytest.approx(0.0 if on_road else WALK_Z, abs=1e-5)
@@ -59,12 +59,8 @@ def test_a_street_with_seven_objects_has_the_main_classes(street):
     assert texts & {"truck", "bus"}
 
 
-def test_every_pixel_of_a_drive_view_has_a_label(street):
-    labels = label_view(street, drive_cameras(street, 40, 64)["020.png"])
-    assert (labels[0] >= 0).all()
-
-
-def test_the_sky_is_self_luminous(street):
+def test_every_pixel_has_a_label_and_the_sky_is_self_luminous(street):
+    assert (label_view(street, drive_cameras(street, 40, 64)["020.png"])[0] >= 0).all()
     # Straight up from the road there is only sky; its colours lie between blue and white.
     up = looking_at(np.array([0.0, LANE_Y, 1.8]), np.array([0.3, LANE_Y, 12.0]))
     camera = drive_cameras(street, 3, 16)["001.png"]
@@ -89,30 +85,25 @@ def test_neighbouring_views_differ_little_in_position_and_direction(street):
     assert yaw.max() == pytest.approx(SWEEP_DEG, abs=2.1) and yaw.min() == pytest.approx(-SWEEP_DEG, abs=2.1)
     # The camera stays in its own lane.
     assert (centres[:, 1] > -LANE + 0.3).all() and (centres[:, 1] < 0).all()
-
-
-def test_fewer_views_shorten_the_drive_and_keep_the_step(street):
-    cameras = drive_cameras(street, 6, 64)
-    x = [cameras[name].centre[0] for name in cameras.names]
-    assert x[-1] - x[0] == pytest.approx(5 * MAX_STEP, abs=0.11)
+    # Fewer views shorten the drive and keep the step.
+    few = drive_cameras(street, 6, 64)
+    assert few["005.png"].centre[0] - few["000.png"].centre[0] == pytest.approx(5 * MAX_STEP, abs=0.11)
 
 
 def test_cameras_of_the_drive_are_outside_all_objects(street):
     cameras = drive_cameras(street, 40, 64)
-    for node in things(street):
-        points = street.triangles[street.node_ids[:, 0] == node].reshape(-1, 3)
-        low, high = points.min(axis=0) - 0.2, points.max(axis=0) + 0.2
-        for name in cameras.names:
-            centre = cameras[name].centre
-            assert not ((low < centre) & (centre < high)).all()
+    centres = np.stack([cameras[name].centre for name in cameras.names])
+    for points in things(street).values():
+        inside = (centres > points.min(axis=0) - 0.2) & (centres < points.max(axis=0) + 0.2)
+        assert not inside.all(axis=1).any()
 
 
 def test_training_cameras_are_outside_objects_and_half_are_close_ups(street):
     rng = np.random.default_rng(0)
-    large = 0
+    large, wholes = 0, list(things(street))
     for _ in range(16):
         labels = label_view(street, training_camera(street, rng, 32))
         middle = labels[0, 10:22, 10:22]
-        large += np.isin(middle, list(set(things(street)))).mean() > 0.3
+        large += np.isin(middle, wholes).mean() > 0.3
         assert len(np.unique(labels[1])) > 3  # not inside a wall
     assert large >= 6

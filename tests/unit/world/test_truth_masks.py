@@ -1,4 +1,7 @@
-"""The diagnostic segmenter reproduces true regions, is deterministic, and runs only on request."""
+"""Faults in true masks occur at their rates, systematic faults repeat across views, and the diagnostic
+segmenter that applies them is deterministic and runs only on request."""
+
+import itertools
 
 import numpy as np
 import pytest
@@ -16,53 +19,260 @@ from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.cli import stage as around
 from hilsplat.cli import stage_commands
+from hilsplat.configuration import parse_section
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import PerturbSettings
-from hilsplat.world.truth_masks import FAULTS, faults_label, run_truth_masks
-
-NAMES = ("000.png", "001.png", "002.png")
-SIZE = (24, 40)
-NODES = (
-    AnnotatedNode(0, 1, -1, "bear"),
-    AnnotatedNode(1, 2, 0, "head"),
-    AnnotatedNode(2, 2, 0, "body"),
-    AnnotatedNode(3, 3, 1, "nose"),
-    AnnotatedNode(4, 1, -1, "table"),
+from hilsplat.world.truth_masks import (
+    FAULTS,
+    Draws,
+    TrueNodes,
+    beside,
+    cut_in_two,
+    displaced,
+    faults_label,
+    faulty_masks,
+    longest_border,
+    run_truth_masks,
+    sibling_borders,
 )
+
 EXACT = PerturbSettings(
     **{fault: (0, 0, 0) if fault.startswith("missing") else 0 for fault in FAULTS}, score_noise=0
 )
+OBJECTS = 25
+WIDTH, HEIGHT = 9, 6
 
 
-def labels_of(view: int) -> dict[Level, np.ndarray]:
-    """Labels of a bear of 12 x 20 px on a table; its head is the left half; each view shifts it by 1 px."""
-    labels = np.full((3, *SIZE), -1, np.int32)
-    left = 6 + view
-    labels[0] = 4
-    labels[0, 6:18, left : left + 20] = 0
-    labels[1, 6:18, left : left + 10] = 1
-    labels[1, 6:18, left + 10 : left + 20] = 2
-    labels[2, 9:12, left + 2 : left + 6] = 3
-    return {level: labels[level.index] for level in LEVELS}
+def row_of_objects(objects: int = OBJECTS) -> tuple[np.ndarray, TrueNodes]:
+    """Objects 8 px wide, a pixel apart, each with a left and a right part that touch; the floor below.
+
+    Ids of object k: whole 3k, parts 3k + 1 and 3k + 2; the floor comes last.
+    """
+    labels = np.full((3, HEIGHT, objects * WIDTH), -1, np.int32)
+    nodes = []
+    for k in range(objects):
+        left = k * WIDTH
+        labels[0, :4, left : left + 8] = 3 * k
+        labels[1, :4, left : left + 4] = 3 * k + 1
+        labels[1, :4, left + 4 : left + 8] = 3 * k + 2
+        nodes.append(AnnotatedNode(3 * k, 1, -1, "cup"))
+        nodes += [AnnotatedNode(3 * k + i, 2, 3 * k, side) for i, side in ((1, "left"), (2, "right"))]
+    floor = len(nodes)
+    labels[0, 4:] = floor
+    nodes.append(AnnotatedNode(floor, 1, -1, "floor"))
+    return labels, TrueNodes.of(tuple(nodes), {floor}, [labels])
+
+
+LABELS, TRUTH = row_of_objects()
+
+
+def with_faults(view="000.png", seed=0, min_area_px=1, **faults):
+    settings = EXACT.model_copy(update=faults)
+    return faulty_masks(LABELS, TRUTH, view, Draws(seed, "set/scene"), settings, min_area_px)
+
+
+def regions(masks, level) -> set[bytes]:
+    return {mask.tobytes() for mask in masks.dense(masks.rows_of(level))}
+
+
+def true_regions(level, skip=(), labels=LABELS) -> set[bytes]:
+    of_level = labels[level.index]
+    return {(of_level == node).tobytes() for node in np.unique(of_level) if node >= 0 and node not in skip}
+
+
+def within_binomial_bounds(successes: int, trials: int, probability: float) -> bool:
+    """Four standard deviations: wrong once in 16,000."""
+    sigma = np.sqrt(trials * probability * (1 - probability))
+    return abs(successes - trials * probability) <= 4 * sigma
+
+
+def test_surroundings_can_be_omitted_and_small_regions_give_no_mask():
+    masks, _ = with_faults(background=False)
+    assert regions(masks, Level.WHOLE) == true_regions(Level.WHOLE, skip=TRUTH.background)
+    masks, _ = with_faults(min_area_px=17)  # parts have 16 px, wholes 32
+    assert len(masks.rows_of(Level.PART)) == 0
+    assert len(masks.rows_of(Level.WHOLE)) == OBJECTS + 1
+
+
+def test_only_siblings_have_common_borders():
+    borders = sibling_borders(LABELS[1], TRUTH)
+    assert borders[1] == {2: 4}
+    assert borders[2] == {1: 4}
+    assert sibling_borders(LABELS[0], TRUTH) == {}  # the floor touches every object
+    assert TRUTH.partner == {node: node + (1 if node % 3 == 1 else -1) for node in borders}
+    assert longest_border({7: 3, 5: 9, 4: 9}) == 4
+
+
+@pytest.mark.parametrize(
+    ("fault", "settings", "trials", "probability"),
+    [
+        ("merged", {"merge": 0.2}, OBJECTS, 0.36),  # either part may start it: 1 - 0.8^2 of the pairs
+        ("missing", {"missing": (0.1, 0.0, 0.0)}, OBJECTS + 1, 0.1),
+        ("missing", {"missing": (0.0, 0.5, 0.0)}, 2 * OBJECTS, 0.5),
+        ("split", {"split": 0.3}, 3 * OBJECTS + 1, 0.3),
+        ("wrong_level", {"wrong_level": 0.2}, 3 * OBJECTS + 1, 0.2),
+    ],
+)
+def test_faults_occur_at_their_rates(fault, settings, trials, probability):
+    views = [with_faults(f"{view:03d}.png", **settings) for view in range(12)]
+    counts = sum(counts[fault] for _, counts in views)
+    assert within_binomial_bounds(counts, 12 * trials, probability)
+    if fault == "missing":
+        assert sum(3 * OBJECTS + 1 - len(masks) for masks, _ in views) == counts
+
+
+def test_a_merged_mask_covers_both_parts():
+    masks, counts = with_faults(merge=1)
+    assert counts["merged"] == OBJECTS
+    assert regions(masks, Level.PART) == true_regions(Level.WHOLE, skip=TRUTH.background)
+    assert regions(masks, Level.WHOLE) == true_regions(Level.WHOLE)
+    # a merged mask has 32 px, the part it stands for 16
+    assert masks.predicted_iou[masks.rows_of(Level.PART)] == pytest.approx(0.5)
+    assert masks.stability[masks.rows_of(Level.PART)] == pytest.approx(0.75)
+
+
+def test_the_pieces_of_a_split_mask_cover_it():
+    masks, counts = with_faults(split=1)
+    assert counts["split"] == 3 * OBJECTS + 1
+    for level in (Level.WHOLE, Level.PART):
+        pieces = masks.dense(masks.rows_of(level)).sum(axis=0)
+        assert np.array_equal(pieces, (LABELS[level.index] >= 0).astype(int))
+
+
+def test_a_cut_leaves_between_30_and_70_percent_on_either_side():
+    mask = np.zeros((40, 50), bool)
+    mask[5:35, 10:40] = True
+    for seed in range(20):
+        first, second = cut_in_two(mask, np.random.default_rng(seed))
+        assert np.array_equal(first ^ second, mask)
+        assert 0.25 < first.sum() / mask.sum() < 0.75
+    single = np.zeros((3, 3), bool)
+    single[1, 1] = True
+    assert len(cut_in_two(single, np.random.default_rng(0))) == 1
+
+
+def test_a_wrong_level_is_one_step_away():
+    masks, _ = with_faults(wrong_level=1)
+    # Every whole becomes a part; about half of the parts become wholes, the others subparts.
+    assert len(masks.rows_of(Level.PART)) == OBJECTS + 1
+    assert within_binomial_bounds(len(masks.rows_of(Level.WHOLE)), 2 * OBJECTS, 0.5)
+    assert len(masks.rows_of(Level.WHOLE)) + len(masks.rows_of(Level.SUBPART)) == 2 * OBJECTS
+    assert [beside(Level.SUBPART, up) for up in (True, False)] == [Level.PART, Level.PART]
+
+
+def test_views_and_levels_are_dropped_at_their_rates():
+    labels, truth = row_of_objects(1)
+    settings = EXACT.model_copy(update={"dropped_views": 0.25, "missing_level": (0.0, 0.4, 0.0)})
+    draws = Draws(0, "set/scene")
+    dropped = without_parts = 0
+    for view in range(150):
+        masks, counts = faulty_masks(labels, truth, f"{view:03d}.png", draws, settings, 1)
+        dropped += counts["dropped"]
+        without_parts += counts["missing_levels"]
+        expected = 0 if counts["dropped"] else 2 if counts["missing_levels"] else 4
+        assert len(masks) == expected
+    assert within_binomial_bounds(dropped, 150, 0.25)
+    assert within_binomial_bounds(without_parts, 150, 0.75 * 0.4)
+
+
+@pytest.mark.parametrize(
+    ("fault", "level", "rate"),
+    [
+        ("merge", Level.WHOLE, 0.36),  # drawn for each of the two parts: 1 - 0.8^2; their union is the whole
+        ("missing", Level.PART, 0.2),
+    ],
+)
+def test_a_systematic_fault_repeats_in_its_share_of_the_views(fault, level, rate):
+    views, of_level = 25, LABELS[level.index]
+    nodes = sorted(set(np.unique(of_level).tolist()) - {-1} - TRUTH.background)
+    found = np.zeros(len(nodes), int)
+    for view in range(views):
+        parts = regions(with_faults(f"{view:03d}.png", **{f"systematic_{fault}": 0.2})[0], Level.PART)
+        found += [(of_level == node).tobytes() in parts for node in nodes]
+    times = found if fault == "merge" else views - found
+    assert 0 < (times > 0).sum() < len(nodes)
+    assert within_binomial_bounds(int((times > 0).sum()), len(nodes), rate)
+    # A pair of which both parts are drawn merges more often, never less: four deviations below 0.9.
+    assert (times[times > 0] >= 0.9 * views - 4 * np.sqrt(views * 0.09)).all()
+
+
+def test_a_higher_probability_only_adds_faults():
+    few = regions(with_faults(missing=(0, 0.1, 0))[0], Level.PART)
+    many = regions(with_faults(missing=(0, 0.4, 0))[0], Level.PART)
+    assert many < few < true_regions(Level.PART)
+
+
+def test_faults_depend_only_on_seed_scene_and_view():
+    settings = PerturbSettings()
+
+    def content(view, draws):
+        masks, _ = faulty_masks(LABELS, TRUTH, view, draws, settings, 1)
+        return b"".join(array.tobytes() for array in masks.arrays().values())
+
+    forth, back = Draws(3, "set/scene"), Draws(3, "set/scene")
+    first, second = content("a.png", forth), content("b.png", forth)
+    assert content("b.png", back) == second != first == content("a.png", back)
+    for other in (Draws(4, "set/scene"), Draws(3, "set/other")):
+        assert content("a.png", other) != first
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_larger_amplitude_lowers_the_iou_and_changes_more_pixels(seed):
+    y, x = np.mgrid[:96, :96] - 47.5
+    mask = x**2 + y**2 < 25**2
+    rough = [displaced(mask, a, 6, np.random.default_rng(seed)) for a in (0, 0.5, 1, 2, 4, 8)]
+    assert np.array_equal(rough[0], mask)
+    ious = [(mask & each).sum() / (mask | each).sum() for each in rough]
+    assert all(more < less for less, more in itertools.pairwise(ious))
+    for less, more in itertools.pairwise(rough):  # what a small amplitude changed, a large one does
+        assert not ((less ^ mask) & ~(more ^ mask)).any()
+
+
+def test_the_standard_deviation_of_a_boundary_is_the_amplitude():
+    mask = np.zeros((64, 64), bool)
+    mask[:, :32] = True
+    shifts = [displaced(mask, 2.0, 6.0, np.random.default_rng(seed)).sum(axis=1) - 32 for seed in range(100)]
+    # the mean of 100 x about 5 independent places; rounding to pixels adds 1/12 to the variance of 4,
+    # clipping at three deviations takes 1 % of it
+    assert np.std(shifts) == pytest.approx(2.0, rel=0.1)
+    assert abs(np.mean(shifts)) < 0.3
+    assert np.abs(shifts).max() <= 6
+
+
+def test_thin_masks_do_not_vanish_and_a_mask_of_the_whole_view_is_unchanged():
+    bar = np.zeros((32, 32), bool)
+    bar[16, 4:28] = True
+    for seed in range(10):
+        assert (displaced(bar, 8, 3, np.random.default_rng(seed)) & bar).sum() == 24
+    full = np.ones((16, 16), bool)
+    assert displaced(full, 4, 3, np.random.default_rng(0)).all()
+
+
+NAMES = ("000.png", "001.png", "002.png")
+
+
+def shifted(view: int) -> np.ndarray:
+    """Labels of a view, shifted so that views differ."""
+    return np.roll(LABELS, view, axis=2)
 
 
 @pytest.fixture
 def world(tmp_path):
     """A posed scene, its last view for testing, and its truth."""
-    cameras = Cameras(
-        NAMES, np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(3), (3, 1, 1)), np.tile(np.int32(SIZE), (3, 1))
-    )
+    size_hw = LABELS.shape[1:]
+    poses, K = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(3), (3, 1, 1))
+    cameras = Cameras(NAMES, poses, K, np.tile(np.int32(size_hw), (3, 1)))
     for name in NAMES:
-        write_png(tmp_path / "scene" / "images" / name, np.zeros((*SIZE, 3), np.uint8))
+        write_png(tmp_path / "scene" / "images" / name, np.zeros((*size_hw, 3), np.uint8))
     split = dict.fromkeys(NAMES, "train") | {NAMES[-1]: "test"}
     points, colours = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    Scene(tmp_path / "scene", "synthetic/bear", "metre", cameras, split, points, colours, np.eye(4)).save()
-    labels = {name: labels_of(view) for view, name in enumerate(NAMES)}
-    write_hierarchy(tmp_path / "truth", NODES, labels, dict.fromkeys(NAMES, range(4)))
-    write_json(tmp_path / "truth" / "scene.json", {"background": [4]})
+    Scene(tmp_path / "scene", "synthetic/cups", "metre", cameras, split, points, colours, np.eye(4)).save()
+    labels = {name: dict(zip(LEVELS, shifted(view), strict=True)) for view, name in enumerate(NAMES)}
+    write_hierarchy(tmp_path / "truth", TRUTH.nodes, labels, dict.fromkeys(NAMES, range(len(TRUTH.nodes))))
+    write_json(tmp_path / "truth" / "scene.json", {"background": sorted(TRUTH.background)})
     write_index(tmp_path / "truth", {name: {} for name in NAMES})
     return tmp_path
 
@@ -79,11 +289,9 @@ def test_without_faults_every_true_region_of_every_training_view_is_a_mask(world
     for view, name in enumerate(NAMES[:2]):
         masks = HierarchicalMasks.load(folder / f"{name}.npz")
         for level in LEVELS:
-            of_level = labels_of(view)[level]
-            expected = {(of_level == node).tobytes() for node in np.unique(of_level) if node >= 0}
-            assert {mask.tobytes() for mask in masks.dense(masks.rows_of(level))} == expected
-        assert (masks.predicted_iou == 1).all()
-        assert index["views"][name]["whole"] == 2
+            assert regions(masks, level) == true_regions(level, labels=shifted(view))
+        assert len(masks) == 3 * OBJECTS + 1 and index["views"][name]["whole"] == OBJECTS + 1
+        assert (masks.predicted_iou == 1).all() and (masks.stability == 1).all()
         assert not any(index["views"][name]["faults"].values())
 
 
@@ -96,10 +304,7 @@ def test_the_index_records_segmenter_and_faults(world):
 
 def test_the_same_faults_give_the_same_bytes_on_any_number_of_threads(world):
     settings = PerturbSettings(merge=0.5, split=0.5, boundary_px=2.0)
-    digests = {
-        sha256_of_path(make(world, f"masks-{run}", settings, threads))
-        for run, threads in enumerate((1, 3, 1))
-    }
+    digests = {sha256_of_path(make(world, f"masks-{run}", settings, run)) for run in (1, 3)}
     assert len(digests) == 1
     other = make(world, "masks-other", settings.model_copy(update={"seed": 1}))
     assert sha256_of_path(other) not in digests
@@ -111,16 +316,10 @@ def test_labels_list_non_default_settings():
     assert faults_label(PerturbSettings(missing=(0, 0, 0.5))) == "truth-perturbed (missing 0/0/0.5)"
 
 
-def test_all_fault_settings_are_in_the_list_of_faults():
-    settings = PerturbSettings.model_fields.keys()
-    about_faults = {"seed", "background", "boundary_smooth_px", "systematic_share", "score_noise"}
-    assert settings - about_faults == set(FAULTS)
-
-
 def test_label_images_of_the_wrong_size_are_refused(world):
     for level in LEVELS:
         write_png(world / "truth" / "labels" / f"001.png.{level.label}.png", np.zeros((12, 20), np.uint16))
-    with pytest.raises(MisalignedArtifactError, match=r"view 001\.png(.|\n)*24 x 40(.|\n)*12 x 20"):
+    with pytest.raises(MisalignedArtifactError, match=r"view 001\.png(.|\n)*6 x 225(.|\n)*12 x 20"):
         make(world)
     assert not (world / "masks").exists()
 
@@ -132,8 +331,6 @@ def test_an_incomplete_truth_folder_is_refused(world):
 
 
 def test_probabilities_above_1_are_refused():
-    from hilsplat.configuration import parse_section
-
     with pytest.raises(SettingsError, match=r"perturb\.missing\.2: Input should be less than or equal to 1"):
         parse_section("perturb", '{"missing": [0, 0, 2]}')
 
