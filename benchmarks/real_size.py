@@ -189,7 +189,7 @@ def compare_decoders(models: Path, photograph: Path, points: int) -> dict[str, f
     The plain network decodes 64 prompts in calls of 8. The factored decoder previews and decodes all of them;
     `mean_ms` includes only the share `KEPT` of the decoding. A random SAM predicts no confident mask, so the
     preview rule itself is not run. The masks of both are compared by pixel: `unequal_px` of `mask_px` differ,
-    and no absolute logit there exceeds `tie`. Random logits cluster around 0; those of a trained SAM are steep.
+    and no absolute logit there exceeds `tie`. Random logits are close to 0; those of a trained SAM are steep.
     """
     from hilsplat.base.images import read_image, resize_to_fit
     from hilsplat.segment.sam import SamModel, ask_network, in_input, point_grid

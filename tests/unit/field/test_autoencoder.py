@@ -1,4 +1,4 @@
-"""The scene autoencoder: shapes, loss, determinism, and which vectors it is trained on."""
+"""The scene autoencoder against torch, its determinism, and the vectors that it is trained on."""
 
 from itertools import pairwise
 
@@ -40,21 +40,24 @@ def unit_vectors(rows: int, channels: int, seed: int = 0) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+def torch_layers(widths: list[int], norm: bool) -> nn.Sequential:
+    layers = [nn.Linear(*widths[:2])]
+    for before, after in pairwise(widths[1:]):
+        if norm:
+            layers.append(nn.BatchNorm1d(before))
+        layers += [nn.ReLU(), nn.Linear(before, after)]
+    return nn.Sequential(*layers)
+
+
 class TorchAutoencoder(nn.Module):
-    """The same network in torch, whose autograd and BatchNorm ours are compared with."""
+    """The same network in torch, the reference for gradients and BatchNorm."""
 
     def __init__(self, arrays: dict[str, np.ndarray], channels: int, latent: int) -> None:
         super().__init__()
-        widths = [channels, *(min(w, channels) for w in (256, 128, 64, 32)), latent]
-        layers = [nn.Linear(channels, widths[1])]
-        for before, after in pairwise(widths[1:]):
-            layers += [nn.BatchNorm1d(before), nn.ReLU(), nn.Linear(before, after)]
-        self.encoder = nn.Sequential(*layers)
-        widths = [latent, *(min(w, channels) for w in (16, 32, 64, 128, 256, 256)), channels]
-        layers = [nn.Linear(latent, widths[1])]
-        for before, after in pairwise(widths[1:]):
-            layers += [nn.ReLU(), nn.Linear(before, after)]
-        self.decoder = nn.Sequential(*layers)
+        inner = [min(width, channels) for width in (256, 128, 64, 32)]
+        outer = [min(width, channels) for width in (16, 32, 64, 128, 256, 256)]
+        self.encoder = torch_layers([channels, *inner, latent], norm=True)
+        self.decoder = torch_layers([latent, *outer, channels], norm=False)
         self.load_state_dict({name: torch.from_numpy(arrays[name]) for name in arrays}, strict=False)
 
     def forward(self, vectors):
@@ -108,7 +111,7 @@ def test_a_trained_network_equals_torch_with_the_statistics_of_all_vectors():
     for module in reference.modules():
         if isinstance(module, nn.BatchNorm1d):
             module.reset_running_stats()
-            module.momentum = None  # the plain average: one pass over everything
+            module.momentum = None  # a plain average, of one pass over all vectors
     given = torch.from_numpy(vectors).double()
     reference.double().train()(given)
     with torch.no_grad():

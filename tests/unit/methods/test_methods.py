@@ -20,7 +20,6 @@ from hilsplat.configuration import parse_run
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.field.code import LinearCode
 from hilsplat.methods import laga, method, registry
-from hilsplat.methods.gaussian_grouping import mask_identities
 from hilsplat.methods.method import MethodInputs
 from hilsplat.methods.registry import METHODS, OURS, method_of, require_method
 from hilsplat.scene.cameras import Camera
@@ -168,15 +167,6 @@ def test_descriptions_of_settings_name_the_methods_that_read_them(inputs_of, nam
     fields = MethodSettings.model_fields
     own = {key for key, field in fields.items() if key != "name" and name in readers(field.description)}
     assert (read & fields.keys()) - {"name"} == own
-
-
-def test_identities_link_the_masks_of_a_region_over_views(inputs_of):
-    inputs = inputs_of()
-    for level in LEVELS:
-        rows = inputs.contributions.rows_of(level)
-        identity = mask_identities(inputs.contributions, level, 1)[rows]
-        region = inputs.latents[rows].argmax(axis=1)
-        assert len(np.unique(np.stack([identity, region]), axis=1).T) == len(np.unique(region))
 
 
 def test_unknown_methods_name_those_that_exist():
