@@ -11,11 +11,9 @@ import scipy.sparse as sp
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
-from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
-from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import EvaluateSettings
-from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.builders import box, cameras_of, masks_of
 from tests.unit.round_gaussians import round_gaussians
 
 SIDE_PX = 64
@@ -73,16 +71,11 @@ def block_world(tmp_path_factory) -> BlockWorld:
     image = np.full((SIDE_PX, SIDE_PX, 3), 90, np.uint8)
     for row in range(len(NODES)):
         image[region(row)] = np.random.default_rng(row).integers(60, 255, 3)
-    views = ("000.png", "001.png")
     pose = np.eye(4)
     pose[2, 3] = 2.0
-    cameras = Cameras(
-        views,
-        np.stack([pose, pose]),
-        np.stack([np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]])] * 2),
-        np.full((2, 2), SIDE_PX, np.int32),
-    )
-    for view in views:
+    K = np.array([[60.0, 0, 32], [0, 60.0, 32], [0, 0, 1]])
+    cameras = cameras_of([pose, pose], K, (SIDE_PX, SIDE_PX))
+    for view in cameras.names:
         write_png(folder / "scene" / "images" / view, image)
     scene = Scene(
         folder / "scene",
@@ -103,8 +96,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
     )
     regions, ones = np.stack(list(map(region, range(len(NODES))))), np.ones(len(NODES), np.float32)
     levels = [node[1] for node in NODES]
-    masks = HierarchicalMasks.from_dense(regions, np.array(levels, np.uint8), ones, ones)
-    masks.save(folder / "masks" / "000.png.npz")
+    masks_of(regions, levels).save(folder / "masks" / "000.png.npz")
     write_index(folder / "clip", {"000.png": {}}, model="models/clip-tiny")
     write_index(folder / "masks", {"000.png": {}}, segmenter="sam", model="models/sam-tiny")
 

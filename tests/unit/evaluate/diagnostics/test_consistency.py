@@ -19,9 +19,9 @@ from hilsplat.evaluate.diagnostics.world_consistency import (
     shared_points,
     view_agreement,
 )
-from hilsplat.scene.cameras import Camera, Cameras
+from hilsplat.scene.cameras import Camera
 from hilsplat.segment.masks import HierarchicalMasks
-from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.builders import box, cameras_of, masks_of
 
 HEIGHT, WIDTH, FOCAL = 6, 10, 8.0
 
@@ -126,12 +126,10 @@ def test_very_small_masks_are_not_compared_and_smaller_ones_are_painted_last():
 
 
 def test_neighbours_are_the_nearest_cameras():
-    poses = [camera(str(x), x).cam_from_world for x in (0.0, 1.0, 3.0)]
-    cameras = Cameras(
-        ("0", "1", "3"), np.stack(poses), np.stack([A.K] * 3), np.tile(np.int32(A.size_hw), (3, 1))
-    )
-    assert neighbours(cameras, ["0", "1", "3"], 1) == [("0", "1"), ("1", "0"), ("3", "1")]
-    assert len(neighbours(cameras, ["0", "1", "3"], 5)) == 6
+    cameras = cameras_of([camera("", x).cam_from_world for x in (0.0, 1.0, 3.0)], A.K, A.size_hw)
+    first, second, third = cameras.names
+    assert neighbours(cameras, cameras.names, 1) == [(first, second), (second, first), (third, second)]
+    assert len(neighbours(cameras, cameras.names, 5)) == 6
 
 
 def test_means_ignore_undefined_values():
@@ -143,27 +141,24 @@ def test_means_ignore_undefined_values():
 @pytest.fixture
 def world(tmp_path):
     """Truth folder and exact masks of the wall in two views; its nodes are a left and a right half."""
-    truth, size_hw, views = tmp_path / "truth", (12, 20), ("000.png", "001.png")
+    truth, size_hw = tmp_path / "truth", (12, 20)
     K = np.array([[16.0, 0, 10], [0, 16.0, 6], [0, 0, 1]])  # a step of 1 to the right: 4 px to the left
-    poses = np.stack([A.cam_from_world, B.cam_from_world])
+    cameras = cameras_of([A.cam_from_world, B.cam_from_world], K, size_hw)
     truth.mkdir()
-    Cameras(views, poses, np.stack([K, K]), np.array([size_hw] * 2, np.int32)).save(truth / "cameras.npz")
+    cameras.save(truth / "cameras.npz")
     corners = [(-9, -9, 4), (9, -9, 4), (9, 9, 4), (-9, 9, 4)]
     vertices = np.array(corners, [(axis, "f4") for axis in "xyz"])
     faces = np.array([([0, 1, 2],), ([0, 2, 3],)], [("vertex_indices", "i4", (3,))])
     elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements).write(truth / "mesh.ply")
-    nothing, labels, ones = np.full(size_hw, -1, np.int32), {}, np.ones(2, np.float32)
-    for view, step in zip(views, (0, 4), strict=True):
+    nothing, labels = np.full(size_hw, -1, np.int32), {}
+    for view, step in zip(cameras.names, (0, 4), strict=True):
         is_right = np.tile(np.arange(20) + step > 11, (12, 1))
         labels[view] = {Level.WHOLE: is_right.astype(np.int32), Level.PART: nothing, Level.SUBPART: nothing}
-        masks = HierarchicalMasks.from_dense(
-            np.stack([~is_right, is_right]), np.ones(2, np.uint8), ones, ones
-        )
-        masks.save(tmp_path / "masks" / f"{view}.npz")
+        masks_of([~is_right, is_right], [1, 1]).save(tmp_path / "masks" / f"{view}.npz")
     nodes = [AnnotatedNode(0, 1, -1, "left"), AnnotatedNode(1, 1, -1, "right")]
-    write_hierarchy(truth, nodes, labels, dict.fromkeys(views, range(2)))
-    index = {view: {} for view in views}
+    write_hierarchy(truth, nodes, labels, dict.fromkeys(cameras.names, range(2)))
+    index = {view: {} for view in cameras.names}
     write_index(tmp_path / "masks", index, scene="synthetic/w", segmenter="graph", model=None)
     return tmp_path
 

@@ -11,27 +11,16 @@ from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
 from hilsplat.segment.masks import HierarchicalMasks, region_ious
-from tests.unit.evaluate.builders import box
+from tests.unit.evaluate.builders import box, masks_of
 
 VIEW = "001.png"
 part = partial(box, size_hw=(64, 64))
 
 
-def masks_of(regions_by_level) -> HierarchicalMasks:
-    dense = [mask for masks in regions_by_level.values() for mask in masks]
-    level = [int(level) for level, masks in regions_by_level.items() for _ in masks]
-    ones = np.ones(len(level), np.float32)
-    return HierarchicalMasks.from_dense(np.stack(dense), np.array(level, np.uint8), ones, ones)
-
-
 def found_masks() -> HierarchicalMasks:
     """The bear whole, the lower half of the chest and none of it elsewhere; three quarters of the head."""
-    return masks_of(
-        {
-            Level.WHOLE: [part((8, 56), (8, 40)), part((44, 56), (44, 60)), part((0, 4), (0, 4))],
-            Level.PART: [part((8, 24), (12, 30))],
-        }
-    )
+    wholes = [part((8, 56), (8, 40)), part((44, 56), (44, 60)), part((0, 4), (0, 4))]
+    return masks_of([*wholes, part((8, 24), (12, 30))], [1, 1, 1, 2])
 
 
 def test_ious_by_hand():
@@ -74,7 +63,7 @@ def test_table_and_picture(block_world, tmp_path):
 def test_the_median_and_the_worst_view_are_drawn(block_world):
     perfect = block_world.annotations
     good = fit_of_view(found_masks(), perfect, VIEW)
-    bad = fit_of_view(masks_of({Level.WHOLE: [part((0, 4), (0, 4))]}), perfect, VIEW)
+    bad = fit_of_view(masks_of([part((0, 4), (0, 4))], [1]), perfect, VIEW)
     assert median_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
     assert median_and_worst({"a": good}) == ["a"]
 

@@ -29,8 +29,7 @@ from hilsplat.evaluate.protocols.points import (
 )
 from hilsplat.evaluate.scores import Measured, read_instances, read_scores, write_instances, write_scores
 from hilsplat.evaluate.stage import scene_from_true
-from hilsplat.scene.cameras import Cameras
-from tests.unit.evaluate.builders import score
+from tests.unit.evaluate.builders import cameras_of, score
 
 OPENGAUSSIAN = PROTOCOLS["scannet/opengaussian-19@1"]
 WAYMO = PROTOCOLS["waymo/segmentation@1"]
@@ -41,21 +40,14 @@ PREDICTION = np.array([1, 1, 2, 4, 2, 2, 3, 1, 1, 2])
 def test_rows_of_the_worked_example():
     rows = list(measure_points(OPENGAUSSIAN, "tree", TRUTH, PREDICTION, SCANNET_19, "frozen"))
     assert {row.protocol for row in rows} == {"scannet/opengaussian-19@1 (points: frozen)"}
-    ious = {row.query: (row.value, row.n) for row in rows if row.metric == "class_iou"}
-    # the first four of the 19: wall, floor, cabinet, bed
-    assert ious == {
-        "wall": (pytest.approx(2 / 5), 5),
-        "floor": (pytest.approx(2 / 3), 3),
-        "cabinet": (pytest.approx(1 / 2), 2),
-        "bed": (0, 1),  # predicted only
-    }
+    ious = {row.query: row.value for row in rows if row.metric == "class_iou"}
+    # the first four of the 19 classes; the bed is only predicted
+    assert ious == pytest.approx({"wall": 2 / 5, "floor": 2 / 3, "cabinet": 1 / 2, "bed": 0})
+    assert [row.n for row in rows if row.metric == "class_iou"] == [5, 3, 2, 1]
     accuracies = {row.query: (row.value, row.n) for row in rows if row.metric == "class_accuracy"}
     assert accuracies == {"wall": (0.5, 4), "floor": (1, 2), "cabinet": (0.5, 2)}
     means = {row.metric: row.value for row in rows if not row.query}
-    assert means == {
-        "miou_present": pytest.approx(0.522222, abs=1e-6),
-        "macc_present": pytest.approx(0.666667, abs=1e-6),
-    }
+    assert means == pytest.approx({"miou_present": 0.522222, "macc_present": 0.666667}, abs=1e-6)
 
 
 def test_missed_points_count_zero_and_a_scene_without_truth_has_no_rows():
@@ -88,12 +80,8 @@ def test_scannet200_is_split_into_head_common_and_tail():
     truth = np.repeat(places, 2)
     prediction = truth * np.array([1, 1, 1, 0, 0, 0])  # head right, common half, tail missed
     rows = list(measure_points(card, "tree", truth, prediction, SCANNET200, "nearest"))
-    assert pooled_points(card, [rows], SCANNET200) == {
-        "miou_occurring": 0.5,
-        "miou_head": 1.0,
-        "miou_common": 0.5,
-        "miou_tail": 0.0,
-    }
+    expected = {"miou_occurring": 0.5, "miou_head": 1.0, "miou_common": 0.5, "miou_tail": 0.0}
+    assert pooled_points(card, [rows], SCANNET200) == expected
 
 
 def test_other_classes_and_other_points_are_refused():
@@ -186,9 +174,7 @@ def cameras_at(centres, rotation):
     poses = np.tile(np.eye(4), (len(centres), 1, 1))
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = -np.asarray(centres, dtype=float) @ rotation.T
-    names = tuple(f"{row}.png" for row in range(len(centres)))
-    K = np.tile(np.eye(3), (len(names), 1, 1))
-    return Cameras(names, poses, K, np.full((len(names), 2), 8, np.int32))
+    return cameras_of(poses, np.eye(3), (8, 8))
 
 
 @pytest.mark.parametrize(("moved", "error"), [((0, 0, 0), 0), ((1, -2, 1), 1)])
