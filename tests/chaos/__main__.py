@@ -16,16 +16,16 @@ import argparse
 import os
 import random
 import shutil
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.chaos.commands import kill_commands
-from tests.chaos.faults import FAULTS, Run, Victim, mounted
+from tests.chaos.faults import FAULTS, Run, mounted
 from tests.conftest import PROJECT
 from tests.workflow.conftest import Project, copy_project
 
@@ -36,37 +36,21 @@ SLACK_S = 3600  # maximum time of a start without a fault, in addition to that o
 
 @dataclass
 class Tally:
-    """Faults, costs of each kill, complete runs, and problems that need manual intervention so far."""
+    """Faults, seconds in all starts, complete runs, and problems that need manual intervention so far."""
 
-    lost_s: list[float] = field(default_factory=list)
-    faults: dict[str, int] = field(default_factory=dict)
+    kills: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0
     finished: int = 0
     problems: list[str] = field(default_factory=list)
-    waiting: list[list[Victim]] = field(default_factory=list)  # victims of the kills since the last start
 
-    @property
-    def kills(self) -> int:
-        """Number of kills so far."""
-        return len(self.lost_s) + len(self.waiting)
-
-    def settle(self, again_s: float | None) -> None:
-        """Count the kills since the last start.
-
-        `again_s` is the time until the new start began a job, a cost of the last kill.
-        """
-        for victims in self.waiting:
-            start_s = (again_s or 0.0) if victims is self.waiting[-1] else 0.0
-            # Victims ran in parallel, so the lost time is the largest of theirs.
-            self.lost_s.append(start_s + max((victim.lost_s for victim in victims), default=0.0))
-        self.waiting = []
-
-    def report(self) -> str:
-        """Return the final lines of output."""
-        lines = [f"{len(self.lost_s)} kills, {self.finished} complete runs"]
+    def report(self, whole_s: float) -> str:
+        """Return the final lines of output; an undisturbed run takes `whole_s` seconds."""
+        lines = [f"{self.kills} kills, {self.finished} complete runs"]
         lines += [f"  {name}: {count}" for name, count in sorted(self.faults.items())]
-        if self.lost_s:
-            median = statistics.median(self.lost_s)
-            lines.append(f"seconds lost per kill: median {median:.1f}, largest {max(self.lost_s):.1f}")
+        if self.kills:
+            lost_s = (self.seconds - self.finished * whole_s) / self.kills
+            lines.append(f"seconds lost per kill, including those of other faults: {lost_s:.1f}")
         lines += [f"PROBLEM {problem}" for problem in self.problems]
         whole = "no manual intervention was needed, and no table differs"
         lines.append("manual intervention was needed" if self.problems else whole)
@@ -105,21 +89,21 @@ def torment(
     deadline = time.monotonic() + 60 * options.minutes
     while True:
         run, may_fail = Run(project), False
-        begun = run.wait_for_a_job(whole_s + SLACK_S)
-        tally.settle(begun)
-        while begun is not None and tally.kills < options.kills and time.monotonic() < deadline:
+        run.watch_for(whole_s + SLACK_S, until_a_job=True)
+        while run.is_running() and tally.kills < options.kills and time.monotonic() < deadline:
             run.watch_for(chance.uniform(0, 4 * whole_s / options.kills))  # two runs' worth
             if not run.is_running():
                 break
             fault = chance.choices(faults, [3 if each.kills else 1 for each in faults])[0]
             print(f"{tally.kills} kills; now {fault.name}: {run.what_runs()}", flush=True)
-            victims = fault.strike(run, chance)
-            tally.faults[fault.name] = tally.faults.get(fault.name, 0) + 1
-            tally.waiting += [victims] if fault.kills else []
+            fault.strike(run, chance)
+            tally.faults[fault.name] += 1
+            tally.kills += fault.kills
             may_fail = may_fail or fault.may_fail
             if fault.ends_run:
                 break
         code = run.wait(whole_s + SLACK_S)
+        tally.seconds += time.monotonic() - run.start_s
         over = tally.kills >= options.kills or time.monotonic() > deadline
         tally.problems += run.problems
         if code != 0 and not may_fail:
@@ -129,7 +113,6 @@ def torment(
             tally.finished += 1
             tally.problems += differences(reference, project)
         if tally.problems or (code == 0 and over):
-            tally.settle(None)
             return tally
         if code == 0:
             for part in (project.root / "results").iterdir():
@@ -178,7 +161,7 @@ def main() -> None:
     finally:
         if disk:
             subprocess.run(["umount", "--lazy", str(results)], check=False)
-    print(tally.report(), flush=True)
+    print(tally.report(whole_s), flush=True)
     if not kept:
         shutil.rmtree(root)
     if options.work is None:

@@ -1,4 +1,4 @@
-"""Runs of Snakemake, faults to inject into them, and the work that a fault destroys."""
+"""Runs of Snakemake, and faults to inject into them."""
 
 import contextlib
 import os
@@ -17,48 +17,6 @@ from tests.workflow.conftest import Project
 POLL_S = 0.25
 LEFT_KIB = 64  # space left on a full disk
 WAKE_S = 60  # maximum time in which a job that was frozen at its start detects that its Snakemake has ended
-
-
-@dataclass
-class Victim:
-    """A job, and how much of its work is not stored yet; times are monotonic."""
-
-    pid: int
-    stage: str
-    cache: Path  # folder in which the stage stores finished views or a checkpoint
-    begun_s: float  # first observation
-    kept_s: float  # last change of the cache
-    first_s: float | None = None  # duration up to its first stored view, which a new start repeats
-    seen_s: float = 0.0  # last observation
-    entries: frozenset[tuple[str, int]] | None = None
-
-    def look(self) -> bool:
-        """Update the cache entries; return False if the job has ended."""
-        if has_ended(self.pid):
-            return False
-        self.seen_s, entries = time.monotonic(), kept_files(self.cache)
-        if self.entries is not None and entries != self.entries:
-            if self.first_s is None:
-                self.first_s = self.seen_s - self.begun_s
-            self.kept_s = self.seen_s
-        self.entries = entries
-        return True
-
-    @property
-    def lost_s(self) -> float:
-        """Upper limit of repeated work: the time since the last stored view, plus that up to the first."""
-        return min(self.seen_s - self.begun_s, self.seen_s - self.kept_s + (self.first_s or 0.0))
-
-
-def kept_files(cache: Path) -> frozenset[tuple[str, int]]:
-    """Return the finished entries of a cache with their modification times."""
-    found = set()
-    for path in (path for path in cache.rglob("*") if "/." not in str(path.relative_to(cache.parent))):
-        try:
-            found.add((str(path), path.stat().st_mtime_ns if path.is_file() else 0))
-        except FileNotFoundError:
-            continue
-    return frozenset(found)
 
 
 def has_ended(pid: int) -> bool:
@@ -86,7 +44,7 @@ class Run:
     def __init__(self, project: Project) -> None:
         self.project = project
         self.problems: list[str] = []
-        self.jobs: dict[int, Victim] = {}
+        self.jobs: dict[int, str] = {}  # process -> stage
         self._frozen: list[int] = []
         self._log = project.root / "said.log"
         self._filler = project.root / "results/filler"
@@ -114,31 +72,23 @@ class Run:
         """Return whether it has not ended."""
         return self.process.poll() is None
 
-    def look(self) -> list[Victim]:
-        """Return the running jobs."""
+    def look(self) -> list[int]:
+        """Return the processes of the running jobs."""
         for pid in children(self.process.pid):
             if pid not in self.jobs and (stage := stage_of(pid)) is not None:
-                now, cache = time.monotonic(), self.project.root / "results/.cache" / stage
-                self.jobs[pid] = Victim(pid, stage, cache, begun_s=now, kept_s=now)
-        return [job for job in self.jobs.values() if job.look()]
+                self.jobs[pid] = stage
+        return [pid for pid in self.jobs if not has_ended(pid)]
 
     def what_runs(self) -> str:
         """Return the running stages."""
-        return ", ".join(job.stage for job in self.look()) or "nothing"
+        return ", ".join(self.jobs[pid] for pid in self.look()) or "nothing"
 
-    def wait_for_a_job(self, limit_s: float) -> float | None:
-        """Return the seconds up to its first job, or None if it ends without a job."""
-        while self.is_running() and time.monotonic() < self.start_s + limit_s:
-            if self.look():
-                return time.monotonic() - self.start_s
-            time.sleep(POLL_S)
-        return None
-
-    def watch_for(self, seconds: float) -> None:
-        """Let it run for some time, and observe the caches of its jobs."""
+    def watch_for(self, seconds: float, until_a_job: bool = False) -> None:
+        """Let it run for some time, or until its first job has begun, and observe its jobs."""
         until = time.monotonic() + seconds
         while self.is_running() and time.monotonic() < until:
-            self.look()
+            if self.look() and until_a_job:
+                break
             time.sleep(POLL_S)
 
     def wait(self, limit_s: float = 7200) -> int:
@@ -155,75 +105,62 @@ class Run:
         until = time.monotonic() + WAKE_S
         while not all(map(has_ended, self.jobs)) and time.monotonic() < until:
             time.sleep(POLL_S)
-        for job in self.jobs.values():
-            if not has_ended(job.pid):
-                self.problems.append(f"{job.stage} (process {job.pid}) outlived its Snakemake")
-                os.kill(job.pid, signal.SIGKILL)
+        for pid, stage in self.jobs.items():
+            if not has_ended(pid):
+                self.problems.append(f"{stage} (process {pid}) outlived its Snakemake")
+                os.kill(pid, signal.SIGKILL)
         if self._filler.parent.is_mount():
             mounted(self._filler.parent, "-o", "remount,rw")
         self._filler.unlink(missing_ok=True)
         return code
 
-    def kill_snakemake(self, chance: random.Random) -> list[Victim]:
+    def kill_snakemake(self, chance: random.Random) -> None:
         """Kill only Snakemake, as the kernel does when memory runs out."""
-        victims = self.look()
         self.process.kill()
-        return victims
 
-    def kill_all(self, chance: random.Random) -> list[Victim]:
+    def kill_all(self, chance: random.Random) -> None:
         """Kill all processes, as in a power failure."""
-        victims = self.look()
         os.killpg(self.process.pid, signal.SIGKILL)
-        return victims
 
-    def kill_a_job(self, chance: random.Random) -> list[Victim]:
+    def kill_a_job(self, chance: random.Random) -> None:
         """Kill one job; the others continue, and the run ends with an error."""
-        victims = self.look()
-        chosen = chance.sample(victims, min(1, len(victims)))
-        for victim in chosen:
-            os.kill(victim.pid, signal.SIGKILL)
-        return chosen
+        if running := self.look():
+            os.kill(chance.choice(running), signal.SIGKILL)
 
-    def freeze_orphans(self, chance: random.Random) -> list[Victim]:
+    def freeze_orphans(self, chance: random.Random) -> None:
         """Freeze the jobs, kill their Snakemake, and wake the jobs later."""
-        victims = self.look()
-        for victim in victims:
-            os.kill(victim.pid, signal.SIGSTOP)
-        self._frozen = [victim.pid for victim in victims]
+        self._frozen = self.look()
+        for pid in self._frozen:
+            os.kill(pid, signal.SIGSTOP)
         self.process.kill()
-        return victims
 
-    def fill_the_disk(self, chance: random.Random) -> list[Victim]:
+    def fill_the_disk(self, chance: random.Random) -> None:
         """Fill the disk until the run has ended, so that jobs fail."""
         with contextlib.suppress(OSError), self._filler.open("wb") as stream:  # jobs also write
             room = shutil.disk_usage(self._filler.parent).free
             stream.write(bytes(max(0, room - LEFT_KIB * 1024)))
-        return []
 
-    def lock_the_disk(self, chance: random.Random) -> list[Victim]:
+    def lock_the_disk(self, chance: random.Random) -> None:
         """Make results read-only until the run has ended."""
         for _ in range(40):  # a remount fails while a file is being written
             if mounted(self._filler.parent, "-o", "remount,ro"):
                 break
             time.sleep(POLL_S)
-        return []
 
-    def clean_up_elsewhere(self, chance: random.Random) -> list[Victim]:
+    def clean_up_elsewhere(self, chance: random.Random) -> None:
         """Clean up the shared folder as another machine of the same name, with other process numbers."""
         code = "import sys; from hilsplat.base import processes; processes.remove_leftovers(sys.argv[1])"
         command = ["unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results"]
         ended = self._beside(command)
         if ended.returncode:
             self.problems.append(f"no clean-up in another process namespace: {ended.stderr}")
-        return []
 
-    def run_twice(self, chance: random.Random) -> list[Victim]:
+    def run_twice(self, chance: random.Random) -> None:
         """Start a second run in the same project, which must refuse without disturbing the first."""
         second = self._beside(self.command)
         said = second.stdout + second.stderr
         if self.is_running() and (second.returncode == 0 or "another hilsplat run" not in said):
             self.problems.append(f"a second run was not refused:\n{said}")
-        return []
 
     def _beside(self, command: list[str]) -> "subprocess.CompletedProcess[str]":
         """Run a command in the project, and return it with its output."""
@@ -255,8 +192,7 @@ class Fault:
     """A fault to inject into a run."""
 
     name: str
-    # injects it, and returns the jobs whose work is lost
-    strike: Callable[[Run, random.Random], list[Victim]]
+    strike: Callable[[Run, random.Random], None]
     kills: bool = True  # whether it counts as a kill
     needs_disk: bool = False  # whether results must be on a separate disk
     may_fail: bool = True  # whether the run may end with an error

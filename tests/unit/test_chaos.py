@@ -1,15 +1,9 @@
-"""What `make chaos` counts and compares."""
+"""What `make chaos` compares."""
 
 from pathlib import Path
 
 from tests.chaos.__main__ import differences
-from tests.chaos.faults import Victim
 from tests.workflow.conftest import Project
-
-
-def test_a_kill_costs_the_work_in_no_cache_and_the_time_to_the_first_view() -> None:
-    assert Victim(1, "masks", Path("cache"), begun_s=10, kept_s=16, first_s=2, seen_s=20).lost_s == 4 + 2
-    assert Victim(2, "field", Path("cache"), begun_s=10, kept_s=10, seen_s=20).lost_s == 10
 
 
 def test_every_other_byte_of_a_table_and_every_unfinished_file_is_reported(tmp_path: Path) -> None:
