@@ -7,12 +7,7 @@ from pathlib import Path
 import huggingface_hub
 import requests
 from huggingface_hub import constants
-from huggingface_hub.errors import (
-    CacheNotFound,
-    HFValidationError,
-    LocalEntryNotFoundError,
-    OfflineModeIsEnabled,
-)
+from huggingface_hub.errors import HFValidationError, LocalEntryNotFoundError, OfflineModeIsEnabled
 from huggingface_hub.utils import validate_repo_id
 from huggingface_hub.utils.sha import git_hash
 
@@ -142,19 +137,14 @@ def read_listing(repository: str, revision: str | None) -> Listing:
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
     """Return a repository's listing from the hub's local cache (HF_HOME; files named by digest), or None."""
     try:
-        repositories = huggingface_hub.scan_cache_dir(constants.HF_HUB_CACHE).repos
-    except CacheNotFound:
+        found = huggingface_hub.snapshot_download(repository, revision=revision, local_files_only=True)
+    except LocalEntryNotFoundError:
         return None
-    requested = revision or constants.DEFAULT_REVISION
-    own = [repo for repo in repositories if (repo.repo_type, repo.repo_id) == ("model", repository)]
-    for snapshot in (snapshot for repo in own for snapshot in repo.revisions):
-        if requested in snapshot.refs or requested == snapshot.commit_hash:
-            files = {}
-            for each in snapshot.files:
-                path = each.file_path.relative_to(snapshot.snapshot_path).as_posix()
-                files[path] = HubFile(path, each.size_on_disk, each.blob_path.name, each.file_path)
-            return Listing(repository, snapshot.commit_hash, "", files)
-    return None
+    snapshot, files = Path(found), {}
+    for file in [path for path in snapshot.rglob("*") if path.is_file()]:
+        path = file.relative_to(snapshot).as_posix()
+        files[path] = HubFile(path, file.stat().st_size, file.resolve().name, file)
+    return Listing(repository, snapshot.name, "", files)
 
 
 def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:

@@ -29,21 +29,6 @@ def unpacked(candidates: Candidates) -> np.ndarray:
     return out
 
 
-def mend(mask: np.ndarray, min_area_px: int) -> np.ndarray:
-    """Fill small holes, then drop small islands except the largest (8-connected)."""
-    cleaned = mask.copy()
-    _, holes, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=8)
-    for label in range(1, len(stats)):
-        if stats[label, cv2.CC_STAT_AREA] < min_area_px:
-            cleaned[holes == label] = True
-    _, islands, stats, _ = cv2.connectedComponentsWithStats(cleaned.astype(np.uint8), connectivity=8)
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    for label, area in enumerate(areas, start=1):
-        if area < min_area_px and label != 1 + areas.argmax():
-            cleaned[islands == label] = False
-    return cleaned
-
-
 def smooth_logits(count: int, side: int, seed: int) -> np.ndarray:
     """Random hills and valleys, float32 (count, side, side)."""
     noise = np.random.default_rng(seed).normal(size=(count, side, side)).astype(np.float32)

@@ -24,8 +24,9 @@ from hilsplat.segment.generate import (
 )
 from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, enlarged, resized_size
 from hilsplat.settings import MasksSettings
+from tests.unit.segment import official
 from tests.unit.segment.handmade import assert_equal_masks, generate, pack
-from tests.unit.segment.plain import flatten_far, mend, quantise, smooth_logits, unpacked
+from tests.unit.segment.plain import flatten_far, quantise, smooth_logits, unpacked
 
 SETTINGS = MasksSettings(points_per_side=2, points_per_batch=3, stability_min=0.0, min_area_px=1)
 IMAGE = np.zeros((32, 32, 3), dtype=np.uint8)
@@ -116,7 +117,8 @@ def test_small_islands_holes_and_masks_are_removed(mask, min_area_px):
     if not mask.any():
         return
     found, changed = clean_masks(pack(mask[None]), min_area_px)
-    expected = mend(mask, min_area_px)
+    expected, _ = official.without_small_regions(mask, min_area_px, "holes")
+    expected, _ = official.without_small_regions(expected, min_area_px, "islands")
     if expected.sum() < min_area_px:
         assert len(found) == 0
     else:
