@@ -187,7 +187,6 @@ def write_scene(
 
 def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> None:
     """Draw camera centres and sparse points from above and from the side."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     poses = scene.cameras.cam_from_world
@@ -205,7 +204,6 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     arrow = 0.08 * float((high - low).max())
 
     figure = Figure(figsize=(12, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     for position, (title, x, y) in enumerate((("from above", 0, 1), ("from the side", 0, 2)), start=1):
         axes = figure.add_subplot(1, 2, position)
         axes.scatter(points[:, x], points[:, y], s=1.5, c=colours, linewidths=0)

@@ -334,12 +334,10 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
         return False
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     shown = lost[:MAX_ROWS]
     figure = Figure(figsize=(12, 1.2 + 2.1 * len(shown)), layout="constrained")
-    FigureCanvasAgg(figure)
     rest = f" (the first {MAX_ROWS})" if len(lost) > MAX_ROWS else ""
     title = f"{len(lost)} of {report['images']} photographs are not registered{rest}"
     figure.suptitle(f"{title}\n{ADVICE}", fontsize=10, parse_math=False)

@@ -24,15 +24,6 @@ from hilsplat.datasets.published import differences
 FOREGROUND = 129
 """Lowest grey value of the foreground: the published evaluation thresholds above 128."""
 
-LAYOUT = """lerf_mask/
-  figurines/  ramen/  teatime/
-    images/             all images
-    images_train/       training images; a posed image that is not here is a test view
-    sparse/0/*.bin      undistorted
-    test_mask/0/green apple.png ...     one folder per test view, one mask per prompt
-    object_mask/        tracked masks for training, not read
-"""
-
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the test masks of a scene, such as "figurines"; pixels are read when needed."""
@@ -96,7 +87,13 @@ DATASET = Dataset(
     licence="none stated for images and masks (the authors' code: Apache-2.0)",
     terms="For research use only; do not redistribute.",
     citation="images: Kerr et al., LERF, ICCV 2023; masks: Ye et al., Gaussian Grouping, ECCV 2024",
-    layout=LAYOUT,
+    layout="""lerf_mask/
+  figurines/  ramen/  teatime/
+    images/             all images
+    images_train/       training images; a posed image that is not here is a test view
+    sparse/0/*.bin      undistorted
+    test_mask/0/green apple.png ...     one folder per test view, one mask per prompt
+    object_mask/        tracked masks for training, not read""",
     required=lambda scene: tuple(
         f"{scene}/{part}" for part in ("images", "images_train", "sparse", "test_mask")
     ),

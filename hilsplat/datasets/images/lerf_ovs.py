@@ -20,14 +20,6 @@ from hilsplat.datasets.labelled import LabelledRegion, LabelledScene, images_by_
 from hilsplat.datasets.published import FRAMES, PAIRS, differences
 from hilsplat.scene.view_names import view_name
 
-LAYOUT = """lerf_ovs/
-  figurines/  ramen/  teatime/  waldo_kitchen/
-    images/frame_00001.jpg ...        undistorted
-    sparse/0/{cameras,images,points3D}.bin
-  label/
-    figurines/frame_00041.json ...    (+ .jpg, not read)
-"""
-
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the labels of a scene, such as "figurines"; masks are rasterised when needed."""
@@ -87,7 +79,12 @@ DATASET = Dataset(
     licence="none stated for images and labels",
     terms="For research use only; do not redistribute.",
     citation="images: Kerr et al., LERF, ICCV 2023; labels: Qin et al., LangSplat, CVPR 2024",
-    layout=LAYOUT,
+    layout="""lerf_ovs/
+  figurines/  ramen/  teatime/  waldo_kitchen/
+    images/frame_00001.jpg ...        undistorted
+    sparse/0/{cameras,images,points3D}.bin
+  label/
+    figurines/frame_00041.json ...    (+ .jpg, not read)""",
     required=lambda scene: (f"{scene}/images", f"{scene}/sparse", f"label/{scene}"),
     open=open_scene,
     protocols=("lerf/langsplat-v2", "lerf/paper-filter", "lerf/paper-mean"),

@@ -27,14 +27,6 @@ FOREGROUND = 255
 SHAPE_TOLERANCE = 0.01
 """Relative tolerance, because mask and photograph of a view differ slightly in aspect ratio."""
 
-LAYOUT = """3d_ovs/
-  bed/  bench/  blue_sofa/  covered_desk/  lawn/  office_desk/  room/  snacks/  sofa/  table/
-    images/00.jpg ...                 (or .png)
-    segmentations/classes.txt         one prompt per line
-    segmentations/00/banana.png ...   one folder per test view, one mask per prompt
-    sparse/0/*.bin                    or, without it, poses_bounds.npy
-"""
-
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the segmentations of a scene, such as "bed"; pixels are read when needed.
@@ -115,7 +107,12 @@ DATASET = Dataset(
     licence="none stated for images and masks (the authors' code: MIT)",
     terms="For research use only; do not redistribute.",
     citation="Liu et al., Weakly Supervised 3D Open-vocabulary Segmentation, NeurIPS 2023",
-    layout=LAYOUT,
+    layout="""3d_ovs/
+  bed/  bench/  blue_sofa/  covered_desk/  lawn/  office_desk/  room/  snacks/  sofa/  table/
+    images/00.jpg ...                 (or .png)
+    segmentations/classes.txt         one prompt per line
+    segmentations/00/banana.png ...   one folder per test view, one mask per prompt
+    sparse/0/*.bin                    or, without it, poses_bounds.npy""",
     required=lambda scene: (f"{scene}/images", f"{scene}/segmentations/classes.txt"),
     open=open_scene,
     protocols=(

@@ -120,10 +120,8 @@ def write_hierarchy(
 ) -> None:
     """Write annotations: label images first, `annotations.json` last.
 
-    Args:
-        nodes: nodes with ids 0, 1, 2, ... in order.
-        labels: per view and level, node id per pixel, -1 for none.
-        views: annotated node ids per view.
+    Nodes are in the order of their ids 0, 1, 2, ...; `labels` contains, per view and level, the node id per
+    pixel (-1 for none), and `views` the ids of the annotated nodes.
     """
     for view, levels in labels.items():
         for level in LEVELS:

@@ -78,7 +78,7 @@ def make_shots(vehicle: np.ndarray) -> list[CameraShot]:
 
 
 @pytest.mark.parametrize("turn", [0, 30, 148])
-def test_four_columns_at_range_two_look_from_the_left_back_round_to_the_right_back(turn):
+def test_columns_start_at_the_rear_and_turn_clockwise(turn):
     azimuths = np.degrees(column_azimuths(4, turned(turn)))  # in the lidar's own frame
     np.testing.assert_allclose(azimuths, np.array([135, 45, -45, -135]) - turn)
     points = range_image_points(np.full((1, 4), 2.0), np.zeros(1), turned(turn))[0]
@@ -104,8 +104,8 @@ def test_rotation_is_yaw_after_pitch_after_roll():
     np.testing.assert_allclose(rotation_of(roll + pitch + yaw) @ [0, 1, 0], [0, 1, 0], atol=1e-12)
 
 
-def test_opencv_axes_give_the_same_pixel():
-    """Half a pixel: Waymo's 0 is the left edge of the first pixel, as here, so K is taken unchanged."""
+def test_opencv_axes_yield_the_same_pixel():
+    """K is unchanged, because 0 is the left edge of the first pixel in Waymo, as here."""
     vehicle = turned(40, x=7.0)
     lens = replace(camera(), vehicle_from_cam=turned(90))
     in_world = vehicle @ turned(90) @ [10, 1, -0.5, 1]
@@ -176,7 +176,7 @@ def test_projections_are_optional_and_reported(root):
     assert scene.warnings[0].startswith("lidar_camera_projection is missing")
 
 
-def test_damaged_components_are_answered_by_a_sentence(root):
+def test_damaged_components_are_refused_with_a_fix(root):
     def path(tag: str) -> Path:
         return root / "validation" / tag / f"{SEGMENT}.parquet"
 

@@ -1,7 +1,7 @@
-"""A finished synthetic scene, and writers of it in the layouts of the image-labelled data sets.
+"""A finished synthetic scene, and functions that write it in the layouts of the image-labelled data sets.
 
-Readers must return its truth. Images are compressed (.jpg), as in the data sets; masks, boxes, texts and
-poses are exact.
+Readers must return its ground truth. Images are compressed (.jpg), as in the data sets; masks, boxes, texts
+and poses are exact.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ MAX_POINTS = 5000
 
 @dataclass(frozen=True, eq=False)
 class TrueWorld:
-    """Images (a folder), true cameras, annotations and visible surface points of a synthetic scene."""
+    """Image folder, ground-truth cameras, annotations and visible surface points of a synthetic scene."""
 
     images: Path
     cameras: Cameras
@@ -47,11 +47,11 @@ class TrueWorld:
         return TrueWorld(folder / "images", cameras, annotations, points)
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Pixels of a view."""
+        """Return the pixels of a view."""
         return read_image(self.images / view)
 
     def nodes(self, view: str, level: Level | None = None) -> dict[str, tuple[int, ...]]:
-        """Annotated and visible nodes of a view by text, of one level or of all; texts sorted."""
+        """Return the annotated and visible nodes of a view by text, sorted, for one level or all levels."""
         found: dict[str, list[int]] = {}
         for one in Level if level is None else (level,):
             labels = self.annotations.label_image(view, one)
@@ -62,7 +62,7 @@ class TrueWorld:
         return {text: tuple(found[text]) for text in sorted(found)}
 
     def mask(self, view: str, nodes: Iterable[int]) -> Bool[np.ndarray, "H W"]:
-        """Union of nodes of any levels."""
+        """Return the union of nodes of any levels."""
         return np.any([self.annotations.mask(view, [node]) for node in nodes], axis=0)
 
 
@@ -73,7 +73,7 @@ def _mesh_points(path: Path) -> Float64[np.ndarray, "P 3"]:
 
 
 def write_jpeg(path: Path, pixels: UInt8[np.ndarray, "H W 3"]) -> None:
-    """Write an image at quality 95, as photographs come."""
+    """Write an image at quality 95."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=95)
 
@@ -201,14 +201,14 @@ def _write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
 
 
 def _depth_range(world: TrueWorld, cam_from_world: np.ndarray) -> np.ndarray:
-    """Nearest and farthest depth of the points in front of a camera; 0 and 1 if there are none."""
+    """Return the nearest and farthest depth of the points in front of a camera; 0 and 1 without points."""
     depth = world.points_xyz @ cam_from_world[2, :3] + cam_from_world[2, 3]
     depth = depth[depth > 0]
     return np.array([depth.min(), depth.max()]) if len(depth) else np.array([0.0, 1.0])
 
 
 def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys: Any) -> dict[str, Any]:
-    """Keys of one object as the tool writes them: a single polygon is not nested."""
+    """Return the keys of one object as the tool writes them: a single polygon is not nested."""
     points = np.concatenate(polygons)
     lists = [polygon.astype(float).tolist() for polygon in polygons]
     return {

@@ -44,7 +44,7 @@ def write_ply(
 ) -> None:
     """Write a binary little-endian mesh: columns of vertices, corners of faces, columns of faces.
 
-    Written without plyfile, which reads it back and would take a Python step per face.
+    plyfile would be slower, because it writes lists face by face in Python.
     """
     rows = np.rec.fromarrays([*vertices.values()], names=[*vertices])
     corners = [("count", "u1"), ("corners", "<i4", faces.shape[1:])]
@@ -66,8 +66,13 @@ def write_ply(
 
 
 SEGMENT_STEP = 7
-"""Segment ids are not contiguous in real scans; neither are ours."""
-GREY = 128
+"""Step between segment ids, which are not contiguous in real scans either."""
+
+
+def _grey_vertices(xyz: Float32[np.ndarray, "P 3"]) -> dict[str, np.ndarray]:
+    """Return the columns x, y, z and colours of vertices."""
+    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
+    return places | dict.fromkeys(("red", "green", "blue", "alpha"), np.full(len(xyz), 128, dtype=np.uint8))
 
 
 def write_label_table(root: Path, categories: Mapping[str, tuple[int, int]]) -> None:
@@ -106,13 +111,11 @@ def write_scan(
     height, width = images[0].size_hw
     info = f"colorHeight = {height}\ncolorWidth = {width}\nsceneType = Synthetic room\n"
     write_text(folder / f"{scan}.txt", info)
-    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
-    grey = np.full(len(xyz), GREY, dtype=np.uint8)
-    colours = dict.fromkeys(("red", "green", "blue", "alpha"), grey)
-    write_ply(folder / f"{scan}_vh_clean_2.ply", {**places, **colours}, faces, {})
+    vertices = _grey_vertices(xyz)
+    write_ply(folder / f"{scan}_vh_clean_2.ply", vertices, faces, {})
     of_object = np.array([categories[name][1] for name in objects] + [0], dtype=np.uint16)
     labels = of_object[object_of_vertex]  # -1, none, is the last
-    write_ply(folder / f"{scan}_vh_clean_2.labels.ply", {**places, **colours, "label": labels}, faces, {})
+    write_ply(folder / f"{scan}_vh_clean_2.labels.ply", {**vertices, "label": labels}, faces, {})
     # Two segments per object, on either side of its middle.
     segment = np.zeros(len(xyz), dtype=np.int64)
     groups = []
@@ -132,7 +135,7 @@ def write_scan(
 
 
 UNDEFINED, NO_OBJECT = -1, -2
-"""Class of an object that none of Replica's fits, and of object 0, which is none."""
+"""Class of an object without a class in Replica, and of object 0, which means no object."""
 
 
 def write_semantic_mesh(
@@ -147,8 +150,6 @@ def write_semantic_mesh(
     Each triangle becomes a quad whose last corner occurs twice. `object_of_face` is a row of `classes` (ids,
     0 for none), -1 for none; in the files, objects count from 1.
     """
-    places = {axis: xyz[:, column] for column, axis in enumerate("xyz")}
-    colours = dict.fromkeys(("red", "green", "blue"), np.full(len(xyz), 128, dtype=np.uint8))
     quads = faces[:, [0, 1, 2, 2]]
     of_face = (object_of_face + 1).astype(np.int32)
     labels = [NO_OBJECT, *(number or UNDEFINED for number in classes)]
@@ -166,14 +167,14 @@ def write_semantic_mesh(
         "objects": objects[::-1],  # real files do not sort them either
     }
     habitat.mkdir(parents=True)
-    write_ply(habitat / "mesh_semantic.ply", {**places, **colours}, quads, {"object_id": of_face})
+    write_ply(habitat / "mesh_semantic.ply", _grey_vertices(xyz), quads, {"object_id": of_face})
     (habitat / "info_semantic.json").write_text(json.dumps(info, indent=1))
 
 
 def write_sequence(folder: Path, images: Sequence[PosedImage]) -> None:
     """Write a sequence in the layout of NICE-SLAM: `traj.txt`, `results/`, and `cam_params.json` beside it.
 
-    The lens in the folder above is that of all its sequences, so all images must share K and size.
+    All images must share K and size, because all sequences in the folder above have the same lens.
     """
     K, (height, width) = images[0].K - HALF_PIXEL, images[0].size_hw
     lens = {"w": width, "h": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
@@ -234,7 +235,7 @@ def write_segment(
 
 
 def _cells(component: str, frame: LidarFrame, images: Sequence[np.ndarray]) -> dict[str, Any]:
-    """A row of range images: values and shape of the first and second return, null if there is none."""
+    """Return a row with values and shape of the first and second return, null if there is none."""
     row: dict[str, Any] = {FRAME: frame.timestamp_micros, LASER: TOP}
     for number in (1, 2):
         image = images[number - 1] if len(images) >= number else None
@@ -258,7 +259,7 @@ def _calibration(camera: WaymoCamera) -> dict[str, Any]:
 
 
 def _write_component(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """One row group, columns typed as the release types them."""
+    """Write one row group; the columns have the types of the release."""
     small = {CAMERA: pa.int8(), LASER: pa.int8(), FRAME: pa.int64()}
     columns = {}
     for name in rows[0]:
@@ -273,9 +274,9 @@ def _write_component(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 VEHICLE_FROM_CAM = np.array([[1.0, 0, 0, 1.5], [0, 1, 0, 0], [0, 0, 1, 2.1], [0, 0, 0, 1]])
 LIDAR_AT = (1.4, 0.0, 2.2)
-"""Place of the lidar on the vehicle, metres; that of the true drive is in its poses."""
+"""Position of the lidar on the vehicle, metres."""
 LIDAR_TURN_DEG = 148.0
-"""The lidar is mounted turned, as Waymo's is: columns are counted from the vehicle's back all the same."""
+"""Yaw of the lidar on the vehicle, as Waymo's is rotated too; columns still start at the vehicle's rear."""
 AZIMUTH_STEPS, BEAMS = 400, 64
 """Columns and rows of the range images: directions per revolution, and evenly spaced beams."""
 FRAME_MICROS = 100_000
@@ -307,7 +308,7 @@ class LabelledMesh:
 
 
 def posed_images(world: Path) -> list[PosedImage]:
-    """Images of a synthetic scene with their true cameras."""
+    """Return the images of a synthetic scene with their ground-truth cameras."""
     cameras = Cameras.load(world / "truth" / "cameras.npz")
     return [
         PosedImage(name, world / "images" / name, camera.cam_from_world, camera.K, camera.size_hw)
@@ -332,7 +333,7 @@ def write_room_as_replica(world: Path, root: Path, scene: str) -> None:
 
 
 def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
-    """Write a street as a segment of Waymo's release 2: range images of its scan, its views as FRONT."""
+    """Write a street as a segment of Waymo's release 2: range images of its scan, and its views as FRONT."""
     scan = read_npz(world / "truth" / "lidar.npz")
     nodes = HierarchyAnnotations.load(world / "truth").nodes
     labels = waymo_labels(scan["node_ids"], [node.text for node in nodes])
@@ -352,7 +353,7 @@ def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
 
 
 def _shot(image: PosedImage, time: int) -> CameraShot:
-    """A view as an image of the front camera."""
+    """Return a view as an image of the front camera."""
     assert isinstance(image.image, Path)
     K = image.K
     lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0, 0, 0, 0], dtype=np.float64)
@@ -370,7 +371,7 @@ def _lidar_frame(
     inclinations: Float[np.ndarray, " H"],
     shot: CameraShot,
 ) -> LidarFrame:
-    """One turn of the scan as a range image. The vehicle heads along the axis x of the world."""
+    """Return one revolution of the scan as a range image; the vehicle heads along the world's x axis."""
     height, width = len(inclinations), AZIMUTH_STEPS
     turn = np.radians(LIDAR_TURN_DEG)
     vehicle_from_lidar = np.eye(4)
