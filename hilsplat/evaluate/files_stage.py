@@ -93,8 +93,8 @@ def run_evaluate_files(
             if any((predictions / f"{each}.txt").is_file() for each in _files_of(extra.points)):
                 points = labelled_points(truth.parent, kind)
             else:
-                least_px = min_region_px or EvaluateSettings().min_region_px
-                views = truths_of(truth, Scene.load(scene), least_px)
+                min_px = min_region_px or EvaluateSettings().min_region_px
+                views = truths_of(truth, Scene.load(scene), min_px)
         else:
             dataset, known, extra = ExtraProtocols.open(labels, data_root)
             name = labels.partition("/")[2]

@@ -22,7 +22,7 @@ from hilsplat.segment.masks import HierarchicalMasks, region_ious
 from hilsplat.segment.origin import masks_label
 from hilsplat.segment.pictures import paint_level
 
-LEAST_PX = 100
+MIN_PX = 100
 """Smaller ground-truth regions are not scored."""
 FIT_IOU = 0.5
 COLUMNS = ("scene", "masks", "level", "views", "regions", "best_iou", "recall", "masks_a_view", "precision")
@@ -33,7 +33,7 @@ COLOURS = "RdYlGn"
 class ViewFit:
     """Masks of one level of one view against the ground-truth regions of that level."""
 
-    ids: Int64[np.ndarray, " r"]  # true nodes with a region of at least `LEAST_PX`
+    ids: Int64[np.ndarray, " r"]  # true nodes with a region of at least `MIN_PX`
     best: Float32[np.ndarray, " r"]  # IoU of the best mask of each, 0 if there is no mask
     masks: int  # number of masks
     fitting: int  # number of masks with an IoU of at least 0.5 with some region of any size
@@ -57,7 +57,7 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
             )
         rows = masks.rows_of(level)
         ids, areas, ious = region_ious(labels, masks.dense(rows))
-        scored = areas >= LEAST_PX
+        scored = areas >= MIN_PX
         best = ious[scored].max(axis=1, initial=0)
         fitting = int((ious.max(axis=0, initial=0) >= FIT_IOU).sum())
         found[level] = ViewFit(ids[scored], best, len(rows), fitting)

@@ -72,11 +72,11 @@ def shared_points(
     camera_b: Camera,
     depth_b: Float[np.ndarray, "Hb Wb"],
     tolerance: float = DEPTH_TOLERANCE,
-    most: int = MAX_POINTS,
+    max_points: int = MAX_POINTS,
 ) -> tuple[Int64[np.ndarray, " P"], Int64[np.ndarray, " P"]]:
     """Return row-major pixels of A (each at most once) and of B that show the same surface points.
 
-    At most `most` of A's pixel centres are used, evenly spaced.
+    At most `max_points` of A's pixel centres are used, evenly spaced.
 
     A point is lifted by A's depth and projected into B. It is visible there if B's depth at the projection
     equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse depth, which
@@ -108,8 +108,8 @@ def shared_points(
     visible = np.abs(shown * in_b[:, 2] - 1) <= tolerance
     x, y = np.floor(xy[visible]).astype(np.int64).T
     pixel_a, pixel_b = pixel[visible], y * width + x
-    if len(pixel_a) > most:
-        kept = np.linspace(0, len(pixel_a) - 1, most).astype(np.int64)
+    if len(pixel_a) > max_points:
+        kept = np.linspace(0, len(pixel_a) - 1, max_points).astype(np.int64)
         pixel_a, pixel_b = pixel_a[kept], pixel_b[kept]
     return pixel_a, pixel_b
 

@@ -25,7 +25,7 @@ from hilsplat.scene.scene import Scene
 from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 WIDTH_IN = 13.0
-MOST_COLUMNS = 8
+MAX_COLUMNS = 8
 """Maximum number of methods drawn as columns in the figure of queries; more are drawn as rows."""
 VIEWS = 4
 """Number of views in the figure of one query."""
@@ -147,9 +147,9 @@ def draw_methods(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: E
     """Draw one row per query and one column per method, transposed if there are many methods."""
     first = methods[0].scene
     scene = first.scene
-    many = len(methods) > MOST_COLUMNS
+    many = len(methods) > MAX_COLUMNS
     shape = max(len(rows), 1), len(methods) + 1
-    width_in = WIDTH_IN * min(shape[0] / MOST_COLUMNS, 1) if many else WIDTH_IN
+    width_in = WIDTH_IN * min(shape[0] / MAX_COLUMNS, 1) if many else WIDTH_IN
     title = f"{scene.name}: queries by method"
     figure, grid = _grid(scene, *(shape[::-1] if many else shape), title, width_in)
     by_query = grid.T if many else grid

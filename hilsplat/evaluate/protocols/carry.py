@@ -2,7 +2,7 @@
 
 | mode | source of a point's label or feature |
 |---|---|
-| `frozen` | its own Gaussian, the one with the point's number, fitted without moving (OpenGaussian) |
+| `frozen` | the Gaussian with the point's index, fitted without moving (OpenGaussian) |
 | `nearest` | the nearest Gaussian that is opaque enough |
 | `vote` | a vote of the k nearest within a radius, weighted by opacity; none beyond the radius |
 | `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |

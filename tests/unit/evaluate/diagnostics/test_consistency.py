@@ -46,7 +46,7 @@ def test_points_of_a_wall_move_by_its_disparity():
     # columns 0 and 1 leave B; the last row has no row below, between which and itself B is read
     assert set(x) == set(range(2, WIDTH))
     assert len(pixel_a) == (HEIGHT - 1) * 8 == 40
-    few, _ = shared_points(A, WALL, B, WALL, most=4)  # evenly spaced
+    few, _ = shared_points(A, WALL, B, WALL, max_points=4)  # evenly spaced
     assert few.tolist() == pixel_a[[0, 13, 26, 39]].tolist()
 
 

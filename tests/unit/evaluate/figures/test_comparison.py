@@ -46,7 +46,7 @@ def test_titles_name_the_method_and_its_iou(block_world, rows):
 
 def test_many_methods_are_rows_and_queries_columns(block_world, rows):
     methods = [
-        Answerer(f"method {n}", "tree", block_world.answers) for n in range(comparison.MOST_COLUMNS + 1)
+        Answerer(f"method {n}", "tree", block_world.answers) for n in range(comparison.MAX_COLUMNS + 1)
     ]
     figure = draw_methods(methods, rows[1], EVALUATE)
     grid = np.array(figure.get_axes()).reshape(len(methods) + 1, len(rows[1]))

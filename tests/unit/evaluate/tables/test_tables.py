@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.configuration import RunSettings
 from hilsplat.datasets.classes import SCANNET200_INSTANCES
@@ -18,12 +17,13 @@ from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
 from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, read_published
-from hilsplat.segment.origin import made_from_truth, masks_label
+from hilsplat.segment.origin import label_of_index, made_from_truth
 from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import score
 
 PUBLISHED = PROJECT / "config" / "published"
 
+LERF = {"protocol": "lerf/tree-nodes@5", "level": ""}
 SCORES = [
     # scene one: L1 0.8 and 0.6, L2 0.5, L3 0.2, 0.0, 0.1; scene two: L1 0.3 only
     score("iou", 0.8, query="a"),
@@ -39,11 +39,11 @@ SCORES = [
     score("iou", 0.4, method="field"),
     score("hc_containment", 1.0, method="truth", protocol="hierarchy/annotations@1", query="", level=""),
     # the LERF protocol
-    score("iou", 0.5, protocol="lerf/tree-nodes@5", level=""),
-    score("boundary_iou", 0.25, protocol="lerf/tree-nodes@5", level=""),
-    score("localization_box", 1.0, protocol="lerf/tree-nodes@5", level=""),
-    score("localization_box", 0.0, protocol="lerf/tree-nodes@5", level="", query="d"),
-    score("iou", 0.7, protocol="lerf/tree-nodes@5", level="", scene="two"),
+    score("iou", 0.5, **LERF),
+    score("boundary_iou", 0.25, **LERF),
+    score("localization_box", 1.0, **LERF),
+    score("localization_box", 0.0, **LERF, query="d"),
+    score("iou", 0.7, **LERF, scene="two"),
     # another variant
     score("iou", 0.9, variant="omega-2", method="field"),
 ]
@@ -61,10 +61,10 @@ def built(tmp_path, name, scores=SCORES, labels=None, absent=()):
     return rows, {suffix: out.with_suffix(suffix).read_text() for suffix in (".md", ".tex", ".html")}
 
 
-def measured(rows, **names):
-    found = [row for row in rows if row["kind"] != "reported"]
-    for name, value in names.items():
-        found = [row for row in found if row[name] == value]
+def measured(rows, method="hilsplat (tree)", **names):
+    """The measured row with these names."""
+    names = {**names, "method": method}
+    found = [row for row in rows if row["kind"] != "reported" and names.items() <= row.items()]
     assert len(found) == 1, found
     return found[0]
 
@@ -75,7 +75,7 @@ def cells(row, *names):
 
 def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
     rows, forms = built(tmp_path, "hierarchy")
-    row = measured(rows, method="hilsplat (tree)", protocol="level given")
+    row = measured(rows, protocol="level given")
     # L1: (0.7 + 0.3) / 2, L2: 0.5, L3: 0.1; Avg (0.5 + 0.5 + 0.1) / 3; HC: (0.8 + 0.4) / 2
     found = cells(row, "L1", "L2", "L3", "Avg", "HC containment")
     assert found == ["50.00", "50.00", "10.00", "36.67", "60.00"]
@@ -98,7 +98,7 @@ def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
 def test_rows_of_a_published_data_set_are_measured_rows(tmp_path):
     scores = [score("iou", 0.5, dataset="lerf", protocol="lerf/langsplat@2", method="field", level="")]
     rows, forms = built(tmp_path, "lerf", scores)
-    assert measured(rows, data="lerf")["kind"] == "measured"
+    assert measured(rows, "hilsplat (field)")["kind"] == "measured"
     assert "## Measured on lerf" in forms[".md"]
     assert "synthetic" not in forms[".md"]
 
@@ -112,17 +112,16 @@ def test_lerf_table_has_a_column_per_scene_and_the_mean_of_scenes(tmp_path):
 
 def test_lerf_mask_means_go_over_texts_and_not_over_pairs(tmp_path):
     protocol = "lerf-mask/gaussian-grouping@1 (wholes)"
-    scores = [
-        score("iou", value, query=query, view=view, protocol=protocol, level="")
-        for query, view, value in (("apple", "a", 0.8), ("apple", "b", 0.6), ("egg", "a", 0.3))
-    ]
+    values = ("apple", "a", 0.8), ("apple", "b", 0.6), ("egg", "a", 0.3)
+    of_mask = {"protocol": protocol, "level": ""}
+    scores = [score("iou", value, query=query, view=view, **of_mask) for query, view, value in values]
     rows, _ = built(tmp_path, "lerf", scores)
     assert measured(rows, protocol=protocol)["Average mIoU"] == "50.00"  # pairs would give 56.67
 
 
 def test_ablation_rows_take_localization_from_the_flat_protocol(tmp_path):
     rows, _ = built(tmp_path, "ablation", labels={"default": "hilsplat", "omega-2": "Omega 2"})
-    row = measured(rows, method="hilsplat (tree)")
+    row = measured(rows)
     assert cells(row, "LERF localization", "L1", "Hi-LERF HC") == ["50.00", "50.00", "60.00"]
     names = [row["method"] for row in rows if row["kind"] != "reported"]
     assert names == ["hilsplat (field)", "hilsplat (tree)", "Omega 2"]
@@ -238,7 +237,7 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
     keyed = {("synthetic-rooms", scene, *key): each for scene, each in matches.items()}
     write_instances(tmp_path / "scores.csv", keyed)
     rows, _ = built(tmp_path, "scannet", scores)
-    row = measured(rows, method="hilsplat (tree)")
+    row = measured(rows)
     assert cells(row, "19 classes mIoU", "ScanNet200 mAcc") == ["30.00", "10.00"]
     assert cells(row, *(f"ScanNet200 {name}" for name in ("AP", "AP@25", "head AP"))) == ["50.00"] * 3
     assert cells(row, "ScanNet200 head mIoU", "ScanNet200 tail mIoU") == ["60.00", ""]
@@ -246,12 +245,9 @@ def test_scannet_shows_all_sets_of_classes_in_one_row_and_instances_of_all_scans
 
 
 def test_replica_shows_scenes_and_their_mean(tmp_path):
-    scores = [
-        point_score("replica/per-scene", "miou_present", value, scene=scene)
-        for scene, value in (("room-1", 0.2), ("room-2", 0.4))
-    ]
-    rows, _ = built(tmp_path, "replica", scores)
-    row = measured(rows, method="hilsplat (tree)")
+    values = {"room-1": 0.2, "room-2": 0.4}.items()
+    scores = [point_score("replica/per-scene", "miou_present", value, scene=name) for name, value in values]
+    row = measured(built(tmp_path, "replica", scores)[0])
     assert cells(row, "room-1 mIoU", "room-2 mIoU", "Mean mIoU") == ["20.00", "40.00", "30.00"]
 
 
@@ -259,8 +255,7 @@ def test_waymo_pools_the_counts_of_all_scenes(tmp_path):
     first = class_scores("waymo/segmentation", 1 / 2, 2, scene="street-1", query="car")
     second = class_scores("waymo/segmentation", 8 / 8, 8, scene="street-2", query="car")
     scores = [replace(row, dataset="synthetic-streets") for row in (*first, *second)]
-    rows, _ = built(tmp_path, "waymo", scores)
-    row = measured(rows, method="hilsplat (tree)")
+    row = measured(built(tmp_path, "waymo", scores)[0])
     # (1 + 8) / (2 + 8) for cars, and 21 absent classes that count 1
     assert row["mIoU, present classes"] == "90.00"
     assert row["mIoU"] == f"{100 * (21 + 0.9) / 22:.2f}"
@@ -284,8 +279,7 @@ def test_point_tables_show_intervals(tmp_path):
     scores = []
     for name, value in {"car": 1.0, "pedestrian": 0.0, "bus": 1.0, "truck": 0.0}.items():
         scores += class_scores("waymo/segmentation", value, 100, query=name)
-    rows, _ = built(tmp_path, "waymo", scores)
-    row = measured(rows, method="hilsplat (tree)")
+    row = measured(built(tmp_path, "waymo", scores)[0])
     assert cells(row, "mIoU, present classes", "Present classes 95 %") == ["50.00", "0 to 100"]
 
 
@@ -360,12 +354,11 @@ def test_a_row_with_true_masks_is_marked_and_not_ranked(tmp_path):
     assert " 90.0 " in stand_in and "**90.0**" not in stand_in
 
 
-def test_masks_are_named_after_the_model_the_segmenter_or_their_label(block_world, tmp_path):
-    assert masks_label(block_world.folder / "masks") == "sam-tiny"
-    write_index(tmp_path, {}, segmenter="graph", model=None)
-    assert masks_label(tmp_path) == "graph"
-    write_index(tmp_path, {}, segmenter="truth-perturbed", model=None, label=TRUE_MASKS)
-    assert masks_label(tmp_path) == TRUE_MASKS
+def test_masks_are_named_after_the_model_the_segmenter_or_their_label():
+    index = {"segmenter": "sam", "model": "models/sam-tiny"}
+    assert label_of_index(index) == "sam-tiny"
+    assert label_of_index({**index, "model": None}) == "sam"
+    assert label_of_index({**index, "label": TRUE_MASKS}) == TRUE_MASKS
     assert made_from_truth(TRUE_MASKS)
     assert not any(map(made_from_truth, ("sam-tiny", "graph", "truth")))
 
