@@ -54,7 +54,7 @@ def times_of(gaussians: Gaussians, camera: Camera, device: Device, threads: int)
         draw(gaussians, camera, 3, threads=threads, device=device).gradients(slope, flat)
 
     settings = SETTINGS.model_copy(update={"device": device})
-    view = TrainingView("view", camera, (255 * np.clip(seen.image, 0, 1)).astype(np.uint8))
+    view = TrainingView(camera, (255 * np.clip(seen.image, 0, 1)).astype(np.uint8))
     start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     generator = np.random.default_rng(0)
     state = FitState(Adam.start(start), ScreenGradients.start(len(gaussians)), generator, step=HALF_WAY)

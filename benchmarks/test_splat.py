@@ -114,7 +114,7 @@ def test_fit_iteration(benchmark, scene, threads):
     view = project_gaussians(gaussians, camera, 3, 2)
     image, _ = blend_forward(view, view.colours, 2)
     target = (255 * np.clip(image, 0, 1)).astype(np.uint8)
-    views = [TrainingView("view", camera, target)]
+    views = [TrainingView(camera, target)]
     rng = np.random.default_rng(3)
     start = {field: getattr(gaussians, field).copy() for field in FIELDS}
     start["sh"] += 0.1 * rng.normal(size=start["sh"].shape).astype(np.float32)

@@ -202,9 +202,10 @@ class _Waiting:
         self._num_gaussians = num_gaussians
         room = CHUNK_WEIGHTS + LARGE_PART  # parts are smaller than LARGE_PART; CHUNK_WEIGHTS triggers adding
         self._indices, self._data = np.empty(room, np.int32), np.empty(room, np.float32)
-        self._clear()
+        self.clear()
 
-    def _clear(self) -> None:
+    def clear(self) -> None:
+        """Remove all parts."""
         self.nonzeros = 0
         self._indptr = [np.zeros(1, np.int64)]
         self._valid = [np.zeros((0, len(LEVELS)), np.bool_)]
@@ -219,17 +220,11 @@ class _Waiting:
         self.nonzeros = after
 
     def held(self) -> StackedWeights:
-        """Return all parts; valid until the next part is appended."""
+        """Return all parts; valid until another part is appended."""
         indptr = np.concatenate(self._indptr)
         arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
         matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)
         return StackedWeights(matrix, np.concatenate(self._valid))
-
-    def take(self) -> StackedWeights:
-        """Return all parts, and remove them."""
-        held = self.held()
-        self._clear()
-        return held
 
 
 class QuadraticBuilder:
@@ -270,7 +265,8 @@ class QuadraticBuilder:
 
     def _add_waiting(self, gram: GramBuilder) -> None:
         if self._waiting.nonzeros:
-            gram.add(self._waiting.take())
+            gram.add(self._waiting.held())
+            self._waiting.clear()
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all parts added so far as arrays."""

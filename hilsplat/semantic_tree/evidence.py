@@ -58,7 +58,6 @@ def mask_evidence(
     Shares have one row per mask of a level, and are zero if the Gaussian is not visible in the mask's view.
     The result does not depend on the number of threads.
     """
-
     num, share = len(view), shares.data.astype(np.float64)
     weight = importance.astype(np.float64)[shares.indices]
     sizes, weighted = weight * np.square(share), weight * share

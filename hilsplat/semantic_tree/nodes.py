@@ -95,9 +95,7 @@ def level_nodes(
     def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         of_cluster = np.full(len(quality) + 1, NONE, np.int64)
         of_cluster[kept] = np.arange(len(kept))
-        return of_cluster, *gaussian_nodes(
-            of_cluster[cluster], len(kept), weights, view, mass, total_mass, MIN_MEMBER_SHARE
-        )
+        return of_cluster, *gaussian_nodes(of_cluster[cluster], len(kept), weights, view, mass, total_mass)
 
     fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
     kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
@@ -119,22 +117,20 @@ def gaussian_nodes(
     view: Int32[np.ndarray, " M"],
     mass: Float32[np.ndarray, "V N"],
     total_mass: Float64[np.ndarray, " N"],
-    min_share: float,
 ) -> tuple[Int32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
     """Assign each Gaussian to the node with the largest product of two shares of its visible weight.
 
-    The first is the share inside the node's masks in all views. The second is the same share in the views
-    with a mask of the node, with `PRIOR_VIEWS` average views added to its denominator. It lets a small
-    object, segmented in few views, keep its Gaussians next to a large one whose masks sometimes cover it.
-    Masks of one view may overlap, and a node may have several masks there, so a Gaussian's weight in a view
-    is capped at its visible mass there.
+    The first is the share inside the node's masks in all views; it must exceed `MIN_MEMBER_SHARE`. The second
+    is the same share in the views with a mask of the node, with `PRIOR_VIEWS` average views added to its
+    denominator. It lets a small object, segmented in few views, keep its Gaussians next to a large one whose
+    masks sometimes cover it. Masks of one view may overlap, and a node may have several masks there, so a
+    Gaussian's weight in a view is capped at its visible mass there.
 
     Args:
         cluster: node of each mask of one level, -1 for none.
         weights: S of the masks.
         mass: visible mass of each Gaussian in each view, px.
         total_mass: sum of `mass` over views, px.
-        min_share: a Gaussian joins only nodes that contain more than this share of its weight in all views.
 
     Returns:
         node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.
@@ -150,7 +146,7 @@ def gaussian_nodes(
     per_node = sp.csr_matrix((capped, (pair_node[per_view.row], per_view.col)), shape=shape)
     del per_view, capped
     per_node.data /= np.maximum(total_mass[per_node.indices], 1e-12)
-    per_node.data[per_node.data <= min_share] = 0
+    per_node.data[per_node.data <= MIN_MEMBER_SHARE] = 0
     per_node.eliminate_zeros()
     column, share = per_node.indices, per_node.data
     in_its_views = np.zeros(per_node.nnz)

@@ -288,7 +288,7 @@ def write_report(
     for view in views:
         shown = picture(view.camera)  # scored as a saved 8-bit image
         drawn, truth = to_float(shown), to_float(view.image)
-        scores[view.name] = {"psnr_db": psnr(drawn, truth), "ssim": ssim(drawn, truth)}
+        scores[view.camera.name] = {"psnr_db": psnr(drawn, truth), "ssim": ssim(drawn, truth)}
         flat.append(psnr(np.broadcast_to(truth.mean(axis=(0, 1)), truth.shape), truth))
         if len(cells) < 3 * MAX_SHOWN:
             error = np.abs(view.image.astype(np.int32) - shown) * ERROR_GAIN

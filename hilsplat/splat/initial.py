@@ -30,7 +30,6 @@ RANDOM_POINTS = 10_000
 class TrainingView:
     """One view, scaled to the fit's resolution."""
 
-    name: str
     camera: Camera
     image: UInt8[np.ndarray, "H W 3"]
 
@@ -44,7 +43,7 @@ def load_views(scene: Scene, split: str, image_scale: float) -> list[TrainingVie
             size_hw = tuple(max(1, round(side * image_scale)) for side in image.shape[:2])
             shrunk = Image.fromarray(image).resize(size_hw[::-1], Image.Resampling.BOX)
             image, camera = np.asarray(shrunk), camera.scaled(size_hw)
-        views.append(TrainingView(name, camera, image))
+        views.append(TrainingView(camera, image))
     return views
 
 

@@ -42,7 +42,6 @@ def render(
     *,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     features: Float32[np.ndarray, "N D"] | None = None,
-    sh_degree: int | None = None,
     threads: int = 1,
     device: Device = "cpu",
 ) -> Rendering:
@@ -50,20 +49,16 @@ def render(
 
     Args:
         features: additional channels to blend in the same pass; any number.
-        sh_degree: degree of spherical harmonics to use; default: that of the Gaussians.
         threads: CPU threads; the result is byte-identical for any number.
         device: backend; see `device.choose_device`.
 
     Raises:
-        HilsplatError: if parameters are not finite, quaternions are zero, or the number of feature
-            rows differs from the number of Gaussians.
+        HilsplatError: if parameters are not finite, quaternions are zero, spherical harmonics have a degree
+            above 3, or the number of feature rows differs from the number of Gaussians.
     """
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    if not 0 <= degree <= min(gaussians.sh_degree, 3):
-        raise HilsplatError(
-            f"spherical harmonics of degree {degree} are not available",
-            expected=f"0 to {gaussians.sh_degree}, the degree of these Gaussians, and at most 3",
-        )
+    degree = gaussians.sh_degree
+    if degree > 3:
+        raise HilsplatError(f"spherical harmonics of degree {degree} cannot be drawn", expected="at most 3")
     seen = draw(gaussians, camera, degree, features=features, threads=threads, device=device)
     color = seen.image[..., :3] + (1 - seen.alpha)[..., None] * np.array(background, np.float32)
     return Rendering(color, seen.alpha, seen.image[..., 3:] if features is not None else None)

@@ -14,9 +14,9 @@ TILE = 16
 BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 """Centre of the first pixel of each 4x4 block, relative to the tile's corner."""
-REACH_SLACK = (1e-2, 1e-6)
-"""A block is skipped if the exponent is below the cut by more than this: an absolute slack, and one relative
-to the squared terms of the exponent (float32 rounding: 6e-8)."""
+_SLACK, _RELATIVE = np.float32(1e-2), np.float32(1e-6)
+"""A block is skipped if the exponent is below the cut by more than an absolute slack plus one relative to the
+squared terms of the exponent (float32 rounding: 6e-8)."""
 AHEAD = 16
 """Number of list entries by which row prefetching is ahead."""
 MAX_ENTRIES = 2**21
@@ -25,7 +25,6 @@ MAX_ENTRIES = 2**21
 _SPAN = np.float32(3.0)
 """Distance between a block's first and last pixel centre."""
 _CUT = np.float32(np.log2(MIN_ALPHA))
-_SLACK, _RELATIVE = np.float32(REACH_SLACK[0]), np.float32(REACH_SLACK[1])
 
 
 @dataclass(frozen=True)

@@ -323,14 +323,10 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
             # also false if the peak is below MIN_ALPHA, where the half-widths are NaN
             if not (x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height):
                 continue
-            first_x, last_x = (
-                max(math.ceil(x - half_x - 0.5), 0),
-                min(math.floor(x + half_x - 0.5), width - 1),
-            )
-            first_y, last_y = (
-                max(math.ceil(y - half_y - 0.5), 0),
-                min(math.floor(y + half_y - 0.5), height - 1),
-            )
+            first_x = max(math.ceil(x - half_x - 0.5), 0)
+            last_x = min(math.floor(x + half_x - 0.5), width - 1)
+            first_y = max(math.ceil(y - half_y - 0.5), 0)
+            last_y = min(math.floor(y + half_y - 0.5), height - 1)
             if last_x < first_x or last_y < first_y:
                 continue
             box[i, 0], box[i, 1], box[i, 2], box[i, 3] = first_x, last_x, first_y, last_y

@@ -21,7 +21,7 @@ from hilsplat.contributions.quadratic import (
 )
 from hilsplat.contributions.quadratic_builder import GramBuilder, QuadraticBuilder, stack_weights
 from hilsplat.contributions.rows import Contributions
-from hilsplat.contributions.stage import ArrayStream, run_contributions
+from hilsplat.contributions.stage import run_contributions
 from hilsplat.contributions.view_matrices import label_maps, labelled_rows, random_half, view_contributions
 from hilsplat.embed.vectors import mask_embeddings
 from hilsplat.segment.digests import index_entry
@@ -34,7 +34,6 @@ from tests.unit.two_boxes_world import (
     WIDTH,
     TwoBoxes,
     build_contributions,
-    reverse_masks,
     two_boxes_weights,
 )
 
@@ -233,24 +232,14 @@ def test_a_resumed_run_writes_the_same_bytes(two_boxes_contributions):
     assert sha256_of_path(out) == before
 
 
-@pytest.fixture
-def checkpointed(two_boxes, monkeypatch):
-    """A function that runs the stage with a checkpoint after each view, and the digest of its result."""
-    settings, folder = ContributionsSettings(keep="gram"), two_boxes.folder
+@pytest.mark.parametrize("is_damaged", [False, True], ids=["whole", "without one file"])
+def test_a_killed_run_resumes_from_its_checkpoint_if_it_is_whole(two_boxes, monkeypatch, is_damaged):
+    settings, folder, drawn = ContributionsSettings(keep="gram"), two_boxes.folder, []
+    weights = stage.pixel_weights
 
     def run(out: str, cache: str) -> str:
         run_contributions(*inputs_of(two_boxes), folder / out, folder / cache, settings, 1)
         return sha256_of_path(folder / out)
-
-    whole = run("whole", "other cache")
-    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
-    return run, whole
-
-
-def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, checkpointed, monkeypatch):
-    run, whole = checkpointed
-    drawn = []
-    weights = stage.pixel_weights
 
     def counted(gaussians, camera, **more):
         drawn.append(camera.name)
@@ -258,35 +247,17 @@ def test_a_killed_run_resumes_from_its_checkpoint(two_boxes, checkpointed, monke
             raise KeyboardInterrupt
         return weights(gaussians, camera, **more)
 
+    expected = run("whole", "other cache")
+    monkeypatch.setattr(quadratic_builder, "CHECKPOINT_SECONDS", 0.0)
     monkeypatch.setattr(stage, "pixel_weights", counted)
     with pytest.raises(KeyboardInterrupt):
         run("out", "cache")
-    assert run("out", "cache") == whole
-    # the first two views are neither drawn nor summed again
-    assert drawn[3:] == list(two_boxes.views[2:])
-    assert not list((two_boxes.folder / "cache").rglob("*.npy"))  # the checkpoint is removed
-
-
-def test_a_checkpoint_without_one_file_is_discarded(two_boxes, checkpointed, monkeypatch):
-    run, whole = checkpointed
-    with monkeypatch.context() as killed:
-        killed.setattr(stage, "write_npz", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            run("out", "cache")
-    lost, *_ = sorted((two_boxes.folder / "cache").rglob("*.npy"))
-    lost.unlink()
-    assert run("out", "cache") == whole
-
-
-def test_array_streams_are_npy_files(tmp_path):
-    rows = np.arange(12, dtype=np.float32).reshape(4, 3)
-    for name, parts, row_shape in (("rows", (rows[:1], rows[1:]), (3,)), ("none", (), ())):
-        stream = ArrayStream(tmp_path / f"{name}.npy", np.float32, row_shape)
-        for part in parts:
-            stream.append(part)
-        stream.close()
-    assert np.array_equal(np.load(tmp_path / "rows.npy", mmap_mode="r"), rows)
-    assert np.load(tmp_path / "none.npy").shape == (0,)
+    if is_damaged:
+        min((folder / "cache").rglob("*.npy")).unlink()
+    assert run("out", "cache") == expected
+    # views in the checkpoint are not drawn again
+    assert drawn[3:] == list(two_boxes.views[0 if is_damaged else 2 :])
+    assert not list((folder / "cache").rglob("*.npy"))  # the checkpoint is removed
 
 
 def test_masks_of_another_size_are_refused(two_boxes):
@@ -298,10 +269,3 @@ def test_masks_of_another_size_are_refused(two_boxes):
     write_index(two_boxes.masks, {**index, view: index_entry(wrong)}, segmenter="sam")
     with pytest.raises(MisalignedArtifactError, match=r"masks of view 001.png do not match its camera"):
         build_contributions(two_boxes)
-
-
-def test_masks_that_their_index_does_not_record_are_refused(two_boxes_contributions):
-    world, _ = two_boxes_contributions
-    reverse_masks(world, "001.png", record=False)
-    with pytest.raises(MisalignedArtifactError, match=r"001\.png\.npz contains different masks"):
-        build_contributions(world)

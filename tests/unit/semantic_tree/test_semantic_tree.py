@@ -9,6 +9,7 @@ import scipy.sparse as sp
 from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
 from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
+from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import (
     gaussian_nodes,
@@ -30,11 +31,12 @@ from tests.unit.two_boxes_world import (
 )
 
 
-def test_gaussians_join_the_node_with_the_largest_share():
+def test_gaussians_join_the_node_with_the_largest_share(monkeypatch):
     def joined(weights, cluster, view, mass, min_share) -> tuple[list[int], np.ndarray]:
+        monkeypatch.setattr(nodes, "MIN_MEMBER_SHARE", min_share)
         S, mass = sp.csr_matrix(np.array(weights, np.float32)), np.array(mass, np.float32)
         masks = np.array(cluster), 2, S, np.array(view, np.int32)
-        node, membership = gaussian_nodes(*masks, mass, mass.sum(axis=0, dtype=np.float64), min_share)
+        node, membership = gaussian_nodes(*masks, mass, mass.sum(axis=0, dtype=np.float64))
         return node.tolist(), membership.tolist()
 
     # Gaussian 0 has 9 of 10 px in node 0 and 2 in node 1; Gaussian 1 has too little (2 of 10) in any
@@ -57,15 +59,14 @@ def test_small_pieces_apart_from_their_node_leave_it():
     # two nodes on a line: node 0 at 0 to 39 and, one unit of mass in 52, at 200; node 1 beside the latter
     means = np.zeros((52, 3))
     means[:, 0] = [*range(40), 200, *range(201, 212)]
-    nodes = np.array([0] * 41 + [1] * 11, np.int32)
-    nearest = nearest_gaussians(means, 1)
-    kept = without_strays(nodes, nearest, np.full(52, 2.0))
-    assert kept.tolist() == nodes.tolist()  # one of forty is more than 2 %
-    mass = np.full(52, 2.0)
+    node = np.array([0] * 41 + [1] * 11, np.int32)
+    nearest, mass = nearest_gaussians(means, 1), np.full(52, 2.0)
+    kept = without_strays(node, nearest, mass)
+    assert kept.tolist() == node.tolist()  # one of forty is more than 2 %
     mass[40] = 1.0
-    assert np.flatnonzero(without_strays(nodes, nearest, mass) != nodes).tolist() == [40]
-    nodes[:] = -1
-    assert (without_strays(nodes, nearest, mass) == -1).all()
+    assert np.flatnonzero(without_strays(node, nearest, mass) != node).tolist() == [40]
+    node[:] = -1
+    assert (without_strays(node, nearest, mass) == -1).all()
 
 
 def test_a_duplicate_cluster_is_not_a_node():
@@ -145,10 +146,10 @@ def test_children_and_ancestors_of_nodes_without_a_part(tree_of_boxes):
 def test_the_readable_tree_and_counts(tree_of_boxes):
     _, out = tree_of_boxes
     assert read_index(out)["nodes"] == {"whole": 2, "part": 3, "subpart": 2}
-    nodes = read_json(out / "tree.json")["nodes"]
-    assert nodes[0]["level"] == Level.WHOLE.label
-    assert nodes[0]["children"] == [2, 4]
-    assert sum(node["gaussians"] for node in nodes if node["level"] == "whole") == NUM_GAUSSIANS
+    listed = read_json(out / "tree.json")["nodes"]
+    assert listed[0]["level"] == Level.WHOLE.label
+    assert listed[0]["children"] == [2, 4]
+    assert sum(node["gaussians"] for node in listed if node["level"] == "whole") == NUM_GAUSSIANS
 
 
 def test_a_rerun_writes_the_same_bytes_and_too_few_views_give_an_empty_tree(tree_of_boxes, caplog):

@@ -75,6 +75,12 @@ def test_pixels_of_nodes_equal_the_product_with_all_weights():
     assert np.array_equal(shown.mask(chosen)[clear], (total > 0.5)[clear])
 
 
+def test_a_pixel_shows_the_node_that_makes_up_more_than_half_of_it():
+    weights = sp.csr_matrix(np.array([[0.7, 0.3, 0], [0.5, 0.5, 0], [0, 0, 0], [0, 0.4, 0.6]], np.float32))
+    shown = ViewNodes.of(weights, np.array([2, 5, -1], np.int32))
+    assert shown.labels((2, 2)).tolist() == [[2, -1], [-1, -1]]
+
+
 @pytest.fixture
 def ply(tmp_path):
     path = tmp_path / "gaussians.ply"
@@ -87,7 +93,7 @@ def tree_of(ply):
     return plain_tree([1, 1, 2, 3], [-1, -1, 0, 0], nodes, gaussians_sha256=sha256_of_file(ply))
 
 
-def test_the_exported_tree_is_a_valid_3dgs_ply(ply, tmp_path):
+def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(ply, tmp_path):
     out = tmp_path / "tree.ply"
     write_tree_ply(ply, tree_of(ply), out)
     vertex = PlyData.read(out)["vertex"]
@@ -95,15 +101,12 @@ def test_the_exported_tree_is_a_valid_3dgs_ply(ply, tmp_path):
     assert vertex["node_part"].tolist() == [-1, 2, -1, -1]
     assert vertex["node_subpart"].tolist() == [3, -1, -1, -1]
     np.testing.assert_array_equal(load_ply(out).means, load_ply(ply).means)
+    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
+    assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
     other = tree_of(ply)
     save_ply(ply, round_gaussians(np.arange(12.0).reshape(4, 3) + 1))  # as many Gaussians
     with pytest.raises(MisalignedArtifactError, match=r"made for another .*\.ply"):
         write_tree_ply(ply, other, tmp_path / "tree.ply")
-
-
-def test_a_selection_contains_the_chosen_gaussians(ply, tmp_path):
-    write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
-    assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
 
 
 def test_a_node_that_nesting_emptied_is_dropped_and_the_others_keep_their_order():
@@ -155,9 +158,3 @@ def test_nodes_are_prompted_in_their_middle_and_the_grid_elsewhere():
     assert (4.5, 3.0) not in map(tuple, points)
     nothing = dict.fromkeys(Level, np.full((4, 4), -1, np.int32))
     np.testing.assert_allclose(guided_points(nothing, point_grid(2), 1), point_grid(2) * 4)
-
-
-def test_a_pixel_shows_the_node_that_makes_up_more_than_half_of_it():
-    weights = sp.csr_matrix(np.array([[0.7, 0.3, 0], [0.5, 0.5, 0], [0, 0, 0], [0, 0.4, 0.6]], np.float32))
-    shown = ViewNodes.of(weights, np.array([2, 5, -1], np.int32))
-    assert shown.labels((2, 2)).tolist() == [[2, -1], [-1, -1]]

@@ -1,7 +1,5 @@
 """gsplat's functions on the CPU: its own projection and harmonics in torch, and the loop of its kernel."""
 
-from typing import Any
-
 import torch
 from gsplat.cuda import _torch_impl as reference
 from torch import Tensor
@@ -16,19 +14,7 @@ def spherical_harmonics(degree: int, directions: Tensor, coefficients: Tensor) -
 
 
 def rasterization(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    eps2d: float,
-    **options: Any,
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d, **options
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """As `gsplat.rasterization` for one view, without tiles."""
     assert options["radius_clip"] == 0 and options["rasterize_mode"] == "classic"
@@ -49,17 +35,7 @@ def rasterization(
 
 
 def rasterize_to_indices_in_range(
-    first: int,
-    last: int,
-    transmittances: Tensor,
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    width: int,
-    height: int,
-    tile: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
+    first, last, transmittances, means2d, conics, opacities, width, height, tile, isect_offsets, flatten_ids
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As in gsplat: Gaussian and pixel of each blended pair, front to back within a pixel."""
     assert first == 0 and bool((transmittances == 1).all())

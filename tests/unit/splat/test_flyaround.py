@@ -12,7 +12,6 @@ from hilsplat.splat.flyaround import (
     closed_path,
     contact_sheet,
     open_path,
-    short_round,
     write_film,
     write_flyaround,
 )
@@ -82,13 +81,6 @@ def test_one_camera_is_repeated_and_opposite_cameras_do_not_break_the_path():
     cameras = ring(2, 48)
     for camera in closed_path([cameras[name] for name in cameras.names], 16):
         assert np.isfinite(camera.cam_from_world).all()
-
-
-def test_short_round_undoes_crossings():
-    corners = np.array([[0, 0], [1, 1], [1, 0], [0, 1.0]])
-    distances = np.linalg.norm(corners[:, None] - corners[None], axis=2)
-    tour = short_round(distances)
-    assert sum(distances[a, b] for a, b in zip(tour, tour[1:] + tour[:1], strict=True)) == pytest.approx(4)
 
 
 def flat_picture(camera: Camera) -> np.ndarray:
