@@ -17,8 +17,8 @@ UNCHECKED = (
     "hilsplat.world.paints",
     "hilsplat.world.shapes",
 )
-"""Modules of small functions that are called tens of thousands of times, for each definition or each piece of
-an object: checks would take five times as long as the tests themselves."""
+"""Modules of small functions that are called tens of thousands of times; checks would take five times as long
+as the tests themselves."""
 
 # All other modules have the shapes and types of arguments and results checked at every call.
 sources = [*(PROJECT / "hilsplat").rglob("[!_]*.py"), *(PROJECT / "models/training").glob("[!_]*.py")]
@@ -51,7 +51,7 @@ def desk_project(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def own_log() -> Iterator[None]:
-    """Handlers that a command adds write to the terminal of its test, which is gone after it."""
+    """Remove the log handlers that a command added: they write to the captured output of its test."""
     before = list(logging.getLogger().handlers)
     yield
     logging.getLogger().handlers[:] = before

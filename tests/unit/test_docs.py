@@ -30,7 +30,7 @@ PAGES = sorted(
 )
 ROOTS = ("hilsplat/", "rules/", "config/", "workflow/", "tests/", "docs/", "benchmarks/", "models/")
 FILES = ("ply", "json", "safetensors", "csv", "png", "md", "py", "smk")
-"""What follows the dot in `gaussians.ply`, which is a file and not a knob."""
+"""Suffixes in names such as `gaussians.ply`, which are files and not settings."""
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.M | re.S)
 

@@ -95,9 +95,9 @@ class Project:
 
 
 def copy_project(source: Path, target: Path, *, results: bool) -> Project:
-    """Copy the project's own files and, on request, results with Snakemake's records; times stay.
+    """Copy the project's own files and, on request, results with Snakemake's records.
 
-    Kernels that numba compiled go along: they hold as long as the time of their source does.
+    Modification times are kept, so that the copied kernels of numba remain valid.
     """
     target.mkdir(parents=True)
     parts = [*PARTS, *(["results", ".snakemake"] if results else [])]

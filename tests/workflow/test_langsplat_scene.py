@@ -14,7 +14,7 @@ from tests.workflow.conftest import SCENE, Project
 
 @pytest.fixture
 def theirs(finished: Project, tmp_path: Path) -> Path:
-    """What 3DGS and LangSplat leave beside the photographs of the tiny scene, with LERF-OVS's labels."""
+    """The tiny scene's photographs with the outputs of 3DGS and LangSplat, and labels as in LERF-OVS."""
     own, folder = str(finished.root / SCENE), tmp_path / "their scene"
     export = ("export", own, "--as")
     finished.hilsplat(*export, "langsplat", "--out", str(folder), folder=tmp_path)
@@ -57,7 +57,7 @@ def test_a_scene_of_langsplat_answers_after_two_commands(
     after = project.hilsplat("query", "photos/theirs", "mug", "--out", str(theirs / "b"))
     level = [text.split("\n")[2].split()[1] for text in (before, after)]
     assert level[0] == level[1]
-    # a rerun of an early stage keeps what was brought
+    # a rerun of an early stage keeps the imported masks
     project.hilsplat("run", "theirs", "--", "--cores", "2", "--forcerun", "poses")
     assert read_index(results / "default/masks")["segmenter"] == "langsplat"
     # other Gaussians rerun the stage

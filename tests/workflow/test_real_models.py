@@ -21,7 +21,7 @@ DESK = Path("results/photos/desk")
 
 
 def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
-    """Put the embedded networks on the hub, without the note that they know only one world."""
+    """Put the embedded networks on the hub, without the entry that limits them to the synthetic world."""
     repository_of = {release.name: release.repository for release in RELEASES}
     for name, embedded in zip(RECOMMENDED, ("sam-tiny", "clip-tiny"), strict=True):
         shutil.copytree(project / "models" / embedded, folder / name)
@@ -62,7 +62,7 @@ def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
     answer = copy.hilsplat("query", "photos/desk", "mug")
     assert "to 'mug' in photos/desk" in answer and "meaningless" not in answer
 
-    # without them, masks and words would be made anew by what is left; poses and Gaussians stay
+    # without these models, the others would recompute masks and vectors; poses and Gaussians are kept
     shutil.rmtree(copy.root / "models/sam2.1-hiera-small")
     shutil.rmtree(copy.root / "models/clip-vit-base-patch16")
     planned = snakemake(copy, "-n")

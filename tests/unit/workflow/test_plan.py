@@ -260,14 +260,6 @@ def test_tables_have_their_own_scenes_and_variants(tmp_path):
     assert variants_in(targets.scores(with_network, "replica")) == ["default", "network", "network.seed1"]
 
 
-def test_a_sweep_without_variants_has_no_table_and_no_plot(tmp_path):
-    found = plan(tmp_path, ablation_variants=[], theta_variants=[], omega_variants=["theta"])
-    assert "results/tables/omega.csv" in targets.tables(found)
-    assert not {"results/tables/ablation.csv", "results/tables/theta.csv"} & set(targets.tables(found))
-    plots = [name for name in targets.default(found) if "sweep-" in name]
-    assert plots == ["results/figures/sweep-omega.png"]
-
-
 def test_a_run_of_photographs_leaves_tables_alone(tmp_path):
     assert targets.default(plan(tmp_path, groups=["photos"])) == [
         "results/figures/photos/desk/panel.png",
