@@ -24,13 +24,14 @@ from hilsplat.world.shapes import (
 )
 
 
-def _legs(b: Builder, x: float, y: float, top: float, paint: Paint, foot_paint: Paint, width: float) -> None:
-    """Add four square legs at (+-x, +-y), each with a foot in another colour."""
+def _legs(b: Builder, x: float, y: float, top: float, paints: list[Paint], width: float) -> None:
+    """Add four square legs at (+-x, +-y), each with a foot, in the paints of leg and foot."""
     foot_height = max(0.05, 0.22 * top)
     shape = box((width, width, top - foot_height), (0, 0, (top + foot_height) / 2), 0.008)
     foot = box((width * 1.3, width * 1.3, foot_height), (0, 0, foot_height / 2), 0.01)
     for px, py in product((-x, x), (-y, y)):
-        b.part("leg", paint, shape.moved(px, py)).subpart("foot, leg tip", foot_paint, foot.moved(px, py))
+        leg = b.part("leg", paints[0], shape.moved(px, py))
+        leg.subpart("foot, leg tip", paints[1], foot.moved(px, py))
 
 
 def _pillow(size: tuple[float, float, float]) -> Mesh:
@@ -119,7 +120,7 @@ def table(b: Builder) -> None:
     top.subpart("edge, rim", "plain", *edges)
     shape = box((depth * 0.46, width * 0.86, 0.012), (0, 0, height + 0.002), 0.003)
     top.subpart("runner, tablecloth", "cloth", shape)
-    _legs(b, depth / 2 - 0.07, width / 2 - 0.07, height - 0.05, leg_paint, foot, 0.07)
+    _legs(b, depth / 2 - 0.07, width / 2 - 0.07, height - 0.05, [leg_paint, foot], 0.07)
 
 
 def desk(b: Builder) -> None:
@@ -159,7 +160,7 @@ def nightstand(b: Builder) -> None:
         drawer = b.part("drawer", front, shape)
         shape = box((0.04, width * 0.36, 0.045), (depth / 2 + 0.04, 0, z), 0.01)
         drawer.subpart("handle, pull", metal, shape)
-    _legs(b, depth / 2 - 0.05, width / 2 - 0.05, 0.14, *b.paints("wood", "plain"), 0.055)
+    _legs(b, depth / 2 - 0.05, width / 2 - 0.05, 0.14, b.paints("wood", "plain"), 0.055)
 
 
 def floor_lamp(b: Builder) -> None:

@@ -22,20 +22,20 @@ from hilsplat.world.shapes import (
 
 PASTELS = {
     "beige": (0.86, 0.78, 0.62),
-    "yellow": (0.90, 0.80, 0.50),
+    "yellow": (0.9, 0.8, 0.5),
     "pink": (0.86, 0.66, 0.62),
-    "orange": (0.86, 0.60, 0.42),
-    "teal": (0.55, 0.72, 0.70),
-    "blue": (0.58, 0.68, 0.80),
+    "orange": (0.86, 0.6, 0.42),
+    "teal": (0.55, 0.72, 0.7),
+    "blue": (0.58, 0.68, 0.8),
     "green": (0.64, 0.74, 0.58),
-    "white": (0.90, 0.89, 0.85),
+    "white": (0.9, 0.89, 0.85),
     "red": (0.72, 0.38, 0.32),
     "grey": (0.66, 0.66, 0.66),
 }
 """sRGB of plastered walls by colour word."""
 
 FOLIAGE = {
-    "green": ((0.20, 0.46, 0.14), (0.42, 0.62, 0.22)),
+    "green": ((0.2, 0.46, 0.14), (0.42, 0.62, 0.22)),
     "orange": ((0.78, 0.42, 0.12), (0.88, 0.62, 0.22)),
 }
 """sRGB of leaves, in shade and in light, by colour word."""
@@ -139,7 +139,7 @@ def sign(b: Builder) -> None:
     pole.subpart("base, foot", "stone grey beige", cylinder(0.16, 0, 0.2, 14, 0.02))
     plate = b.part("plate, panel, board")
     form = str(b.rng.choice(["round", "octagon", "triangle", "square"]))
-    size = b.between(0.40, 0.46)
+    size = b.between(0.4, 0.46)
     symbol = plate.subpart("symbol, pictogram")
     colours, mark, corners, turn = {
         "round": (("red", "blue"), "white", 28, 0.0),
@@ -365,7 +365,7 @@ def car(b: Builder) -> None:
     paint = lacquer(b, "red orange yellow green teal blue white grey purple")
     metal, pane = b.paint("metal grey black"), glass(b)
     length, w = b.between(4.1, 4.7), b.between(1.78, 1.9)
-    low, belt, top = 0.3, b.between(0.90, 0.98), b.between(1.46, 1.6)
+    low, belt, top = 0.3, b.between(0.9, 0.98), b.between(1.46, 1.6)
     half = length / 2
     outline = [(-half, low), (half, low), (half, belt - 0.22), (half - 0.1, belt - 0.14)]
     body = b.part("body, chassis", paint, extrude([*outline, (half - 1.1, belt), (-half + 0.05, belt)], w))
@@ -375,7 +375,7 @@ def car(b: Builder) -> None:
     door = body.subpart("door, doors")
     leaf, middle = lacquer(b, paint.colour), (low + belt) / 2 + 0.03
     for side in (-1, 1):
-        for x, reach in ((0.10, 1.0), (-1.0, 0.9)):
+        for x, reach in ((0.1, 1.0), (-1.0, 0.9)):
             door.put(leaf, box((reach, 0.05, belt - low - 0.2), (x, side * w / 2, middle), 0.02))
     estate = b.chance(0.4)
     back = -half + (0.12 if estate else 0.75)
@@ -485,7 +485,7 @@ def pedestrian(b: Builder) -> None:
     coat = b.paint("cloth red orange yellow green teal blue purple pink white")
     trousers = b.paint("plain blue black brown grey beige green")
     tall = b.between(1.62, 1.86)
-    hip, shoulder = 0.49 * tall, 0.80 * tall
+    hip, shoulder = 0.49 * tall, 0.8 * tall
     stride = b.between(0.12, 0.26)
     spine = [(0, 0, hip - 0.08), (0, 0, hip + 0.2), (0, 0, shoulder - 0.12), (0, 0, shoulder + 0.03)]
     shape = sweep(spine, [0.21, 0.22, 0.25, 0.13], 16).scaled(0.78, 1.0, 1.0)
