@@ -137,10 +137,11 @@ def read_listing(repository: str, revision: str | None) -> Listing:
 def read_cached_listing(repository: str, revision: str | None) -> Listing | None:
     """Return a repository's listing from the hub's local cache (HF_HOME; files named by digest), or None."""
     try:
-        found = huggingface_hub.snapshot_download(repository, revision=revision, local_files_only=True)
+        folder = huggingface_hub.snapshot_download(repository, revision=revision, local_files_only=True)
     except LocalEntryNotFoundError:
         return None
-    snapshot, files = Path(found), {}
+    snapshot = Path(folder)
+    files = {}
     for file in [path for path in snapshot.rglob("*") if path.is_file()]:
         path = file.relative_to(snapshot).as_posix()
         files[path] = HubFile(path, file.stat().st_size, file.resolve().name, file)

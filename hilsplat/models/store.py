@@ -65,7 +65,6 @@ RELEASES = (
 
 RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
 """Models that `hilsplat models get` downloads without a name; docs/models.md gives the reasons."""
-COLUMNS = "{:<24} {:<5} {:>8}  {:<11} {:<11} {}"  # of `models_table`
 
 
 @dataclass(frozen=True)
@@ -188,7 +187,7 @@ def models_table() -> str:
             megabytes = f"{sum(path.stat().st_size for path in files) / 1e6:.0f}"
             use = "the synthetic world only" if model.embedded else ""
             rows.append((name, model.family.upper(), megabytes, "", state(name), use))
-    lines = [COLUMNS.format(*row).rstrip() for row in rows]
+    lines = ["{:<24} {:<5} {:>8}  {:<11} {:<11} {}".format(*row).rstrip() for row in rows]
     lines += [
         "",
         "hilsplat models get NAME, or owner/name on the hub; without a name, the recommended pair",
