@@ -116,7 +116,7 @@ class Dataset:
             )
 
     def _has_begun(self, root: Path) -> bool:
-        """Return whether a folder has a required path of a known scene or, if none is known, any scene."""
+        """Return whether a folder has a required path of a known scene or, without known scenes, a scene."""
         if not self.scenes:
             return bool(self.found(root))
         return any(

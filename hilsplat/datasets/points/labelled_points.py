@@ -102,7 +102,7 @@ class PointScene:
             facts[f"{labelling} classes"] = len(np.unique(points.class_id[points.class_id > 0]))
             facts[f"{labelling} instances"] = len(np.unique(points.instance_id[points.instance_id > 0]))
             if points.visible is not None:
-                facts[f"{labelling} points that a camera sees"] = int(points.visible.sum())
+                facts[f"{labelling} points visible to a camera"] = int(points.visible.sum())
         return SceneReport(facts, self.warnings)
 
 

@@ -136,7 +136,7 @@ DATASET = Segments(
   validation/                          release 2.0.1, one parquet file per component and segment
     camera_image/<segment>.parquet
     camera_calibration/  lidar/  lidar_calibration/  lidar_pose/  lidar_segmentation/  vehicle_pose/
-    lidar_camera_projection/           optional: which points a camera sees
+    lidar_camera_projection/           optional: which points are visible to a camera
   individual_files_validation_segment-<segment>_with_camera_labels.tfrecord     or release 1.4.3""",
     required=lambda segment: tuple(f"{SPLITS[0]}/{tag}/{segment}.parquet" for tag in parquet.COMPONENTS),
     open=open_segment,

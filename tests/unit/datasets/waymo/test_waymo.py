@@ -164,7 +164,7 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
     report = DATASETS["waymo"].check(root, SEGMENT)
-    assert report.facts["waymo points that a camera sees"] == 6
+    assert report.facts["waymo points visible to a camera"] == 6
     (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
     assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
 
