@@ -177,6 +177,26 @@ def ask(page, text: str) -> None:
     page.keyboard.press("Enter")
 
 
+def keep(page, text: str) -> None:
+    """Query, and keep the answer with its key."""
+    ask_and_wait(page, text)
+    page.locator("#view").focus()
+    page.keyboard.press("k")
+    page.get_by_text(f"Kept “{text}”").wait_for()
+
+
+def chips(page):
+    return page.get_by_label("Kept queries").get_by_role("listitem")
+
+
+def phone_fits(page) -> bool:
+    """Whether a phone shows the view in its full width, with the panel below."""
+    page.set_viewport_size({"width": 390, "height": 780})
+    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
+    is_below = panel["y"] >= view["y"] + view["height"] and view["height"] > 150
+    return is_below and view["width"] == 390 >= page.evaluate("document.documentElement.scrollWidth")
+
+
 def answers(page):
     return page.get_by_role("region", name="Answers").get_by_role("button")
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.browser.conftest import answers, ask, serving
+from tests.browser.conftest import answers, ask, phone_fits, serving
 
 SERIOUS = ("serious", "critical")
 
@@ -67,6 +67,10 @@ def test_the_picture_is_large_enough_at_twice_the_text_size(opened, desk_address
     box = page.locator("#view").bounding_box()
     assert box["height"] > 250 and box["width"] > 300
     assert page.evaluate("document.documentElement.scrollWidth") <= 640
+
+
+def test_on_a_phone_the_panel_is_below_the_view(opened, desk_address):
+    assert phone_fits(opened(desk_address))
 
 
 def test_controls_are_at_least_24_px_high(opened, desk_address):

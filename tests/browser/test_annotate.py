@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilsplat.annotate.labels import Label, label_path, read_labels, traced, write_labels
+from hilsplat.annotate.labels import Label, label_path, read_labels, write_labels
 from hilsplat.datasets.registry import open_labelled
 from hilsplat.web.file_changes import version_of
-from tests.browser.conftest import serving
+from tests.browser.conftest import phone_fits, serving
 from tests.conftest import PROJECT
 from tests.unit.artifact_changes import change_index, write_again
-from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH, region_mask
+from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, WIDTH
 
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 
@@ -69,6 +69,13 @@ def draw_mug(page) -> None:
     polygon(page, (1, 1), (15, 1), (15, 20), (1, 20))
 
 
+def draw_book(page) -> None:
+    page.locator("#view").press("Escape")
+    page.locator("#view").press("n")
+    name(page, "book")
+    polygon(page, (22, 2), (36, 2), (36, 20))
+
+
 def drag(page, start: tuple[int, int], *path: tuple[int, int]) -> None:
     """Drag with the mouse over pixels of the photograph."""
     page.mouse.move(*place(page, *start))
@@ -78,8 +85,19 @@ def drag(page, start: tuple[int, int], *path: tuple[int, int]) -> None:
     page.mouse.up()
 
 
-def items(page):
-    return page.get_by_role("tree", name="In this photograph").get_by_role("treeitem")
+def things(page) -> list[str]:
+    """Labels of the things that the photograph's list shows."""
+    items = page.get_by_role("tree", name="In this photograph").get_by_role("treeitem")
+    return [item.get_attribute("aria-label") for item in items.all()]
+
+
+def offers_at(page, x: int, y: int):
+    """Click a pixel with the proposing tool, and return the buttons of its proposals."""
+    page.locator("#view").press("x")
+    page.mouse.click(*place(page, x, y))
+    offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
+    offers.first.wait_for()
+    return offers
 
 
 def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, root):
@@ -87,7 +105,7 @@ def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, root):
     page.locator("#view").press("j")  # a part of it
     name(page, "handle")
     polygon(page, (10, 4), (30, 4), (30, 10), (10, 10))
-    assert [item.get_attribute("aria-label") for item in items(page).all()] == ["mug, whole", "handle, part"]
+    assert things(page) == ["mug, whole", "handle, part"]
     mug, handle = kept(root)
     assert (handle.parent, handle.level, handle.origin) == (mug.id, 2, "drawn")
     expected = np.zeros(SIZE, bool)
@@ -113,31 +131,28 @@ def test_the_brush_adds_and_the_eraser_removes_pixels(page, root):
         before = after
 
 
-def test_changes_are_undone_and_redone_and_each_is_saved(page, root):
+def test_changes_are_undone_and_redone_even_after_a_reload_and_each_is_saved(page, root):
+    file = label_path(root / "annotated/photos/desk", "000.png")
     draw_mug(page)
-    first = (root / "annotated/photos/desk/000.json").read_bytes()
-    page.locator("#view").press("Escape")
-    page.locator("#view").press("n")
-    name(page, "book")
-    polygon(page, (22, 2), (36, 2), (36, 20))
-    both = (root / "annotated/photos/desk/000.json").read_bytes()
+    first = file.read_bytes()
+    draw_book(page)
+    both = file.read_bytes()
     page.locator("#view").press("Control+z")
     saved(page)
-    assert (root / "annotated/photos/desk/000.json").read_bytes() == first and items(page).count() == 1
+    assert file.read_bytes() == first and things(page) == ["mug, whole"]
+    page.reload()
+    page.locator("body[data-ready=yes]").wait_for()
     page.get_by_role("button", name="Undo").click()
     saved(page)
-    assert not (root / "annotated/photos/desk/000.json").exists()
-    for _ in range(2):
-        page.locator("#view").press("Control+Shift+z")
+    assert not file.exists()
+    for key in ("Control+Shift+z", "Control+y"):
+        page.locator("#view").press(key)
         saved(page)
-    assert (root / "annotated/photos/desk/000.json").read_bytes() == both
+    assert file.read_bytes() == both
 
 
 def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, root):
-    page.locator("#view").press("x")
-    page.mouse.click(*place(page, 6, 6))
-    offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
-    offers.first.wait_for()
+    offers = offers_at(page, 6, 6)
     assert offers.count() == 3
     offers.nth(0).click()
     saved(page)
@@ -146,7 +161,7 @@ def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, root):
     (mug,) = kept(root)
     assert mug.origin == "proposed" and mug.text == "mug"
     assert open_labelled("annotated/photos/desk", root).views["000.png"] == ()
-    assert items(page).first.get_attribute("aria-label") == "mug, whole, proposed"
+    assert things(page) == ["mug, whole, proposed"]
     page.locator("#view").press("a")
     saved(page)
     assert kept(root)[0].origin == "accepted"
@@ -154,15 +169,16 @@ def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, root):
     assert kept(root)[0].origin == "edited"
 
 
-def test_a_new_thing_has_no_name(page, root):
+def test_a_new_thing_has_neither_name_nor_parent(page, root):
     draw_mug(page)
+    offers_at(page, 6, 6).get_by_text("subpart").first.click()
+    page.get_by_text("Proposed without a parent: the parent of a subpart is a part").wait_for()
     page.locator("#view").press("Escape")
     assert page.locator("#text").input_value() == "" and page.locator("#title").inner_text() == "New thing"
-    page.locator("#view").press("x")
-    page.mouse.click(*place(page, 26, 6))
-    page.get_by_role("region", name="Proposals at this pixel").get_by_role("button").first.click()
+    offers_at(page, 26, 6).first.click()
     saved(page)
-    assert [label.text for label in kept(root)] == ["mug", "unnamed"]
+    assert [label.text for label in kept(root)] == ["mug", "unnamed", "unnamed"]
+    assert {label.parent for label in kept(root)} == {None}
     page.locator("#view").press("a")
     page.get_by_role("status").get_by_text("Accepted.").wait_for()
     page.locator("#view").press("Control+z")
@@ -170,19 +186,13 @@ def test_a_new_thing_has_no_name(page, root):
 
 
 def test_things_are_transferred_to_the_next_photograph(page, root):
-    mug = region_mask("mug") | region_mask("handle")
-    label = Label(id=4, level=1, text="mug", polygons=traced(mug))
-    page.evaluate(f"hilsplat.store.change([[0, [{label.model_dump_json()}]]])")
-    saved(page)
+    draw_mug(page)
     page.locator("#view").press("]")
     page.get_by_role("button", name="From others").click()
     page.get_by_text("1 proposed").first.wait_for()
     saved(page)
-    (carried,) = kept(root, "001.png")
-    expected = region_mask("mug", 1) | region_mask("handle", 1)
-    found = carried.mask(SIZE)
-    assert (carried.id, carried.origin) == (4, "proposed")
-    assert (found & expected).sum() / (found | expected).sum() > 0.75
+    (mug,), (carried,) = kept(root), kept(root, "001.png")
+    assert (carried.id, carried.text, carried.origin) == (mug.id, "mug", "proposed")
 
 
 def test_concurrent_changes_are_not_overwritten(page, opened, root):
@@ -191,14 +201,10 @@ def test_concurrent_changes_are_not_overwritten(page, opened, root):
     path = label_path(root / "annotated/photos/desk", "000.png")
     theirs = [kept(root)[0].model_copy(update={"text": "cup"})]
     write_labels(path, "000.png", SIZE, theirs, version_of(path))
-    page.locator("#view").press("Escape")
-    page.locator("#view").press("n")
-    name(page, "book")
-    polygon(page, (22, 2), (36, 2), (36, 20))
+    draw_book(page)
     page.get_by_text("have changed since they were read").wait_for()
-    items(page).first.wait_for()
-    assert kept(root) == theirs
-    assert [item.get_attribute("aria-label") for item in items(page).all()] == ["cup, whole"]
+    page.get_by_role("treeitem", name="cup, whole").wait_for()
+    assert kept(root) == theirs and things(page) == ["cup, whole"]
 
 
 def test_files_are_exported_and_imported_again(page, root, tmp_path):
@@ -219,7 +225,7 @@ def test_files_are_exported_and_imported_again(page, root, tmp_path):
     np.testing.assert_array_equal(kept(root)[0].mask(SIZE), before)
     page.get_by_label("Files to import").set_input_files(file)
     page.get_by_text("0 labels imported into 0 photographs; already present: 1.").wait_for()
-    assert items(page).count() == 1
+    assert things(page) == ["mug, whole"]
 
 
 def test_a_refused_change_and_later_ones_are_undone(page, opened, root):
@@ -238,35 +244,10 @@ def test_a_refused_change_and_later_ones_are_undone(page, opened, root):
         route.continue_()
     page.get_by_text("is entirely outside").wait_for()
     saved(page)
-    assert kept(root) == first
-    assert [item.get_attribute("aria-label") for item in items(page).all()] == ["mug, whole"]
+    assert kept(root) == first and things(page) == ["mug, whole"]
     page.locator("#view").press("Control+z")  # the mug, as before
     saved(page)
-    assert kept(root) == [] and items(page).count() == 0
-
-
-def test_the_undo_history_survives_a_reload(page, root):
-    draw_mug(page)
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
-    assert items(page).count() == 1
-    page.locator("#view").press("Control+z")
-    saved(page)
-    assert kept(root) == []
-    page.locator("#view").press("Control+y")
-    saved(page)
-    assert [label.text for label in kept(root)] == ["mug"]
-
-
-def test_a_subpart_proposed_below_a_whole_has_no_parent(page, root):
-    draw_mug(page)
-    page.locator("#view").press("x")
-    page.mouse.click(*place(page, 6, 6))
-    offers = page.get_by_role("region", name="Proposals at this pixel").get_by_role("button")
-    offers.get_by_text("subpart").first.click()
-    page.get_by_text("Proposed without a parent: the parent of a subpart is a part, but mug is a whole.").wait_for()
-    saved(page)
-    assert [label.parent for label in kept(root)] == [None, None]
+    assert kept(root) == [] and things(page) == []
 
 
 def area(root: Path) -> int:
@@ -324,15 +305,8 @@ def test_sam_outlines_clicked_things(opened, browser, desk, tmp_path):
         page.close()
 
 
-def test_without_sam_there_is_no_tool_for_it(page):
-    assert not page.locator("#segment-label").is_visible()
-
-
-def test_on_a_phone_the_page_fits_the_width(page):
-    page.set_viewport_size({"width": 390, "height": 780})
-    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
-    assert view["width"] == 390 and view["height"] > 150 and panel["y"] >= view["y"] + view["height"]
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+def test_the_page_fits_a_phone_and_has_no_tool_for_a_missing_sam(page):
+    assert phone_fits(page) and not page.locator("#segment-label").is_visible()
 
 
 def test_a_rewritten_scene_is_reported(opened, desk, root, tmp_path_factory):
@@ -349,5 +323,5 @@ def test_a_rewritten_scene_is_reported(opened, desk, root, tmp_path_factory):
         assert [label.text for label in kept(root)] == ["rim"]
         page.get_by_role("button", name="Reload").click()
         page.get_by_role("alert").wait_for(state="hidden")
-        items(page).first.wait_for()
+        page.get_by_role("treeitem", name="rim, whole").wait_for()
         page.close()

@@ -9,11 +9,15 @@ from PIL import Image
 from hilsplat.base.artifacts import atomic_folder
 from hilsplat.base.images import write_png
 from tests.browser.conftest import (
+    HEIGHT,
+    WIDTH,
     answers,
     ask,
     ask_and_wait,
+    chips,
     choose_row,
     drawn,
+    keep,
     on_page,
     pixels,
     save,
@@ -44,6 +48,9 @@ def test_a_query_typed_after_the_slash_key_paints_its_answer(opened, desk_addres
         assert 0.01 < orange.mean() < 0.4
         grey = (np.ptp(picture, axis=2) < 8) & (picture.max(axis=2) > 8)
         assert grey.mean() > 0.1 and (orange | grey | (picture.max(axis=2) <= 8)).mean() > 0.9
+    ask(page, "unicorn")
+    doubt = "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'."
+    page.get_by_role("status").get_by_text(doubt).wait_for()
 
 
 def test_a_query_typed_before_the_tree_is_loaded_runs_later(opened, desk_address):
@@ -58,14 +65,6 @@ def test_a_query_typed_before_the_tree_is_loaded_runs_later(opened, desk_address
     held[0].continue_()
     answers(page).first.wait_for()
     assert page.locator("#text").input_value() == "mug > handle"
-
-
-@both
-def test_doubts_are_reported(opened, desk_address, painter):
-    page = opened(desk_address, painter)
-    ask_and_wait(page, "unicorn")
-    status = page.get_by_role("status").inner_text()
-    assert "'unicorn' may not be in the scene: the model's vocabulary lacks 'unicorn'." in status
 
 
 @both
@@ -125,7 +124,7 @@ def test_keys_move_in_the_outline(opened, desk_address, scene):
     page.locator(f"#overlay path.chosen[data-node='{child}']").wait_for(state="attached")
 
 
-def test_queries_by_an_image_and_by_a_frame_drawn_over_the_view(opened, desk_address, scene, tmp_path):
+def test_queries_with_an_image_a_framed_part_of_the_view_and_a_node(opened, desk_address, scene, tmp_path):
     page = opened(desk_address)
     book = scene.query("book", "whole")[0].node
     write_png(tmp_path / "blue.png", np.full((40, 30, 3), (0, 0, 250), np.uint8))
@@ -142,6 +141,14 @@ def test_queries_by_an_image_and_by_a_frame_drawn_over_the_view(opened, desk_add
     page.keyboard.up("Alt")
     answers(page).first.wait_for()
     assert page.locator("#answers li").first.get_attribute("data-node") == str(book)
+    page.locator("#view").press("Escape")
+    handle = scene.query("mug > handle")[0].node
+    choose_row(page, handle)
+    page.get_by_role("button", name="More like this").click()
+    answers(page).first.wait_for()
+    assert page.locator("#answers li").first.get_attribute("data-node") == str(
+        scene.like_node(handle)[0].node
+    )
 
 
 def test_two_answerers_are_shown_side_by_side(opened, desk_address):
@@ -158,18 +165,19 @@ def test_two_answerers_are_shown_side_by_side(opened, desk_address):
     assert left.std() > 10 and np.abs(left - right).mean() < 12  # both answer the mug, from one camera
 
 
-def test_an_address_opens_the_same_view(opened, desk_address, scene):
+def test_an_address_opens_the_same_view_with_the_same_queries(opened, desk_address):
     page = opened(desk_address)
+    keep(page, "book")
     ask_and_wait(page, "mug > handle")
     page.locator("#view").focus()
     for key in ("ArrowLeft", "ArrowUp", "+"):
         page.keyboard.press(key)
     page.wait_for_timeout(1200)
     assert "token" not in page.url
-    fragment = "#" + page.url.partition("#")[2]
-    again = opened(desk_address, fragment=fragment)
+    again = opened(desk_address, fragment="#" + page.url.partition("#")[2])
     answers(again).first.wait_for()
     assert again.locator("#text").input_value() == "mug > handle"
+    assert chips(again).all_inner_texts() == chips(page).all_inner_texts()
     found, expected = wire_camera(again), wire_camera(page)
     np.testing.assert_allclose(found["cam_from_world"], expected["cam_from_world"], atol=1e-3)
     np.testing.assert_allclose(found["K"], expected["K"], rtol=1e-3)
@@ -204,13 +212,11 @@ def test_films_show_progress_and_gifs_have_the_chosen_size(opened, desk_address,
 
 def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, desk_address, tmp_path, scene):
     page = opened(desk_address)
-    ask_and_wait(page, "book")
-    page.get_by_role("button", name="Keep", exact=True).click()
-    page.get_by_text("Kept “book”").wait_for()
+    keep(page, "book")
     ask_and_wait(page, "mug > handle")
     page.locator("#view").press("ArrowLeft")
     file = save(page, "Page with answers, HTML", tmp_path / "page.html")
-    context = browser.new_context(viewport={"width": 740, "height": 420}, offline=True)
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True)
     alone, wrong = context.new_page(), []
     alone.on("pageerror", lambda error: wrong.append(str(error)))
     alone.on("console", lambda said: said.type == "error" and wrong.append(said.text))
@@ -224,19 +230,10 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     assert alone.locator("#answers li").get_attribute("data-node") == str(hit.node)
     ask(alone, "spoon")
     alone.get_by_text("This page contains only the answers to: book, mug > handle").wait_for()
-    chips = alone.get_by_label("Kept queries").get_by_role("listitem")
-    assert [chip.inner_text().split("\n")[0] for chip in chips.all()] == ["book"]
+    assert [chip.inner_text().split("\n")[0] for chip in chips(alone).all()] == ["book"]
     assert alone.locator("#overlay path.kept").count() == 1
     assert not wrong
     context.close()
-
-
-def test_on_a_phone_the_panel_is_below_the_view(opened, desk_address):
-    page = opened(desk_address)
-    page.set_viewport_size({"width": 390, "height": 780})
-    view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
-    assert view["width"] == 390 and panel["width"] == 390 and panel["y"] >= view["y"] + view["height"]
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 def test_keys_do_not_act_during_typing(opened, desk_address):
@@ -277,13 +274,3 @@ def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opene
         assert page.locator("#text").input_value() == "mug > handle"
         assert not page.locator("#overlay path.chosen").count()
         page.close()  # before its server ends: it asks for changes
-
-
-def test_nodes_similar_to_the_choice_are_listed(opened, desk_address, scene):
-    page = opened(desk_address)
-    handle = scene.query("mug > handle")[0].node
-    choose_row(page, handle)
-    page.get_by_role("button", name="More like this").click()
-    answers(page).first.wait_for()
-    expected = scene.like_node(handle)[0].node
-    assert page.locator("#answers li").first.get_attribute("data-node") == str(expected)

@@ -21,21 +21,9 @@ def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
     assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
 
 
-def test_the_server_paints_the_first_picture_once_and_sends_no_nodes(opened, desk_address):
-    asked = []
-    page = opened(desk_address, "server")
-    page.on("request", lambda request: asked.append(request.url))
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
-    page.evaluate("hilsplat.begun")
-    page.wait_for_timeout(1000)
-    assert len([url for url in asked if "/api/frame" in url]) == 1
-    assert not [url for url in asked if "/api/nodes/" in url or "/api/splats" in url]
-
-
 def test_at_most_two_small_pictures_are_requested_at_once(opened, desk_address):
     page = opened(desk_address, "server")
-    page.wait_for_timeout(2000)  # until its own are all there
+    page.wait_for_timeout(2000)  # until all of its pictures are loaded
     held = []
     for pattern in ("**/api/crop/**", "**/api/thumb/**"):
         page.route(pattern, lambda route: held.append(route))
@@ -88,10 +76,10 @@ def test_a_held_key_moves_evenly(opened, desk_address):
 
 def test_no_node_stays_marked_as_hovered_after_a_flight(opened, desk_address):
     page = opened(desk_address)
-    row = page.locator("[role=treeitem] > .row").first
-    row.locator(".label").click()
+    labels = page.locator("[role=treeitem] > .row .label")
+    labels.first.click()
     page.locator("#overlay path.chosen").first.wait_for(state="attached")
-    page.locator("[role=treeitem] > .row .label").nth(1).hover()
+    labels.nth(1).hover()
     page.locator("#overlay path.hover").first.wait_for(state="attached")
     page.locator("#view").press("f")
     page.locator("#overlay path.hover").first.wait_for(state="detached")
@@ -102,7 +90,7 @@ def test_back_returns_to_the_previous_query(opened, desk_address):
     page.wait_for_timeout(800)
     for text in ("mug > handle", "book"):
         ask_and_wait(page, text)
-        page.wait_for_timeout(1200)  # the address follows
+        page.wait_for_timeout(1200)  # until the address is updated
     page.go_back()
     page.wait_for_function("document.getElementById('text').value === 'mug > handle'")
     answers(page).first.wait_for()
@@ -117,8 +105,7 @@ def test_back_returns_to_the_previous_query(opened, desk_address):
     assert not answers(page).count()
 
 
-@pytest.mark.parametrize("painter", ["gl", "server"])
-@pytest.mark.parametrize("colour", ["relevancy", "field"])
+@pytest.mark.parametrize(("painter", "colour"), [("gl", "relevancy"), ("gl", "field"), ("server", "field")])
 def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, desk_address, painter, colour):
     page = opened(desk_address, painter)
     ask_and_wait(page, "mug")

@@ -29,11 +29,11 @@ def test_querying_choosing_naming_and_saving_in_the_viewer(opened, desk, tmp_pat
     shutil.copytree(desk.parents[2], tmp_path / "project")  # the names of this test are its own
     with serving(folder) as address:
         page = opened(address)
-        walk(page, folder, tmp_path)
+        query_choose_name_and_save(page, folder, tmp_path)
         page.close()
 
 
-def walk(page, desk, tmp_path) -> None:
+def query_choose_name_and_save(page, desk, tmp_path) -> None:
     page.keyboard.type("mug > handle")  # the text box has the focus
     press(page, "Enter")
     page.locator("#answers button").first.wait_for()

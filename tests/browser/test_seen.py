@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from hilsplat.base.images import write_png
-from tests.browser.conftest import answers, ask, ask_and_wait, wire_camera
+from tests.browser.conftest import answers, ask, ask_and_wait, choose_row, wire_camera
 
 
 def painted_nodes(page) -> set[int]:
@@ -20,9 +20,7 @@ def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tool
     label.first.wait_for(state="attached")
     tools = page.locator("#tools").bounding_box()
     for _ in range(40):
-        page.evaluate(
-            "hilsplat.camera.move(0, 3, 0); hilsplat.redraw()"
-        )  # until the box has left the picture
+        page.evaluate("hilsplat.camera.move(0, 3, 0); hilsplat.redraw()")  # until the box leaves the picture
         page.wait_for_timeout(100)
         top = page.evaluate("document.querySelector('#overlay text')?.getBoundingClientRect().toJSON()")
         if top is None:
@@ -34,7 +32,7 @@ def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tool
 def test_a_flight_ends_with_the_whole_node_in_view(opened, desk_address, scene):
     page = opened(desk_address, "server")
     for text in ("mug", "mug > handle"):
-        page.locator(f"[role=treeitem][data-node='{scene.query(text)[0].node}'] > .row .label").click()
+        choose_row(page, scene.query(text)[0].node)
         page.locator("#view").press("f")
         page.wait_for_timeout(1500)
         box = page.locator("#overlay path.chosen")
@@ -59,20 +57,6 @@ def test_the_first_five_similar_nodes_are_painted(opened, desk_address, scene, t
     assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
 
 
-def test_answers_by_name_or_similarity_show_no_caution(opened, desk_address):
-    page = opened(desk_address, "server")
-    shown = "own.showAnswers({ caution: 'no word means anything' }, ANSWER, {})"
-    said = "document.getElementById('caution').hidden || document.getElementById('caution').textContent"
-    code = f"import('/static/answers.js').then((own) => {{ {shown}; return {said}; }})"
-    answers_and_cautions = {
-        "null": "no word means anything",  # nothing is asked yet
-        "{ hits: [], caution: 'not this one' }": "not this one",
-        "{ hits: [], caution: '' }": True,  # by name or by likeness: the server gives it none
-    }
-    for answer, expected in answers_and_cautions.items():
-        assert page.evaluate(code.replace("ANSWER", answer)) == expected
-
-
 def test_the_present_photograph_is_marked_even_if_it_shows_the_answer(opened, desk_address, scene):
     page = opened(desk_address, "server", color_scheme="dark")
     ask_and_wait(page, "mug > handle")
@@ -82,14 +66,3 @@ def test_the_present_photograph_is_marked_even_if_it_shows_the_answer(opened, de
     button.wait_for()
     marks = "[getComputedStyle(each).borderTopColor, getComputedStyle(each, '::before').borderTopColor]"
     assert button.evaluate(f"(each) => {marks}") == ["rgb(255, 138, 31)", "rgb(255, 255, 255)"]
-
-
-def test_saving_masks_reports_the_size_of_the_file(opened, desk_address):
-    page = opened(desk_address, "server")
-    ask_and_wait(page, "mug > handle")
-    page.locator("#save summary").click()
-    with page.expect_download() as started:
-        page.get_by_role("button", name=re.compile("Masks in all photographs")).click()
-    size = started.value.path().stat().st_size
-    page.get_by_role("status").get_by_text(f"Saved desk-masks.zip, {-(-size // 1000)} kB.").wait_for()
-    assert page.locator("#saving").is_hidden()
