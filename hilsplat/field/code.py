@@ -249,11 +249,7 @@ Code = LinearCode | Autoencoder
 
 
 def load_code(folder: Path) -> Code:
-    """Read the network or linear code of a finished folder.
-
-    Raises:
-        ArtifactError: the file is missing or damaged.
-    """
+    """Read the network or linear code of a finished folder; raise ArtifactError if missing or damaged."""
     path = autoencoder_file(folder)
     state, about = read_tensors(path)
     try:
@@ -300,9 +296,5 @@ class LanguageField:
 
     @staticmethod
     def load(path: Path) -> "LanguageField":
-        """Read `field.safetensors`.
-
-        Raises:
-            ArtifactError: the file is missing, damaged or not a language field.
-        """
+        """Read `field.safetensors`; raise ArtifactError if it is missing, damaged or not a language field."""
         return made(LanguageField, *read_tensors(path), path)

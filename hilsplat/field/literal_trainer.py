@@ -1,8 +1,8 @@
 """Train the field as in the paper: render a view, compute its losses, take an Adam step on the features.
 
-It is the slow reference for the sparse solver (`solver.solve_field`). Both minimise the same
-objective, term by term. Here each step computes every term on the rendered maps of one random view; the
-expectation over the views is the solver's objective.
+It is the slow reference for the sparse solver (`solver.solve_field`). Both minimise the same objective, term
+by term. Here each step computes every term on the rendered maps of one random view; the mean over all views
+is the solver's objective.
 
 Departs from `train.py` of minghanqin/LangSplat, whose loop it follows: one run trains all three levels on the
 same views; rendered features are divided by alpha, so that losses and queries use the same features; thinly

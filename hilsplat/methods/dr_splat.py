@@ -6,7 +6,7 @@ length and stores its product-quantised bytes (kaist-ami/Dr-Splat `train.py`). N
 
 Departs from the published code:
     - the product quantiser is trained on the scene's own mask vectors, not on general images;
-    - one byte per four vector elements (128 bytes for 512); the published index file sets its own number;
+    - one byte per four vector elements (128 bytes for 512); the published index file has its own number;
     - weights of a pixel are divided by its alpha, those below `contributions.min_weight` are dropped, and
       pixels with alpha below `MIN_ALPHA` are ignored;
     - all three levels are used instead of one (`--feature_level`);

@@ -10,7 +10,7 @@ The authors' values are in the constants, and `steps` 30,000, `rate` 0.0025 (0.0
 
 Departs:
     - identities come from masks linked by shared Gaussians, as in our tree, not from a video tracker (DEVA),
-      so that a table row shows what the codes and classifier add;
+      so that a table row shows the effect of the codes and the classifier;
     - each level is trained separately; the authors use one set of masks;
     - pixels without an identity are ignored; the authors assign them a separate class;
     - geometry is frozen instead of trained together with the codes;

@@ -47,8 +47,8 @@ MIN_SHARE = 400 / (988 * 731)  # minimum share of the image in a mask: 400 px of
 SAME_IOU = 0.8
 HARD_COSINE = 0.5
 RADIUS = (0.3, 0.2, 0.1)  # radius of density clusters for wholes, parts, subparts
-LEAST_MASKS = 5  # minimum number of masks within a dense mask's radius, limited to the number of views
-MOST_DESCRIPTORS = 20
+MIN_MASKS = 5  # minimum number of masks within a dense mask's radius, limited to the number of views
+MAX_DESCRIPTORS = 20
 PIXELS = 2048
 
 
@@ -146,7 +146,7 @@ def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[
     """
     group, best = np.zeros(len(vectors), np.int64), -1.0
     distance = cdist(vectors, vectors)
-    for count in range(2, min(MOST_DESCRIPTORS, len(vectors) - 1) + 1):
+    for count in range(2, min(MAX_DESCRIPTORS, len(vectors) - 1) + 1):
         _, tried = kmeans(vectors, count, seed)
         if len(np.unique(tried)) == count and (score := silhouette(distance, tried)) > best:
             group, best = tried, score
@@ -187,7 +187,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
 
     train(views, [trained], loss, settings, seed, PIXELS)
     features = unit_slices(trained.detach()).numpy()
-    A, least = contributions.matrix("A"), min(LEAST_MASKS, len(contributions.views))
+    A, least = contributions.matrix("A"), min(MIN_MASKS, len(contributions.views))
     image_px = np.array([np.prod(inputs.view_camera(view).size_hw) for view in contributions.views])
     large = (contributions.pixels > 0) & (contributions.area_px > MIN_SHARE * image_px[contributions.view])
     for level in LEVELS:

@@ -43,7 +43,7 @@ POSITION_WIDTHS = (128,) * 4
 FIRST_UNCERTAINTY = 0.01
 UNCERTAINTY_RATE = 0.05  # Adam's rate for uncertainties, regardless of the rate of the codes
 NETWORK_RATE = 0.2  # factor of the codes' rate for the networks; the authors use 1
-LEAST_SMOOTHING = 0.1  # smoothing weight of a fully certain Gaussian; it is 1 for a fully uncertain one
+MIN_SMOOTHING = 0.1  # smoothing weight of a fully certain Gaussian; it is 1 for a fully uncertain one
 SMOOTHING = 0.1
 SAMPLES = 1000
 PIXELS = 1024
@@ -69,7 +69,7 @@ def smoothing_loss(
     codes: Float[Tensor, "s 8"], predicted: Float[Tensor, "s 8"], uncertainty: Float[Tensor, " s"]
 ) -> Float[Tensor, ""]:
     """Return squared distances that pull predictions to codes, and uncertain codes to predictions."""
-    weight = LEAST_SMOOTHING + (1 - LEAST_SMOOTHING) * uncertainty.detach()
+    weight = MIN_SMOOTHING + (1 - MIN_SMOOTHING) * uncertainty.detach()
     follow = (predicted - codes.detach()).square().mean(1).mean()
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()
 

@@ -153,7 +153,7 @@ class LabelledView:
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Return the labelled pixels of training views with any, on every `pixel_step`-th row and column.
+    """Return the labelled pixels of each training view that has any, on every `pixel_step`-th row and column.
 
     Raises:
         ArtifactError: no view has a labelled pixel.

@@ -34,7 +34,7 @@ from hilsplat.settings import MethodSettings
 CHANNELS = 16
 MIN_PATCH_PX = 3
 LEVEL_WEIGHT = 0.2  # weight of each additional step of sharing, relative to the previous one
-SPREAD, LEAST_TEMPERATURE, MOST_TEMPERATURE = 10.0, 0.5, 1.0
+SPREAD, MIN_TEMPERATURE, MAX_TEMPERATURE = 10.0, 0.5, 1.0
 THRESHOLDS = (0.5, 0.8, 0.95)
 
 
@@ -61,15 +61,15 @@ def hierarchical_loss(
     """Return the contrast of pixels with patch prototypes, summed over the steps of sharing.
 
     A pixel's loss is -log of the softmax over prototypes. Its weight is 1 at the pixel's own patch and 1/5
-    (1/25) at patches that share one mask fewer (two fewer). There the loss is at least that of the previous
-    step, so that nearer patches come first. Patches without a shared mask are negatives only. Rendered
-    features have unit length; `shared` counts the masks shared by two patches.
+    (1/25) at patches that share one mask fewer (two fewer). The loss of a step is at least that of the
+    previous step, so that patches with more shared masks are closer. Patches without a shared mask are only
+    negatives. Rendered features have unit length; `shared` counts the masks shared by two patches.
     """
     num = len(shared)
     prototypes, _ = segment_means(rendered, patch, num)
     apart = (rendered - prototypes[patch]).detach().norm(dim=1, keepdim=True)
     spread, _ = segment_means(apart, patch, num)
-    temperature = (SPREAD * spread[:, 0]).clamp(LEAST_TEMPERATURE, MOST_TEMPERATURE)
+    temperature = (SPREAD * spread[:, 0]).clamp(MIN_TEMPERATURE, MAX_TEMPERATURE)
     surprise = -log_softmax(rendered @ unit(prototypes).T / temperature, dim=1)
     own = surprise.gather(1, patch[:, None])
     total = own.mean()

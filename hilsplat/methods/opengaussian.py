@@ -35,7 +35,7 @@ CHANNELS = 6
 SMOOTHING = 0.1
 KMEANS_STEPS = 5
 POSITION = 0.5
-LEAST_WEIGHT, HARD_WEIGHT = 0.1, 0.9
+MIN_WEIGHT, HARD_WEIGHT = 0.1, 0.9
 HARD_FROM = 0.5  # share of steps after which only the closest pairs keep their weight
 
 
@@ -60,9 +60,9 @@ def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]
     inverse = 1 / ((means[:, None] - means[None]).square().sum(2) + 1)
     others = inverse.masked_fill(torch.eye(num, dtype=torch.bool), -1.0)
     rank = others.detach().argsort(dim=1, stable=True).argsort(dim=1)  # own 0, farthest 1, closest num - 1
-    weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (num - 1)
+    weight = MIN_WEIGHT + (1 - MIN_WEIGHT) * rank / (num - 1)
     if done >= HARD_FROM:
-        weight = torch.where(weight < HARD_WEIGHT, LEAST_WEIGHT, weight)
+        weight = torch.where(weight < HARD_WEIGHT, MIN_WEIGHT, weight)
     return (weight * others)[rank > 0].mean()
 
 

@@ -37,7 +37,7 @@ CHANNELS = 32
 NEIGHBOURS = 16
 SCALES = 8  # random scales per step, plus one below and one above all masks of the view
 PIXELS = 256
-MOST_WEIGHT = 10.0
+MAX_WEIGHT = 10.0
 EASY_POSITIVE, HARD_NEGATIVE = 0.75, 0.5
 COSINE = 0.95  # minimum average in a cluster; 0.5 doesn't separate parts and subparts on development scenes
 
@@ -78,7 +78,7 @@ def pair_weights(area_px: Float64[np.ndarray, " p"]) -> Float32[np.ndarray, "p p
     pairs = np.outer(area_px, area_px)
     weight = pairs.max() / np.maximum(pairs, 1e-12)
     low, high = weight.min(), weight.max()
-    return (1 + (MOST_WEIGHT - 1) * (weight - low) / max(high - low, 1e-12)).astype(np.float32)
+    return (1 + (MAX_WEIGHT - 1) * (weight - low) / max(high - low, 1e-12)).astype(np.float32)
 
 
 def affinity_loss(
@@ -88,27 +88,27 @@ def affinity_loss(
     weight: Float32[np.ndarray, "p p"],  # of each pair
     random: np.random.Generator,
 ) -> Float[Tensor, ""]:
-    """Return a loss that raises gated cosines within groups, lowers positive ones across, and keeps length 1.
+    """Return a loss that raises gated cosines in groups, lowers positive ones between groups; lengths stay 1.
 
-    Pairs used are those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
+    Pairs used: those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
     """
     gated = unit(rendered[None] * gates[:, None])
     cosine = gated @ gated.transpose(1, 2)
-    truth = torch.from_numpy(same)
-    never, always = ~truth.any(0), truth.all(0)
+    grouped = torch.from_numpy(same)
+    never, always = ~grouped.any(0), grouped.all(0)
     mixed = ~(never | always)
     easy = mixed.sum() / 2
     draw = torch.from_numpy(random.random(mixed.shape, dtype=np.float32))
     pair = torch.ones_like(mixed).triu(1)
     found = cosine.detach()
     positive = mixed | (always & (draw < easy / always.sum().clamp(min=1)))
-    positive = (positive | (truth & (found < EASY_POSITIVE)).any(0)) & pair
+    positive = (positive | (grouped & (found < EASY_POSITIVE)).any(0)) & pair
     negative = mixed | (never & (draw < easy / never.sum().clamp(min=1)))
-    negative = (negative | (~truth & (found > HARD_NEGATIVE)).any(0)) & pair
+    negative = (negative | (~grouped & (found > HARD_NEGATIVE)).any(0)) & pair
     weights = torch.from_numpy(weight)
     total = (1 - rendered.norm(dim=1).mean()).square()
-    attract = weights * (positive & truth) / (len(gates) * positive.sum().clamp(min=1))
-    repel = weights * (negative & ~truth) / (len(gates) * negative.sum().clamp(min=1))
+    attract = weights * (positive & grouped) / (len(gates) * positive.sum().clamp(min=1))
+    repel = weights * (negative & ~grouped) / (len(gates) * negative.sum().clamp(min=1))
     return total + (repel * cosine.relu() - attract * cosine).sum()
 
 

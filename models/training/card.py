@@ -16,7 +16,7 @@ from models.training.clip import CROP_PX, DIMENSIONS
 from models.training.data import LabelledViews, nested_targets
 from models.training.loop import Curve
 from models.training.measure_clip import COMMON
-from models.training.measure_sam import LEAST_PX, SIZES, predict_masks
+from models.training.measure_sam import MIN_PX, SIZES, predict_masks
 from models.training.sam import FRAME_PX, MASK_STRIDE, SamDecoder, SamEncoder
 
 RECORD = "training.json"
@@ -133,7 +133,7 @@ in float32.
 
 ## How good it is
 Measured on {recipe["validation_scenes"]} held-out scenes from the training range, for regions of at least
-{LEAST_PX} px in views of {FRAME_PX} x {FRAME_PX}.
+{MIN_PX} px in views of {FRAME_PX} x {FRAME_PX}.
 
 One point: a region and then a pixel in it are sampled, and the mask from the head of the region's level is
 compared with the region. "Best head" uses the best of the three masks; the correlation is between predicted

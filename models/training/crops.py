@@ -19,7 +19,7 @@ FRAMES: tuple[str, ...] = (
     *("a photo of a {}", "a photo of the {}", "a picture of a {}"),
 )
 GENERIC_FRAMES: tuple[str, ...] = ("{}", "{}", "a photo of {}", "a photo of a {}", "the {}", "a {}")
-LEAST_PX = 24  # minimum area of a region
+MIN_PX = 24  # minimum area of a region
 SHOWS = 0.5  # IoU above which a segmented mask is matched to a node
 SHOWS_NOTHING = 0.2  # IoU below which a segmented mask is matched to no node
 
@@ -141,7 +141,7 @@ def list_crops(views: LabelledViews, masks: Sequence[HierarchicalMasks] = ()) ->
         for at in LEVELS:
             areas = np.bincount(labels[at.index].reshape(-1) + 1, minlength=len(nodes) + 1)[1:]
             for node, box in boxes_of(labels[at.index]).items():
-                if areas[node] >= LEAST_PX and nodes[node].phrases:
+                if areas[node] >= MIN_PX and nodes[node].phrases:
                     caption = sets.setdefault(nodes[node].phrases, len(sets))
                     rows.append((view, node, nodes[node].level, root[node], -1, caption))
                     boxes.append(box)

@@ -14,7 +14,7 @@ from hilsplat.world.paints import COLOURS
 from models.training.clip import CANONICAL, ClipText, ClipVision
 from models.training.crops import CropTable, list_segmented
 from models.training.data import LabelledViews, normalised
-from models.training.measure_sam import LEAST_PX, mean_or_zero
+from models.training.measure_sam import MIN_PX, mean_or_zero
 
 CHUNK = 256  # crops embedded at once
 COMMON = 20  # number of most common texts of each level in the smaller set of competing texts
@@ -141,7 +141,7 @@ def measure_queries(
 ) -> dict[str, dict[str, float]]:
     """Measure both models together: each text's most similar automatic mask in a view, and its regions.
 
-    Regions smaller than `LEAST_PX` are not queried.
+    Regions smaller than `MIN_PX` are not queried.
 
     Returns:
         For each level: `iou`, the mean IoU of the mask most similar to the text and the union of all regions
@@ -157,7 +157,7 @@ def measure_queries(
             labels = views.labels[view][level.index]
             areas = np.bincount(labels.reshape(-1) + 1, minlength=len(nodes) + 1)[1:]
             by_text: dict[str, list[int]] = {}
-            for node in np.flatnonzero(areas >= LEAST_PX).tolist():
+            for node in np.flatnonzero(areas >= MIN_PX).tolist():
                 if nodes[node].phrases:
                     by_text.setdefault(nodes[node].phrases[0], []).append(node)
             if not by_text:

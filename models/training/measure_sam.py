@@ -20,7 +20,7 @@ from hilsplat.settings import MasksSettings
 from models.training.data import LabelledViews, normalised
 from models.training.sam import HEADS, MASK_STRIDE, STRIDE, SamDecoder, SamEncoder, positional_embeddings
 
-LEAST_PX = 100  # minimum area of a scored region, because the IoU of a few pixels is not informative
+MIN_PX = 100  # minimum area of a scored region, because the IoU of a few pixels is not informative
 # area classes of regions, px: inclusive minimum, exclusive maximum
 SIZES = {"small": (0, 400), "medium": (400, 1600), "large": (1600, np.inf)}
 PER_LEVEL = 8  # maximum number of regions scored per view and level
@@ -55,7 +55,7 @@ def draw_regions(
     for head, level in enumerate(HEADS):
         at_level = labels[level.index]
         ids, areas = np.unique(at_level, return_counts=True)
-        for node in rng.permutation(ids[(ids >= 0) & (areas >= LEAST_PX)])[:per_level]:
+        for node in rng.permutation(ids[(ids >= 0) & (areas >= MIN_PX)])[:per_level]:
             ys, xs = np.nonzero(at_level == node)
             pick = int(rng.integers(len(ys)))
             drawn.append((head, int(node), xs[pick] + 0.5, ys[pick] + 0.5))
@@ -165,7 +165,7 @@ def measure_everything(masks: list[HierarchicalMasks], views: LabelledViews) -> 
         for view, found in enumerate(masks):
             rows = found.rows_of(level)
             _, areas, iou = region_ious(views.labels[view][level.index], found.dense(rows))
-            scored = areas >= LEAST_PX
+            scored = areas >= MIN_PX
             best += (iou[scored].max(axis=1) if len(rows) else np.zeros(int(scored.sum()))).tolist()
             if len(iou):
                 fits += int((iou.max(axis=0) >= 0.5).sum())

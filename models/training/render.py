@@ -1,4 +1,4 @@
-"""Views of random training scenes, rendered into a cache."""
+"""Views of random training scenes, rendered into a cache, and the vocabulary of the world."""
 
 import json
 import logging
@@ -18,7 +18,7 @@ from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_object
 from hilsplat.world.render import label_view, render_view
-from hilsplat.world.scenes.kinds import build_scene, training_camera
+from hilsplat.world.scenes.kinds import KINDS, build_scene, training_camera
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.seeds import TRAINING_SEEDS, require_split
 from models.training.data import LabelledNode, LabelledViews
@@ -34,6 +34,11 @@ MIXTURE: dict[str, tuple[float, int, int]] = {
 }
 # Sub-samples per pixel side: half the time of the benchmark's 3, with no visible difference in a crop.
 SAMPLES = 2
+DRAWS = 8  # objects drawn per class for the vocabulary, because some parts of a class are random
+SURFACES = {
+    *("ceiling", "curb", "floor", "ground", "lane marker", "road"),
+    *("rug", "sidewalk", "sky", "table", "tablecloth", "wall"),
+}
 
 
 def phrases_of(nodes: Sequence[AnnotatedNode]) -> tuple[LabelledNode, ...]:
@@ -146,3 +151,19 @@ def training_seeds(scenes: int, validation: int) -> tuple[list[int], list[int]]:
     """Return the seeds of training scenes, and of validation scenes from the end of the range."""
     first, last = TRAINING_SEEDS.start, TRAINING_SEEDS.stop
     return list(range(first, first + scenes)), list(range(last - validation, last))
+
+
+def world_vocabulary() -> str:
+    """Return the vocabulary of the synthetic world as file content for `hilsplat.query.vocabulary`."""
+    things: set[str] = set()
+    parts: set[str] = set()
+    for seed in range(TRAINING_SEEDS.start, TRAINING_SEEDS.start + DRAWS):
+        scenes = [build_scene(kind, seed, 1) for kind in KINDS]
+        for world in (*objects_of_every_class(seed), *scenes):
+            for node in world.nodes:
+                (things if node.level == int(Level.WHOLE) else parts).add(node.text)
+    sections = {"things": things - SURFACES, "parts": parts, "surfaces": things & SURFACES}
+    lines = ["# What clip-tiny was taught, by `python -m models.training`."]
+    for section, texts in sections.items():
+        lines += ["", f"[{section}]", *sorted(texts)]
+    return "\n".join(lines) + "\n"

@@ -18,11 +18,16 @@ from models.training.export import export_clip, export_sam
 from models.training.loop import Budget, Curve
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import automatic_masks, measure_everything, measure_sam
-from models.training.render import generator_digest, kind_of_seed, render_training_views, training_seeds
+from models.training.render import (
+    generator_digest,
+    kind_of_seed,
+    render_training_views,
+    training_seeds,
+    world_vocabulary,
+)
 from models.training.settings import TrainingSettings
 from models.training.train_clip import train_clip
 from models.training.train_sam import train_sam
-from models.training.vocabulary import world_vocabulary
 
 # Increment a version when networks, windows or losses change, so that cached trainings start again.
 RECIPE_VERSIONS = {"sam": 2, "clip": 3}

@@ -15,7 +15,8 @@ from models.training.measure_sam import measure_sam
 from models.training.sam import SamDecoder, SamEncoder
 from models.training.sam_loss import Teacher, training_loss
 
-# Window sizes, drawn for each step: small windows cover more scenes, large ones more of each scene.
+# Window sizes, drawn for each step in proportion to their shares: small windows cover more scenes, large ones
+# more of each scene.
 CROP_STAGES = (CropStage(0.4, 128, 16, 24), CropStage(0.4, 192, 8, 36), CropStage(0.2, 256, 4, 48))
 # Window sizes later in the training, which include whole views as at run time. In the first training that
 # ended with them, the IoU of wholes rose by 0.04 in 700 steps.
@@ -23,12 +24,6 @@ GROWN_STAGES = (CropStage(0.3, 192, 8, 36), CropStage(0.4, 256, 4, 48), CropStag
 GROWN_AT = 9500  # first step with `GROWN_STAGES`, which are also used during the whole learning rate decay
 TUNING = Tuning(peak=2e-3)
 QUICK_VIEWS = 24  # number of held-out views measured for each row of the learning curve
-
-
-def stage_of_draw(draw: float, stages: Sequence[CropStage]) -> CropStage:
-    """Return the stage selected by a uniform number in [0, 1), in proportion to the shares."""
-    ends = np.cumsum([stage.share for stage in stages])
-    return stages[min(len(stages) - 1, int(np.searchsorted(ends, draw, side="right")))]
 
 
 def train_sam(
@@ -59,7 +54,9 @@ def train_sam(
         # The first batch of the decay is prefetched before the decay begins, so it is excluded.
         falling = 0 <= training.progress.decay_from < step
         windows = grown_stages if falling or step >= GROWN_AT else stages
-        return draw_batch(views, classes, stage_of_draw(rng.random(), windows), rng)
+        ends = np.cumsum([stage.share for stage in windows])
+        drawn = min(len(windows) - 1, int(np.searchsorted(ends, rng.random(), side="right")))
+        return draw_batch(views, classes, windows[drawn], rng)
 
     def loss_of(batch: SamBatch, step: int) -> tuple[Tensor, dict[str, float]]:
         generator = torch.Generator().manual_seed(seed * 1_000_003 + step)

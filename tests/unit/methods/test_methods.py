@@ -103,7 +103,7 @@ def fit_of(name, inputs, kind=MethodSettings, **changed):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_regions_of_every_level_get_their_own_code(inputs_of, monkeypatch, name):
-    monkeypatch.setattr(laga, "LEAST_MASKS", 3)  # some regions have masks in three of the four views
+    monkeypatch.setattr(laga, "MIN_MASKS", 3)  # some regions have masks in three of the four views
     features = fit_of(name, inputs_of())
     _, rows, least = FITS[name]
     for row in rows:
