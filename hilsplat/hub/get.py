@@ -86,16 +86,13 @@ class Prepared:
 def get_models(
     names: Sequence[str], models: Path | None = None, revision: str | None = None, variant: str = ""
 ) -> str:
-    """Download models, check each, and install them.
+    """Download, check and install models; return a report on each, and which are used for photographs.
 
     Args:
         names: released models, or owner/name; empty for the recommended pair.
         models: parent folder of the models; None for the user's.
         revision: branch, tag or commit of a single model; None for the hub's default.
         variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
-
-    Returns:
-        the report of `check_model` on each model, and which models are used for photographs.
 
     Raises:
         DownloadError: the hub is unreachable, denies access, lacks files, or sends bytes with a wrong digest.

@@ -50,7 +50,6 @@ class Network:
     Each call runs in one thread (`one_thread_session`), and several threads may call a network.
 
     Args:
-        path: the `.onnx` file.
         graph: a modified graph to use instead of the file (`onnx_graph`).
         provider: the only execution provider to use, or None for the first that works.
 

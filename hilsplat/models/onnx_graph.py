@@ -63,7 +63,9 @@ def _inputs(node: Any) -> list[str]:
 
 
 def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: int) -> bytes | None:
-    """Return SAM's encoder with global attention computed for one row of patches at a time.
+    """Return the graph of SAM's encoder with global attention computed for one row of patches at a time.
+
+    The result is None if a layer has another form, or weights are external or 16-bit.
 
     As exported, such a layer writes the weights of all pairs of patches (800 MB) and reads them four times.
     The weights of one row fit into the processor's cache. onnxruntime loops over rows (operator Scan);
@@ -73,9 +75,6 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
         path: the `.onnx` file of a ViT encoder exported from transformers.
         layers: layers with global attention.
         side: patches per side of the image.
-
-    Returns:
-        the serialised graph, or None if a layer has another form, or weights are external or 16-bit.
     """
     import onnx
 

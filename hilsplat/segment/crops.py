@@ -43,7 +43,6 @@ def crop_to_square(
     Args:
         box, inside: image and mask, cropped to the mask's box.
         background: pixels outside the mask: `black`, `keep` (unchanged), or `dim` (0.35 of their brightness).
-        size: side of the result, px.
         as_langsplat: follow LangSplat's preprocessing: omit the last row and column of the box (but keep at
             least one), and use bilinear resizing for shrinking, too.
     """

@@ -320,13 +320,10 @@ def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndar
 
 
 def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
-    """Compare the factored decoder with the network on a random image and random prompts.
+    """Return the largest difference between the factored decoder and the network on random inputs.
 
-    Returns:
-        the largest difference of predicted IoUs, and of logits relative to the largest logit above 1.
-
-    Raises:
-        ModelError: if the network doesn't declare the shapes of its inputs.
+    It covers predicted IoUs, and logits divided by the largest one (at least 1). A ModelError is raised if
+    the network doesn't declare the shapes of its inputs.
     """
     rng = np.random.default_rng(0)
     features = {}
