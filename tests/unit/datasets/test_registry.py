@@ -75,7 +75,7 @@ def run(*words):
     return result.exit_code, result.output
 
 
-def test_the_command_lists_data_sets_and_what_is_there(data_root):
+def test_the_command_lists_data_sets_and_their_scenes(data_root):
     assert "found" not in run("list")[1]
     code, output = run("list", "--data-root", data_root)
     assert code == 0
@@ -201,7 +201,7 @@ def test_the_data_set_of_the_documentation_is_read(example, tmp_path):
     assert tmp_path / "mine/labels/000/mug.png" in places
 
 
-def test_its_missing_folder_is_named(example, tmp_path):
+def test_a_missing_folder_of_the_documented_data_set_is_named(example, tmp_path):
     (tmp_path / "mine/images").mkdir(parents=True)
     with pytest.raises(SceneError, match="also mine/labels"):
         example.DESK.open(tmp_path, "mine")

@@ -1,4 +1,4 @@
-"""Videos, archives and folders become photographs: of videos, sharp, distinct, upright ones in sRGB."""
+"""Videos, archives and folders become photographs; video frames are sharp, distinct, upright and in sRGB."""
 
 import json
 import stat
@@ -28,7 +28,7 @@ def wall(width=900, height=240):
 
 
 def pan(steps, size=(320, 240)):
-    """Pictures of a camera that moves over the wall by these steps, px."""
+    """Pictures of a camera that pans over the wall by these steps, px."""
     left = np.cumsum(steps).astype(int)
     return [wall()[: size[1], x : x + size[0]].copy() for x in left]
 
@@ -75,7 +75,7 @@ def test_the_sharpest_frame_of_each_section_is_selected(tmp_path):
 
 
 def test_a_resting_camera_gives_one_frame_despite_jitter(tmp_path):
-    tremble = [200, *[1, -1] * 40]  # a path of 80 px, at most one of them from the start
+    tremble = [200, *[1, -1] * 40]  # a path of 80 px, never more than one px from the start
     video = write_video(tmp_path / "a.mp4", pan(tremble))
     _, notes, origin = extracted([video], tmp_path, 20)
     assert len(origin["frames"]) == 1
@@ -102,7 +102,7 @@ def test_the_display_matrix_turns_frames_upright(tmp_path, rotation, turns):
     assert np.abs(found - expected).mean() < 12
 
 
-def test_times_are_those_of_the_stream_rather_than_its_rate(tmp_path):
+def test_times_are_the_time_stamps_of_the_stream(tmp_path):
     times = [0, 200, 400, 1500, 1700, 3000, 3400, 4000]
     video = write_video(tmp_path / "a.mkv", pan([0] + [20] * 7), times=times)
     _, _, origin = extracted([video], tmp_path, 8)

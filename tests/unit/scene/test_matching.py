@@ -47,7 +47,7 @@ def compared_one_by_one(one, other):
     return [[row, column] for row, column in there.items() if back.get(column) == row]
 
 
-@pytest.mark.parametrize("multiplied", ("as this processor does best", "in float32"))
+@pytest.mark.parametrize("multiplied", ("in integers if supported", "in float32"))
 def test_matches_are_the_mutual_nearest_of_all(monkeypatch, multiplied):
     if multiplied == "in float32":
         monkeypatch.setattr(matching, "_integer_products", lambda: None)

@@ -1,4 +1,4 @@
-"""Photographs are posed, or refused with names and numbers; lost ones are shown; EXIF gives focal lengths."""
+"""Photographs are posed, or refused with names and numbers; lost ones are drawn; EXIF has focal lengths."""
 
 import json
 from pathlib import Path
@@ -112,7 +112,7 @@ def test_renders_are_posed_with_unchanged_pixels_and_reruns_are_identical(tmp_pa
         run_poses(renders, out, "world/corner", "metre", True, PosesSettings(), 0, threads)
     scene = Scene.load(first)
     assert scene.views("train") == [f"{number}.png" for number in range(5)]  # too few for a test view
-    assert scene.unit == "arbitrary"  # structure from motion cannot recover the metre
+    assert scene.unit == "arbitrary"  # structure from motion cannot recover the metric scale
     np.testing.assert_array_equal(scene.image("2.png"), read_image(tmp_path / "renders" / "2.png"))
     centres = np.array([scene.cameras[view].centre for view in scene.views()])
     # ratios of distances do not depend on the similarity that SfM leaves undetermined
@@ -279,7 +279,7 @@ def test_the_35_mm_equivalent_is_read_from_every_format(tmp_path, suffix):
     assert exif_focal_px(path, (300, 400)) == pytest.approx(500 * 26 / 43.2666)
 
 
-def test_it_is_scaled_with_a_picture_that_is_shrunk_and_rotated(tmp_path):
+def test_the_focal_length_scales_with_a_shrunk_and_rotated_picture(tmp_path):
     path = photograph(tmp_path / "a.heic", size=(800, 600), orientation=6, focal_35=26)
     (image,) = prepare_images([path], tmp_path / "work", max_side_px=400)
     assert image.size_hw == (400, 300)
@@ -287,7 +287,7 @@ def test_it_is_scaled_with_a_picture_that_is_shrunk_and_rotated(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "resolution"), [(2, 2540.0), (3, 1000.0), (4, 100.0), (None, 2540.0)])
-def test_without_it_focal_length_and_sensor_resolution_are_used(tmp_path, unit, resolution):
+def test_without_an_equivalent_the_sensor_resolution_is_used(tmp_path, unit, resolution):
     """100 px per mm: a lens of 5 mm is 500 px, in half the picture 250, in a tenth-size copy 50."""
     tags = {"focal": IFDRational(5), "resolution": IFDRational(int(resolution))}
     if unit:
@@ -302,5 +302,5 @@ def test_without_it_focal_length_and_sensor_resolution_are_used(tmp_path, unit, 
 @pytest.mark.parametrize(
     "tags", [{}, {"focal": IFDRational(5)}, {"focal_35": 0}, {"focal": IFDRational(1, 0)}]
 )
-def test_without_usable_tags_there_is_none(tmp_path, tags):
+def test_without_usable_tags_there_is_no_focal_length(tmp_path, tags):
     assert exif_focal_px(photograph(tmp_path / "a.jpg", **tags), (300, 400)) is None

@@ -52,7 +52,7 @@ def test_a_world_written_as_lerf_mask_is_read_back_equal(true_world, teatime):
     assert scene.report().facts["posed views"] == 4
 
 
-def test_test_views_are_posed_images_that_images_train_lacks(true_world, teatime):
+def test_test_views_are_posed_images_missing_from_images_train(true_world, teatime):
     write_png(teatime / "images" / "frame_00000.png", np.zeros((24, 40, 3), np.uint8))  # without a pose
     assert list(open_scene(teatime).views) == ["frame_00002.png", "frame_00004.png"]
     (teatime / "images_train" / "frame_00001.jpg").unlink()

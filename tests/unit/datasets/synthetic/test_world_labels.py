@@ -1,4 +1,4 @@
-"""A true room read back from ScanNet's and Replica's layout, a true street from Waymo's."""
+"""A synthetic room in the layouts of ScanNet and Replica, and a street in Waymo's, are read back equal."""
 
 import numpy as np
 import pytest
