@@ -8,8 +8,6 @@ from types import SimpleNamespace
 import pytest
 
 from hilsplat.base.errors import HilsplatError, SettingsError
-from hilsplat.configuration import SECTIONS
-from hilsplat.models.store import model_digest
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
 from hilsplat.workflow.plan import Plan, any_of, some
@@ -301,30 +299,6 @@ def embedded_models(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     lay_model("sam-tiny", "sam", embedded=True)
     lay_model("clip-tiny", "clip", embedded=True)
-
-
-@pytest.mark.usefixtures("embedded_models")
-def test_a_downloaded_model_reruns_only_masks_and_clip_of_photographs(tmp_path):
-    photo, drawn = Job("photos", "desk"), Job()
-
-    def parameters(job: Job) -> dict[str, str]:
-        model_digest.cache_clear()  # as in another process
-        made = plan(tmp_path, groups=["benchmark", "photos"], overrides=OF_PHOTOGRAPHS)
-        settings = {name: made.settings(name)(job) for name in SECTIONS}
-        return {**settings, **{f"model of {name}": made.model(name)(job) for name in ("masks", "clip")}}
-
-    before = {job: parameters(job) for job in (photo, drawn)}
-    assert json.loads(before[photo]["masks"])["segmenter"] == "graph"
-    assert json.loads(before[photo]["clip"])["model"] == "models/clip-tiny"
-    lay_model("sam-vit-base", "sam")
-    lay_model("clip-vit-base-patch16", "clip")
-    after = {job: parameters(job) for job in (photo, drawn)}
-    assert after[drawn] == before[drawn]
-    moved = {name for name, value in after[photo].items() if value != before[photo][name]}
-    assert moved == {"masks", "clip", "model of masks", "model of clip"}
-    masks = json.loads(after[photo]["masks"])
-    assert (masks["segmenter"], masks["model"]) == ("sam", "models/sam-vit-base")
-    assert json.loads(after[photo]["clip"])["model"] == "models/clip-vit-base-patch16"
 
 
 @pytest.mark.usefixtures("embedded_models")

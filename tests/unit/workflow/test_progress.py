@@ -60,61 +60,71 @@ def run(clock, monkeypatch) -> RunProgress:
     return found
 
 
-def display(run: RunProgress, stream: io.StringIO) -> ProgressDisplay:
-    return ProgressDisplay(stream, logging.Formatter().format, run)
+class Screen:
+    """The display of a run, and its output."""
+
+    def __init__(self, run: RunProgress, stream: io.StringIO) -> None:
+        self.stream = stream
+        self.display = ProgressDisplay(stream, logging.Formatter().format, run)
+
+    def tell(self, event: str = "", text: str = "a block", level: int = 20, **more: object) -> None:
+        record = logging.LogRecord("snakemake", level, __file__, 1, text, None, None)
+        record.__dict__.update(more, **({"event": event} if event else {}))
+        self.display.show(record)
+
+    def start(self, number: int, rule: str, log: Path | None = None, variant: str = "default") -> None:
+        wildcards = {"dataset": "photos", "scene": "desk", "variant": variant}
+        logs = [str(log)] if log else []
+        self.tell("job_info", jobid=number, rule_name=rule, wildcards=wildcards, threads=2, log=logs)
+
+    def end(self, number: int) -> None:
+        self.tell("job_finished", job_id=number)
+
+    @property
+    def text(self) -> str:
+        """The output so far."""
+        return self.stream.getvalue()
 
 
-def tell(shown: ProgressDisplay, event: str = "", text: str = "a block", level: int = 20, **more) -> None:
-    record = logging.LogRecord("snakemake", level, __file__, 1, text, None, None)
-    record.__dict__.update(more, **({"event": event} if event else {}))
-    shown.show(record)
+@pytest.fixture
+def screen(run) -> Screen:
+    return Screen(run, io.StringIO())
 
 
-def start(shown: ProgressDisplay, number: int, rule: str, log: Path | None = None, variant="default") -> None:
-    wildcards = {"dataset": "photos", "scene": "desk", "variant": variant}
-    logs = [str(log)] if log else []
-    tell(shown, "job_info", jobid=number, rule_name=rule, wildcards=wildcards, threads=2, log=logs)
-
-
-def test_in_a_file_a_finished_stage_is_one_plain_line(run, clock):
-    stream = io.StringIO()
-    shown = display(run, stream)
-    tell(shown, "run_info", "Job stats", stats=JOBS)
-    tell(shown, "job_started", jobs=[1])
-    tell(shown, text="Select jobs to execute...")
-    start(shown, 1, "gaussians")
+def test_in_a_file_a_finished_stage_is_one_plain_line(screen, clock):
+    screen.tell("run_info", "Job stats", stats=JOBS)
+    screen.tell("job_started", jobs=[1])
+    screen.tell(text="Select jobs to execute...")
+    screen.start(1, "gaussians")
     clock.now = 290.0
-    tell(shown, "job_finished", job_id=1)
-    tell(shown, "progress", done=1, total=3)
-    start(shown, 2, "field")
-    shown.close()
-    assert stream.getvalue() == "Job stats\nphotos/desk gaussians: 290 s (1 of 3 done, about 2 min left)\n"
+    screen.end(1)
+    screen.tell("progress", done=1, total=3)
+    screen.start(2, "field")
+    screen.display.close()
+    assert screen.text == "Job stats\nphotos/desk gaussians: 290 s (1 of 3 done, about 2 min left)\n"
 
 
 @pytest.mark.parametrize("order", [("semantic_tree", "clip"), ("clip", "semantic_tree")])
-def test_the_query_commands_are_printed_once_tree_and_vectors_exist(run, tmp_path, order):
-    variant, stream = tmp_path / "photos/desk/default", io.StringIO()
-    shown = display(run, stream)
+def test_the_query_commands_are_printed_once_tree_and_vectors_exist(screen, tmp_path, order):
+    variant = tmp_path / "photos/desk/default"
     for rule in (*order, *order):
-        assert "ready" not in stream.getvalue() or (variant / rule).exists()
+        assert "ready" not in screen.text or (variant / rule).exists()
         write_index(variant / rule, {})
-        start(shown, 2, rule, variant / f"logs/{rule}.log")
-        tell(shown, "job_finished", job_id=2)
-    assert stream.getvalue().count("photos/desk is ready to query:") == 1
-    assert stream.getvalue().count('hilsplat query photos/desk "..."') == 1
+        screen.start(2, rule, variant / f"logs/{rule}.log")
+        screen.end(2)
+    assert screen.text.count("photos/desk is ready to query:") == 1
+    assert screen.text.count('hilsplat query photos/desk "..."') == 1
 
 
-def test_queries_of_key_views_are_announced_before_those_of_all_views(run, tmp_path):
+def test_queries_of_key_views_are_announced_before_those_of_all_views(screen, tmp_path):
     scene = tmp_path / "photos/desk"
     write_index(scene / "scene", {name: {"split": "test" if name == "c" else "train"} for name in "abc"})
     write_index(scene / "key-views/masks", {"a": {}})
-    stream = io.StringIO()
-    shown = display(run, stream)
     for number, variant in enumerate(("key-views", "default")):
         write_index(scene / variant / "semantic_tree", {})
-        start(shown, number, "clip", scene / variant / "logs/clip.log", variant)
-        tell(shown, "job_finished", job_id=number)
-    lines = stream.getvalue().splitlines()
+        screen.start(number, "clip", scene / variant / "logs/clip.log", variant)
+        screen.end(number)
+    lines = screen.text.splitlines()
     assert lines[1:5] == [
         "photos/desk is ready to query:",
         "photos/desk answers from 1 of 2 photographs until the run ends",
@@ -124,36 +134,31 @@ def test_queries_of_key_views_are_announced_before_those_of_all_views(run, tmp_p
     assert lines[6:] == ["photos/desk uses all photographs"]
 
 
-def test_errors_are_shown_in_full_and_a_retry_counts_once(run):
-    stream = io.StringIO()
-    shown = display(run, stream)
-    tell(shown, "run_info", "Job stats", stats=JOBS)
-    start(shown, 1, "gaussians")
-    tell(shown, "job_error", "Error in rule gaussians:\n    the whole log", logging.ERROR, jobid=1)
-    assert stream.getvalue().endswith("Error in rule gaussians:\n    the whole log\n")
+def test_errors_are_shown_in_full_and_a_retry_counts_once(screen, run):
+    screen.tell("run_info", "Job stats", stats=JOBS)
+    screen.start(1, "gaussians")
+    screen.tell("job_error", "Error in rule gaussians:\n    the whole log", logging.ERROR, jobid=1)
+    assert screen.text.endswith("Error in rule gaussians:\n    the whole log\n")
     assert run.counts() == "0 of 3 done, 1 failed, about 2 min left"
-    start(shown, 1, "gaussians")
+    screen.start(1, "gaussians")
     assert run.counts() == "0 of 3 done, about 7 min left"
 
 
-def test_a_target_is_not_a_job(run):
-    stream = io.StringIO()
-    shown = display(run, stream)
-    tell(shown, "run_info", "", stats={"all": 1, "total": 1})
-    start(shown, 0, "all")
-    tell(shown, "job_finished", job_id=0)
-    assert stream.getvalue() == "\n" and run.counts() == "0 of 0 done"
+def test_a_target_is_not_a_job(screen, run):
+    screen.tell("run_info", "", stats={"all": 1, "total": 1})
+    screen.start(0, "all")
+    screen.end(0)
+    assert screen.text == "\n" and run.counts() == "0 of 0 done"
 
 
 def test_a_terminal_has_a_status_line_below_the_others(run, clock):
-    stream = Terminal()
-    shown = display(run, stream)
-    tell(shown, "run_info", "", stats=JOBS)
-    start(shown, 1, "gaussians", variant="paper")
+    screen = Screen(run, Terminal())
+    screen.tell("run_info", "", stats=JOBS)
+    screen.start(1, "gaussians", variant="paper")
     clock.now = 100.0
-    tell(shown, text="a warning", level=logging.WARNING)
-    printed = stream.getvalue()
-    shown.close()
+    screen.tell(text="a warning", level=logging.WARNING)
+    printed = screen.text
+    screen.display.close()
     line = "0 of 3 done, about 5 min left | photos/desk paper gaussians"
     assert "a warning" in printed and line in printed[printed.index("a warning") :]
 
@@ -167,10 +172,9 @@ def log_lines(path: Path, *records: tuple[int, str, str]) -> None:
     path.write_text("\n".join([*lines, ""]))
 
 
-def test_the_progress_in_a_log_is_shown_and_counts(run, clock, tmp_path):
+def test_the_progress_in_a_log_is_shown_and_counts(screen, run, clock, tmp_path):
     log = tmp_path / "gaussians.log"
-    shown = display(run, io.StringIO())
-    start(shown, 1, "gaussians", log)
+    screen.start(1, "gaussians", log)
     clock.now = 600.0  # later than estimated
     log_lines(log, (20, "hilsplat.base.progress", "photographs read: 3 of 4"))
     assert run.line().endswith("photos/desk gaussians: photographs read 3 of 4")
@@ -182,7 +186,7 @@ def test_the_progress_in_a_log_is_shown_and_counts(run, clock, tmp_path):
     assert run.line().endswith("photos/desk gaussians")
 
 
-def test_warnings_of_a_stage_are_printed_when_it_ends(run, tmp_path):
+def test_warnings_of_a_stage_are_printed_when_it_ends(screen, tmp_path):
     log = tmp_path / "poses.log"
     log_lines(
         log,
@@ -192,11 +196,9 @@ def test_warnings_of_a_stage_are_printed_when_it_ends(run, tmp_path):
     )
     assert warnings_in(log) == ["2 photographs did not register\n  IMG_1"]
     assert last_progress(log) is None and last_progress(tmp_path / "none") is None
-    stream = io.StringIO()
-    shown = display(run, stream)
-    start(shown, 1, "poses", log)
-    tell(shown, "job_finished", job_id=1)
-    assert stream.getvalue().startswith("2 photographs did not register\n  IMG_1\nphotos/desk poses: 0 s")
+    screen.start(1, "poses", log)
+    screen.end(1)
+    assert screen.text.startswith("2 photographs did not register\n  IMG_1\nphotos/desk poses: 0 s")
 
 
 def test_estimates_follow_what_jobs_took(run):
@@ -209,9 +211,8 @@ def test_estimates_follow_what_jobs_took(run):
     assert estimates.seconds("field") == 60
 
 
-def test_a_long_last_job_is_not_divided_among_the_cores(run, clock):
-    shown = display(run, io.StringIO())
-    start(shown, 1, "gaussians")
+def test_a_long_last_job_is_not_divided_among_the_cores(screen, run):
+    screen.start(1, "gaussians")
     run.running[1] = progress.RunningJob("gaussians", {}, 1, None, 0.0)
     assert run.seconds_left() == 600
 
