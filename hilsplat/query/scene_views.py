@@ -14,8 +14,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
-from hilsplat.semantic_tree.tree import SemanticTree
-from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.gaussians import Gaussians
 
 MIN_SHOWN_SHARE = 1e-4

@@ -23,7 +23,7 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions
-from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
+from hilsplat.segment.digests import require_same_masks
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.nodes import (
     MIN_VISIBLE_PX,
@@ -108,9 +108,8 @@ def build_tree(
     S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
     view = contributions.view
     visible = mass > MIN_VISIBLE_PX
-    num_visible = visible.sum(axis=0)
     total_mass = mass.sum(axis=0, dtype=np.float64)
-    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(num_visible, 1)
+    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
 
     level: list[int] = []
     quality: list[float] = []
@@ -202,7 +201,8 @@ def run_semantic_tree(
         ArtifactError: the masks do not record their segmenter.
     """
     contributions = Contributions.load(contributions_folder)
-    scene = read_index(contributions_folder)["scene"]
+    index = read_index(contributions_folder)
+    scene = index["scene"]
     require_same_masks(contributions_folder, masks_folder)
     with stage_log("semantic tree", scene) as counts:
         join_wholes = read_index(masks_folder, "segmenter")["segmenter"] == "graph"
@@ -219,18 +219,13 @@ def run_semantic_tree(
                 scene,
                 settings.min_views,
             )
-        masks = np.bincount(contributions.view, minlength=len(contributions.views)).tolist()
-        digests = digests_in(contributions_folder)
         with atomic_folder(out) as folder:
             fields = {name: value for name, value in vars(tree).items() if isinstance(value, np.ndarray)}
             write_npz(folder / "tree.npz", **fields)
             write_json(folder / "tree.json", {"scene": scene, "nodes": readable_nodes(tree)})
             write_index(
                 folder,
-                {
-                    view: {MASKS_SHA256: digests[view], "masks": count}
-                    for view, count in zip(contributions.views, masks, strict=True)
-                },
+                index["views"],
                 scene=scene,
                 nodes=per_level,
                 orphans=orphans,

@@ -13,8 +13,7 @@ from hilsplat.scene.finished import require_same
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.sam import point_grid
 from hilsplat.segment.stage import run_masks
-from hilsplat.semantic_tree.tree import SemanticTree
-from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.settings import MasksSettings
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights

@@ -17,7 +17,7 @@ from hilsplat.query.scene_views import Opened, ViewStore
 from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
-from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.semantic_tree.tree import ViewNodes
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights

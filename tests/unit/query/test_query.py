@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilsplat.base.errors import ArtifactError, MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.field.autoencoder import run_autoencoder
 from hilsplat.field.code import LanguageField, load_code
@@ -14,11 +14,10 @@ from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
 from hilsplat.query.relevancy_kernels import fill_maps
 from hilsplat.query.scene_views import ViewStore
-from hilsplat.scene.finished import FinishedScene, require_same
+from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.build import run_semantic_tree
-from hilsplat.semantic_tree.tree import SemanticTree
-from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.artifact_changes import write_record
 from tests.unit.round_gaussians import round_gaussians
@@ -505,10 +504,3 @@ def test_field_image_has_one_colour_per_region(scene):
     a, b = image[region_mask(0)].mean(axis=0), image[region_mask(1)].mean(axis=0)
     assert np.abs(a - b).max() > 50
     assert np.array_equal(image, scene.field_image("000.png", Level.WHOLE))
-
-
-def test_artifacts_of_other_gaussians_are_refused(tmp_path):
-    path = tmp_path / "gaussians.ply"
-    path.write_bytes(b"new")
-    with pytest.raises(MisalignedArtifactError, match="language field of toy was made"):
-        require_same("language field", "toy", path, "0" * 64)

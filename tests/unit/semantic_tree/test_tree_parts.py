@@ -13,8 +13,7 @@ from hilsplat.semantic_tree.build import RANKED, crop_ranks
 from hilsplat.semantic_tree.export import write_selection_ply, write_tree_ply
 from hilsplat.semantic_tree.guided_masks import guided_points
 from hilsplat.semantic_tree.nodes import nest_nodes, renumbered_without_empty
-from hilsplat.semantic_tree.tree import OrientedBox, oriented_box
-from hilsplat.semantic_tree.view_nodes import ViewNodes
+from hilsplat.semantic_tree.tree import OrientedBox, ViewNodes, oriented_box
 from hilsplat.splat.ply import load_ply, save_ply
 from tests.unit.evaluate.plain_tree import plain_tree
 from tests.unit.round_gaussians import round_gaussians
