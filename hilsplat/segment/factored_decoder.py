@@ -275,10 +275,10 @@ class FactoredDecoder:
     def decode(
         self, image: ImageTerms, points_xy: Float[np.ndarray, "P 2"], *, fine: bool
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"], Kept]:
-        """Return predicted IoUs, logits and the arrays that `logits` needs for one foreground point per prompt.
+        """Return predicted IoUs, logits and the arrays that `logits` needs, for one point per prompt.
 
-        Points are in px of the network's input. With `fine`, all 4 x 4 logits of each pixel of the image side
-        are computed, otherwise only the first.
+        Points are inside the object, in px of the network's input. With `fine`, all 4 x 4 logits of each
+        pixel of the image side are computed, otherwise only the first.
         """
         pe = _run(self._tokens, self._blank, points_xy)[0]
         pe = pe.reshape(len(points_xy), *pe.shape[-2:])
