@@ -1,10 +1,13 @@
-"""Downloads from a loopback hub: models are installed completely and checked, or not at all."""
+"""Downloads from a loopback hub, and exports: models are installed completely and checked, or not at all."""
 
 import errno
 import hashlib
 import json
 import logging
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import huggingface_hub
@@ -13,10 +16,11 @@ from huggingface_hub.utils import reset_sessions
 
 from hilsplat.base.artifacts import sha256_of_file
 from hilsplat.base.errors import DiskSpaceError, DownloadError, ModelError
+from hilsplat.embed.clip import ClipModel
 from hilsplat.embed.model_check import check_models
 from hilsplat.hub import get
 from hilsplat.hub.get import get_models
-from hilsplat.models.store import models_table, real_model
+from hilsplat.models.store import RELEASES, models_table, real_model
 from tests.loopback_hub import Refusal, git_sha1
 from tests.unit.hub.conftest import CLIP, SAM, point_at
 from tests.unit.segment.handmade import move_weights
@@ -24,6 +28,8 @@ from tests.unit.segment.handmade import move_weights
 ENCODER = "vision_encoder.onnx"
 TARGET = Path("models/sam-vit-base")
 STAGING = Path("models/.sam-vit-base.part")
+EXPORTED = "clip-vit-b-16-laion2b"
+REPOSITORY = next(release.repository for release in RELEASES if release.name == EXPORTED)
 
 
 def visible() -> list[str]:
@@ -319,3 +325,45 @@ def test_files_in_the_hubs_cache_are_not_transferred(hub, tmp_path):
     get_models(["sam-vit-base"])
     assert hub.ranges(ENCODER) == [] and hub.ranges("prompt_encoder_mask_decoder.onnx") == []
     assert visible() == ["sam-vit-base"]
+
+
+def test_exported_weights_give_the_vectors_of_transformers(hub, clip_parts):
+    import torch
+
+    model, processor, exported = clip_parts
+    hub.repositories[REPOSITORY] = exported.parent / "torch"
+    environment = {key: value for key, value in os.environ.items() if key != "HF_HUB_OFFLINE"}
+    environment |= {"HF_ENDPOINT": hub.endpoint, "HF_HOME": str(Path.cwd() / "home")}
+    code = "from hilsplat.cli.main import main; main()"
+    words = [sys.executable, "-c", code, "models", "get", EXPORTED]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "kind       clip" in done.stdout and f"folder     models/{EXPORTED}" in done.stdout
+    folder = Path("models") / EXPORTED
+    origin = json.loads((folder / "origin.json").read_text())
+    assert origin["repository"] == REPOSITORY and "optimum-onnx" in origin["exported"]
+    assert "model.safetensors" in [entry["path"] for entry in origin["files"]]
+    names = {path.name for path in folder.rglob("*")}
+    assert {"vision_model.onnx", "text_model.onnx", "preprocessor_config.json", "tokenizer.json"} <= names
+    assert not {"model.onnx", "model.safetensors"} & names
+    assert sorted(path.name for path in Path("models").iterdir() if path.is_dir()) == [EXPORTED]
+    inputs = processor.tokenizer(["red mug"], return_tensors="pt")
+    with torch.no_grad():
+        (expected,) = model.get_text_features(**inputs).numpy()
+    (found,) = ClipModel.load(folder).embed_texts(["red mug"])
+    # both to unit length; float32 through two runtimes
+    assert abs(found - expected / (expected**2).sum() ** 0.5).max() < 1e-4
+
+
+def test_weights_that_cannot_be_exported_show_the_exporter_s_last_lines(tmp_path):
+    (tmp_path / "config.json").write_text('{"model_type": "clip"}')
+    with pytest.raises(ModelError, match=r"the exporter exited with 1(.|\n)*Error(.|\n)*pip install"):
+        get.export_networks(tmp_path, tmp_path / "out")
+
+
+def test_without_the_extra_nothing_is_fetched_and_the_error_gives_the_command(hub, clip_parts, monkeypatch):
+    hub.repositories[REPOSITORY] = clip_parts[2].parent / "torch"
+    monkeypatch.setattr(get, "NEEDED", (*get.NEEDED, "no_such_exporter.onnx"))
+    with pytest.raises(ModelError, match=r"no no_such_exporter.onnx\n  fix +pip install .* '\.\[export\]'"):
+        get_models([EXPORTED])
+    assert not hub.ranges("model.safetensors")
