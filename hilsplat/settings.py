@@ -46,7 +46,7 @@ def _takes(annotation: Any, kind: type) -> bool:
     return annotation in (kind, Any) or any(_takes(part, kind) for part in get_args(annotation))
 
 
-Probability = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Granularity = Annotated[float, Field(gt=0, lt=2)]
 Size = Annotated[int, Field(ge=1, le=1000)]
 Auto = Literal["auto"]
@@ -98,10 +98,10 @@ class GaussiansSettings(Section):
     steps_per_view: int = knob(60, "steps per training view, if fewer than `iterations` in total", ge=1)
     max_gaussians: int = knob(50_000, "maximum number of Gaussians at any step", ge=100)
     image_scale: float = knob(1.0, "scale of the fit's images; 0.5 halves their sides", gt=0, le=1)
-    quarter_until: float = knob(0.15, "share of the iterations at quarter size", ge=0, le=1, origin="3DGS: 0")
-    half_until: float = knob(0.75, "share of the iterations before full size", ge=0, le=1, origin="3DGS: 0")
+    quarter_until: Share = knob(0.15, "share of the iterations at quarter size", origin="3DGS: 0")
+    half_until: Share = knob(0.75, "share of the iterations before full size", origin="3DGS: 0")
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
-    ssim_weight: float = knob(0.2, "D-SSIM's share of the loss; the rest is L1", ge=0, le=1, origin="3DGS")
+    ssim_weight: Share = knob(0.2, "D-SSIM's share of the loss; the rest is L1", origin="3DGS")
     # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
     # config/paper.yaml uses the published number and sizes of steps.
     means_rate: float = knob(
@@ -115,12 +115,10 @@ class GaussiansSettings(Section):
     sh_rate: float = knob(
         4e-3, "step size of constant harmonics; others: 1/20 of it", gt=0, origin="3DGS: 2.5e-3"
     )
-    densify_from: float = knob(
-        0.06, "start of densification, as a share of iterations", ge=0, le=1, origin="3DGS: 500 / 30000"
+    densify_from: Share = knob(
+        0.06, "start of densification, as a share of iterations", origin="3DGS: 500 / 30000"
     )
-    densify_until: float = knob(
-        0.6, "end of densification, as a share of iterations", ge=0, le=1, origin="3DGS: 0.5"
-    )
+    densify_until: Share = knob(0.6, "end of densification, as a share of iterations", origin="3DGS: 0.5")
     densify_every: int = knob(100, "steps between densifications", ge=1, origin="3DGS")
     densify_gradient: float = knob(
         4e-4, "screen-space gradient above which a Gaussian is cloned or split", gt=0, origin="3DGS: 2e-4"
@@ -131,8 +129,8 @@ class GaussiansSettings(Section):
     strategy: Literal["default", "mcmc"] = knob(
         "default", "default: clone, split and prune (3DGS); mcmc: relocate, and add noise", origin="3DGS"
     )
-    mcmc_growth: float = knob(
-        0.05, "mcmc: growth per densification, up to max_gaussians", unit="share", ge=0, le=1, origin="MCMC"
+    mcmc_growth: Share = knob(
+        0.05, "mcmc: growth per densification, up to max_gaussians", unit="share", origin="MCMC"
     )
     mcmc_noise: float = knob(5e5, "mcmc: weight of the noise on the means", ge=0, origin="MCMC")
     mcmc_opacity_weight: float = knob(0.01, "mcmc: weight of the mean opacity", ge=0, origin="MCMC")
@@ -205,7 +203,7 @@ class MasksSettings(Section):
         "number, else 0.7",
         origin="SAM: 0.88, LangSplat: 0.7",
     )
-    stability_min: Probability | Auto = knob(
+    stability_min: Share | Auto = knob(
         "auto",
         "minimum stability of a mask; auto: the model folder's number, else 0.85",
         origin="SAM: 0.95, LangSplat: 0.85",
@@ -235,7 +233,7 @@ class MasksSettings(Section):
         "predicted IoU x stability must exceed this; 0: keep all; auto: the model folder's number, else 0.7",
         origin="LangSplat: 0.7",
     )
-    nms_inner: float = knob(0.5, "threshold for suppressing inner masks", ge=0, le=1, origin="LangSplat")
+    nms_inner: Share = knob(0.5, "threshold for suppressing inner masks", origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
         (0.12, 0.04, 0.015), "graph: minimum segment at whole, part, subpart, as a share of the image side"
     )
@@ -257,27 +255,25 @@ class PerturbSettings(Section):
     boundary_smooth_px: float = knob(
         6.0, "length along the boundary over which the displacement changes", unit="px", ge=1, le=256
     )
-    merge: float = knob(
-        0.02, "probability per node and view of merging with a sibling in contact", ge=0, le=1
-    )
-    split: float = knob(0.02, "probability per mask of being cut in two", ge=0, le=1)
-    missing: tuple[Probability, Probability, Probability] = knob(
+    merge: Share = knob(0.02, "probability per node and view of merging with a sibling in contact")
+    split: Share = knob(0.02, "probability per mask of being cut in two")
+    missing: tuple[Share, Share, Share] = knob(
         (0.01, 0.04, 0.1), "probability that a mask is missing: whole, part, subpart"
     )
-    missing_level: tuple[Probability, Probability, Probability] = knob(
+    missing_level: tuple[Share, Share, Share] = knob(
         (0.0, 0.0, 0.0), "probability that a view has no masks of the level: whole, part, subpart"
     )
-    wrong_level: float = knob(0.02, "probability that a mask is one level off", ge=0, le=1)
-    dropped_views: float = knob(0.0, "probability that a view has no masks at all", ge=0, le=1)
-    systematic_merge: float = knob(
-        0.02, "probability per node, drawn once per scene, of the same wrong merge in most views", ge=0, le=1
+    wrong_level: Share = knob(0.02, "probability that a mask is one level off")
+    dropped_views: Share = knob(0.0, "probability that a view has no masks at all")
+    systematic_merge: Share = knob(
+        0.02, "probability per node, drawn once per scene, of the same wrong merge in most views"
     )
-    systematic_missing: float = knob(
-        0.02, "probability per node, drawn once per scene, of having no mask in most views", ge=0, le=1
+    systematic_missing: Share = knob(
+        0.02, "probability per node, drawn once per scene, of having no mask in most views"
     )
-    systematic_share: float = knob(0.9, "probability that a systematic fault occurs in a view", ge=0, le=1)
-    score_noise: float = knob(
-        0.05, "standard deviation of predicted IoU and stability about their true values", ge=0, le=1
+    systematic_share: Share = knob(0.9, "probability that a systematic fault occurs in a view")
+    score_noise: Share = knob(
+        0.05, "standard deviation of predicted IoU and stability about their true values"
     )
 
 
@@ -444,12 +440,10 @@ class FieldSettings(Section):
     cg_steps: int = knob(6, "conjugate-gradient steps on the quadratic losses", ge=0)
     lbfgs_steps: int = knob(6, "L-BFGS steps, if L_ins or L_part has a weight", ge=0)
     min_mask_px: int = knob(50, "L_ins and L_part ignore smaller masks", unit="px", ge=1)
-    prune_cosine: float = knob(
+    prune_cosine: Share = knob(
         1.0,
         "L_ins and L_part omit a mask if the cosine of its mean feature with that of a larger, unrelated "
         "mask of the same view and level is higher; 1: keep all",
-        ge=0,
-        le=1,
         origin="paper: pruning, no number",
     )
 
