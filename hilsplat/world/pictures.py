@@ -23,7 +23,7 @@ from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.scene import Assembly, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import box
-from hilsplat.world.views import looking_at, on_sphere, pinhole
+from hilsplat.world.views import on_sphere, square_camera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,10 +77,10 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
     style = Style(light_position=(1.2, -1.0, 3.6), exposure=1.3)
     scene = assembly.finished(1, (), style)
     middle = np.array([0, 0, 0.48 * height * scale])
-    pose = looking_at(middle + on_sphere(AZIMUTH_DEG, ELEVATION_DEG, 1.9), middle)
+    sight = middle + on_sphere(AZIMUTH_DEG, ELEVATION_DEG, 1.9), middle
     reach = max(0.90 * RADIUS, 0.60 * height * scale)
     fov_deg = 2 * float(np.degrees(np.arctan(reach / 1.75)))
-    return scene, Camera("class.png", pose, pinhole(CLASS_PX, fov_deg), (CLASS_PX, CLASS_PX))
+    return scene, square_camera("class.png", sight, CLASS_PX, fov_deg)
 
 
 def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:

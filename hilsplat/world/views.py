@@ -5,7 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from hilsplat.scene.cameras import Cameras
+from hilsplat.scene.cameras import Camera, Cameras
+
+Sight = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+"""Position of a camera, and the point that it looks at."""
 
 
 def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
@@ -40,14 +43,17 @@ def arc_azimuths(views: int, arc_deg: float | int) -> Float[np.ndarray, " V"]:
     return arc_deg * (share - 0.5)
 
 
-def numbered_cameras(
-    cam_from_world: Sequence[Float[np.ndarray, "4 4"]], K: Float[np.ndarray, "3 3"], image_px: int
-) -> Cameras:
+def square_camera(name: str, sight: Sight, image_px: int, fov_deg: float | int) -> Camera:
+    """Return an upright camera with square images."""
+    return Camera(name, looking_at(*sight), pinhole(image_px, fov_deg), (image_px, image_px))
+
+
+def numbered_cameras(sights: Sequence[Sight], image_px: int, fov_deg: float | int) -> Cameras:
     """Return square views named 000.png, 001.png, ... with shared intrinsics."""
-    views = len(cam_from_world)
+    views = len(sights)
     return Cameras(
         tuple(f"{i:03d}.png" for i in range(views)),
-        np.stack(cam_from_world),
-        np.tile(K, (views, 1, 1)),
+        np.stack([looking_at(*sight) for sight in sights]),
+        np.tile(pinhole(image_px, fov_deg), (views, 1, 1)),
         np.full((views, 2), image_px, dtype=np.int32),
     )

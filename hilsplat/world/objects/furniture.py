@@ -3,8 +3,6 @@
 Fronts face +x; the backs of fixtures (doors, windows, curtains, pictures, mirrors) are at x = 0.
 """
 
-from itertools import product
-
 import numpy as np
 
 from hilsplat.world.objects.builder import CORNERS, Builder
@@ -29,9 +27,9 @@ def _legs(b: Builder, x: float, y: float, top: float, paints: list[Paint], width
     foot_height = max(0.05, 0.22 * top)
     shape = box((width, width, top - foot_height), (0, 0, (top + foot_height) / 2), 0.008)
     foot = box((width * 1.3, width * 1.3, foot_height), (0, 0, foot_height / 2), 0.01)
-    for px, py in product((-x, x), (-y, y)):
-        leg = b.part("leg", paints[0], shape.moved(px, py))
-        leg.subpart("foot, leg tip", paints[1], foot.moved(px, py))
+    for side_x, side_y in CORNERS:
+        leg = b.part("leg", paints[0], shape.moved(side_x * x, side_y * y))
+        leg.subpart("foot, leg tip", paints[1], foot.moved(side_x * x, side_y * y))
 
 
 def _pillow(size: tuple[float, float, float]) -> Mesh:

@@ -9,6 +9,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.scenes import room, street, tabletop
 from hilsplat.world.scenes.scene import WorldScene
+from hilsplat.world.views import Sight, numbered_cameras, square_camera
 
 
 class SceneKind(NamedTuple):
@@ -16,20 +17,24 @@ class SceneKind(NamedTuple):
 
     Attributes:
         build: builds a scene, (seed, objects).
-        cameras: returns the views of a scene, (scene, views, image_px, arc_deg): square images 000.png,
-            001.png, ..., jittered by the scene's seed, and close enough for structure from motion.
-        training_camera: returns a random camera for training, (scene, rng, image_px).
+        sights: returns the cameras of a scene, (scene, views, arc_deg), jittered by the scene's seed, and
+            close enough for structure from motion.
+        fov_deg: their field of view.
+        training_sight: draws a random camera for training and its field of view, (scene, rng).
     """
 
     build: Callable[[int, int], WorldScene]
-    cameras: Callable[[WorldScene, int, int, float | int], Cameras]
-    training_camera: Callable[[WorldScene, np.random.Generator, int], Camera]
+    sights: Callable[[WorldScene, int, float | int], list[Sight]]
+    fov_deg: float
+    training_sight: Callable[[WorldScene, np.random.Generator], tuple[Sight, float]]
 
 
 KINDS: dict[str, SceneKind] = {
-    "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_cameras, tabletop.training_camera),
-    "room": SceneKind(room.build_room, room.loop_cameras, room.training_camera),
-    "street": SceneKind(street.build_street, street.drive_cameras, street.training_camera),
+    "tabletop": SceneKind(
+        tabletop.build_tabletop, tabletop.ring_sights, tabletop.FOV_DEG, tabletop.training_sight
+    ),
+    "room": SceneKind(room.build_room, room.loop_sights, room.FOV_DEG, room.training_sight),
+    "street": SceneKind(street.build_street, street.drive_sights, street.FOV_DEG, street.training_sight),
 }
 """Scene kinds by their name in the scene sheet."""
 
@@ -57,10 +62,12 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
 
 
 def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int) -> Cameras:
-    """Return the views of a scene that the world stage renders."""
-    return KINDS[scene.kind].cameras(scene, views, image_px, arc_deg)
+    """Return the views of a scene that the world stage renders: square images 000.png, 001.png, ..."""
+    kind = KINDS[scene.kind]
+    return numbered_cameras(kind.sights(scene, views, arc_deg), image_px, kind.fov_deg)
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:
     """Return a random view of a training scene."""
-    return KINDS[scene.kind].training_camera(scene, rng, image_px)
+    sight, fov_deg = KINDS[scene.kind].training_sight(scene, rng)
+    return square_camera("random.png", sight, image_px, fov_deg)

@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from hilsplat.base.levels import NONE
-from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.objects.catalogue import ROOM_THINGS
 from hilsplat.world.paints import PaintBox
 from hilsplat.world.scenes.floorplan import WALL_GAP, FloorPlan, Room, Space, turned_space
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import Mesh, box, rotation_about
-from hilsplat.world.views import arc_azimuths, looking_at, numbered_cameras, pinhole
+from hilsplat.world.views import Sight, arc_azimuths
 
 logger = logging.getLogger(__name__)
 
@@ -398,7 +397,7 @@ def room_of(scene: WorldScene) -> Room:
     return Room(2 * float(high[0]), 2 * float(high[1]), float(high[2]))
 
 
-def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sight]:
     """Return cameras on a loop through the room that look across its middle from two alternating heights.
 
     The views show the far wall with everything in front of it, and the middle from all sides. A camera that
@@ -406,16 +405,15 @@ def loop_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
     """
     rng = np.random.default_rng([scene.seed, 25])
     spots = path_points(room_of(scene), arc_azimuths(views, arc_deg) + rng.uniform(-1, 1, views))
-    transforms = []
-    for i in range(views):
-        centre = np.array([*spots[i], EYE_HEIGHTS[i % 2] + rng.uniform(-0.03, 0.03)])
-        target = np.array([*(-0.5 * spots[i]), LOOK_AT_Z]) + rng.uniform(-0.04, 0.04, 3)
-        transforms.append(looking_at(centre, target))
-    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+    sights = []
+    for i, spot in enumerate(spots):
+        centre = np.array([*spot, EYE_HEIGHTS[i % 2] + rng.uniform(-0.03, 0.03)])
+        sights.append((centre, np.array([*(-0.5 * spot), LOOK_AT_Z]) + rng.uniform(-0.04, 0.04, 3)))
+    return sights
 
 
-def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """Return a random camera for training: a third as in `loop_cameras`, the others near one object.
+def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
+    """Draw a camera for training: a third of the draws as in `loop_sights`, the others near one object.
 
     The position is inside the room and outside all objects.
     """
@@ -429,8 +427,7 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
         target = np.array([*thing.centre_xy, thing.base_z + 0.5 * thing.height]) + rng.uniform(-0.1, 0.1, 3)
         size = max(thing.footprint, thing.height / 2)
         centre = _free_centre(scene, room, target, size, rng)
-    K = pinhole(image_px, rng.uniform(54, 66))
-    return Camera("random.png", looking_at(centre, target), K, (image_px, image_px))
+    return (centre, target), rng.uniform(54, 66)
 
 
 def _free_centre(

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import ObjectModel
 from hilsplat.world.paints import Colour, Paint
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import Mesh, box, joined, lathe, rotation_about
-from hilsplat.world.views import looking_at, numbered_cameras, on_sphere, pinhole
+from hilsplat.world.views import Sight, on_sphere
 
 logger = logging.getLogger(__name__)
 
@@ -315,7 +314,7 @@ def _daylight(rng: np.random.Generator) -> Style:
     return Style(position, 14.0, light, above, below, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
 
 
-def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sight]:
     """Return the cameras of a drive along the street, for the global mapper (see `docs/world.md`).
 
     The camera moves along its lane and sways, while its yaw sweeps between the two sides of the street in
@@ -326,28 +325,28 @@ def drive_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float |
     length = DRIVE_X[1] - DRIVE_X[0]
     step = min(MAX_STEP, length / max(1, views - 1))
     start = (DRIVE_X[0] + DRIVE_X[1] - step * (views - 1)) / 2
-    transforms = []
+    sights = []
     for i in range(views):
         phase = (i % SWEEP_VIEWS) / SWEEP_VIEWS
         yaw = SWEEP_DEG * (4 * abs(phase - 0.5) - 1) + float(rng.uniform(-2, 2))
         middle = np.array([start + i * step, LANE_Y + SWAY_M * np.sin(2 * np.pi * phase), CAMERA_Z])
         centre = middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12])
-        transforms.append(looking_at(centre, centre + on_sphere(yaw, float(pitch_rng.uniform(-1, 3)), 1.0)))
-    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+        sights.append((centre, centre + on_sphere(yaw, float(pitch_rng.uniform(-1, 3)), 1.0)))
+    return sights
 
 
-def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """Return a random camera for training: a view from the road, or a close-up of a visible object."""
-    intrinsics = pinhole(image_px, float(rng.uniform(56, 66)))
-    pose = _close_up(scene, rng) if rng.random() < 0.5 else None
-    if pose is None:
+def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
+    """Draw a camera for training: a view from the road, or a close-up of a visible object."""
+    fov_deg = float(rng.uniform(56, 66))
+    sight = _close_up(scene, rng) if rng.random() < 0.5 else None
+    if sight is None:
         centre = np.array([rng.uniform(DRIVE_X[0], 14), rng.uniform(-2.4, -0.8), rng.uniform(1.5, 2.4)])
         yaw = rng.uniform(-60, 60) if rng.random() < 0.85 else rng.uniform(90, 270)
-        pose = looking_at(centre, centre + on_sphere(yaw, rng.uniform(-6, 6), 1.0))
-    return Camera("random.png", pose, intrinsics, (image_px, image_px))
+        sight = centre, centre + on_sphere(yaw, rng.uniform(-6, 6), 1.0)
+    return sight, fov_deg
 
 
-def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, "4 4"] | None:
+def _close_up(scene: WorldScene, rng: np.random.Generator) -> Sight | None:
     """Return a camera on the road side of a random unoccluded object, or None if none is found."""
     wholes = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
     for _ in range(30):
@@ -368,7 +367,7 @@ def _close_up(scene: WorldScene, rng: np.random.Generator) -> Float[np.ndarray, 
         if abs(centre[1]) > FRONT - 0.5 or inside.all():
             continue
         if _sees(scene, centre, corners, node, rng):
-            return looking_at(centre, target)
+            return centre, target
     return None
 
 

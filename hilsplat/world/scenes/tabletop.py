@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.world.objects.builder import CORNERS
 from hilsplat.world.objects.catalogue import TABLETOP, build_object
 from hilsplat.world.paints import Paint, PaintBox
 from hilsplat.world.scenes.scene import Assembly, PlacedObject, Style, WorldScene, footprint_of
 from hilsplat.world.shapes import Mesh, box, cylinder, loft, rotation_about
-from hilsplat.world.views import arc_azimuths, looking_at, numbered_cameras, on_sphere, pinhole
+from hilsplat.world.views import Sight, arc_azimuths, on_sphere
 
 logger = logging.getLogger(__name__)
 
@@ -182,7 +181,7 @@ def _fabric(paints: PaintBox, scale: float) -> Paint:
     return replace(paint, scale=paint.scale * 2.2 / scale * 0.5) if paint.kind == "weave" else paint
 
 
-def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int = 360.0) -> Cameras:
+def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sight]:
     """Return slightly jittered cameras around the table at two alternating elevations.
 
     Neighbours should be at most 9 degrees apart: structure from motion failed with larger steps. The arc is
@@ -190,17 +189,17 @@ def ring_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | 
     """
     rng = np.random.default_rng([scene.seed, 5])
     target = np.array([0.0, 0.0, LOOK_AT_Z])
-    transforms = []
+    sights = []
     for i, middle in enumerate(arc_azimuths(views, arc_deg)):
         azimuth = middle + rng.uniform(-1, 1)
         elevation = ELEVATIONS_DEG[i % 2] + rng.uniform(-1.5, 1.5)
         centre = target + on_sphere(azimuth, elevation, DISTANCE * rng.uniform(0.97, 1.03))
-        transforms.append(looking_at(centre, target + rng.uniform(-0.03, 0.03, 3)))
-    return numbered_cameras(transforms, pinhole(image_px, FOV_DEG), image_px)
+        sights.append((centre, target + rng.uniform(-0.03, 0.03, 3)))
+    return sights
 
 
-def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int = 256) -> Camera:
-    """Return a random camera for training that sees the whole table or, in half of the draws, one object."""
+def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
+    """Draw a camera for training that sees the whole table or, in half of the draws, one object."""
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
     nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps sizes
     if scene.placed and rng.random() < 0.5:
@@ -210,5 +209,4 @@ def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int =
     else:
         target = np.array([0.0, 0.0, LOOK_AT_Z]) + rng.uniform(-0.15, 0.15, 3) * np.array([1, 1, 0.5])
         distance = nearer * DISTANCE * rng.uniform(0.85, 1.12)
-    centre = target + on_sphere(azimuth, elevation, distance)
-    return Camera("random.png", looking_at(centre, target), pinhole(image_px, fov_deg), (image_px, image_px))
+    return (target + on_sphere(azimuth, elevation, distance), target), fov_deg

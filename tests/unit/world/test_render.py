@@ -8,21 +8,19 @@ from hilsplat.scene.cameras import Camera
 from hilsplat.world import render
 from hilsplat.world.paints import Paint
 from hilsplat.world.render import label_view, render_and_label, render_view
-from hilsplat.world.scenes.kinds import build_scene
+from hilsplat.world.scenes.kinds import build_scene, scene_cameras, training_camera
 from hilsplat.world.scenes.scene import Style
-from hilsplat.world.scenes.tabletop import ring_cameras, training_camera
 from hilsplat.world.shapes import box, joined, sphere
 from hilsplat.world.textures import fractal_noise, grains, hash01
 from hilsplat.world.truth import TrueMesh
-from hilsplat.world.views import looking_at, pinhole
+from hilsplat.world.views import square_camera
 from tests.unit.world.scenes import scene_of
 
 STONE = Paint("grey", "stone", (0.6, 0.5, 0.4), (0.3, 0.3, 0.3), 8.0, 0.0, 10.0, 0.3, (5.0, 6.0, 7.0))
 
 
 def camera_at(centre, target=(0.0, 0.0, 0.0), side_px: int = 64, fov_deg: float = 50.0) -> Camera:
-    pose = looking_at(np.array(centre), np.array(target))
-    return Camera("a.png", pose, pinhole(side_px, fov_deg), (side_px, side_px))
+    return square_camera("a.png", (np.array(centre), np.array(target)), side_px, fov_deg)
 
 
 def test_label_image_of_a_box_is_its_analytic_projection():
@@ -103,7 +101,7 @@ def test_vectorised_grain_is_bit_identical_to_fractal_noise():
 @pytest.mark.parametrize("samples", (2, 3))
 def test_image_and_labels_do_not_depend_on_the_height_of_bands(monkeypatch, samples):
     scene = build_scene("tabletop", 100, 3)
-    camera = ring_cameras(scene, 12, 48, 100.0)["005.png"]
+    camera = scene_cameras(scene, 12, 48, 100.0)["005.png"]
     plain = render_view(scene, camera, samples), label_view(scene, camera)
     for rays in (1, 48 * 5 * samples**2, 10**9):
         monkeypatch.setattr(render, "BAND_RAYS", rays)
@@ -122,14 +120,14 @@ def test_omitted_shadow_rays_do_not_change_the_image(monkeypatch):
 
 def test_ring_cameras_alternate_in_elevation_and_an_arc_is_centred_on_the_front():
     scene = build_scene("tabletop", 100, 1)
-    cameras = ring_cameras(scene, 40, 256)
+    cameras = scene_cameras(scene, 40, 256, 360)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     azimuth = np.unwrap(np.arctan2(centres[:, 1], centres[:, 0]))
     # Jitter moves each by at most 1 degree.
     assert np.degrees(np.diff(azimuth)) == pytest.approx(9.0, abs=2.1)
     assert (np.diff(centres[:, 2]) * np.tile([1, -1], 20)[:39] > 0).all()
     assert np.linalg.det(cameras.cam_from_world[:, :3, :3]) == pytest.approx(1.0)
-    cameras = ring_cameras(scene, 12, 128, 100.0)
+    cameras = scene_cameras(scene, 12, 128, 100.0)
     for name, end in (("000.png", -50), ("011.png", 50)):
         x, y, _ = cameras[name].centre
         assert np.degrees(np.arctan2(y, x)) == pytest.approx(end, abs=1.1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilsplat.world.render import label_view, render_view
+from hilsplat.world.scenes.kinds import scene_cameras, training_camera
 from hilsplat.world.scenes.scene import WorldScene
 from hilsplat.world.scenes.street import (
     FRONT,
@@ -16,11 +17,9 @@ from hilsplat.world.scenes.street import (
     SWAY_M,
     SWEEP_DEG,
     WALK_Z,
-    drive_cameras,
     part_boxes,
-    training_camera,
 )
-from hilsplat.world.views import looking_at
+from hilsplat.world.views import square_camera
 
 VEHICLES = {"car", "truck", "bus"}
 
@@ -60,11 +59,10 @@ def test_a_street_with_seven_objects_has_the_main_classes(street):
 
 
 def test_every_pixel_has_a_label_and_the_sky_is_self_luminous(street):
-    assert (label_view(street, drive_cameras(street, 40, 64)["020.png"])[0] >= 0).all()
+    assert (label_view(street, scene_cameras(street, 40, 64, 360)["020.png"])[0] >= 0).all()
     # Straight up from the road there is only sky; its colours lie between blue and white.
-    up = looking_at(np.array([0.0, LANE_Y, 1.8]), np.array([0.3, LANE_Y, 12.0]))
-    camera = drive_cameras(street, 3, 16)["001.png"]
-    camera = type(camera)("up.png", up, camera.K, camera.size_hw)
+    up = np.array([0.0, LANE_Y, 1.8]), np.array([0.3, LANE_Y, 12.0])
+    camera = square_camera("up.png", up, 16, 62.0)
     sky = next(node for node in street.background if street.nodes[node].text == "sky")
     assert (label_view(street, camera)[0] == sky).all()
     image = render_view(street, camera, 1).astype(int)
@@ -72,7 +70,7 @@ def test_every_pixel_has_a_label_and_the_sky_is_self_luminous(street):
 
 
 def test_neighbouring_views_differ_little_in_position_and_direction(street):
-    cameras = drive_cameras(street, 40, 64)
+    cameras = scene_cameras(street, 40, 64, 360)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     forward = cameras.cam_from_world[:, 2, :3]
     step = np.diff(centres, axis=0)
@@ -86,12 +84,12 @@ def test_neighbouring_views_differ_little_in_position_and_direction(street):
     # The camera stays in its own lane.
     assert (centres[:, 1] > -LANE + 0.3).all() and (centres[:, 1] < 0).all()
     # Fewer views shorten the drive and keep the step.
-    few = drive_cameras(street, 6, 64)
+    few = scene_cameras(street, 6, 64, 360)
     assert few["005.png"].centre[0] - few["000.png"].centre[0] == pytest.approx(5 * MAX_STEP, abs=0.11)
 
 
 def test_cameras_of_the_drive_are_outside_all_objects(street):
-    cameras = drive_cameras(street, 40, 64)
+    cameras = scene_cameras(street, 40, 64, 360)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     for points in things(street).values():
         inside = (centres > points.min(axis=0) - 0.2) & (centres < points.max(axis=0) + 0.2)
