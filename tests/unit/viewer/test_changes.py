@@ -13,7 +13,7 @@ from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.scene_thread import ShownScene
-from tests.unit.artifact_changes import change_index, write_again
+from tests.unit.artifact_changes import write_again
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import browsing
 
@@ -104,7 +104,8 @@ def test_a_later_variant_is_not_opened_together_with_old_parts(page, desk):
     write_again(desk / "gaussians.ply")
     answer = page.post("/api/query", json={"text": "mug", "variant": "second"})
     assert answer.status_code == 409
-    assert page.post("/api/query", json={"text": "mug", "variant": "second"}, params={"of": load(page)})
+    asked = {"text": "mug", "variant": "second"}
+    assert page.post("/api/query", json=asked, params={"of": load(page)}).status_code == 200
 
 
 def test_names_are_saved_although_the_field_of_another_variant_cannot_be_read(page, desk):
@@ -133,20 +134,6 @@ def test_a_page_gets_no_data_of_a_later_state(page, desk):
     for path in ("splats/0", "nodes/default", "variant/default", "thumb/0"):
         assert page.get(f"/api/{path}", params={"of": page.state}).status_code == 409
         assert page.get(f"/api/{path}", params={"of": again}).status_code == 200
-
-
-def test_an_outline_has_the_digest_of_its_tree(page, desk):
-    before = page.get("/api/variant/default").json()["tree"]
-    write_again(desk / "default/semantic_tree")
-    load(page)
-    assert page.get("/api/variant/default").json()["tree"] == before  # the same rows again
-    with np.load(desk / "default/semantic_tree/tree.npz") as held:
-        arrays = {**held, "quality": held["quality"] * 0.5}
-    np.savez(desk / "default/semantic_tree/tree.npz", **arrays)
-    change_index(desk / "default/semantic_tree")
-    write_again(desk / "default/semantic_tree")
-    load(page)
-    assert page.get("/api/variant/default").json()["tree"] != before
 
 
 def test_created_and_replaced_files_count_as_changed(tmp_path):
