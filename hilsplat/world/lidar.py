@@ -54,7 +54,7 @@ class LidarScan:
 
     def save(self, path: Path) -> None:
         """Write all fields as .npz; equal scans give equal bytes."""
-        write_npz(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+        write_npz(path, **vars(self))
 
 
 def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:

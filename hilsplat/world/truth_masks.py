@@ -366,12 +366,12 @@ def faulty_masks(
                 if settings.boundary_px:
                     field = draws.generator("boundary", *name)
                     mask = displaced(piece, settings.boundary_px, settings.boundary_smooth_px, field)
-                stands_at = level
+                mask_level = level
                 if draws.chance("wrong level", *name) < settings.wrong_level:
-                    stands_at = beside(level, up=draws.chance("which level", *name) < 0.5)
+                    mask_level = beside(level, up=draws.chance("which level", *name) < 0.5)
                     counts["wrong_level"] += 1
                 quality = max(_iou(mask, of_level == node) for node in group)
-                found.append((mask, stands_at, *_scores(quality, draws, settings, name)))
+                found.append((mask, mask_level, *_scores(quality, draws, settings, name)))
     masks = HierarchicalMasks.from_dense(
         np.array([each[0] for each in found], bool).reshape(len(found), *labels.shape[1:]),
         np.array([int(each[1]) for each in found], np.uint8),
