@@ -34,11 +34,11 @@ GLANCING_COSINE = 0.03
 
 @dataclass(frozen=True, eq=False)
 class LidarScan:
-    """P measured points with their true nodes.
+    """P measured points, with the nodes that were hit.
 
     Attributes:
-        points: positions in the world of the true cameras, noise included, metres.
-        node_ids: nodes that were hit (whole, part, subpart; -1 none).
+        points: positions in the frame of the ground-truth cameras, with noise, metres.
+        node_ids: whole, part and subpart; -1 for none.
         pose_index: row of `origins` from which each point was measured.
         range_m: measured distance to that origin.
         beam: number of the beam, 0 to 63 from the lowest.

@@ -32,7 +32,7 @@ _HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that jitters rays
 
 
 def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
-    """Return the true node id per level and pixel (-1 none), from one ray through each pixel's centre."""
+    """Return the node id per level and pixel (-1 none), from one ray through each pixel's centre."""
     return _labels(scene, scene.caster.nearest(*_rays(camera, 1)).triangle, camera.size_hw)
 
 

@@ -40,7 +40,7 @@ def annotated_nodes(
     """Return the ids of the nodes that are scored in a view, in ascending order.
 
     Nodes with the same text (four legs) match one query, so the size limit applies to their union: either
-    all visible ones are annotated or none. The true region would be wrong if one large leg were annotated
+    all visible ones are annotated or none. The ground truth would be wrong if one large leg were annotated
     and three small ones were not.
 
     Args:
@@ -173,7 +173,7 @@ def refined(
 
 @dataclass(frozen=True, eq=False)
 class TrueMesh:
-    """Triangles of a scene, in the frame of its true cameras; corner positions are in scene units."""
+    """Triangles of a scene, in the frame of its ground-truth cameras, scene units."""
 
     triangles: Float32[np.ndarray, "F 3 3"]
 
