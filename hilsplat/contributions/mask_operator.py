@@ -4,8 +4,6 @@ Rows with a multiple of sixteen float32 channels use the loops `_wide_means` and
 are bit-identical to those of the plain loops.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +12,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import WIDTH, lanes, load, store
+from hilsplat.base.processes import over_edges
 from hilsplat.contributions.compositing import plus
 
 MEDIAN_SOFTENING = 1e-4
@@ -54,9 +53,9 @@ class MaskOperator:
         edges = [0, *shares.tolist(), len(out)]
         if _fills_lanes(out):
             flat = features.reshape(-1), out.shape[1], out.reshape(-1)
-            self._share(lambda first, last: _wide_means(first, last, *A, *flat), edges)
+            over_edges(_wide_means, edges, self.threads, *A, *flat)
         else:
-            self._share(lambda first, last: _means(first, last, *A, features, out), edges)
+            over_edges(_means, edges, self.threads, *A, features, out)
         return out
 
     def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
@@ -67,18 +66,13 @@ class MaskOperator:
         edges = np.linspace(0, self.num_gaussians, parts + 1).astype(np.int64).tolist()
         if _fills_lanes(out):
             flat = values.reshape(-1), values.shape[1], out.reshape(-1)
-            self._share(lambda begin, end: _wide_spread(begin, end, *A, *flat), edges)
+            over_edges(_wide_spread, edges, self.threads, *A, *flat)
         else:
-            self._share(lambda begin, end: _spread(begin, end, *A, values, out), edges)
+            over_edges(_spread, edges, self.threads, *A, values, out)
         return out
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.indptr, self.indices, self.data, self.level_index
-
-    def _share(self, work: Callable[[int, int], None], edges: list[int]) -> None:
-        """Distribute the ranges between edges over threads."""
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, edges[:-1], edges[1:]))
 
 
 def _fills_lanes(values: np.ndarray) -> bool:

@@ -5,7 +5,6 @@ levels, as an upper triangle with three values per pair of Gaussians. If W has f
 and streamed instead. Both give the same products.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from jaxtyping import Bool, Float, Float32
 from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import WIDTH, lanes, load, store
 from hilsplat.base.levels import LEVELS
+from hilsplat.base.processes import over_edges
 from hilsplat.contributions.compositing import padded, plus
 
 PRODUCT_PARTS = 4
@@ -58,8 +58,7 @@ class Gram:
                 _gram_product(*rows, features, out)
             return out
 
-        with ThreadPoolExecutor(self.threads) as pool:
-            parts = list(pool.map(part, edges[:-1], edges[1:]))
+        parts = over_edges(part, edges, self.threads)
         total = parts[0]
         for begin, rest in zip(edges[1:-1], parts[1:], strict=True):
             total[begin:] += rest

@@ -85,35 +85,13 @@ class _Rows:
             self._indices, self._values = enlarged(self._indices, self._values, kept, 2 * needed)
 
 
-class _Block:
-    """Rows of G, with the few pairs that were added late kept separately.
-
-    A part shows about 10 % of the Gaussians of a large scene. Sums of known pairs are updated in place, and
-    only the late pairs are rewritten, until there are enough to merge.
-    """
-
-    def __init__(self, rows: int) -> None:
-        self.rows, self.late = _Rows(rows), _Rows(rows)
-
-    def replace_late(self, indptr: np.ndarray, indices: np.ndarray, values: np.ndarray) -> None:
-        """Replace the late pairs, and merge them if there are many."""
-        self.late.replace(indptr, indices, values)
-        if MERGE_AT * self.late.nonzeros > self.rows.nonzeros:
-            self.merged()
-
-    def merged(self) -> _Rows:
-        """Merge the late pairs and return all pairs."""
-        if self.late.nonzeros:
-            self.rows.merge(self.late)
-            self.late = _Rows(len(self.rows.indptr) - 1)
-        return self.rows
-
-
 class GramBuilder:
     """Sum of G over parts of W, such as one view after another; its memory grows only with G.
 
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
-    pixels into parts nor on the number of threads.
+    pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene:
+    sums of known pairs are updated in place, and only pairs that were added late are rewritten, until there
+    are enough to merge.
     """
 
     def __init__(self, num_gaussians: int, threads: int) -> None:
@@ -121,7 +99,8 @@ class GramBuilder:
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
         self._pixels = self._places = np.zeros(0, np.int32)
-        self._blocks = [_Block(end - begin) for begin, end in self._ranges]
+        self._rows = [_Rows(end - begin) for begin, end in self._ranges]
+        self._late = [_Rows(end - begin) for begin, end in self._ranges]
         self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
         for _ in range(self._threads):
             sums, fresh = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
@@ -130,7 +109,7 @@ class GramBuilder:
     @property
     def nonzeros(self) -> int:
         """Number of pairs of Gaussians so far."""
-        return sum(block.rows.nonzeros + block.late.nonzeros for block in self._blocks)
+        return sum(rows.nonzeros for rows in (*self._rows, *self._late))
 
     def add(self, part: StackedWeights) -> None:
         """Add W' diag(valid) W of further pixels; the columns of W must be sorted within rows."""
@@ -142,15 +121,25 @@ class GramBuilder:
             begin, end = self._ranges[number]
             if columns[0][begin] == columns[0][end]:
                 return
-            block, indptr = self._blocks[number], np.zeros(end - begin + 1, np.int64)
-            sums, fresh, *late = self._idle.get()
-            known = block.rows.arrays(), block.late.arrays()
-            late = add_to_block(begin, end, arrays, columns, *known, sums, fresh, indptr, *late)
-            block.replace_late(indptr, *late)
-            self._idle.put((sums, fresh, *late))
+            rows, late, indptr = self._rows[number], self._late[number], np.zeros(end - begin + 1, np.int64)
+            sums, fresh, *buffers = self._idle.get()
+            known = rows.arrays(), late.arrays()
+            buffers = add_to_block(begin, end, arrays, columns, *known, sums, fresh, indptr, *buffers)
+            late.replace(indptr, *buffers)
+            self._idle.put((sums, fresh, *buffers))
+            if MERGE_AT * late.nonzeros > rows.nonzeros:
+                self._merged(number)
 
         with ThreadPoolExecutor(self._threads) as pool:
-            list(pool.map(grow, range(len(self._blocks))))
+            list(pool.map(grow, range(BLOCKS)))
+
+    def _merged(self, number: int) -> _Rows:
+        """Merge the late pairs of a block, and return all its pairs."""
+        rows, late = self._rows[number], self._late[number]
+        if late.nonzeros:
+            rows.merge(late)
+            self._late[number] = _Rows(len(rows.indptr) - 1)
+        return rows
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return each Gaussian's weights in W: the start of its list, and lists of pixels and places.
@@ -170,14 +159,14 @@ class GramBuilder:
         """Return all sums so far as arrays."""
         return {
             f"{name}_{number}": array
-            for number, block in enumerate(self._blocks)
-            for name, array in zip(ROWS, block.merged().arrays(), strict=True)
+            for number in range(BLOCKS)
+            for name, array in zip(ROWS, self._merged(number).arrays(), strict=True)
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from `state`."""
-        for number, block in enumerate(self._blocks):
-            block.rows.replace(*(state[f"{name}_{number}"] for name in ROWS))
+        for number, rows in enumerate(self._rows):
+            rows.replace(*(state[f"{name}_{number}"] for name in ROWS))
 
     def finish(self) -> Gram:
         """Return G of all added parts, and empty the builder."""
@@ -186,8 +175,8 @@ class GramBuilder:
         values = np.empty((len(indices), len(LEVELS)), np.float32)
         done = 0
         for number, (begin, end) in enumerate(self._ranges):
-            some_indptr, some_indices, some_values = self._blocks[number].merged().arrays()
-            self._blocks[number] = _Block(end - begin)
+            some_indptr, some_indices, some_values = self._merged(number).arrays()
+            self._rows[number] = _Rows(end - begin)
             indptr[begin + 1 : end + 1] = some_indptr[1:] + done
             indices[done : done + len(some_indices)] = some_indices
             values[done : done + len(some_indices)] = some_values

@@ -3,15 +3,14 @@
 Everything is sparse: only masks that share Gaussians are compared.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Float64, Int32
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.processes import over_edges
 
 ROWS_AT_A_TIME = 64
 """Number of masks per thread task."""
@@ -65,13 +64,12 @@ def mask_evidence(
     rows, by_column = (shares.indptr, shares.indices), (columns.indptr, columns.indices, columns.data)
     flags = np.ascontiguousarray(visible.T).view(np.uint8)
     everywhere = np.zeros((num, len(visible)))  # size of each mask as seen from each view
-    ranges = list(pairwise([*range(0, num, ROWS_AT_A_TIME), num])) or [(0, 0)]
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        list(pool.map(lambda span: _seen_sizes(*span, *rows, sizes, flags, everywhere), ranges))
-        own = everywhere[np.arange(num), view]
-        seen = np.where(everywhere < min_covisible * own[:, None], 0.0, everywhere)
-        pairs = (*rows, weighted, *by_column, view, seen, everywhere)
-        parts = list(pool.map(lambda span: _shared_pairs(*span, *pairs), ranges))
+    edges = [0, *range(ROWS_AT_A_TIME, num, ROWS_AT_A_TIME), num]
+    over_edges(_seen_sizes, edges, threads, *rows, sizes, flags, everywhere)
+    own = everywhere[np.arange(num), view]
+    seen = np.where(everywhere < min_covisible * own[:, None], 0.0, everywhere)
+    pairs = (*rows, weighted, *by_column, view, seen, everywhere)
+    parts = over_edges(_shared_pairs, edges, threads, *pairs)
     counts, indices, *sums = (np.concatenate(each) for each in zip(*parts, strict=True))
     indptr = np.concatenate(([0], np.cumsum(counts)))
     intersection, union = (sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in sums)

@@ -5,10 +5,7 @@ byte-identical for any number of threads.
 """
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +14,7 @@ from scipy.sparse import csr_matrix
 
 from hilsplat.base.errors import HilsplatError
 from hilsplat.base.lanes import WIDTH, aligned
+from hilsplat.base.processes import over_edges
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
@@ -25,18 +23,6 @@ from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, pro
 
 RANGES_PER_THREAD = 4
 """Number of work ranges per thread; several ranges balance the load."""
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="rasterise")
-
-
-def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *arguments: Any) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for neighbouring `edges` on threads; return results in order."""
-    if threads <= 1:
-        return [work(begin, end, *arguments) for begin, end in pairwise(edges)]
-    return list(_pool(threads).map(lambda begin, end: work(begin, end, *arguments), edges[:-1], edges[1:]))
 
 
 def over_ranges(
