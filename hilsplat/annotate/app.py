@@ -41,9 +41,6 @@ MAX_BODY_BYTES = 16 << 20
 """Maximum size of a request, enough for a COCO file of a whole scene."""
 
 
-# -- requests -------------------------------------------------------------------------------------
-
-
 class Stroke(Message):
     """A brush stroke: discs of one radius along points, px."""
 
@@ -159,9 +156,6 @@ class OpenedScene(ShownScene):
         return known_labels(self.labels, self.scene.cameras, self.scene.cameras.names)
 
 
-# -- the server -----------------------------------------------------------------------------------
-
-
 class Annotator:
     """Request handlers of the annotation page for one scene."""
 
@@ -233,14 +227,12 @@ def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
 
 
 def _at(opened: OpenedScene, asked: At) -> list[dict[str, Any]]:
-    """Return the outlines of the nodes or masks that contain a pixel."""
     with opened.unchanged():
         view = view_name(opened.scene, asked.view)
         return [vars(proposal) for proposal in opened.proposals.at(view, asked.x, asked.y)]
 
 
 def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
-    """Return the outlines that the scene's SAM finds around clicks or in a box."""
     with opened.same_photographs():
         view = view_name(opened.scene, asked.view)
         return [vars(found) for found in opened.clicks.outlines(view, asked.clicks, asked.box)]
@@ -267,7 +259,6 @@ def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
 
 
 def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
-    """Return all annotations in the format of another program."""
     kind = of["kind"]
     if kind not in get_args(Kind):
         raise SettingsError(f"format {kind!r} is unknown", expected=", ".join(get_args(Kind)))

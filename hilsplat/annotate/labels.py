@@ -117,9 +117,6 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     return [cut[label.id] for label in labels]
 
 
-# -- files ----------------------------------------------------------------------------------------
-
-
 def label_path(folder: Path, view: str) -> Path:
     """Return the path of a view's annotations."""
     return Path(folder) / f"{Path(view).stem}.json"

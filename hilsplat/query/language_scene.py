@@ -121,26 +121,26 @@ class LanguageScene(FieldScene):
         from hilsplat.splat.ply import load_ply
         from hilsplat.splat.rasterise.api import pixel_weights
 
-        opened = opened or Opened()
-        scene = opened.get(Scene.load, parts.scene)
-        gaussians = opened.get(load_ply, parts.gaussians)
-        tree = opened.get(SemanticTree.load, parts.semantic_tree, parts.clip)
-        made_for = {"semantic tree": tree.gaussians_sha256}
-        clip = opened.get(open_clip_of, parts.clip, settings.template)
+        files = opened or Opened()
+        scene = files.get(Scene.load, parts.scene)
+        gaussians = files.get(load_ply, parts.gaussians)
+        tree = files.get(SemanticTree.load, parts.semantic_tree, parts.clip)
+        clip = files.get(open_clip_of, parts.clip, settings.template)
+
+        def require(path: Path, made_for: dict[str, str]) -> None:
+            require_made_for(path, files.get(sha256_of_file, path), scene.name, made_for)
+
+        for_gaussians = {"semantic tree": tree.gaussians_sha256}
         language = code = None
         if parts.field is not None and parts.autoencoder is not None:
-            language = opened.get(LanguageField.load, parts.field)
-            made_for["language field"] = language.gaussians_sha256
-            code_file = autoencoder_file(parts.autoencoder)
-            own = {"language field": language.autoencoder_sha256}
-            require_made_for(code_file, opened.get(sha256_of_file, code_file), scene.name, own)
-            code = opened.get(load_code, parts.autoencoder)
+            language = files.get(LanguageField.load, parts.field)
+            for_gaussians["language field"] = language.gaussians_sha256
+            require(autoencoder_file(parts.autoencoder), {"language field": language.autoencoder_sha256})
+            code = files.get(load_code, parts.autoencoder)
             clip.require_width(code.channels, f"autoencoder {parts.autoencoder}")
-        cameras = parts.scene / "cameras.npz"
-        own = {"semantic tree": tree.cameras_sha256}
-        require_made_for(cameras, opened.get(sha256_of_file, cameras), scene.name, own)
-        require_made_for(parts.gaussians, opened.get(sha256_of_file, parts.gaussians), scene.name, made_for)
-        drawn = is_drawn(parts.scene)
+        require(parts.scene / "cameras.npz", {"semantic tree": tree.cameras_sha256})
+        require(parts.gaussians, for_gaussians)
+        is_meaningless = is_embedded(clip.model.config) and not is_drawn(parts.scene)
         return LanguageScene(
             scene,
             gaussians,
@@ -153,7 +153,7 @@ class LanguageScene(FieldScene):
             clip.embed_texts,
             settings,
             threads,
-            meaningless(clip.model.folder.name) if is_embedded(clip.model.config) and not drawn else "",
+            meaningless(clip.model.folder.name) if is_meaningless else "",
             names or NodeNames(),
             naming,
             clip.unknown_words,

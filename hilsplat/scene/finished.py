@@ -62,13 +62,7 @@ class FinishedScene:
             ArtifactError: the folder, the variant or a part is missing.
         """
         folder = Path(folder)
-        if not folder.is_dir():
-            raise ArtifactError(
-                f"scene folder {folder} is missing",
-                expected="results/<dataset>/<scene> of a finished run, or a copy of it",
-                found=f"no such folder in {Path.cwd()}",
-                fix="correct the path, or name the results folder",
-            )
+        require_scene_folder(folder)
         finished = finished_variants(folder)
         if finished and not (folder / variant).exists():
             raise ArtifactError(
@@ -131,6 +125,17 @@ class FinishedScene:
                 expected="values of EvaluateSettings",
                 fix="remove the damaged provenance of the scores, or run the workflow again",
             ) from error
+
+
+def require_scene_folder(folder: Path) -> None:
+    """Raise ArtifactError if the folder of a scene does not exist."""
+    if not folder.is_dir():
+        raise ArtifactError(
+            f"scene folder {folder} is missing",
+            expected="results/<dataset>/<scene> of a run, or a copy of it",
+            found=f"no such folder in {Path.cwd()}",
+            fix="correct the path, or name the results folder",
+        )
 
 
 def refining(folder: Path) -> str:

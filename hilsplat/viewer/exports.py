@@ -61,9 +61,6 @@ def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Gr
         return out.read_bytes()
 
 
-# -- masks ----------------------------------------------------------------------------------------
-
-
 def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
     """Make a ZIP with masks of nodes in all views: a PNG per node and view that shows it, and one COCO file.
 
@@ -92,9 +89,6 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
             yield number + 1, len(scene.views)
         archive.writestr("coco.json", json.dumps(coco, ensure_ascii=False))
     return held.getvalue()
-
-
-# -- crops ----------------------------------------------------------------------------------------
 
 
 def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
@@ -146,9 +140,6 @@ def _square_around(points: np.ndarray, camera: Camera) -> tuple[float, float, fl
     side = float((high - low).max()) * (1 + 2 * CROP_MARGIN) + 4
     x, y = ((low + high) / 2 - side / 2).tolist()
     return x, y, side
-
-
-# -- films ----------------------------------------------------------------------------------------
 
 
 def flight(asked: Film, scene: Scene) -> list[Camera]:

@@ -132,9 +132,6 @@ def box_corners(rows: np.ndarray) -> list[list[float]]:
     return np.round(OrientedBox.from_array(rows).corners(), 5).tolist()
 
 
-# -- answers --------------------------------------------------------------------------------------
-
-
 class FoundNode(TypedDict):
     """One answer; `node` is a row of the semantic tree, and views are numbered in camera order."""
 

@@ -2,11 +2,12 @@
 
 import logging
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from hilsplat.base.artifacts import read_index, sha256_of_file
 from hilsplat.base.errors import ArtifactError, HilsplatError, SettingsError
@@ -14,7 +15,7 @@ from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.names import NodeNames, tree_digest
 from hilsplat.query.scene_views import Opened, ViewStore
-from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants
+from hilsplat.scene.finished import FinishedScene, SceneParts, finished_variants, require_scene_folder
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.origin import masks_label
 from hilsplat.semantic_tree.tree import ViewNodes
@@ -55,13 +56,7 @@ class ViewerScene(ShownScene):
         self.folder, self.first, self.threads = Path(folder), variant, threads
         self.opened = Opened()
         ply = self.folder / "gaussians.ply"
-        if not self.folder.is_dir():
-            raise ArtifactError(
-                f"scene folder {folder} is missing",
-                expected="results/<dataset>/<scene> of a run, or a copy of it",
-                found=f"no such folder in {Path.cwd()}",
-                fix="correct the path, or name the results folder",
-            )
+        require_scene_folder(self.folder)
         if not ply.exists():
             raise ArtifactError(
                 f"{folder} has no Gaussians to show yet: {ply} is missing", fix=f"hilsplat run {ply}"
@@ -77,16 +72,14 @@ class ViewerScene(ShownScene):
                 fix="lower gaussians.max_gaussians",
             )
         self._variants: dict[str, LanguageScene] = {}
-        self._relevancy: dict[tuple[str, str, str], np.ndarray] = {}
-        self._painted: tuple[Any, Paint] | None = None
+        self.field_relevancy = lru_cache(KEPT_RELEVANCIES)(self._field_relevancy)
+        self.paint = lru_cache(1)(self._paint)
 
     def opened_again(self) -> "ViewerScene":
         return ViewerScene(self.folder, self.first, self.threads)
 
     def news(self) -> dict[str, Any]:
         return {**super().news(), "variants": self.variants}
-
-    # -- variants ---------------------------------------------------------------------------------
 
     @property
     def variants(self) -> list[str]:
@@ -132,8 +125,6 @@ class ViewerScene(ShownScene):
             if opened.finished and opened.finished.parts.semantic_tree.resolve() == semantic_tree.resolve():
                 self._variants[variant] = replace(opened, names=names)
 
-    # -- descriptions -----------------------------------------------------------------------------
-
     def described(self) -> dict[str, Any]:
         own = {"variants": self.variants, "of": self.state, "folder": self.folder.name}
         return payload.described_scene(self.scene, self.gaussians) | own
@@ -173,36 +164,25 @@ class ViewerScene(ShownScene):
         with self.unchanged():
             return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
 
-    # -- painting ---------------------------------------------------------------------------------
-
-    def field_relevancy(self, variant: str, text: str, level: str) -> np.ndarray:
+    def _field_relevancy(self, variant: str, text: str, level: str) -> UInt8[np.ndarray, " N"]:
         """Return each Gaussian's field relevancy in steps of 1/255, as `FieldScene.gaussian_relevancy`."""
-        key = (variant, text, level)
-        if key not in self._relevancy:
-            found = self.answering(variant).gaussian_relevancy(text, level)
-            for oldest in list(self._relevancy)[: 1 - KEPT_RELEVANCIES]:
-                del self._relevancy[oldest]
-            self._relevancy[key] = (np.clip(found, 0, 1) * 255 + 0.5).astype(np.uint8)
-        return self._relevancy[key]
+        found = self.answering(variant).gaussian_relevancy(text, level)
+        return (np.clip(found, 0, 1) * 255 + 0.5).astype(np.uint8)
 
-    def paint(self, variant: str, style: Style) -> Paint | None:
-        """Resolve a style for each Gaussian; None: the scene's own colours. The last result is cached.
+    def _paint(self, variant: str, style: Style) -> Paint | None:
+        """Resolve a style for each Gaussian; None: the scene's own colours.
 
         Raises:
             SettingsError: the style does not fit the tree.
         """
         if not style.table and not style.ramp:
             return None
-        key = (variant, style)
-        if self._painted is None or self._painted[0] != key:
-            scene = self.answering(variant)
-            relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
-            try:
-                paint = Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
-            except ValueError as error:
-                raise SettingsError(f"the style cannot be painted: {error}", fix="reload the page") from error
-            self._painted = (key, paint)
-        return self._painted[1]
+        scene = self.answering(variant)
+        relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
+        try:
+            return Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
+        except ValueError as error:
+            raise SettingsError(f"the style cannot be painted: {error}", fix="reload the page") from error
 
     def warm_up(self) -> None:
         """Compile the loops of rendering, picking and masks before the page opens."""

@@ -60,9 +60,6 @@ def guarded(
     return Guard(Starlette(routes=routes, exception_handlers=handlers), token, max_body, embedded=embedded)
 
 
-# -- answers --------------------------------------------------------------------------------------
-
-
 def as_json(value: Any) -> bytes:
     """Encode a value as compact JSON."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
@@ -119,9 +116,6 @@ def encoded(pixels: UInt8[np.ndarray, "H W 3"], kind: str = "jpeg", quality: int
     made, data = cv2.imencode(".jpg" if kind == "jpeg" else ".png", pixels[..., ::-1], options)
     assert made
     return data.tobytes()
-
-
-# -- the socket -----------------------------------------------------------------------------------
 
 
 def listening_at(port: int) -> socket.socket:
