@@ -75,7 +75,7 @@ def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) + HALF_PIXEL, size_hw
 
 
-def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
+def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     """Return the posed images of a rendered sequence, by frame number.
 
     Line n of the pose file is frame n; lines without an image are skipped. Also return a sentence for each
@@ -107,7 +107,7 @@ def read_images(folder: Path, every: int = 1) -> tuple[tuple[PosedImage, ...], t
         size_hw = height, width = image_size_hw(frames[0][1])
         K = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
     images = []
-    for number, image in frames[::every]:
+    for number, image in frames:
         pose = np.linalg.inv(rigid_pose(poses[number], f"{path}, line {number + 1}"))
         images.append(PosedImage(image.name, image, pose, K, size_hw))
     more = len(poses) - len(frames)
@@ -253,8 +253,8 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
     return LabelledPoints(xyz, class_id, instance, "replica", faces)
 
 
-def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
-    """Read a scene, such as "room_0": every n-th frame, and the release's labels or else OpenNeRF's."""
+def open_scene(root: Path, scene: str) -> PointScene:
+    """Read a scene, such as "room_0": its frames, and the release's labels or else OpenNeRF's."""
     habitat, short = root / scene / "habitat", scene.replace("_", "")
     text = root / f"semantic_labels_{short}.txt"
     if habitat.is_dir():
@@ -270,7 +270,7 @@ def open_scene(root: Path, scene: str, every: int = 1) -> PointScene:
             found=listing(root),
             fix="unpack the original release there",
         )
-    images, warnings = read_images(sequence_folder(root, scene), every)
+    images, warnings = read_images(sequence_folder(root, scene))
     for warning in warnings:
         logger.warning("%s: %s", scene, warning)
     return PointScene(scene, images, {"replica": truth}, warnings)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int32
 from hilsplat.base.errors import SceneError
 from hilsplat.base.files import list_images
 from hilsplat.datasets.classes import SCANNET200
-from hilsplat.datasets.dataset import Dataset, listing
+from hilsplat.datasets.dataset import Dataset
 from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import (
     UNPACK_AGAIN,
@@ -102,21 +102,14 @@ def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
         ) from error
 
 
-def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
+def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     """Return posed colour images by frame number, skipping frames that tracking lost.
 
     ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
     640), so half a pixel is added to the principal point in K.
 
-    Every n-th frame is used, counting lost ones. Also return a sentence for each item that was skipped.
+    Also return a sentence for each item that was skipped.
     """
-    if not (folder / "color").is_dir():
-        raise SceneError(
-            f"{folder} has no color/ folder",
-            expected="color/, pose/ and intrinsic/ exported from the .sens file",
-            found=listing(folder),
-            fix="export the frames with ScanNet's SensReader",
-        )
     frames = by_number(list_images(folder / "color"))
     K = read_matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3] + HALF_PIXEL
     lost, without, images = [], [], []
@@ -126,7 +119,7 @@ def read_images(folder: Path, scan: str, every: int = 1) -> tuple[tuple[PosedIma
         size_hw = int(info["colorHeight"]), int(info["colorWidth"])
     else:
         size_hw = image_size_hw(frames[0][1]) if frames else (0, 0)
-    for number, path in frames[::every]:
+    for number, path in frames:
         pose = folder / "pose" / f"{number}.txt"
         if not pose.is_file():
             without.append(number)
@@ -225,12 +218,12 @@ def _from_aggregation(
     return fine, instance, unknown
 
 
-def open_scan(root: Path, scan: str, every: int = 1, aligned: bool = False) -> PointScene:
-    """Read every n-th frame and the labels of a scan; `aligned` applies axisAlignment to mesh and poses."""
+def open_scan(root: Path, scan: str, aligned: bool = False) -> PointScene:
+    """Read the frames and labels of a scan; `aligned` applies axisAlignment to mesh and poses."""
     folder = scan_folder(root, scan)
     DATASET.require(root, scan)
     truth, of_labels = read_truth(folder, scan, read_label_table(root / LABEL_TABLE))
-    images, of_images = read_images(folder, scan, every)
+    images, of_images = read_images(folder, scan)
     if aligned:
         turn = axis_alignment(folder, scan)
         back = np.linalg.inv(turn)
