@@ -85,8 +85,10 @@ class Project:
         file.write_text(text.replace(old, new))
 
     def files(self, folder: Path | str) -> dict[str, bytes]:
-        """Bytes of all files under a folder, except for Snakemake's own hidden time stamps."""
+        """Bytes of a file, or of all files in a folder except for Snakemake's hidden time stamps."""
         base = self.root / folder
+        if base.is_file():
+            return {"": base.read_bytes()}
         return {
             str(file.relative_to(base)): file.read_bytes()
             for file in sorted(base.rglob("*"))

@@ -66,12 +66,6 @@ def copy_artifact(source: Path, target: Path) -> None:
         shutil.copy2(record, target.with_name(record.name))
 
 
-def contents(project: Project, path: str) -> dict[str, bytes]:
-    """Bytes of a file, or of the files of a folder."""
-    file = project.root / path
-    return project.files(path) if file.is_dir() else {"": file.read_bytes()}
-
-
 @pytest.mark.parametrize("rule", OUTPUTS)
 def test_declared_inputs_are_enough(
     rule: str, jobs: Mapping[str, Job], finished: Project, empty: Project
@@ -84,7 +78,7 @@ def test_declared_inputs_are_enough(
     empty.run("bash", "-c", job.command)
     for path in job.outputs:
         if path not in TIMED:
-            assert contents(empty, path) == contents(finished, path), path
+            assert empty.files(path) == finished.files(path), path
 
 
 def test_no_stage_before_evaluate_declares_the_truth(jobs: Mapping[str, Job]) -> None:
