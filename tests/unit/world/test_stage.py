@@ -1,4 +1,4 @@
-"""The world stage writes images for the next stages, and truth for evaluation only."""
+"""The world stage writes images for the next stages, and ground truth only for evaluation and pictures."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,13 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.settings import WorldSettings
-from hilsplat.world.objects.catalogue import GENERATOR_VERSION
-from hilsplat.world.pictures import show_world
+from hilsplat.world.objects.catalogue import GENERATOR_VERSION, TABLETOP
+from hilsplat.world.pictures import draw_classes, draw_scenes, node_colours, show_world, tree_lines
 from hilsplat.world.render import label_view
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.stage import parse_source, run_world
 from hilsplat.world.truth import annotated_nodes, smallest_areas
+from tests.conftest import PROJECT
 
 SETTINGS = WorldSettings(views=3, image_px=64, arc_deg=30, objects=3, samples=1)
 
@@ -101,3 +102,31 @@ def test_a_contact_sheet_is_drawn(world, tmp_path):
     assert min(read_image(tmp_path / "sheet.png").shape[:2]) > 400
     with pytest.raises(ArtifactError, match="missing or incomplete"):
         show_world(tmp_path, tmp_path / "sheet.png")
+
+
+def test_the_manual_lists_all_tabletop_classes():
+    text = " ".join((PROJECT / "docs" / "world.md").read_text().split())
+    *names, last = TABLETOP
+    assert f"The {len(TABLETOP)} classes are {', '.join(names)} and {last}." in text
+
+
+def test_a_picture_of_classes_shows_an_object_on_plain_ground(tmp_path):
+    draw_classes(tmp_path / "classes.png", ("burger",))
+    # The ground and the page are grey.
+    colourful = np.ptp(read_image(tmp_path / "classes.png").astype(int), axis=2) > 60
+    assert 0.01 < colourful.mean() < 0.2
+
+
+def test_a_picture_of_a_single_scene_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("hilsplat.world.pictures.SCENE_PX", 48)
+    draw_scenes("tabletop", [100], tmp_path / "scenes.png")
+    height, width, _ = read_image(tmp_path / "scenes.png").shape
+    assert width > height
+
+
+def test_the_tree_lists_a_shared_text_once():
+    rows = [(1, -1, "chair"), (2, 0, "chair leg"), (3, 1, "chair foot"), (2, 0, "chair leg")]
+    rows += [(3, 3, "chair foot")]
+    nodes = tuple(AnnotatedNode(row, *fields) for row, fields in enumerate(rows))
+    assert [(depth, node.id) for depth, node in tree_lines(nodes)] == [(0, 0), (1, 1), (2, 2)]
+    assert len(np.unique(node_colours(100), axis=0)) > 95
