@@ -138,10 +138,17 @@ def write_flyaround(
 
 
 def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
+    """Encode one or more equally sized frames as MP4, as `encoded_film`."""
+    for _ in encoded_film(path, frames, per_second):
+        pass
+
+
+def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> Iterator[None]:
     """Encode one or more equally sized frames as MP4; with one PyAV version, equal frames give equal bytes.
 
-    An odd last row or column is cropped: yuv420p needs even sides. Frames are consumed one by one, so that a
-    long video needs little memory. `path` is in a temporary folder, or a file of an atomic writer.
+    An odd last row or column is cropped: yuv420p needs even sides. Frames are consumed one by one, with a
+    yield after each, so that a long video needs little memory. The file is complete when the iterator ends.
+    `path` is in a temporary folder, or a file of an atomic writer.
     """
     frames = iter(frames)
     first = next(frames)
@@ -155,6 +162,7 @@ def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_sec
             # the encoder's own conversion is not always byte-identical
             picture = av.VideoFrame.from_ndarray(even, format="rgb24").reformat(format="yuv420p")
             film.mux(stream.encode(picture))
+            yield
         film.mux(stream.encode())
 
 

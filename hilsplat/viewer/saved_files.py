@@ -1,15 +1,13 @@
 """Files that users can save from the page.
 
-Films take long and read only arrays, so they have their own thread. Other slow files are made in steps on the
-scene thread, which runs other requests between the steps. All of these are sent as lines of JSON, then the
-file: `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
+Slow files are made in steps on the scene thread, which runs other requests between the steps. Films read only
+arrays, so they have their own thread. The response contains lines of JSON, then the file:
+`{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
 
-import asyncio
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from threading import Event
 from typing import Any
 
 from starlette.requests import Request
@@ -24,8 +22,6 @@ from hilsplat.viewer.html_page import html_page
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.scene_thread import SceneThread
 from hilsplat.web.server import as_json, read
-
-NOT_STORED = {"cache-control": "no-store"}
 
 
 class SavedFiles:
@@ -58,62 +54,37 @@ class SavedFiles:
     async def _film(self, request: Request) -> Response:
         asked = await read(request, wire.Film)
 
-        def prepared(shown: ViewerScene) -> Callable[..., bytes]:
-            return partial(
-                exports.film,
-                shown.gaussians,
-                exports.flight(asked, shown.scene),
-                shown.paint(asked.variant, asked.style),
-                kind=asked.format,
-                threads=shown.threads,
-            )
+        def begin(shown: ViewerScene) -> exports.Steps:
+            cameras, paint = exports.flight(asked, shown.scene), shown.paint(asked.variant, asked.style)
+            return exports.film(shown.gaussians, cameras, paint, kind=asked.format, threads=shown.threads)
 
-        of = -(-asked.frames // exports.STEP[asked.format])
-        return StreamingResponse(
-            self._filmed(await self.thread.do(request, prepared), of), headers=NOT_STORED
-        )
+        return await self._in_steps(request, begin, self.films)
 
-    async def _filmed(self, film: Callable[..., bytes], of: int) -> AsyncIterator[bytes]:
-        loop, made, left = asyncio.get_running_loop(), asyncio.Queue[int | None](), Event()
+    async def _in_steps(
+        self,
+        request: Request,
+        begin: Callable[[ViewerScene], exports.Steps],
+        worker: ThreadPoolExecutor | None = None,
+    ) -> Response:
+        """Return the response for a file; `begin` runs on the scene thread, further steps on a worker."""
 
-        def on_frame(number: int) -> None:
-            if left.is_set():
-                raise CancelledError("the page that requested this film is closed")
-            loop.call_soon_threadsafe(made.put_nowait, number)
-
-        making = loop.run_in_executor(self.films, partial(film, on_frame=on_frame))
-        making.add_done_callback(lambda _: made.put_nowait(None))
-        try:
-            yield _line(made=0, of=of)
-            while (number := await made.get()) is not None:
-                yield _line(made=number, of=of)
-            try:
-                data = await making
-            except (HilsplatError, OSError) as error:  # such as a full disk
-                yield _line(error=f"the film could not be made: {error}")
-                return
-            yield _line(bytes=len(data))
-            yield data
-        finally:  # also if the user closed the page or cancelled the film
-            left.set()
-            making.cancel()
-
-    async def _in_steps(self, request: Request, begin: Callable[[ViewerScene], exports.Steps]) -> Response:
         def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
             steps = begin(shown)
             return steps, next(steps)  # raises errors before the response starts
 
         begun = await self.thread.do(request, first)
-        return StreamingResponse(self._stepped(*begun), headers=NOT_STORED)
+        return StreamingResponse(self._stepped(*begun, worker), headers={"cache-control": "no-store"})
 
-    async def _stepped(self, steps: exports.Steps, first: tuple[int, int]) -> AsyncIterator[bytes]:
+    async def _stepped(
+        self, steps: exports.Steps, first: tuple[int, int], worker: ThreadPoolExecutor | None
+    ) -> AsyncIterator[bytes]:
         found: tuple[int, int] | bytes = first
         while isinstance(found, tuple):
             yield _line(made=found[0], of=found[1])
             try:
-                found = await self.thread.run(partial(_step, steps))
-            except (HilsplatError, OSError) as error:
-                yield _line(error=str(error))
+                found = await self.thread.run(partial(_step, steps), worker)
+            except (HilsplatError, OSError) as error:  # such as a full disk
+                yield _line(error=f"the file could not be made: {error}")
                 return
         yield _line(bytes=len(found))
         yield found
