@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from hilsplat.base.artifacts import parse_json
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.labelled import check_label_size, image_size_hw
+from hilsplat.scene.layouts import read_json_object
 
 Polygon = Float[np.ndarray, "_ 2"] | Int[np.ndarray, "_ 2"] | Sequence[tuple[int, int]]
 
@@ -100,15 +100,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
         SceneError: the file is not JSON, a key is missing or has the wrong type, a polygon is entirely
             outside the image, a box is [x, y, width, height], or the image is not a scaled copy.
     """
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise SceneError(
-            f"label file {path} cannot be read: {error}",
-            expected="JSON with info and objects",
-            fix="unpack the labels again",
-        ) from error
-    labels = parse_isat(path, content)
+    labels = parse_isat(path, read_json_object(path, "unpack or export the labels again"))
     if image is None:
         return labels
     resized = check_label_size(f"label file {path}", labels.size_hw, image_size_hw(image))

@@ -147,8 +147,8 @@ def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_pa
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"info": ', "cannot be read"),
-        ("[]", "has no `objects` list"),
+        ('{"info": ', "is not valid JSON"),
+        ("[]", "is not a JSON object"),
         ('{"shapes": []}', "has no `objects` list"),
         ('{"info": {}, "objects": []}', "does not state the size"),
         (thing(category=None), "has no category"),

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from hilsplat.base.errors import SceneError
+from hilsplat.base.images import write_png
 from hilsplat.datasets.points.replica import (
     object_of_vertices,
     open_scene,
@@ -27,6 +27,7 @@ XYZ = np.array([[x, y, 0] for y in (1, 0) for x in range(4)], np.float32)
 QUADS = np.array([[4, 5, 1, 0], [5, 6, 2, 1], [6, 7, 3, 2]], np.int32)
 OBJECT = np.array([2, 1, 3], np.int32)
 NAMED = [{"id": 20, "name": "chair"}, {"id": 93, "name": "wall"}]
+SOFA = [{"id": 20, "name": "sofa"}]
 
 
 def make_habitat(folder: Path, labels=(-2, 20, 93, -1)) -> Path:
@@ -44,13 +45,8 @@ def make_images(folder: Path, frames: int) -> list[PosedImage]:
 
 def make_semantic_nerf(folder: Path, frames: int, lines: int | None = None) -> Path:
     """A sequence whose frame n is at x = n."""
-    for name in ("rgb", "depth"):
-        (folder / name).mkdir(parents=True)
-    for number in range(frames):
-        Image.fromarray(np.full((6, 10, 3), number, np.uint8)).save(folder / "rgb" / f"rgb_{number}.png")
-        depth = np.full((6, 10), 2500, np.uint16)
-        Image.fromarray(depth).save(folder / "depth" / f"depth_{number}.png")
-    Image.fromarray(np.zeros((6, 10, 3), np.uint8)).save(folder / "rgb" / "vis_rgb_0.png")
+    for name in (*(f"rgb_{number}" for number in range(frames)), "vis_rgb_0"):
+        write_png(folder / "rgb" / f"{name}.png", np.zeros((6, 10, 3), np.uint8))
     rows = np.tile(np.eye(4).ravel(), (frames if lines is None else lines, 1))
     rows[:, 3] = np.arange(len(rows))
     np.savetxt(folder / "traj_w_c.txt", rows)
@@ -102,9 +98,7 @@ def test_labels_per_vertex_as_text(tmp_path):
         assert points.class_id.tolist() == [20, 93, 0, 0, 20, 20, 20, 20]
         assert points.instance_id.tolist() == [20001, 93002, 0, 0, 20001, 20001, 20003, 20003]
         assert points.faces.shape[1] == 3
-    with pytest.raises(
-        SceneError, match=r"classes that are not in Replica(.|\n)*found     20001 \(3 lines\)"
-    ):
+    with pytest.raises(SceneError, match=r"(?s)not in Replica.*found     20001 \(3 lines\)"):
         read_labelled_mesh(tmp_path / "quads.ply", instances)
     labels.write_text("20\n93\n")
     with pytest.raises(SceneError, match=r"expected  8 lines\n  found     2"):
@@ -124,9 +118,9 @@ def test_a_scene_is_read_from_either_sequence(tmp_path):
     assert DATASETS["replica"].found(tmp_path) == ("room_0",)
 
 
-def info_of(habitat: Path, **content) -> Path:
-    (habitat / "info_semantic.json").write_text(json.dumps(content))
-    return habitat
+def habitat_with(folder: Path, **info) -> Path:
+    (make_habitat(folder) / "info_semantic.json").write_text(json.dumps(info))
+    return folder
 
 
 def sequence_with(folder: Path, poses: str) -> Path:
@@ -146,15 +140,10 @@ def sequence_with(folder: Path, poses: str) -> Path:
             "classes that are not in Replica.*found     class id 205",
         ),
         (
-            lambda at: read_semantic_mesh(
-                info_of(make_habitat(at), classes=[{"id": 20, "name": "sofa"}], id_to_label=[0, 1, 2, 3])
-            ),
+            lambda at: read_semantic_mesh(habitat_with(at, classes=SOFA, id_to_label=[0, 1, 2, 3])),
             "found     20 sofa",
         ),
-        (
-            lambda at: read_semantic_mesh(info_of(make_habitat(at))),
-            "expected  an object with classes, id_to_label",
-        ),
+        (lambda at: read_semantic_mesh(habitat_with(at)), "expected  an object with classes, id_to_label"),
         (
             lambda at: (make_habitat(at) / "info_semantic.json").unlink() or read_semantic_mesh(at),
             r"info_semantic\.json is missing\n  found     mesh_semantic\.ply",

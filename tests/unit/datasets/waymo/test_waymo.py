@@ -38,21 +38,17 @@ def turned(degrees: float, x: float = 0.0) -> np.ndarray:
 
 
 def camera(*distortion: float) -> WaymoCamera:
-    lens = np.array([2000.0, 2000, 960, 640, *(distortion or np.zeros(5))])
+    lens = np.array([2000.0, 2000, 960, 640, *(distortion or (0,) * 5)])
     return WaymoCamera("FRONT", lens, np.eye(4), (1280, 1920))
 
 
-def one_return(ranges, classes, instances=None, cameras=None) -> LidarReturn:
+def one_return(ranges, classes, instances=0, cameras=0) -> LidarReturn:
     """A return of one row."""
     width = len(ranges)
-    image = np.zeros((1, width, 4), np.float32)
-    image[0, :, 0] = ranges
-    labels = np.zeros((1, width, 2), np.int32)
-    labels[0, :, 1] = classes
-    labels[0, :, 0] = instances if instances is not None else 0
-    cells = np.zeros((1, width, 6), np.int32)
-    cells[0, :, 0] = cameras if cameras is not None else 0
-    return LidarReturn(image, labels, cells)
+    image, cells = np.zeros((1, width, 4), np.float32), np.zeros((1, width, 6), np.int32)
+    image[0, :, 0], cells[0, :, 0] = ranges, cameras
+    labels = np.stack(np.broadcast_arrays(instances, classes), axis=1).astype(np.int32)
+    return LidarReturn(image, labels[None], cells)
 
 
 def make_frame(
@@ -177,18 +173,16 @@ def test_projections_are_optional_and_reported(root):
 
 
 def test_damaged_components_are_refused_with_a_fix(root):
-    def path(tag: str) -> Path:
-        return root / "validation" / tag / f"{SEGMENT}.parquet"
-
     def refused(message: str) -> None:
         with pytest.raises(SceneError, match=f"(?s){message}"):
             open_segment(root, SEGMENT)
 
-    path("lidar_pose").write_bytes(path("lidar_pose").read_bytes()[:200])
+    poses, ranges = (root / f"validation/{tag}/{SEGMENT}.parquet" for tag in ("lidar_pose", "lidar"))
+    poses.write_bytes(poses.read_bytes()[:200])
     refused("cannot be read.*found     a file of 200 bytes.*fix ")
-    path("lidar_pose").write_bytes(path("lidar").read_bytes())
+    poses.write_bytes(ranges.read_bytes())
     refused("is not the component lidar_pose of release 2")
-    path("lidar_pose").unlink()
+    poses.unlink()
     refused("component lidar_pose of segment .* is missing.*fix       download")
     (root / "all").mkdir()
     (root / "validation").rename(root / "all" / "validation")
@@ -245,10 +239,8 @@ def encoded(frame: LidarFrame, shots: list[CameraShot], labelled: bool = True) -
 
 def write_records(path: Path, records: list[bytes]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as stream:
-        for record in records:
-            length = struct.pack("<Q", len(record))
-            stream.write(length + b"\0\0\0\0" + record + b"\0\0\0\0")
+    none = bytes(4)  # instead of a checksum
+    path.write_bytes(b"".join(struct.pack("<Q", len(record)) + none + record + none for record in records))
     return path
 
 
@@ -275,10 +267,8 @@ def test_both_releases_give_the_same_scene(root, tmp_path):
         assert first.image == second.image and first.size_hw == second.size_hw
         np.testing.assert_array_equal(first.cam_from_world, second.cam_from_world)
     assert DATASETS["waymo"].found(tmp_path / "old") == (SEGMENT,)
-    # without its prefix and in a folder of its split
-    write_records(
-        tmp_path / "other" / "validation" / name.removeprefix("individual_files_validation_"), records
-    )
+    short = name.removeprefix("individual_files_validation_")  # also in the folder of its split
+    write_records(tmp_path / "other" / "validation" / short, records)
     assert len(open_segment(tmp_path / "other", SEGMENT).images) == 6
 
 
