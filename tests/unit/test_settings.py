@@ -108,6 +108,18 @@ def test_overrides_apply_in_order_group_then_scene_then_variant() -> None:
     assert run.stages("v", scopes=("g", "d/s")).coverage_tree.theta == 0.8
 
 
+def test_only_random_variants_are_repeated_per_seed() -> None:
+    network = {"autoencoder": {"code": "network"}}
+    variants = {"network": network, "langsplat": {"method": {"name": "langsplat"}}}
+    run = parse_run({"seeds": 3, "variants": variants, "overrides": {"photos": network}})
+    assert run.seeded("default") == ["default"]
+    assert run.seeded("langsplat") == ["langsplat", "langsplat.seed1", "langsplat.seed2"]
+    assert len(run.seeded("default", scopes=("photos",))) == 3
+    assert [run.seed_of(name) for name in run.seeded("network")] == [0, 1, 2]
+    assert not run.stages("langsplat").depends_on_seed("autoencoder")
+    assert not run.stages("network").depends_on_seed("semantic_tree")
+
+
 @pytest.mark.parametrize("name", SECTIONS)
 def test_a_section_describes_its_settings_and_round_trips_through_json(name: str) -> None:
     for knob, field in SECTIONS[name].model_fields.items():

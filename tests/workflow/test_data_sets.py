@@ -47,7 +47,7 @@ def planned(project, tmp_path_factory) -> str:
     touch(scan / "color/0.jpg", scan / "pose/0.txt", scan / "intrinsic/intrinsic_color.txt")
     touch(*(scan / name for name in names))
     models = ('masks={"model": "models/sam-tiny"}', 'clip={"model": "models/clip-tiny"}')
-    result = copy.snakemake("-n", "--config", *models, "data_root=data", config="paper", check=False)
+    result = copy.snakemake("-n", "-p", "--config", *models, "data_root=data", config="paper", check=False)
     return result.stdout + result.stderr
 
 
@@ -74,6 +74,7 @@ def test_a_scan_is_exported_before_its_poses_are_imported(planned):
 def test_absent_scenes_are_listed_with_the_reason(planned):
     assert "lerf/ramen is skipped: scene ramen of LERF-OVS is incomplete" in planned
     assert re.search(r"replica/room_0 is skipped: .*one level too deep", planned)
+    assert re.search(r" table replica --published .* --absent 'replica \(", planned)
 
 
 def test_every_stage_and_table_is_planned(planned):

@@ -52,6 +52,17 @@ def test_damage_is_repaired_even_without_snakemakes_records(
     assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
 
 
+def test_other_settings_count_even_without_snakemakes_records(drawn: Project) -> None:
+    forget(drawn)
+    config = drawn.root / "config/config.yaml"
+    text = config.read_text()
+    try:
+        drawn.edit("config/config.yaml", "world: {views: 12,", "world: {views: 13,")
+        assert "rule world:" in drawn.hilsplat_run(IMAGES, "--", "-n").stdout
+    finally:
+        config.write_text(text)
+
+
 def test_an_unusable_setting_is_refused_before_any_job(drawn: Project) -> None:
     before = drawn.files("results")
     for start in (drawn.hilsplat_run, drawn.snakemake):

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from hilsplat.base.errors import ModelError
 from hilsplat.cli.main import app
 from hilsplat.models.folder import ModelFolder
-from hilsplat.splat.rasterise import api
+from hilsplat.splat.rasterise import api, parity
 from hilsplat.workflow import doctor
 from hilsplat.workflow.resources import is_installed
 from tests.unit.models.test_store import lay
@@ -156,3 +156,13 @@ def test_a_check_that_fails_unexpectedly_does_not_stop_the_others(monkeypatch):
 
     monkeypatch.setattr(doctor, "CHECKS", (check, doctor.python))
     assert [finding.state for finding in doctor.examine()] == ["fault", "ok"]
+
+
+def test_the_cuda_self_test_runs_once(monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(parity, "disagreement", lambda one, other: drawn.append(other))
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path)
+    monkeypatch.setitem(__import__("sys").modules, "gsplat", SimpleNamespace(__version__="1.5"))
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "a GPU")
+    assert parity.cuda_disagreement() is None and parity.cuda_disagreement() is None
+    assert drawn == ["cuda"]

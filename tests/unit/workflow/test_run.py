@@ -81,6 +81,8 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
     assert options[:2] == ["seed=1", 'only=["two"]']
     assert command[-3:] == ["--", "tables", file]
     assert "--cores=1" in command and "--cores" not in command and "--keep-going" in command
+    runs.run(["synthetic/two"], [], [])
+    assert 'only=["synthetic/two"]' in started[-1]
 
 
 def test_a_misspelt_scene_is_refused(folder, started):
