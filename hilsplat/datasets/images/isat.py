@@ -107,13 +107,13 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
     return replace(labels, warnings=(*labels.warnings, *resized))
 
 
-def parse_isat(path: Path, content: Any) -> IsatFile:
+def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
     """Check the content of a label file, like `read_isat`; `path` is used only in messages."""
-    if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
+    if not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no `objects` list",
             expected="an ISAT file: info, objects",
-            found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
+            found=f"keys {', '.join(content)}",
             fix="convert labels from other tools (labelme, COCO)",
         )
     info: Any = content.get("info")
