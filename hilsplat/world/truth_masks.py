@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int32
+from scipy.sparse.csgraph import connected_components
 
 from hilsplat.base.artifacts import atomic_folder, read_index, read_json, sha256_of_json, write_index
 from hilsplat.base.errors import MisalignedArtifactError
@@ -77,9 +78,7 @@ def run_truth_masks(
     draws = Draws(settings.seed, scene.name)
     label = faults_label(settings)
     with stage_log("masks", scene.name) as counts:
-        logger.warning(
-            "masks %s: %s, made from the ground truth: a diagnostic, not a result", scene.name, label
-        )
+        logger.warning("masks %s: %s, from the ground truth: a diagnostic, not a result", scene.name, label)
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
             labels = true_labels(annotations, view)
@@ -198,35 +197,26 @@ def longest_border(around: Mapping[int, int]) -> int:
 def merged_groups(
     ids: Sequence[int], borders: Borders, truth: TrueNodes, view: str, draws: Draws, settings: PerturbSettings
 ) -> list[tuple[int, ...]]:
-    """Group the nodes of one level into the masks of a view, each group in ascending order.
+    """Group the nodes of one level into the masks of a view; `ids` and each group are in ascending order.
 
     With probability `merge`, a node is merged with the sibling with which it shares the longest border in
     the view. A node drawn for a systematic merge is merged with its `partner` in `systematic_share` of the
     views in which the two are adjacent.
     """
-    owner = {node: node for node in ids}
-
-    def find(node: int) -> int:
-        while owner[node] != node:
-            node = owner[node]
-        return node
-
+    if not ids:
+        return []
+    row = {node: number for number, node in enumerate(ids)}
+    merged = np.zeros((len(ids), len(ids)), bool)
     for node in ids:
-        around = {other: length for other, length in borders.get(node, {}).items() if other in owner}
-        if not around:
-            continue
-        wrong = []
-        if draws.chance("merge", view, node) < settings.merge:
-            wrong.append(longest_border(around))
+        around = {other: length for other, length in borders.get(node, {}).items() if other in row}
+        if around and draws.chance("merge", view, node) < settings.merge:
+            merged[row[node], row[longest_border(around)]] = True
         if truth.partner.get(node) in around and systematic("merge", node, view, draws, settings):
-            wrong.append(truth.partner[node])
-        for other in wrong:
-            low, high = sorted((find(node), find(other)))
-            owner[high] = low
+            merged[row[node], row[truth.partner[node]]] = True
     groups: dict[int, list[int]] = defaultdict(list)
-    for node in ids:
-        groups[find(node)].append(node)
-    return [tuple(sorted(group)) for _, group in sorted(groups.items())]
+    for node, group in zip(ids, connected_components(merged, directed=False)[1], strict=True):
+        groups[group].append(node)
+    return [tuple(group) for group in groups.values()]
 
 
 def systematic(fault: str, node: int, view: str, draws: Draws, settings: PerturbSettings) -> bool:

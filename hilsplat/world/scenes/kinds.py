@@ -17,24 +17,20 @@ class SceneKind(NamedTuple):
 
     Attributes:
         build: builds a scene, (seed, objects).
-        sights: returns the cameras of a scene, (scene, views, arc_deg), jittered by the scene's seed, and
-            close enough for structure from motion.
-        fov_deg: their field of view.
+        sights: returns cameras and their field of view in degrees, (scene, views, arc_deg). The cameras are
+            jittered by the scene's seed, and close enough for structure from motion.
         training_sight: draws a random camera for training and its field of view, (scene, rng).
     """
 
     build: Callable[[int, int], WorldScene]
-    sights: Callable[[WorldScene, int, float | int], list[Sight]]
-    fov_deg: float
+    sights: Callable[[WorldScene, int, float | int], tuple[list[Sight], float]]
     training_sight: Callable[[WorldScene, np.random.Generator], tuple[Sight, float]]
 
 
 KINDS: dict[str, SceneKind] = {
-    "tabletop": SceneKind(
-        tabletop.build_tabletop, tabletop.ring_sights, tabletop.FOV_DEG, tabletop.training_sight
-    ),
-    "room": SceneKind(room.build_room, room.loop_sights, room.FOV_DEG, room.training_sight),
-    "street": SceneKind(street.build_street, street.drive_sights, street.FOV_DEG, street.training_sight),
+    "tabletop": SceneKind(tabletop.build_tabletop, tabletop.ring_sights, tabletop.training_sight),
+    "room": SceneKind(room.build_room, room.loop_sights, room.training_sight),
+    "street": SceneKind(street.build_street, street.drive_sights, street.training_sight),
 }
 """Scene kinds by their name in the scene sheet."""
 
@@ -63,8 +59,8 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
 
 def scene_cameras(scene: WorldScene, views: int, image_px: int, arc_deg: float | int) -> Cameras:
     """Return the views of a scene that the world stage renders: square images 000.png, 001.png, ..."""
-    kind = KINDS[scene.kind]
-    return numbered_cameras(kind.sights(scene, views, arc_deg), image_px, kind.fov_deg)
+    sights, fov_deg = KINDS[scene.kind].sights(scene, views, arc_deg)
+    return numbered_cameras(sights, image_px, fov_deg)
 
 
 def training_camera(scene: WorldScene, rng: np.random.Generator, image_px: int) -> Camera:

@@ -397,7 +397,7 @@ def room_of(scene: WorldScene) -> Room:
     return Room(2 * float(high[0]), 2 * float(high[1]), float(high[2]))
 
 
-def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sight]:
+def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:
     """Return cameras on a loop through the room that look across its middle from two alternating heights.
 
     The views show the far wall with everything in front of it, and the middle from all sides. A camera that
@@ -409,7 +409,7 @@ def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sig
     for i, spot in enumerate(spots):
         centre = np.array([*spot, EYE_HEIGHTS[i % 2] + rng.uniform(-0.03, 0.03)])
         sights.append((centre, np.array([*(-0.5 * spot), LOOK_AT_Z]) + rng.uniform(-0.04, 0.04, 3)))
-    return sights
+    return sights, FOV_DEG
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:

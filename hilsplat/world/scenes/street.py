@@ -314,7 +314,7 @@ def _daylight(rng: np.random.Generator) -> Style:
     return Style(position, 14.0, light, above, below, float(rng.uniform(1.0, 1.15)), SCALE, 45.0)
 
 
-def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sight]:
+def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:
     """Return the cameras of a drive along the street, for the global mapper (see `docs/world.md`).
 
     The camera moves along its lane and sways, while its yaw sweeps between the two sides of the street in
@@ -332,7 +332,7 @@ def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Si
         middle = np.array([start + i * step, LANE_Y + SWAY_M * np.sin(2 * np.pi * phase), CAMERA_Z])
         centre = middle + rng.uniform(-1, 1, 3) * np.array([0.05, 0.15, 0.12])
         sights.append((centre, centre + on_sphere(yaw, float(pitch_rng.uniform(-1, 3)), 1.0)))
-    return sights
+    return sights, FOV_DEG
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:

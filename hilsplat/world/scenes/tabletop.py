@@ -181,7 +181,7 @@ def _fabric(paints: PaintBox, scale: float) -> Paint:
     return replace(paint, scale=paint.scale * 2.2 / scale * 0.5) if paint.kind == "weave" else paint
 
 
-def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sight]:
+def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:
     """Return slightly jittered cameras around the table at two alternating elevations.
 
     Neighbours should be at most 9 degrees apart: structure from motion failed with larger steps. The arc is
@@ -195,7 +195,7 @@ def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> list[Sig
         elevation = ELEVATIONS_DEG[i % 2] + rng.uniform(-1.5, 1.5)
         centre = target + on_sphere(azimuth, elevation, DISTANCE * rng.uniform(0.97, 1.03))
         sights.append((centre, target + rng.uniform(-0.03, 0.03, 3)))
-    return sights
+    return sights, FOV_DEG
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
