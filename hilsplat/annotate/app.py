@@ -289,5 +289,5 @@ def run_annotate(
     annotator, annotated = Annotator(opened), len(opened.known())
     first = opened.scene.cameras.names[0]
     annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles its loops before the first click
-    about = f"{opened.scene.name}: {annotated} photographs annotated in {labels}, the page"
+    about = f"{opened.scene.name}: {annotated} photographs annotated in {labels}; page"
     serve(annotator.app, about, port=port, browser=browser, on_ready=on_ready)

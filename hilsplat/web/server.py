@@ -131,7 +131,7 @@ def listening_at(port: int) -> socket.socket:
         made.bind(("127.0.0.1", port))
     except OSError as error:
         made.close()
-        fix = "choose another, or leave it out"
+        fix = "choose another port, or omit it"
         raise SettingsError(f"port {port} cannot be used: {error}", fix=fix) from error
     made.listen()  # before the address is printed, so that early connections wait and are not refused
     return made
@@ -160,7 +160,7 @@ def serve(
     token, listening = secrets.token_urlsafe(24), listening_at(port)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
     config = configured(app(token))
-    on_ready(f"{about} at {address}\nCtrl-C ends it")
+    on_ready(f"{about} at {address}\nPress Ctrl-C to stop")
     if browser:
         webbrowser.open(address)
     uvicorn.Server(config).run(sockets=[listening])

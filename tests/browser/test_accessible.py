@@ -22,9 +22,13 @@ def violations(page) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_the_viewer_has_no_serious_violation(opened, desk_address, scheme):
+@pytest.mark.parametrize(("scheme", "brightness"), [("dark", (0, 150)), ("light", (600, 765))])
+def test_the_viewer_has_no_serious_violation_in_the_colours_of_the_user(
+    opened, desk_address, scheme, brightness
+):
     page = opened(desk_address, color_scheme=scheme)
+    colour = page.evaluate("getComputedStyle(document.getElementById('panel')).backgroundColor")
+    assert brightness[0] <= sum(int(value) for value in colour[4:-1].split(",")) <= brightness[1]
     assert violations(page) == []
     ask(page, "mug > handle")
     answers(page).first.click()
@@ -46,15 +50,6 @@ def test_the_annotator_has_no_serious_violation(opened, desk, tmp_path, scheme):
         page.close()
 
 
-def test_the_colour_scheme_of_the_user_is_used(opened, desk_address):
-    def brightness(scheme: str) -> int:
-        page = opened(desk_address, color_scheme=scheme)
-        colour = page.evaluate("getComputedStyle(document.getElementById('panel')).backgroundColor")
-        return sum(int(value) for value in colour[4:-1].split(","))
-
-    assert brightness("dark") < 150 < 600 < brightness("light")
-
-
 def test_the_chosen_level_is_visible_in_forced_colours(opened, desk_address):
     page = opened(desk_address, forced_colors="active")
     outlines = """[...document.querySelectorAll('#levels label')].map((label) => [
@@ -62,15 +57,12 @@ def test_the_chosen_level_is_visible_in_forced_colours(opened, desk_address):
     assert all((style == "solid") == checked for checked, style in page.evaluate(outlines))
 
 
-def test_the_picture_is_large_enough_at_twice_the_text_size(opened, desk_address):
+def test_the_picture_is_large_enough_at_twice_the_text_size_and_on_a_phone(opened, desk_address):
     page = opened(desk_address, viewport={"width": 640, "height": 360})
     box = page.locator("#view").bounding_box()
     assert box["height"] > 250 and box["width"] > 300
     assert page.evaluate("document.documentElement.scrollWidth") <= 640
-
-
-def test_on_a_phone_the_panel_is_below_the_view(opened, desk_address):
-    assert phone_fits(opened(desk_address))
+    assert phone_fits(page)
 
 
 def test_controls_are_at_least_24_px_high(opened, desk_address):

@@ -236,17 +236,6 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     context.close()
 
 
-def test_keys_do_not_act_during_typing(opened, desk_address):
-    page = opened(desk_address)
-    box = page.locator("#text")
-    box.fill("")
-    box.press_sequentially("o ? [")
-    assert box.input_value() == "o ? ["
-    assert not page.get_by_role("dialog").is_visible()
-    page.locator("#view").press("?")
-    assert page.get_by_role("dialog", name="Keys").is_visible()
-
-
 def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opened, desk, tmp_path_factory):
     project = tmp_path_factory.mktemp("changing")
     shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)

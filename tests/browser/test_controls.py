@@ -74,17 +74,6 @@ def test_a_held_key_moves_evenly(opened, desk_address):
     assert page.evaluate("hilsplat.camera.c") == before
 
 
-def test_no_node_stays_marked_as_hovered_after_a_flight(opened, desk_address):
-    page = opened(desk_address)
-    labels = page.locator("[role=treeitem] > .row .label")
-    labels.first.click()
-    page.locator("#overlay path.chosen").first.wait_for(state="attached")
-    labels.nth(1).hover()
-    page.locator("#overlay path.hover").first.wait_for(state="attached")
-    page.locator("#view").press("f")
-    page.locator("#overlay path.hover").first.wait_for(state="detached")
-
-
 def test_back_returns_to_the_previous_query(opened, desk_address):
     page = opened(desk_address)
     page.wait_for_timeout(800)

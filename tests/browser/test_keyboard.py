@@ -34,11 +34,17 @@ def test_querying_choosing_naming_and_saving_in_the_viewer(opened, desk, tmp_pat
 
 
 def query_choose_name_and_save(page, desk, tmp_path) -> None:
-    page.keyboard.type("mug > handle")  # the text box has the focus
+    page.keyboard.type("o ? [")  # the text box has the focus: these keys do not act
+    assert page.locator("#text").input_value() == "o ? [" and not page.get_by_role("dialog").is_visible()
+    press(page, "Control+a")
+    page.keyboard.type("mug > handle")
     press(page, "Enter")
     page.locator("#answers button").first.wait_for()
     tab_to(page, "#answers button")
     press(page, "Enter", "u")  # the handle is chosen, then the mug that it is part of
+    press(page, "?")
+    assert page.get_by_role("dialog", name="Keys").is_visible()
+    press(page, "Escape")
     press(page, "n")
     page.keyboard.type("Souvenir <b")
     press(page, "Enter")

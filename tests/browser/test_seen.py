@@ -29,11 +29,14 @@ def test_a_box_beside_the_picture_has_no_label_and_labels_stay_clear_of_the_tool
     page.wait_for_function("!document.querySelector('#overlay text')")  # the last picture may be on its way
 
 
-def test_a_flight_ends_with_the_whole_node_in_view(opened, desk_address, scene):
+def test_a_flight_ends_with_the_whole_node_in_view_and_no_node_hovered(opened, desk_address, scene):
     page = opened(desk_address, "server")
     for text in ("mug", "mug > handle"):
         choose_row(page, scene.query(text)[0].node)
+        page.locator("[role=treeitem] > .row .label").last.hover()
+        page.locator("#overlay path.hover").first.wait_for(state="attached")
         page.locator("#view").press("f")
+        page.locator("#overlay path.hover").first.wait_for(state="detached")
         page.wait_for_timeout(1500)
         box = page.locator("#overlay path.chosen")
         box.wait_for(state="attached")
@@ -57,7 +60,7 @@ def test_the_first_five_similar_nodes_are_painted(opened, desk_address, scene, t
     assert len(page.evaluate(shown.replace("ROUTE", "'tree'"))) == 7
 
 
-def test_the_present_photograph_is_marked_even_if_it_shows_the_answer(opened, desk_address, scene):
+def test_the_current_photograph_is_marked_even_if_it_shows_the_answer(opened, desk_address, scene):
     page = opened(desk_address, "server", color_scheme="dark")
     ask_and_wait(page, "mug > handle")
     best = scene.views.index(scene.query("mug > handle")[0].best_views[0])

@@ -65,12 +65,6 @@ def test_views_are_numbers_and_never_paths(client, labels, path):
     assert sent.status_code in (404, 405, 422) and not labels.exists()
 
 
-def test_static_files_are_those_of_this_page_and_of_all_pages(client):
-    for name in ("annotate.js", "annotate.css", "style.css", "http.js"):
-        assert client.get(f"/static/{name}").status_code == 200
-    assert client.get("/static/main.js").status_code == 404  # of the other page
-
-
 # -- saving -----------------------------------------------------------------------------------------
 
 
