@@ -104,18 +104,15 @@ class QuadraticProblem:
 
 
 def conjugate_gradient(
-    problem: QuadraticProblem,
-    start: Float32[np.ndarray, "N 3 D"],
-    steps: int,
-    curved: Float32[np.ndarray, "N 3 D"] | None = None,
+    problem: QuadraticProblem, steps: int, curved: Float32[np.ndarray, "N 3 D"] | None = None
 ) -> np.ndarray:
-    """Minimise the quadratic part in a few steps, preconditioned by the visible mass; `curved` is G start.
+    """Minimise the quadratic part in a few steps from the lifted start, preconditioned by the visible mass.
 
-    Levels and channels do not interact, so each has its own step size.
+    Levels and channels do not interact, so each has its own step size. `curved` is G F_lifted, if available.
     """
     scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
-    features = start.copy()
+    features = problem.lifted.copy()
     residual = problem.right_side()
     residual -= problem.hessian_product(features, curved)
     direction, ratio = np.zeros_like(residual), np.zeros(residual.shape[1:], np.float32)

@@ -48,7 +48,7 @@ def solve_field(
     at_lift = problem.quadratic.product(lifted)
     report: dict[str, object] = {"lifted": problem.terms(lifted) | contrast.values(lifted)}
     if settings.cg_steps and any(problem.weights):
-        features = conjugate_gradient(problem, lifted, settings.cg_steps, at_lift)
+        features = conjugate_gradient(problem, settings.cg_steps, at_lift)
         report["after_cg"] = problem.terms(features) | contrast.values(features)
     else:
         features = lifted.copy()

@@ -25,8 +25,8 @@ import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
-from hilsplat.base.levels import LEVELS, NONE, Level
-from hilsplat.methods.common.groups import associated_codes, group_means, kmeans, standardised
+from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.methods.common.groups import associated_codes, kmeans, standardised
 from hilsplat.methods.common.training import product, segment_means, train, unit
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
@@ -118,35 +118,18 @@ def instances(
     return leaf
 
 
-def level_field(
-    inputs: MethodInputs,
-    level: Level,
-    features: Float32[np.ndarray, "N C"],
-    codebook: tuple[int, int],
-    seed: int,
-) -> Float32[np.ndarray, "N D"]:
-    """Return the code of each Gaussian's instance at a level, 0 where no mask fits the instance."""
-    contributions = inputs.contributions
-    rows = contributions.rows_of(level)
-    A = contributions.matrix("A")[rows]
-    shown = np.flatnonzero(np.bincount(A.indices, A.data, contributions.num_gaussians) > 0)
-    if not len(shown):
-        return np.zeros((contributions.num_gaussians, inputs.latents.shape[1]), np.float32)
-    leaf = np.full(contributions.num_gaussians, NONE, np.int64)
-    leaf[shown] = instances(features[shown], contributions.means()[shown], codebook, seed)
-    of_leaf, _ = group_means(features[shown], leaf[shown], codebook[0] * codebook[1])
-    of_mask = A @ features
-
-    def closeness(mask: np.ndarray, group: np.ndarray) -> np.ndarray:
-        return 1 - np.abs(of_mask[mask] - of_leaf[group]).mean(axis=1)
-
-    return associated_codes(inputs, leaf, rows, closeness)
-
-
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train instance features, group Gaussians, and assign the groups the codes of masks."""
+    """Train instance features, and assign each level's instances the codes of the masks that fit them.
+
+    Gaussians get 0 where no mask fits their instance.
+    """
     features, found = instance_features(inputs, settings, seed), inputs.no_features()
+    contributions, seen, means = inputs.contributions, inputs.seen(), inputs.contributions.means()
     for level in LEVELS:
-        own, level_seed = features[:, level.index], seed + level.index
-        found[:, level.index] = level_field(inputs, level, own, settings.codebook, level_seed)
+        own, rows = features[:, level.index], contributions.rows_of(level)
+        shown = np.flatnonzero(seen[:, level.index])
+        if len(shown):
+            leaf = np.full(len(own), NONE, np.int64)
+            leaf[shown] = instances(own[shown], means[shown], settings.codebook, seed + level.index)
+            found[:, level.index] = associated_codes(inputs, leaf, rows, own)
     return found

@@ -1,7 +1,6 @@
 """Groups of Gaussians with similar features, and each group's code from the masks that show it."""
 
 import warnings
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -22,9 +21,6 @@ CENTRES = 256  # k-means centres that `clusters` merges
 KMEANS_ROUNDS = 10  # Lloyd iterations for these
 MIN_SCORE = 0.2  # minimum score of a mask for a group's code: OpenGaussian's value for ScanNet
 MIN_VIEWS = 2  # minimum number of views for a group's code: as above; OpenGaussian's number for LERF is 5
-
-# function of (mask, group) pairs
-Closeness = Callable[[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]], Float[np.ndarray, " k"]]
 
 
 def kmeans(
@@ -99,15 +95,16 @@ def associated_codes(
     inputs: MethodInputs,
     group: Int64[np.ndarray, " N"],  # -1 for none
     rows: Int64[np.ndarray, " m"],  # candidate masks
-    closeness: Closeness | None = None,  # factor of the score; its masks are indices into `rows`
+    features: Float32[np.ndarray, "N C"] | None = None,
 ) -> Float32[np.ndarray, "N D"]:
     """Return the code of each Gaussian's group, averaged over its best-fitting masks of all views.
 
     Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU uses visible weights instead of a group
     rendered alone, so that hidden Gaussians do not count.
 
-    A mask is chosen only if its score is above `MIN_SCORE`. Groups with masks in fewer than `MIN_VIEWS` views
-    get 0; in a scene with one view, one is enough.
+    A mask's score is its IoU with the group, times 1 minus the mean difference of their mean `features`, if
+    given. A mask is chosen only if its score is above `MIN_SCORE`. Groups with masks in fewer than
+    `MIN_VIEWS` views get 0; in a scene with one view, one is enough.
     """
     contributions = inputs.contributions
     num_groups = int(group.max(initial=NONE)) + 1
@@ -120,8 +117,10 @@ def associated_codes(
     size = np.stack([np.bincount(group[has], seen[has], num_groups) for seen in contributions.mass()])
     view = contributions.view[rows][mask]
     score = shared.data / (area[mask] + size[view, of] - shared.data)
-    if closeness is not None:
-        score = score * closeness(mask, of)
+    if features is not None:
+        of_mask = contributions.matrix("A")[rows] @ features
+        of_group, _ = group_means(features[has], group[has], num_groups)
+        score = score * (1 - np.abs(of_mask[mask] - of_group[of]).mean(axis=1))
     order = np.lexsort((mask, -score, of, view))
     key = view[order].astype(np.int64) * num_groups + of[order]
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]

@@ -140,15 +140,18 @@ def test_a_group_has_the_average_code_of_its_best_mask_in_each_view(
 ):
     monkeypatch.setattr(groups, "MIN_SCORE", least)
     monkeypatch.setattr(groups, "MIN_VIEWS", views)
-    # view 0: mask 0 holds both Gaussians of group 0 (IoU 1), mask 1 one of them; view 1: mask 2, IoU 2/3
+    # view 0: mask 0 contains both Gaussians of group 0 (IoU 1), mask 1 one of them; view 1: mask 2, IoU 2/3
+    shares, means = np.float32([[1, 1, 0], [1, 0, 0], [1, 1, 1]]), np.zeros((3, 3), np.float32)
+    if far is not None:
+        means[far, 2] = 0.9  # the mean feature of the mask, 0 in the group
     contributions = types.SimpleNamespace(
-        matrix={"S": sp.csr_matrix(np.float32([[1, 1, 0], [1, 0, 0], [1, 1, 1]]))}.get,
+        matrix={"S": sp.csr_matrix(shares), "A": sp.csr_matrix(means)}.get,
         mass=lambda: np.ones((num_views, 3), np.float32),
         view=np.array([0, 0, 1]),
     )
     inputs = types.SimpleNamespace(contributions=contributions, latents=np.float32([[1], [5], [2]]))
-    closeness = lambda mask, group: np.where(mask == far, 0.1, 1.0)  # noqa: E731
-    found = inspect.unwrap(associated_codes)(inputs, np.array([0, 0, -1]), np.arange(3), closeness)
+    features = np.float32([[0], [0], [1]])
+    found = inspect.unwrap(associated_codes)(inputs, np.array([0, 0, -1]), np.arange(3), features)
     assert found.tolist() == [[expected], [expected], [0.0]]
 
 
