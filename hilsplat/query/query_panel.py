@@ -97,11 +97,10 @@ class _Page:
         self, text: str, x: float, y: float, *, size: float = 8.0, bold: bool = False, rotation: float = 0.0
     ) -> None:
         """Write a text centred at (x, y)."""
-        weight = "bold" if bold else "normal"
         place = (x / self.width_px, 1 - y / self.height_px)
         written = self.figure.text(*place, text, ha="center", va="center", size=size, rotation=rotation)
         written.set_parse_math(False)
-        written.set_fontweight(weight)
+        written.set_fontweight("bold" if bold else "normal")
 
     def show(
         self, picture: UInt8[np.ndarray, "H W 3"], title: str, left: int, top: int, row_px: int, bold: bool

@@ -46,7 +46,7 @@ class Paint:
         Relevancy is in steps of 1/255, and required if the style has a ramp.
 
         Raises:
-            ValueError: the table has another number of rows.
+            SettingsError: the table has another number of rows, or isn't base64.
         """
         if style.ramp:
             assert relevancy is not None

@@ -54,11 +54,16 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
         with shown.unchanged():
             described["crops"][node] = _text(encoded(exports.crop(scene, node, shown.threads)))
         yield made + 1, len(nodes)
-    scripts = {name: text.decode() for name, text in static.items() if name.endswith(".js")}
+    # Data URLs have no relative paths, so the scripts import each other by name.
+    scripts = {
+        name: re.sub(r'from "\./', 'from "hilsplat/', text.decode())
+        for name, text in static.items()
+        if name.endswith(".js")
+    }
     scripts["api.js"] = scripts.pop("offline.js")
     sorter = scripts.pop("sorter.js")
     imports = {
-        f"hilsplat/{name}": f"data:text/javascript;base64,{_text(_by_name(text).encode())}"
+        f"hilsplat/{name}": f"data:text/javascript;base64,{_text(text.encode())}"
         for name, text in scripts.items()
     }
     parts = {
@@ -80,11 +85,6 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
     page = re.sub(r'<script type="module"[^>]*></script>\n', "", page)
     last = f'{held}\n<script type="module">import "hilsplat/main.js";</script>\n</body>'
     return page.replace("</body>", last).encode()
-
-
-def _by_name(script: str) -> str:
-    """Return a script with relative imports replaced by names, because data URLs have no relative paths."""
-    return re.sub(r'from "\./', 'from "hilsplat/', script)
 
 
 def _inert(text: str) -> str:

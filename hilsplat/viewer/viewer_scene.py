@@ -179,10 +179,7 @@ class ViewerScene(ShownScene):
             return None
         scene = self.answering(variant)
         relevancy = self.field_relevancy(variant, style.text, style.level) if style.ramp else None
-        try:
-            return Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
-        except ValueError as error:
-            raise SettingsError(f"the style cannot be painted: {error}", fix="reload the page") from error
+        return Paint.of(style, scene.tree.node_of_gaussian, len(scene.tree), relevancy)
 
     def warm_up(self) -> None:
         """Compile the loops of rendering, picking and masks before the page opens."""

@@ -1,13 +1,13 @@
 """Request models of the page, which check shapes, sizes and finiteness."""
 
 import base64
-import binascii
 from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 from pydantic import Field, field_validator, model_validator
 
+from hilsplat.base.errors import SettingsError
 from hilsplat.scene.cameras import Camera
 from hilsplat.web.messages import MAX_SIDE_PX, MAX_TEXT, Message, Text
 
@@ -81,12 +81,14 @@ def _rows(text: str, width: int, count: int) -> np.ndarray:
     if not text:
         return np.zeros((count, width), np.uint8)
     try:
-        values = np.frombuffer(base64.b64decode(text, validate=True), np.uint8)
-    except binascii.Error as error:
-        raise ValueError(f"not base64: {error}") from error
-    if len(values) != width * count:
-        raise ValueError(f"{len(values)} bytes where {count} rows of {width} were expected")
-    return values.reshape(count, width)
+        return np.frombuffer(base64.b64decode(text, validate=True), np.uint8).reshape(count, width)
+    except ValueError as error:
+        raise SettingsError(
+            "the style cannot be painted",
+            expected=f"base64 of {count} rows of {width} bytes",
+            found=str(error),
+            fix="reload the page",
+        ) from error
 
 
 class Asked(Message):

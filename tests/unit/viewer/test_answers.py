@@ -292,7 +292,7 @@ def test_a_film_on_a_full_disk_reports_the_error(client, monkeypatch, kind):
 
 
 def test_a_file_is_not_continued_after_its_page_is_closed(shown):
-    files, steps = SavedFiles(SceneThread(shown), {}), iter([(made, 9) for made in range(1, 9)])
+    files, steps = SavedFiles(SceneThread(shown), {}), ((made, 9) for made in range(1, 9))
 
     async def leave() -> None:
         parts = files._stepped(steps, (0, 9), files.films)
