@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
@@ -14,6 +14,7 @@ from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.datasets.labelled import LabelledRegion
 from hilsplat.datasets.registry import open_labelled
+from hilsplat.evaluate.metrics.masks import iou_matrix
 from hilsplat.evaluate.protocols.view_truth import truths_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
@@ -53,7 +54,7 @@ def add_view(
 ) -> None:
     """Compare the regions of a view with the masks or nodes at each level."""
     ious = {
-        level: region_ious(np.stack([mask.ravel() for _, mask in regions]), found[level]) for level in LEVELS
+        level: iou_matrix(np.stack([mask.ravel() for _, mask in regions]), found[level]) for level in LEVELS
     }
     bests: dict[tuple[str, ...], np.ndarray] = {}
     for row, (region, _) in enumerate(regions):
@@ -70,15 +71,6 @@ def add_view(
         if region.level is not None and len(region.path) > 1:
             inside = 0.0 if parent is None or child is None else float((parent & child).sum() / child.sum())
             fits[region.level].containment.append(inside)
-
-
-def region_ious(
-    regions: Bool[np.ndarray, "R P"], masks: Bool[np.ndarray, "M P"]
-) -> Float64[np.ndarray, "R M"]:
-    """Return the IoU of every region with every mask; regions and masks may overlap."""
-    shared = regions.astype(np.float32) @ masks.T.astype(np.float32)
-    union = regions.sum(axis=1)[:, None] + masks.sum(axis=1)[None] - shared
-    return np.divide(shared, union, out=np.zeros(shared.shape), where=union > 0)
 
 
 def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:

@@ -13,7 +13,7 @@ from hilsplat.base.errors import ArtifactError, MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
-from hilsplat.evaluate.metrics.masks import iou
+from hilsplat.evaluate.metrics.masks import iou, iou_matrix
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
 from hilsplat.evaluate.protocols.cards import VIEW_CONSISTENCY
@@ -118,13 +118,8 @@ def best_ious(
     inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
 ) -> Float[np.ndarray, " m"]:
     """Return, for each mask of A with enough shared points, the highest IoU with a mask of B, in points."""
-    a = inside_a[inside_a.sum(axis=1) >= min_points].astype(np.float32)  # counts exactly up to 2**24
-    b = inside_b.astype(np.float32)
-    if not len(b):
-        return np.zeros(len(a))
-    both = (a @ b.T).astype(np.float64)
-    union = a.sum(axis=1, dtype=np.float64)[:, None] + b.sum(axis=1, dtype=np.float64)[None, :] - both
-    return (both / union).max(axis=1)
+    large = inside_a[inside_a.sum(axis=1) >= min_points]
+    return iou_matrix(large, inside_b).max(axis=1, initial=0)
 
 
 def pair_disagreement(

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 
 from hilsplat.base.levels import LEVELS, Level
 
@@ -15,6 +15,15 @@ def iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> 
     """Return intersection over union; 0 for two empty masks, as in OpenGaussian's script."""
     union = np.count_nonzero(prediction | truth)
     return np.count_nonzero(prediction & truth) / union if union else 0.0
+
+
+def iou_matrix(
+    regions: Bool[np.ndarray, "R P"], masks: Bool[np.ndarray, "M P"]
+) -> Float64[np.ndarray, "R M"]:
+    """Return the IoU of every region with every mask, 0 for two empty ones; both may overlap."""
+    shared = regions.astype(np.float32) @ masks.T.astype(np.float32)  # counts exactly up to 2**24 px
+    union = regions.sum(axis=1)[:, None] + masks.sum(axis=1)[None] - shared
+    return np.divide(shared, union, out=np.zeros(shared.shape), where=union > 0)
 
 
 def boundary_width_px(size_hw: tuple[int, int]) -> int:

@@ -8,7 +8,7 @@ import pytest
 from hilsplat.annotate.labels import Label, label_path, traced, write_labels
 from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledRegion
-from hilsplat.evaluate.diagnostics.label_fits import Fits, add_view, region_ious, run_label_fits
+from hilsplat.evaluate.diagnostics.label_fits import Fits, add_view, run_label_fits
 from hilsplat.query.names import NO_FILE
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, build_finished_desk, region_mask
 
@@ -18,12 +18,6 @@ SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 def strip(begin: int, end: int) -> np.ndarray:
     """One row of 12 pixels with some of them set."""
     return (np.arange(12) >= begin) & (np.arange(12) < end)
-
-
-def test_ious_of_strips_are_counted():
-    regions, masks = np.stack([strip(0, 6), strip(3, 9)]), np.stack([strip(0, 6), strip(4, 8), strip(0, 0)])
-    np.testing.assert_allclose(region_ious(regions, masks), [[1, 2 / 8, 0], [3 / 9, 4 / 6, 0]])
-    assert region_ious(regions, masks[:0]).shape == (2, 0)
 
 
 def test_levels_are_compared_with_their_own_and_with_all_and_children_with_their_parents():

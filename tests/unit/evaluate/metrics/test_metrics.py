@@ -18,6 +18,7 @@ from hilsplat.evaluate.metrics.masks import (
     hits_a_box,
     hits_the_mask,
     iou,
+    iou_matrix,
     peak_points,
     pixel_accuracy,
 )
@@ -156,6 +157,13 @@ def test_boundary_iou_of_a_shifted_square():
     assert boundary_iou(prediction, truth) == pytest.approx(10 / 30)
     empty = np.zeros((10, 10), dtype=bool)
     assert iou(empty, empty) == boundary_iou(empty, empty) == 0
+
+
+def test_every_region_is_compared_with_every_mask():
+    regions = np.array([[1, 1, 1, 0, 0], [0, 0, 1, 1, 0]], bool)
+    masks = np.array([[1, 1, 1, 0, 0], [0, 1, 1, 1, 1], [0, 0, 0, 0, 0]], bool)
+    np.testing.assert_allclose(iou_matrix(regions, masks), [[1, 2 / 5, 0], [1 / 4, 2 / 4, 0]])
+    assert iou_matrix(regions, masks[:0]).shape == (2, 0)
 
 
 @pytest.mark.parametrize(
