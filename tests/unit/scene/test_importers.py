@@ -41,9 +41,8 @@ def write_colmap(folder, suffix="bin"):
     names = ["a.jpg", "b.jpg", "c.jpg"]
     write_images(folder / "images", names)
     model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=40, height=30, params=[50.0, 51.0, 19.0, 16.0]
-    )
+    params = [50.0, 51.0, 19.0, 16.0]
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=40, height=30, params=params)
     model.add_camera_with_trivial_rig(camera)
     for number, name in enumerate(names):
         pose = np.eye(4)[:3]
@@ -119,9 +118,8 @@ def test_poses_named_by_the_user_replace_those_in_the_folder(tmp_path, place):
     (tmp_path / "photos/sparse/0/images.bin").write_bytes(b"")
     out = tmp_path / "out"
     run_poses(tmp_path / "photos", out, "a/b", "metre", False, PosesSettings(), 0, 1, tmp_path / place)
-    np.testing.assert_allclose(
-        Scene.load(out).cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-6
-    )
+    cameras = Scene.load(out).cameras
+    np.testing.assert_allclose(cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-6)
 
 
 def test_missing_poses_are_refused_and_none_ignores_those_in_the_folder(tmp_path):
@@ -257,9 +255,8 @@ def write_record3d(folder, metadata="metadata.json", images="rgb", count=3):
     # half a turn about y: quaternion (0, 1, 0, 0) in the order x, y, z, w
     poses = [[0, 1, 0, 0, *(number * np.array([0.1, 0.2, 0.3]))] for number in range(count)]
     intrinsics = [100.0, 0, 0, 0, 101.0, 0, 61.0, 44.0, 1]  # by columns
-    (folder / metadata).write_text(
-        json.dumps({"K": intrinsics, "w": 120, "h": 90, "fps": 60, "poses": poses})
-    )
+    content = {"K": intrinsics, "w": 120, "h": 90, "fps": 60, "poses": poses}
+    (folder / metadata).write_text(json.dumps(content))
 
 
 def test_record3d_exports_are_turned_to_z_up_and_long_ones_are_thinned_evenly(tmp_path, monkeypatch):

@@ -103,9 +103,8 @@ def test_a_world_written_as_lerf_ovs_is_read_back_equal(true_world, lerf):
     (paw,) = [region for region in scene.views["frame_00002.png"] if region.text == "paw"]
     # One region with both boxes: rows 14 to 17, columns 3 to 6 and 13 to 18.
     assert paw.boxes().tolist() == [[3, 14, 6, 17], [13, 14, 18, 17]]
-    for name, posed in zip(
-        true_world.cameras.names, posed_images(lerf / "figurines", "").values(), strict=True
-    ):
+    views = posed_images(lerf / "figurines", "").values()
+    for name, posed in zip(true_world.cameras.names, views, strict=True):
         camera = true_world.cameras[name]
         assert np.allclose(posed.cam_from_source, camera.cam_from_world, atol=1e-12)
         assert np.array_equal(posed.camera.calibration_matrix(), camera.K)
