@@ -18,14 +18,15 @@ from jaxtyping import Bool
 from hilsplat.annotate.labels import Label, as_file, known_labels, labels_of, traced, whole_pixels
 from hilsplat.base.artifacts import atomic_folder, parse_json, write_text
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.images.isat import parse_isat, trace_polygons
+from hilsplat.datasets.images.isat import fill_polygons, parse_isat, trace_polygons
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.web.coco import coco_content, coco_region
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
-OURS = ("level", "parent", "origin")
+OURS = {"level", "parent", "origin"}
+"""Keys of ours in the other formats."""
 
 
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
@@ -102,20 +103,21 @@ def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
                 "category": label.text,
                 "group": label.id,
                 "segmentation": ring,
-                "area": int(label.model_copy(update={"polygons": [ring]}).mask(size_hw).sum()),
+                "area": int(fill_polygons([ring], size_hw).sum()),
                 "layer": float(label.level),
                 "bbox": [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()],
                 "iscrowd": 0,
                 "note": "",
             }
-            objects.append({**described, **_ours(label)})
+            objects.append({**described, **label.model_dump(include=OURS)})
     return _json({"info": info, "objects": objects})
 
 
 def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
     shapes = []
     for label in labels:
-        about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **_ours(label)}
+        own = label.model_dump(include=OURS)
+        about = {"group_id": label.id, "shape_type": "polygon", "flags": {}, **own}
         shapes += [{"label": label.text, "points": ring, **about} for ring in label.polygons]
     image = {"imagePath": view, "imageData": None, "imageHeight": size_hw[0], "imageWidth": size_hw[1]}
     return _json({"version": "5.5.0", "flags": {}, "shapes": shapes, **image})
@@ -134,12 +136,8 @@ def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, A
                 **coco_region(label.mask(cameras[view].size_hw)),
                 "thing": label.id,
             }
-            content["annotations"].append({**described, **_ours(label)})
+            content["annotations"].append({**described, **label.model_dump(include=OURS)})
     return content
-
-
-def _ours(label: Label) -> dict[str, object]:
-    return {name: getattr(label, name) for name in OURS}
 
 
 def _json(value: object) -> str:

@@ -21,23 +21,6 @@ def test_a_refused_query_removes_the_previous_answers(opened, desk_address):
     assert page.evaluate("hilsplat.painted()[0].style.table.every((value) => value === 0)")
 
 
-def test_at_most_two_small_pictures_are_requested_at_once(opened, desk_address):
-    page = opened(desk_address, "server")
-    page.wait_for_timeout(2000)  # until all of its pictures are loaded
-    held = []
-    for pattern in ("**/api/crop/**", "**/api/thumb/**"):
-        page.route(pattern, lambda route: held.append(route))
-    page.reload()
-    page.locator("body[data-ready=yes]").wait_for()
-    page.evaluate("hilsplat.begun")
-    page.wait_for_timeout(1000)
-    assert len(held) == 2
-    held[0].continue_()
-    page.wait_for_timeout(500)
-    assert len(held) == 3
-    page.unroute_all(behavior="ignoreErrors")
-
-
 def test_zooming_out_is_limited_and_home_returns_to_the_start(opened, desk_address):
     page = opened(desk_address)
     begun = wire_camera(page)

@@ -14,8 +14,8 @@ from hilsplat.datasets.registry import open_labelled
 from hilsplat.segment.masks import HierarchicalMasks
 from tests.unit.artifact_changes import write_again
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
+from tests.unit.viewer.conftest import ADDRESS, TOKEN, browser_of
 
-TOKEN, ADDRESS = "secret-of-the-test", "http://127.0.0.1:4000"
 SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 MUG = {"id": 1, "level": 1, "text": "mug", "polygons": [[[1, 1], [12, 1], [12, 20], [1, 20]]]}
 HANDLE = {"id": 2, "level": 2, "parent": 1, "text": "handle"}
@@ -34,12 +34,9 @@ def labels(tmp_path) -> Path:
 
 
 def opened(desk: Path, labels: Path) -> TestClient:
-    headers = {"origin": ADDRESS, "sec-fetch-site": "same-origin"}
     app = Annotator(OpenedScene(desk, labels, "default", 1)).app(TOKEN)
-    client = TestClient(app, base_url=ADDRESS, headers=headers)
-    assert client.get("/api/labels").status_code == 403  # the guard of tests/unit/viewer/test_guard.py
-    assert client.get(f"/?token={TOKEN}").status_code == 200
-    return client
+    assert TestClient(app, base_url=ADDRESS).get("/api/labels").status_code == 403
+    return browser_of(app)
 
 
 @pytest.fixture

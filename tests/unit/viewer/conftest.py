@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -10,6 +9,7 @@ from starlette.testclient import TestClient
 
 from hilsplat.viewer.app import Viewer
 from hilsplat.viewer.viewer_scene import ViewerScene
+from hilsplat.web.guard import Guard
 from tests.unit.finished_desk import SCENE
 
 TOKEN = "secret-of-the-test"
@@ -26,13 +26,16 @@ def shown(built_desk) -> ViewerScene:
     return ViewerScene(built_desk / SCENE)
 
 
-@contextmanager
-def browsing(shown: ViewerScene) -> Iterator[TestClient]:
-    """A browser that was given the printed address, with the headers of the page."""
+def browser_of(app: Guard) -> TestClient:
+    """A browser that has opened the printed address, with the headers of the page."""
     headers = {"origin": ADDRESS, "sec-fetch-site": "same-origin"}
-    with TestClient(Viewer(shown).app(TOKEN), base_url=ADDRESS, headers=headers) as browser:
-        assert browser.get(f"/?token={TOKEN}").status_code == 200
-        yield browser
+    browser = TestClient(app, base_url=ADDRESS, headers=headers)
+    assert browser.get(f"/?token={TOKEN}").status_code == 200
+    return browser
+
+
+def browsing(shown: ViewerScene) -> TestClient:
+    return browser_of(Viewer(shown).app(TOKEN))
 
 
 @pytest.fixture(scope="module")
