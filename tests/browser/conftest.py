@@ -113,7 +113,7 @@ def cloud_address(browser, cloud) -> Iterator[str]:
 
 @pytest.fixture
 def opened(browser) -> Iterator[Callable]:
-    """Opens an address, waits until everything is loaded, and checks for errors at the end.
+    """A function that opens an address and waits until everything is loaded; errors fail the test at its end.
 
     A console error, an uncaught exception or a request to another address fails the test, except for what
     the test has put into `opened.expected`.
@@ -148,7 +148,7 @@ def opened(browser) -> Iterator[Callable]:
 
 
 def drawn(page, act: Callable[[], object]) -> None:
-    """Do something and wait until the picture is drawn again."""
+    """Run `act` and wait until the picture is redrawn."""
     view = page.locator("#view")
     before = int(view.get_attribute("data-drawn"))
     act()
@@ -160,14 +160,14 @@ def drawn(page, act: Callable[[], object]) -> None:
 
 
 def pixels(page) -> np.ndarray:
-    """The present WebGL picture, (height, width, 3) uint8."""
+    """The current WebGL picture, (height, width, 3) uint8."""
     found = page.evaluate("hilsplat.pixels()")
     values = np.array(found["data"], np.uint8).reshape(found["height"], found["width"], 4)
     return values[::-1, :, :3]
 
 
 def wire_camera(page) -> dict:
-    """The page's camera, as the server reads it."""
+    """The page's camera in the format of requests."""
     code = "(() => { const v = document.getElementById('view'); "
     return page.evaluate(code + "return hilsplat.camera.wire(v.clientWidth, v.clientHeight); })()")
 
@@ -202,7 +202,7 @@ def answers(page):
 
 
 def ask_and_wait(page, text: str) -> None:
-    """Ask, and wait for the answers."""
+    """Query, and wait for the answers."""
     ask(page, text)
     answers(page).first.wait_for()
 

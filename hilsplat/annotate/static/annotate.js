@@ -1,4 +1,4 @@
-// The annotation page: photograph, tool and thing; the server computes all regions.
+// The annotation page; the server computes all regions.
 
 import { ask, exportUrl, scene as described, watch } from "./api.js";
 import { $, counted, LEVELS, make } from "./elements.js";
@@ -19,7 +19,7 @@ const labels = () => store.labels(number);
 const own = () => labels().find((label) => label.id === chosen) ?? null;
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
-// Requests run one after the other, because each region is computed from the previous one.
+// Requests run one after the other, because each region depends on the previous one.
 let waiting = 0;   // pending requests whose result may have to be saved
 const soon = (work) => {
   waiting++;
@@ -171,7 +171,7 @@ function cornerAt(at) {
   return best && { ...best, rings: rings.map((ring) => ring.map((point) => [...point])) };
 }
 
-// The server draws the new outline, inside its parent.
+// The server computes the new outline, cut to its parent.
 function reshape(rings) {
   const label = own(), view = number;
   soon(async () => {
@@ -353,7 +353,7 @@ document.addEventListener("keydown", (event) => {
 
 const resize = (by) => { $("radius").value = radius() + by; draw(); };
 const pickLevel = (value) => { setLevel(value); levelChanged(); };
-// The parent is kept only if it is one level above the new level.
+// A new level clears the parent, which must be one level above.
 const levelChanged = () => edit({ level: level(), parent: null });
 
 $("thing").addEventListener("submit", (event) => event.preventDefault());

@@ -1,4 +1,4 @@
-// Mouse, pen and touch on the photograph. One pointer draws with the tool; the right button or two move, wheel and pinch zoom.
+// Mouse, pen and touch on the photograph: one pointer draws with the tool, the right button or two fingers move, wheel and pinch zoom.
 
 export function attachHands(sheet, { drawing, down, drag, up, hover, close }) {
   const host = sheet.host, pointers = new Map();
