@@ -126,11 +126,7 @@ def gaussian_nodes(
     masks sometimes cover it. Masks of one view may overlap, and a node may have several masks there, so a
     Gaussian's weight in a view is capped at its visible mass there.
 
-    Args:
-        cluster: node of each mask of one level, -1 for none.
-        weights: S of the masks.
-        mass: visible mass of each Gaussian in each view, px.
-        total_mass: sum of `mass` over views, px.
+    `cluster` is the node of each mask, -1 for none; the other arguments are as in `level_nodes`.
 
     Returns:
         node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.
@@ -235,10 +231,8 @@ def mask_fits(
 ) -> tuple[Int32[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
     """Return the node that each mask shows: the one with the best soft IoU in the mask's view.
 
-    Args:
-        S: weight of each Gaussian in each mask, px.
-        mass: visible mass of each Gaussian in each view, px.
-        linked: node that each mask was linked into, -1 for none.
+    `linked` is the node that each mask was linked into, -1 for none; `S` and `mass` are in px, as in
+    `Contributions`.
 
     Returns:
         best node at the mask's level, -1 if the mask shares no Gaussians with any node; and the IoU with the

@@ -48,10 +48,7 @@ def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -
     """Transform Gaussians from coordinates a to b, given b_from_a.
 
     A camera transformed with them sees the same image: spherical harmonics are rotated too, because they are
-    functions of the direction in the world.
-
-    Raises:
-        HilsplatError: if `similarity` is not a similarity.
+    functions of the direction in the world. The errors are those of `decompose`.
     """
     scale, rotation, translation = decompose(similarity)
     g = gaussians

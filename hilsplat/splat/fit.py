@@ -3,7 +3,6 @@
 import json
 import logging
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -311,7 +310,7 @@ def write_report(
     with atomic_folder(folder) as temporary:
         write_png(temporary / "test_views.png", contact_sheet(cells, columns=6))
         path = [view.camera for view in load_views(scene, "train", settings.image_scale) or views]
-        write_flyaround(temporary, path, partial(picture, threads=1), threads)
+        write_flyaround(temporary, path, lambda camera: picture(camera, 1), threads)
         if curve is not None:
             _draw_curves(temporary / "curves.png", curve)
         write_json(temporary / "report.json", report)

@@ -30,11 +30,7 @@ EVERYTHING = 2**31 - 1
 
 
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Copy the fields of Gaussians to the device.
-
-    Raises:
-        HilsplatError: if parameters are not finite or quaternions are zero.
-    """
+    """Copy the fields of Gaussians to the device, unless some cannot be drawn (`refuse_broken`)."""
     g = {name: torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS}
     broken = (g["quats"] == 0).all(dim=1)
     for values in g.values():

@@ -8,7 +8,6 @@ import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
 from hilsplat.base.errors import MisalignedArtifactError
-from hilsplat.base.levels import Level
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import (
@@ -129,6 +128,10 @@ def test_two_boxes_give_exactly_their_regions(tree_of_boxes):
     assert tree.box[0][0] == pytest.approx([0, 0, 0], abs=0.01)
     assert tree.box[0][1] == pytest.approx([5, 7, 0], abs=0.01)
     assert (tree.quality > 0.7).all()
+    assert read_index(out)["nodes"] == {"whole": 2, "part": 3, "subpart": 2}
+    listed = read_json(out / "tree.json")["nodes"]
+    assert (listed[0]["level"], listed[0]["children"]) == ("whole", [2, 4])
+    assert sum(node["gaussians"] for node in listed if node["level"] == "whole") == NUM_GAUSSIANS
 
 
 def test_children_and_ancestors_of_nodes_without_a_part(tree_of_boxes):
@@ -141,15 +144,6 @@ def test_children_and_ancestors_of_nodes_without_a_part(tree_of_boxes):
     assert ancestors[6].tolist() == [1, -1, 6]  # straight under the whole
     orphan = replace(tree, parent=np.where(np.arange(7) == 2, -1, tree.parent).astype(np.int32))
     assert orphan.ancestors()[5].tolist() == [-1, 2, 5]
-
-
-def test_the_readable_tree_and_counts(tree_of_boxes):
-    _, out = tree_of_boxes
-    assert read_index(out)["nodes"] == {"whole": 2, "part": 3, "subpart": 2}
-    listed = read_json(out / "tree.json")["nodes"]
-    assert listed[0]["level"] == Level.WHOLE.label
-    assert listed[0]["children"] == [2, 4]
-    assert sum(node["gaussians"] for node in listed if node["level"] == "whole") == NUM_GAUSSIANS
 
 
 def test_a_rerun_writes_the_same_bytes_and_too_few_views_give_an_empty_tree(tree_of_boxes, caplog):

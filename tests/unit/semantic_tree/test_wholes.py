@@ -51,13 +51,6 @@ def test_regions_are_joined_while_the_pair_costs_less_than_the_limit():
     assert joined(symmetric(3, _01=9, _02=1), shares, 0.33).tolist() == [0, 0, 1]
 
 
-def test_sides_are_means_of_the_views_that_show_a_region():
-    # each in a view of its own: the pair makes up 0.09 of either, not of both together
-    shares = np.array([[0.09, 0, 0], [0, 0.09, 0]])
-    assert joined(symmetric(2, _01=1), shares, 0.301).tolist() == [0, 0]
-    assert joined(symmetric(2, _01=1), shares, 0.299).tolist() == [0, 1]
-
-
 def joined_by_search(touch: np.ndarray, shares: np.ndarray, most: float) -> list[list[int]]:
     """The rule written out: all pairs are compared before every join."""
     groups = [[region] for region in range(len(shares))]
