@@ -130,7 +130,7 @@ def test_exactly_one_of_labels_and_truth_is_required(tmp_path):
 
 @pytest.fixture
 def data_set(monkeypatch):
-    """Function that lets `--labels set/scene` open what it is given."""
+    """Function that makes `--labels set/s` open the given labels."""
 
     def put(known, flat=(), points=()):
         extra = ExtraProtocols(*(tuple(map(card_named, names)) for names in (flat, points)))

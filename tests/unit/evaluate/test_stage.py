@@ -58,7 +58,7 @@ def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opene
 
 
 def labelled(block_world, views=("001.png",), levels=True):
-    """Labels that say what the block world's annotations say; without levels, flat."""
+    """Labels equal to the block world's annotations, with or without levels."""
     annotations = block_world.annotations
     regions = []
     for node in annotations.nodes:

@@ -38,8 +38,8 @@ PERFECT = [[0, 2, -1]] * 2 + [[0, -1, -1]] * 2 + [[1, 3, -1]] * 2 + [[1, -1, -1]
 
 
 def test_faults_are_counted_one_by_one():
-    # the chest falls into two nodes of 3 and 1; one Gaussian of the bear is in its larger one; the head
-    # hangs under the chest
+    # The chest is split into nodes of 3 and 1 Gaussians; the larger also has one of the bear. The parent of
+    # the head is the chest.
     nodes = [[0, 3, -1]] * 2 + [[0, -1, -1]] + [[1, -1, -1]] * 4 + [[2, -1, -1]]
     found = measure_tree(tree_of(nodes, [1, 1, 1, 2], [-1, -1, -1, 1]), VOTES, TRUTH)
     whole = found[Level.WHOLE]

@@ -1,4 +1,4 @@
-"""Figures of the paper: which methods and queries are shown, and that answers are drawn in place."""
+"""Figures of the paper: methods, queries, titles and masks of answers."""
 
 from pathlib import Path
 

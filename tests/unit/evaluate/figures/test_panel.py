@@ -1,4 +1,4 @@
-"""Pictures are drawn for scenes with and without annotations, and show what they claim."""
+"""Panels of scenes with and without annotations, and the answers drawn in them."""
 
 import re
 import shutil

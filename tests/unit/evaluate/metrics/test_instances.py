@@ -42,7 +42,7 @@ EXAMPLE = [(A, 4), (B, 3), (VOID, 3)]
 
 
 def test_worked_example_of_ten_vertices():
-    # p1 is A; p2 lies in void; p3 = points 3-5 shares 2 of 4 with B
+    # p1 is A; p2 is in void; p3 = points 3-5 shares 2 of 4 with B
     result = precisions(scan_of(EXAMPLE, [(0, 4, 0.9), (7, 9, 0.8), (3, 6, 0.6)]))
     assert ap25(result) == 1.0
     assert ap50(result) == 0.5
@@ -87,7 +87,7 @@ def test_a_second_match_is_a_false_positive_and_may_be_the_first_of_another(
 
 
 def test_only_the_first_match_marks_a_prediction_as_used():
-    # one prediction over A and B overlaps each by 4 of 8 > 0.25: A takes it, B is missed
+    # one prediction over A and B overlaps each by 4 of 8 > 0.25: it matches A, and B is missed
     matches = match_instances(*scan_of([(A, 4), (B, 4)], [(0, 8, 0.9)]), (CLASS,), 1)
     quarter = len(OVERLAPS) - 1
     assert matches.is_match[matches.overlap_index == quarter].tolist() == [True]
@@ -117,7 +117,7 @@ def test_predictions_in_void_are_ignored_and_others_are_false_positives(
 
 
 def test_small_instances_and_predictions_and_other_classes_do_not_count():
-    # B has 3 points, fewer than 4. Its prediction lies in an instance left out: ignored.
+    # B has 3 points, fewer than 4. Its prediction is in an ignored instance, so it is ignored too.
     scan = scan_of(EXAMPLE, [(0, 4, 0.9), (4, 8, 0.8)])
     assert precisions(scan, min_points=4).tolist() == [[1.0] * 10]
     scan = scan_of(EXAMPLE, [(0, 3, 0.9), (0, 4, 0.8)], classes=[CLASS, 77])

@@ -1,4 +1,4 @@
-"""Every example here is small enough to check with pencil and paper."""
+"""Metrics of masks, rules for maps and hierarchical consistency, on examples worked by hand."""
 
 import hypothesis.extra.numpy as hnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Classes of points: the worked example, what the benchmarks make of it, Waymo's own regression test."""
+"""Classes of points: the worked example under each benchmark's mean, and Waymo's own regression test."""
 
 import zlib
 

@@ -1,4 +1,4 @@
-"""Every protocol has a name and a version, and nothing it decides changes without a new one."""
+"""Every protocol has a name and a version, and no number changes without a new version."""
 
 import hashlib
 import re
@@ -21,7 +21,7 @@ from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.settings import EvaluateSettings
 
 DECIDED = {
-    # full name: first eight digits of what `digest` makes of metrics, averaging, missing, rule and classes
+    # full name: digest of metrics, averaging, missing, rule and classes
     "lerf/langsplat@2": "704f6f3d",
     "lerf/tree-nodes@5": "2cdcbb8d",
     "lerf/langsplat-v2@2": "f209b912",
@@ -58,9 +58,9 @@ LATER = {"empty_wins": False, "truth": "labels", "united": ()}
 
 
 def digest(card):
-    """What decides a number, without the words that explain it.
+    """Digest of everything that determines a number, without the explanations.
 
-    What was added later counts only where it is not the default, so that the digests of other cards stand.
+    Fields added later are included only if they differ from their default, so other digests are unchanged.
     """
     rule = asdict(card.rule) if card.rule else None
     if rule:

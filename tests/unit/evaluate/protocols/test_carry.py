@@ -1,4 +1,4 @@
-"""Which Gaussians a point takes its label or feature from, and with what weight."""
+"""Gaussians assigned to points, with weights, and the labels and features transferred from them."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def gaussians_of(opacities=OPAQUE, means=MEANS, scales=(1.0, 1, 1), quats=((1, 0
 
 
 def carried(xs, mode, gaussians=None, radius=0.0):
-    """What the points (x, 0, 0) take from the three Gaussians on the x axis."""
+    """Assign Gaussians, by default the three on the x axis, to the points (x, 0, 0)."""
     points = np.array([[x, 0.0, 0.0] for x in xs])
     return carried_to(points, gaussians_of() if gaussians is None else gaussians, mode, radius)
 
@@ -87,7 +87,7 @@ def test_density_turns_with_the_gaussian(length):
     quats = length * np.array([[2, 0, 0, 1], [2, 0, 0, -1]])
     turned = gaussians_of([0.5] * 2, np.zeros((2, 3)), (2.0, 0.5, 1), quats)
     found = carried_to(2 * np.array([[3 / 5, 4 / 5, 0]]), turned, "density", 0.0)
-    # The second sees it at twice the angle: (2 * -7/25 / 2)**2 + (2 * 24/25 / 0.5)**2
+    # In the frame of the second, it is at twice the angle: (2 * -7/25 / 2)**2 + (2 * 24/25 / 0.5)**2
     alpha = np.exp([-1 / 2, -((7 / 25) ** 2 + 3.84**2) / 2])
     np.testing.assert_allclose(found.features(np.eye(2))[0], alpha / alpha.sum())
 

@@ -1,4 +1,4 @@
-"""What is queried, what counts, and what a missing answer scores."""
+"""Queries of a view, their scores, and the scores of missing answers."""
 
 from types import SimpleNamespace
 
@@ -34,9 +34,9 @@ def truth_of(folder, nodes, regions):
 
 
 class HandMade:
-    """Answers that are given: node i of `masks` answers the texts that name it.
+    """Given answers: nodes, rows of `masks`, by text or path and level; relevancy maps by text.
 
-    `scene_wide` has those that differ where not this view is given.
+    `scene_wide` has the answers that differ when the whole scene is searched.
     """
 
     def __init__(self, masks, answers, relevancy=None):

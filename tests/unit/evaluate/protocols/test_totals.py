@@ -1,4 +1,4 @@
-"""From rows to a table's number: every averaging order by hand."""
+"""Averages of rows in a table: every averaging order by hand."""
 
 import math
 from collections.abc import Mapping
