@@ -80,7 +80,7 @@ def opened(browser: Any, folder: Path, painter: str) -> dict[str, float]:
         page.evaluate("hilsplat.begun")
         whole = time.perf_counter() - begin
         drag = timed_redraw(page, lambda: dragged(page))
-        page.get_by_label("Ask").first.fill(TEXT)
+        page.locator("#text").fill(TEXT)
         answer = timed_redraw(page, lambda: page.keyboard.press("Enter"))
         heap = counter.send("Runtime.getHeapUsage")
         found = {
