@@ -5,10 +5,11 @@ Each reader raises SceneError if its file is missing or damaged.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 from plyfile import PlyData, PlyParseError
 
 from hilsplat.base.errors import MisalignedArtifactError, SceneError
@@ -156,55 +157,53 @@ def read_matrix(path: Path) -> np.ndarray:
     return matrix
 
 
-def read_ply(path: Path, corners: int) -> PlyData:
-    """Read a mesh whose faces have `corners` corners each."""
-    require_file(path)
-    lists = {"face": {"vertex_indices": corners}}
-    try:
-        content = PlyData.read(path, known_list_len=lists)
-        for element in ("vertex", "face"):
-            content[element]  # KeyError if there is none
-    except (PlyParseError, KeyError, ValueError, OSError) as error:
-        raise SceneError(
-            f"{path} cannot be read: {error}",
-            expected=f"a PLY mesh with faces of {corners} corners",
-            found=f"a file of {path.stat().st_size} bytes",
-            fix=UNPACK_AGAIN,
-        ) from error
-    return content
+class PlyMesh:
+    """A PLY mesh whose faces have `corners` corners each."""
 
+    def __init__(self, path: Path, corners: int) -> None:
+        self.path = require_file(path)
+        try:
+            self._content = PlyData.read(path, known_list_len={"face": {"vertex_indices": corners}})
+            for element in ("vertex", "face"):
+                self._content[element]  # KeyError if there is none
+        except (PlyParseError, KeyError, ValueError, OSError) as error:
+            raise SceneError(
+                f"{path} cannot be read: {error}",
+                expected=f"a PLY mesh with faces of {corners} corners",
+                found=f"a file of {path.stat().st_size} bytes",
+                fix=UNPACK_AGAIN,
+            ) from error
 
-def ply_column(path: Path, content: PlyData, element: str, name: str) -> np.ndarray:
-    """Return a property of all vertices or faces, by name."""
-    data = content[element].data
-    if name not in data.dtype.names:
-        raise SceneError(
-            f"the {element} element of {path} has no property {name}",
-            expected=name,
-            found=", ".join(data.dtype.names),
-            fix="use the labelled file that the data set distributes",
-        )
-    return np.asarray(data[name])
+    def column(self, element: str, name: str) -> np.ndarray:
+        """Return a property of all vertices or faces, by name."""
+        data = self._content[element].data
+        if name not in data.dtype.names:
+            raise SceneError(
+                f"the {element} element of {self.path} has no property {name}",
+                expected=name,
+                found=", ".join(data.dtype.names),
+                fix="use the labelled file that the data set distributes",
+            )
+        return np.asarray(data[name])
 
+    @cached_property
+    def xyz(self) -> Float32[np.ndarray, "P 3"]:
+        """Positions of the vertices."""
+        return np.stack([self.column("vertex", axis) for axis in "xyz"], axis=1).astype(np.float32)
 
-def ply_places(path: Path, content: PlyData) -> np.ndarray:
-    """Return the vertices of a mesh, float32 (P, 3)."""
-    columns = [ply_column(path, content, "vertex", axis) for axis in "xyz"]
-    return np.stack(columns, axis=1).astype(np.float32)
-
-
-def ply_faces(path: Path, content: PlyData) -> np.ndarray:
-    """Return the corners of all faces, int32 (F, corners); each must be a vertex."""
-    faces = ply_column(path, content, "face", "vertex_indices").astype(np.int32)
-    count = len(content["vertex"].data)
-    if faces.size and (faces.min() < 0 or faces.max() >= count):
-        raise SceneError(
-            f"{path}: a face has a corner that is not a vertex",
-            expected=f"0 to {count - 1}",
-            found=f"{faces.min()} to {faces.max()}",
-            fix=UNPACK_AGAIN,
-        )
-    return faces
+    @cached_property
+    def faces(self) -> Int32[np.ndarray, "F corners"]:
+        """Corners of all faces; each must be a vertex."""
+        faces = self.column("face", "vertex_indices").astype(np.int32)
+        count = len(self._content["vertex"].data)
+        if faces.size and (faces.min() < 0 or faces.max() >= count):
+            raise SceneError(
+                f"{self.path}: a face has a corner that is not a vertex",
+                expected=f"0 to {count - 1}",
+                found=f"{faces.min()} to {faces.max()}",
+                fix=UNPACK_AGAIN,
+            )
+        return faces
 
 
 def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:

@@ -27,14 +27,11 @@ from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import (
     UNPACK_AGAIN,
     LabelledPoints,
+    PlyMesh,
     PointScene,
     by_number,
-    ply_column,
-    ply_faces,
-    ply_places,
     read_json_object,
     read_numbers,
-    read_ply,
     require_file,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
@@ -182,10 +179,9 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
     The file numbers objects from 0; `instance_id` is that number + 1, and 0 if the class is undefined.
     """
     path = habitat / "mesh_semantic.ply"
-    mesh = read_ply(path, 4)
+    mesh = PlyMesh(path, 4)
     classes = class_of_objects(habitat / "info_semantic.json")
-    quads = ply_faces(path, mesh)
-    of_face = ply_column(path, mesh, "face", "object_id").astype(np.int64)
+    quads, of_face = mesh.faces, mesh.column("face", "object_id").astype(np.int64)
     if of_face.size and (of_face.min() < 0 or of_face.max() >= len(classes)):
         raise SceneError(
             f"{path} and info_semantic.json do not match",
@@ -193,11 +189,10 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
             found=f"{of_face.min()} to {of_face.max()}",
             fix="use both files of the same scene",
         )
-    xyz = ply_places(path, mesh)
-    owner = object_of_vertices(quads, of_face, len(xyz))
+    owner = object_of_vertices(quads, of_face, len(mesh.xyz))
     class_id = np.where(owner >= 0, classes[owner], 0).astype(np.int32)
     instance = np.where(class_id > 0, owner + 1, 0).astype(np.int32)
-    return LabelledPoints(xyz, class_id, instance, "replica", triangles_of(quads))
+    return LabelledPoints(mesh.xyz, class_id, instance, "replica", triangles_of(quads))
 
 
 def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]:
@@ -231,12 +226,12 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
     These are `semantic_labels_<scene>.txt` and, if available, `instance_labels_<scene>.txt`.
     """
     try:
-        mesh = read_ply(mesh_path, 3)
-        faces = ply_faces(mesh_path, mesh)
+        mesh = PlyMesh(mesh_path, 3)
+        faces = mesh.faces
     except SceneError:
-        mesh = read_ply(mesh_path, 4)
-        faces = triangles_of(ply_faces(mesh_path, mesh))
-    xyz = ply_places(mesh_path, mesh)
+        mesh = PlyMesh(mesh_path, 4)
+        faces = triangles_of(mesh.faces)
+    xyz = mesh.xyz
     class_id = read_vertex_labels(labels, len(xyz))
     instance = np.zeros(len(xyz), dtype=np.int32)
     if instances is not None:

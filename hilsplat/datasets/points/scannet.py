@@ -22,14 +22,11 @@ from hilsplat.datasets.labelled import image_size_hw
 from hilsplat.datasets.points.labelled_points import (
     UNPACK_AGAIN,
     LabelledPoints,
+    PlyMesh,
     PointScene,
     by_number,
-    ply_column,
-    ply_faces,
-    ply_places,
     read_json_object,
     read_matrix,
-    read_ply,
     require_file,
 )
 from hilsplat.scene.posed_images import HALF_PIXEL, PosedImage, rigid_pose
@@ -155,11 +152,10 @@ def read_truth(
     """
     mesh_path = folder / f"{scan}_vh_clean_2.ply"
     label_path = folder / f"{scan}_vh_clean_2.labels.ply"
-    mesh, labelled = read_ply(mesh_path, 3), read_ply(label_path, 3)
-    xyz, faces = ply_places(mesh_path, mesh), ply_faces(mesh_path, mesh)
-    nyu40 = ply_column(label_path, labelled, "vertex", "label").astype(np.int32)
-    same = ply_places(label_path, labelled)
-    if len(nyu40) != len(xyz) or not np.allclose(same, xyz, atol=SAME_PLACE_M):
+    mesh, labelled = PlyMesh(mesh_path, 3), PlyMesh(label_path, 3)
+    xyz, faces = mesh.xyz, mesh.faces
+    nyu40 = labelled.column("vertex", "label").astype(np.int32)
+    if len(nyu40) != len(xyz) or not np.allclose(labelled.xyz, xyz, atol=SAME_PLACE_M):
         raise SceneError(
             f"{label_path.name} does not match {mesh_path.name} of {scan}",
             expected=f"the same {len(xyz)} vertices in the same order",

@@ -10,7 +10,7 @@ from jaxtyping import Int32
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.classes import NYU40, REPLICA_NAMES, SCANNET200, WAYMO_22
-from hilsplat.datasets.points.labelled_points import LabelledPoints, ply_column, ply_places, read_ply
+from hilsplat.datasets.points.labelled_points import LabelledPoints, PlyMesh
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 
 OTHERPROP = 40
@@ -98,11 +98,10 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
         raise SceneError(
             f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="omit them"
         )
-    path = world / "truth" / "mesh.ply"
-    mesh = read_ply(path, 3)
-    seen = ply_column(path, mesh, "vertex", "views") > 0
-    whole = ply_column(path, mesh, "vertex", "whole").astype(np.int32)[seen]
-    xyz = ply_places(path, mesh)[seen].astype(np.float64)
+    mesh = PlyMesh(world / "truth" / "mesh.ply", 3)
+    seen = mesh.column("vertex", "views") > 0
+    whole = mesh.column("vertex", "whole").astype(np.int32)[seen]
+    xyz = mesh.xyz[seen].astype(np.float64)
     ids = [scannet_ids(text) for text in texts]
     fine = _of_nodes([fine for fine, _ in ids], whole)
     nyu40 = LabelledPoints(xyz, _of_nodes([broad for _, broad in ids], whole), whole + 1, "nyu40")

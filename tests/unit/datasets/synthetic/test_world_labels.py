@@ -7,7 +7,6 @@ from scipy.spatial import cKDTree
 from hilsplat.base.artifacts import read_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.datasets.points import replica, scannet
-from hilsplat.datasets.points.labelled_points import read_ply
 from hilsplat.datasets.registry import open_labels
 from hilsplat.datasets.sources import export_images
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
@@ -63,7 +62,7 @@ def classes_of(mesh, seen=slice(None)):
 
 def test_room_as_scannet_reads_back_equal(room, tmp_path):
     write_room_as_scannet(room, tmp_path, "scene0000_00")
-    scene, mesh = scannet.open_scan(tmp_path, "scene0000_00"), LabelledMesh.open(room)
+    scene, mesh = scannet.open_scan(tmp_path, "scene0000_00"), LabelledMesh(room)
     np.testing.assert_array_equal(scene.truth["nyu40"].xyz, mesh.xyz)
     np.testing.assert_array_equal(scene.truth["nyu40"].faces, mesh.faces)
     np.testing.assert_array_equal(scene.truth["nyu40"].instance_id, mesh.whole + 1)
@@ -89,7 +88,7 @@ def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(room, tmp_pat
 
 def test_room_as_replica_reads_back_equal(room, tmp_path):
     write_room_as_replica(room, tmp_path, "room_0")
-    scene, mesh = replica.open_scene(tmp_path, "room_0"), LabelledMesh.open(room)
+    scene, mesh = replica.open_scene(tmp_path, "room_0"), LabelledMesh(room)
     truth, expected = scene.truth["replica"], classes_of(mesh)["replica"]
     np.testing.assert_array_equal(truth.xyz, mesh.xyz)
     np.testing.assert_array_equal(truth.class_id, expected)
@@ -120,9 +119,8 @@ def test_street_as_waymo_reads_back_equal(street, tmp_path):
 
 
 def test_a_room_is_labelled_where_a_camera_sees_it(room):
-    mesh, found = LabelledMesh.open(room), labelled_points(room, "room")
-    views = read_ply(room / "truth/mesh.ply", 3)["vertex"]["views"]
-    seen = np.asarray(views) > 0
+    mesh, found = LabelledMesh(room), labelled_points(room, "room")
+    seen = mesh.column("vertex", "views") > 0
     assert 0 < seen.sum() < len(seen)
     np.testing.assert_array_equal(found["nyu40"].xyz, mesh.xyz[seen])
     for labelling, expected in classes_of(mesh, seen).items():

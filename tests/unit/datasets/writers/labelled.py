@@ -17,7 +17,7 @@ from hilsplat.base.artifacts import write_json, write_text
 from hilsplat.base.images import read_image, write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.images.isat import trace_polygons
-from hilsplat.datasets.points.labelled_points import ply_column, ply_places, read_ply
+from hilsplat.datasets.points.labelled_points import PlyMesh
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.exporting import pinhole_model
@@ -67,8 +67,8 @@ class TrueWorld:
 
 
 def _mesh_points(path: Path) -> Float64[np.ndarray, "P 3"]:
-    mesh = read_ply(path, 3)
-    xyz = ply_places(path, mesh)[ply_column(path, mesh, "vertex", "views") > 0].astype(np.float64)
+    mesh = PlyMesh(path, 3)
+    xyz = mesh.xyz[mesh.column("vertex", "views") > 0].astype(np.float64)
     return xyz[:: max(1, -(-len(xyz) // MAX_POINTS))]
 
 

@@ -4,7 +4,6 @@ import io
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from PIL import Image
 from hilsplat.base.artifacts import read_npz, write_json, write_text
 from hilsplat.base.images import read_image
 from hilsplat.datasets.classes import REPLICA_NAMES
-from hilsplat.datasets.points.labelled_points import ply_column, ply_faces, ply_places, read_ply
+from hilsplat.datasets.points.labelled_points import PlyMesh
 from hilsplat.datasets.points.scannet import LABEL_TABLE
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
 from hilsplat.datasets.synthetic.world_labels import replica_id, scannet_ids, waymo_labels
@@ -282,29 +281,15 @@ AZIMUTH_STEPS, BEAMS = 400, 64
 FRAME_MICROS = 100_000
 
 
-@dataclass(frozen=True, eq=False)
-class LabelledMesh:
+class LabelledMesh(PlyMesh):
     """The labelled surface of a synthetic scene; `whole` is a row of `texts`, -1 for none."""
 
-    xyz: Float32[np.ndarray, "P 3"]
-    whole: Int32[np.ndarray, " P"]
-    faces: Int32[np.ndarray, "F 3"]
-    whole_of_face: Int32[np.ndarray, " F"]
-    texts: tuple[str, ...]
-
-    @staticmethod
-    def open(world: Path) -> "LabelledMesh":
-        """Read `truth/mesh.ply` and the texts of `truth/annotations.json`."""
-        path = world / "truth" / "mesh.ply"
-        mesh = read_ply(path, 3)
-        nodes = HierarchyAnnotations.load(path.parent).nodes
-        return LabelledMesh(
-            ply_places(path, mesh),
-            ply_column(path, mesh, "vertex", "whole").astype(np.int32),
-            ply_faces(path, mesh),
-            ply_column(path, mesh, "face", "whole").astype(np.int32),
-            tuple(node.text for node in nodes),
-        )
+    def __init__(self, world: Path) -> None:
+        super().__init__(world / "truth" / "mesh.ply", 3)
+        self.whole = self.column("vertex", "whole").astype(np.int32)
+        self.whole_of_face = self.column("face", "whole").astype(np.int32)
+        nodes = HierarchyAnnotations.load(world / "truth").nodes
+        self.texts = tuple(node.text for node in nodes)
 
 
 def posed_images(world: Path) -> list[PosedImage]:
@@ -318,7 +303,7 @@ def posed_images(world: Path) -> list[PosedImage]:
 
 def write_room_as_scannet(world: Path, root: Path, scan: str) -> None:
     """Write a room as `scans/<scan>`; nodes count as objects in their order."""
-    mesh = LabelledMesh.open(world)
+    mesh = LabelledMesh(world)
     categories = {text: scannet_ids(text) for text in mesh.texts}
     write_label_table(root, categories)
     write_scan(root, scan, posed_images(world), mesh.xyz, mesh.faces, mesh.whole, mesh.texts, categories)
@@ -326,7 +311,7 @@ def write_room_as_scannet(world: Path, root: Path, scan: str) -> None:
 
 def write_room_as_replica(world: Path, root: Path, scene: str) -> None:
     """Write a room as a scene of Replica with the sequence in the layout of NICE-SLAM."""
-    mesh = LabelledMesh.open(world)
+    mesh = LabelledMesh(world)
     classes = [replica_id(text) for text in mesh.texts]
     write_semantic_mesh(root / scene / "habitat", mesh.xyz, mesh.faces, mesh.whole_of_face, classes)
     write_sequence(root / scene.replace("_", ""), posed_images(world))
