@@ -43,13 +43,13 @@ from hilsplat.settings import SemanticTreeSettings
 APART_DEG = 30.0
 """Directions at least this far apart do not lower each other's score."""
 
-LEAST_NEW = 0.1
+MIN_NEW = 0.1
 """Share of a crop's score that remains if a higher-ranked crop has the same direction."""
 
 RANKED = 32
 """Number of crops ranked per node."""
 
-LEAST_IOU = 1e-3
+MIN_IOU = 1e-3
 """Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
 
 NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
@@ -86,7 +86,7 @@ def crop_ranks(
             rank[rows[best]] = place
             cosine = np.clip(directions[rows] @ directions[rows[best]], -1, 1)
             apart = np.rad2deg(np.arccos(cosine)) / APART_DEG
-            new = np.minimum(new, np.clip(apart, LEAST_NEW, 1))
+            new = np.minimum(new, np.clip(apart, MIN_NEW, 1))
             left[best] = -1
     return rank
 
@@ -153,7 +153,7 @@ def build_tree(
     centroid, box, oriented = node_boxes(node_of_gaussian, levels, means, total_mass)
     fits, iou = mask_fits(node_of_gaussian, S, mass, view, contributions.level, cluster_of_mask)
     # Nesting may remove the Gaussians that a node's masks show; the node still needs a crop.
-    fit = np.where(cluster_of_mask == NONE, 0.0, np.maximum(iou, LEAST_IOU))
+    fit = np.where(cluster_of_mask == NONE, 0.0, np.maximum(iou, MIN_IOU))
     score = (np.sqrt(contributions.area_px) * fit).astype(np.float32)
     if join_wholes:  # a piece's mask has a low IoU with the joined whole, but still shows it
         pieces = contributions.rows_of(Level.WHOLE)

@@ -39,7 +39,7 @@ MAX_OPACITY = 1 - 1e-6
 """Maximum opacity; opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
 """Rate at which noise decreases with opacity (paper: k = 100): at opacity 0.1 its factor is e^-9.5."""
-LEAST_GATE = 1e-6
+MIN_GATE = 1e-6
 """Noise whose factor is smaller than this is skipped."""
 
 
@@ -154,7 +154,7 @@ def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below
     for row in range(begin, end):
         opacity = 1.0 / (1.0 + np.exp(-np.float64(logits[row])))
         gate = 1.0 / (1.0 + np.exp(NOISE_SHARPNESS * (opacity - dead_below)))
-        if gate < LEAST_GATE:
+        if gate < MIN_GATE:
             continue
         w, x = np.float64(quats[row, 0]), np.float64(quats[row, 1])
         y, z = np.float64(quats[row, 2]), np.float64(quats[row, 3])

@@ -10,7 +10,7 @@ from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise import api
 from hilsplat.splat.rasterise.device import Device
 
-LEAST_AGREEMENT = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
+MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
 """Maximum differences attributed to rounding. That of gradients is relative and covers all Gaussians."""
 
 
@@ -54,7 +54,7 @@ def disagreement(one: Device, other: Device) -> str | None:
         errors.append(np.linalg.norm(first - second) / np.maximum(np.linalg.norm(first), 1e-12))
     apart["gradients"] = float(np.max(errors))  # NaN if any is
     wrong = [
-        f"{what} by {apart[what]:.2g}" for what, most in LEAST_AGREEMENT.items() if not apart[what] <= most
+        f"{what} by {apart[what]:.2g}" for what, most in MAX_DIFFERENCES.items() if not apart[what] <= most
     ]
     return f"{other} differs from {one}: {', '.join(wrong)}" if wrong else None
 
