@@ -194,7 +194,8 @@ def phone_fits(page) -> bool:
     page.set_viewport_size({"width": 390, "height": 780})
     view, panel = page.locator("#view").bounding_box(), page.locator("#panel").bounding_box()
     is_below = panel["y"] >= view["y"] + view["height"] and view["height"] > 150
-    return is_below and view["width"] == 390 >= page.evaluate("document.documentElement.scrollWidth")
+    is_wide = view["width"] == panel["width"] == 390
+    return is_below and is_wide and page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 def answers(page):
