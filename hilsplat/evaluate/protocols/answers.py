@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import Level
@@ -40,25 +40,21 @@ def relevancy_of(
 
 
 class PackedMasks:
-    """Predicted masks of one view at one bit per pixel, for measures across levels and views."""
+    """Predicted masks of one view at one bit per pixel."""
 
     def __init__(self, size_hw: tuple[int, int]) -> None:
         self.size_hw = size_hw
-        self.bits: dict[tuple, np.ndarray] = {}
+        self._bits: dict[object, np.ndarray] = {}
 
-    def put(self, key: tuple, mask: np.ndarray) -> None:
-        self.bits[key] = np.packbits(mask)
+    def put(self, key: object, mask: np.ndarray) -> None:
+        self._bits[key] = np.packbits(mask)
 
-    def __contains__(self, key: tuple) -> bool:
-        return key in self.bits
+    def __contains__(self, key: object) -> bool:
+        return key in self._bits
 
-    def get(self, key: tuple) -> np.ndarray:
-        return unpacked(self.bits[key], self.size_hw)
-
-
-def unpacked(bits: UInt8[np.ndarray, " B"], size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Return the mask that `numpy.packbits` packed."""
-    return np.unpackbits(bits, count=size_hw[0] * size_hw[1]).astype(bool).reshape(size_hw)
+    def get(self, key: object) -> Bool[np.ndarray, "H W"]:
+        height, width = self.size_hw
+        return np.unpackbits(self._bits[key], count=height * width).astype(bool).reshape(height, width)
 
 
 class Selections:
@@ -67,7 +63,7 @@ class Selections:
     def __init__(self, scene: "LanguageScene") -> None:
         self.scene = scene
         self._of: dict[tuple, np.ndarray] = {}
-        self._masks: dict[tuple[str, bytes], np.ndarray] = {}
+        self._masks: dict[str, PackedMasks] = {}
 
     def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:
         """Return the ids of the nodes that answer the last text of a path, ordered from coarse to fine.
@@ -83,10 +79,10 @@ class Selections:
         """Return the union of the given nodes in a view; each is rendered once, for all protocols."""
         if len(ids) == 0:
             return np.zeros(size_hw, dtype=bool)
-        key = (view, ids.tobytes())
-        if key not in self._masks:
-            self._masks[key] = np.packbits(np.asarray(self.scene.node_masks(view, ids)).astype(bool))
-        return unpacked(self._masks[key], size_hw)
+        masks, key = self._masks.setdefault(view, PackedMasks(size_hw)), ids.tobytes()
+        if key not in masks:
+            masks.put(key, np.asarray(self.scene.node_masks(view, ids)).astype(bool))
+        return masks.get(key)
 
 
 def mask_rows(

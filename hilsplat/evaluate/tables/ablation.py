@@ -36,19 +36,17 @@ COLUMNS_NOTE = (
 
 def ablation_table(sources: Sources) -> Table:
     """Build the paper's ablation: parts of its method enabled one after the other, in the paper's reading."""
-    footnotes = (
-        COLUMNS_NOTE,
+    note = (
         "Initial-2D: levels of the 2D masks by the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
-        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md says how each was read.",
+        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md says how each was read."
     )
-    blocks = [sources.reported(PAPER_DATA, "ablation", families=False), *component_blocks(sources)]
-    return sources.finished("ablation", "Ablation", blocks, footnotes)
+    return _table(sources, "ablation", "Ablation", "ablation", note)
 
 
 def component_table(sources: Sources) -> Table:
     """Build our own ablation: the contribution of each part of the default field and of its code."""
-    footnotes = (COLUMNS_NOTE, "Rows name the losses that are switched on; d is the size of a latent.")
-    return sources.finished("components", "Parts of the default field", component_blocks(sources), footnotes)
+    note = "Rows name the losses that are switched on; d is the size of a latent."
+    return _table(sources, "components", "Parts of the default field", "parts", note)
 
 
 def theta_table(sources: Sources) -> Table:
@@ -58,7 +56,8 @@ def theta_table(sources: Sources) -> Table:
         "from this tree (masks.levels: tree), so theta moves masks between levels. With levels by SAM's head "
         "it affects a field only through L_ins and L_part, and the linked semantic tree not at all."
     )
-    return _sweep(sources, "theta", "coverage threshold theta", "coverage threshold", note)
+    title = "Influence of the coverage threshold theta"
+    return _table(sources, "theta", title, "coverage threshold", note, ("field",))
 
 
 def omega_table(sources: Sources) -> Table:
@@ -67,20 +66,23 @@ def omega_table(sources: Sources) -> Table:
         "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and "
         "lambda_2 = exp(-5): with 1e-6 and 1e-5 all rows are equal."
     )
-    return _sweep(sources, "omega", "similarity degree Omega", "similarity degrees", note)
+    title = "Influence of the similarity degree Omega"
+    return _table(sources, "omega", title, "similarity degrees", note, ("field",))
 
 
-def _sweep(sources: Sources, name: str, setting: str, reported: str, note: str) -> Table:
-    blocks = [
-        sources.reported(PAPER_DATA, reported, families=False),
-        *component_blocks(sources, ("field",)),
-    ]
-    return sources.finished(name, f"Influence of the {setting}", blocks, (COLUMNS_NOTE, note))
+def _table(
+    sources: Sources,
+    name: str,
+    title: str,
+    reported: str,
+    note: str,
+    methods: tuple[str, ...] = ("field", "tree", "tree-path"),
+) -> Table:
+    blocks = [sources.reported(PAPER_DATA, reported, families=False), *component_blocks(sources, methods)]
+    return sources.finished(name, title, blocks, (COLUMNS_NOTE, note))
 
 
-def component_blocks(
-    sources: Sources, methods: tuple[str, ...] = ("field", "tree", "tree-path")
-) -> list[Block]:
+def component_blocks(sources: Sources, methods: tuple[str, ...]) -> list[Block]:
     """Return one row per variant and method, with all protocols of the ablation side by side."""
     scores = measured.with_seeds(sources.scores)
     blocks = measured.measured_blocks(
