@@ -52,7 +52,7 @@ def test_the_panel_is_written_with_the_pictures_of_poses_and_fit_beside_it(opene
     given = {"fit": tmp_path / "fit", "truth": opened.truth}
     panel.run_figures(opened.parts, out, settings, EvaluateSettings(), **given)
     with Image.open(out) as picture:
-        assert picture.width == 1430
+        assert (picture.width, picture.info["Software"]) == (1430, "hilsplat")
     assert (tmp_path / "registration.png").read_bytes() == b"cameras"
     assert (tmp_path / "fit.png").read_bytes() == b"renders"
 
