@@ -1,7 +1,6 @@
 """A flat world of coloured blocks whose tree, field and annotations are exact."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,16 +32,6 @@ def region(row):
     return box(*NODES[row][3:], (SIDE_PX, SIDE_PX))
 
 
-@dataclass(frozen=True)
-class BlockWorld:
-    """Folders of a finished scene, and the scene that answers."""
-
-    folder: Path
-    scene: Scene
-    annotations: HierarchyAnnotations
-    answers: object
-
-
 def encode_texts(texts):
     """A text is its own axis; canonical phrases share one that no node has."""
     vectors = np.zeros((len(texts), 8), np.float32)
@@ -52,7 +41,8 @@ def encode_texts(texts):
 
 
 @pytest.fixture(scope="session")
-def block_world(tmp_path_factory) -> BlockWorld:
+def block_world(tmp_path_factory):
+    """Folder of a finished scene, its annotations, and the opened scene."""
     from hilsplat.base.artifacts import write_index
     from hilsplat.field.code import Autoencoder, LanguageField
     from hilsplat.query.language_scene import LanguageScene
@@ -77,23 +67,14 @@ def block_world(tmp_path_factory) -> BlockWorld:
     cameras = cameras_of([pose, pose], K, (SIDE_PX, SIDE_PX))
     for view in cameras.names:
         write_png(folder / "scene" / "images" / view, image)
+    split, points = {"000.png": "train", "001.png": "test"}, np.zeros((0, 3), np.float32)
+    points_and_colours = points, points.astype(np.uint8)
     scene = Scene(
-        folder / "scene",
-        "synthetic/blocks",
-        "metre",
-        cameras,
-        {"000.png": "train", "001.png": "test"},
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        np.eye(4),
+        folder / "scene", "synthetic/blocks", "metre", cameras, split, *points_and_colours, np.eye(4)
     )
     scene.save()
-    write_hierarchy(
-        folder / "truth",
-        [AnnotatedNode(row, level, parent, text) for row, (text, level, parent, *_) in enumerate(NODES)],
-        {"001.png": labels},
-        {"001.png": range(len(NODES))},
-    )
+    nodes = [AnnotatedNode(row, level, parent, text) for row, (text, level, parent, *_) in enumerate(NODES)]
+    write_hierarchy(folder / "truth", nodes, {"001.png": labels}, {"001.png": range(len(NODES))})
     regions, ones = np.stack(list(map(region, range(len(NODES))))), np.ones(len(NODES), np.float32)
     levels = [node[1] for node in NODES]
     masks_of(regions, levels).save(folder / "masks" / "000.png.npz")
@@ -103,10 +84,7 @@ def block_world(tmp_path_factory) -> BlockWorld:
     blocks = SIDE_PX // BLOCK_PX
     ys, xs = np.divmod(np.arange(SIDE_PX**2), SIDE_PX)
     block_of_pixel = (ys // BLOCK_PX) * blocks + xs // BLOCK_PX
-    weights = sp.csr_matrix(
-        (np.ones(SIDE_PX**2, np.float32), (np.arange(SIDE_PX**2), block_of_pixel)),
-        shape=(SIDE_PX**2, blocks**2),
-    )
+    weights = sp.csr_matrix(np.eye(blocks**2, dtype=np.float32)[block_of_pixel])
     middle = BLOCK_PX * np.stack(np.divmod(np.arange(blocks**2), blocks)).T + BLOCK_PX // 2
     node_of_gaussian = np.stack([labels[level][middle[:, 0], middle[:, 1]] for level in LEVELS], axis=1)
     clip = encode_texts(TEXTS)
@@ -127,16 +105,10 @@ def block_world(tmp_path_factory) -> BlockWorld:
         crop_rank=np.zeros(len(NODES), np.int32),
         view_area_px=regions.sum(axis=(1, 2), dtype=np.float32)[:, None],
     )
-    answers = LanguageScene(
-        scene,
-        gaussians,
-        tree,
-        lambda view: weights,
-        LanguageField(features, "0", "0"),
-        Uncoded(8, 8, {}),
-        encode_texts,
-    )
-    return BlockWorld(folder, scene, HierarchyAnnotations.load(folder / "truth"), answers)
+    field = LanguageField(features, "0", "0"), Uncoded(8, 8, {})
+    answers = LanguageScene(scene, gaussians, tree, lambda view: weights, *field, encode_texts)
+    annotations = HierarchyAnnotations.load(folder / "truth")
+    return SimpleNamespace(folder=folder, scene=scene, annotations=annotations, answers=answers)
 
 
 @pytest.fixture
