@@ -186,51 +186,42 @@ def three_wholes(scene) -> SemanticTree:
     return replace(scene.tree, level=level, parent=parent)
 
 
-@pytest.mark.parametrize(("b_corner", "found"), [(2.4, "A top left"), (2.6, "B corner")])
-def test_the_shortfall_of_an_ancestor_counts_half(scene, three_wholes, b_corner, found):
-    # A is best, B 1 below it, which counts half: 2.0 against b_corner - 0.5
-    margin = of_path({"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": b_corner})
-    hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
-    assert hits.ids.tolist() == [NODE[found]]
+def orphaned(tree: SemanticTree, name: str) -> SemanticTree:
+    parent = tree.parent.copy()
+    parent[NODE[name]] = -1
+    return replace(tree, parent=parent)
 
 
-@pytest.mark.parametrize(("b", "found"), [(2.7, "A top left"), (2.8, "B corner")])
-def test_parts_of_an_unlikely_first_thing_do_not_compete(scene, three_wholes, b, found):
-    # a quarter of the range of 5 is 1.25
-    margin = of_path({"A": 4.0, "B": b}, {"A top left": 0.0, "B corner": 9.0})
-    hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
-    assert hits.ids.tolist() == [NODE[found]]
+@pytest.mark.parametrize(
+    ("first", "last", "orphan", "found", "route"),
+    [
+        # A is best, B 1 below it, which counts half: 2.0 against 2.4 - 0.5 and 2.6 - 0.5
+        ({"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": 2.4}, None, "A top left", "descendant"),
+        ({"A": 4.0, "B": 3.0}, {"A top left": 2.0, "B corner": 2.6}, None, "B corner", "child"),
+        # parts of a B further below A than 1.25, a quarter of the range of 5, do not compete
+        ({"A": 4.0, "B": 2.7}, {"A top left": 0.0, "B corner": 9.0}, None, "A top left", "descendant"),
+        ({"A": 4.0, "B": 2.8}, {"A top left": 0.0, "B corner": 9.0}, None, "B corner", "child"),
+        # B top, the best whole, holds nothing, and all else is further below it: all nodes compete
+        ({"A": 1, "B": 0, "B top": 4}, {"A top left": 1.0, "B corner": 1.2}, None, "A top left", "fallback"),
+        # a missing ancestor counts half a tenth of the range, 0.25
+        ({"A": 4.0}, {"A top left": 2.0, "B corner": 2.2}, "B corner", "A top left", "descendant"),
+        ({"A": 4.0}, {"A top left": 2.0, "B corner": 2.3}, "B corner", "B corner", "fallback"),
+    ],
+)
+def test_answers_of_a_path_depend_on_their_ancestors(three_wholes, first, last, orphan, found, route):
+    tree = orphaned(three_wholes, orphan) if orphan else three_wholes
+    hits = search_path(tree, of_path(first, last), ("x", "y"), 0.99, Level.SUBPART)
+    assert (hits.ids.tolist(), hits.route) == ([NODE[found]], route)
 
 
-def test_if_no_likely_thing_has_parts_all_nodes_compete_as_a_fallback(scene, three_wholes):
-    # B top, the best whole, holds nothing, and all else is further below it than a quarter of the range
-    margin = of_path({"A": 1.0, "B": 0.0, "B top": 4.0}, {"A top left": 1.0, "B corner": 1.2})
-    hits = search_path(three_wholes, margin, ("x", "y"), 0.99, Level.SUBPART)
-    assert (hits.ids.tolist(), hits.route) == ([NODE["A top left"]], "fallback")
-
-
-def test_hidden_ancestors_do_not_compete_with_shown_ones(scene, three_wholes):
-    parent = three_wholes.parent.copy()
-    parent[NODE["B corner"]] = -1
-    tree = replace(three_wholes, parent=parent)
+def test_hidden_ancestors_do_not_compete_with_shown_ones(three_wholes):
+    tree = orphaned(three_wholes, "B corner")
     # B top would leave A unlikely, and B corner, which nothing holds, the answer
     margin = of_path({"A": 1.0, "B top": 4.0}, {}, {"A top left": 2.0, "B corner": 0.0})
     for hidden, found in (("B", "B corner"), ("B top", "A top left")):
         shown = np.arange(7) != NODE[hidden]
         hits = search_path(tree, margin, ("x", "y", "z"), 0.99, shown=shown)
         assert hits.ids.tolist() == [NODE[found]]
-
-
-def test_a_missing_ancestor_counts_a_tenth_of_the_range(scene, three_wholes):
-    parent = three_wholes.parent.copy()
-    parent[NODE["B corner"]] = -1
-    tree = replace(three_wholes, parent=parent)
-    # of the range of 5 half a tenth, 0.25
-    for b_corner, found in ((2.2, "A top left"), (2.3, "B corner")):
-        margin = of_path({"A": 4.0}, {"A top left": 2.0, "B corner": b_corner})
-        hits = search_path(tree, margin, ("x", "y"), 0.99, Level.SUBPART)
-        assert hits.ids.tolist() == [NODE[found]]
-    assert hits.route == "fallback"
 
 
 FINISHED = ("default/semantic_tree", "default/autoencoder", "default/clip", "default/masks", "scene")
