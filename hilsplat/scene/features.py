@@ -42,6 +42,9 @@ EXIF_ORIENTATION = ExifTags.Base.Orientation
 DIAGONAL_35MM = 43.2666
 """Diagonal of a 35 mm frame in mm, the reference of the equivalent focal length in EXIF."""
 
+Lens = tuple[list[str], str, list[float] | None]
+"""Views that share a camera, its COLMAP model, and its initial parameters; None to have COLMAP guess them."""
+
 
 @dataclass(frozen=True)
 class WorkImage:
@@ -115,13 +118,11 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
     return images
 
 
-def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[WorkImage]]:
+def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:
     """Group views with shared intrinsics: by size and EXIF focal length ("auto"), all ("yes") or none."""
-    if single_camera == "no":
-        return [[image] for image in images]
     groups: dict[object, list[WorkImage]] = {}
     for image in images:
-        key = image.size_hw if single_camera == "yes" else (image.size_hw, image.focal_px)
+        key = {"yes": image.size_hw, "no": image.view}.get(single_camera, (image.size_hw, image.focal_px))
         groups.setdefault(key, []).append(image)
     if single_camera == "yes" and len(groups) > 1:
         sizes = sorted({f"{width} x {height}" for (height, width) in (image.size_hw for image in images)})
@@ -131,64 +132,43 @@ def camera_groups(images: Sequence[WorkImage], single_camera: str) -> list[list[
             found=", ".join(sizes),
             fix="set poses.single_camera to auto, or remove the images of other sizes",
         )
-    return list(groups.values())
-
-
-def import_images(
-    database: Path, folder: Path, views: Sequence[str], camera_model: str, camera: pycolmap.Camera | None
-) -> None:
-    """Add images that share a camera to a database; without a camera, COLMAP guesses its parameters."""
-    options = pycolmap.ImageReaderOptions()
-    options.camera_model = camera_model
-    if camera is not None:
-        options.camera_params = ", ".join(repr(float(value)) for value in camera.params)
-    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, list(views), options)
+    lenses: list[Lens] = []
+    for group in groups.values():
+        (height, width), focal = group[0].size_hw, group[0].focal_px
+        name, params = camera_model.upper(), None
+        if focal is not None:
+            params = pycolmap.Camera.create_from_model_name(1, name, focal, width, height).params.tolist()
+        lenses.append(([image.view for image in group], name, params))
+    return lenses
 
 
 def find_matches(
-    database: Path,
-    folder: Path,
-    images: Sequence[WorkImage],
-    camera_model: str,
-    settings: PosesSettings,
-    seed: int,
-    threads: int,
+    database: Path, folder: Path, lenses: Sequence[Lens], settings: PosesSettings, seed: int, threads: int
 ) -> str:
     """Add images to a new database, extract features and match them; return the matcher that was used.
 
-    Call this in a separate process: if the database cannot be written, COLMAP throws in a C++ thread.
+    Features are extracted on the CPU; the result does not depend on `threads`. Call this in a separate
+    process: if the database cannot be written, COLMAP throws in a C++ thread.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     pycolmap.Database.open(database).close()  # creates the file
     # Feature extraction would add images as its threads finish, so ids and results would depend on timing.
-    for group in camera_groups(images, settings.single_camera):
-        (height, width), focal = group[0].size_hw, group[0].focal_px
-        name, camera = camera_model.upper(), None
-        if focal is not None:
-            camera = pycolmap.Camera.create_from_model_name(1, name, focal, width, height)
-        import_images(database, folder, [image.view for image in group], name, camera)
-    return features_and_matches(database, folder, [image.view for image in images], settings, seed, threads)
-
-
-def features_and_matches(
-    database: Path, folder: Path, views: Sequence[str], settings: PosesSettings, seed: int, threads: int
-) -> str:
-    """Extract features of registered images and match them; return the matcher that was used.
-
-    Features are extracted on the CPU; the result does not depend on `threads`. Call this in a separate
-    process, as `find_matches`.
-    """
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    names: list[str] = []
+    for views, camera_model, params in lenses:
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = camera_model
+        if params is not None:
+            reader.camera_params = ", ".join(map(repr, params))
+        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, views, reader)
+        names += views
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.use_gpu = False
     options.max_image_size = settings.max_side_px
     options.sift.max_num_features = settings.max_features
     options.sift.peak_threshold = PEAK_THRESHOLD
-    pycolmap.extract_features(
-        database, folder, list(views), extraction_options=options, device=pycolmap.Device.cpu
-    )
-    num_views, matcher = len(views), settings.matcher
+    pycolmap.extract_features(database, folder, names, extraction_options=options, device=pycolmap.Device.cpu)
+    num_views, matcher = len(names), settings.matcher
     if matcher == "auto":
         matcher = "exhaustive" if num_views <= EXHAUSTIVE_UP_TO else "sequential"
     verification = pycolmap.TwoViewGeometryOptions()

@@ -22,6 +22,7 @@ from hilsplat.scene.features import (
     count_matches,
     find_matches,
     incremental_options,
+    lenses_of,
     prepare_images,
     verified_matches,
 )
@@ -128,11 +129,9 @@ def _reconstruct(
     if camera_model == "auto":
         camera_model = "simple_pinhole" if is_render else "simple_radial"
     work_images = prepare_images(sources, work / "images", settings.max_side_px)
-    database = work / "features.db"
+    database, lenses = work / "features.db", lenses_of(work_images, camera_model, settings.single_camera)
     logger.info("%s: extracting and matching the features of %d images", name, len(work_images))
-    matcher = in_own_process(
-        find_matches, database, work / "images", work_images, camera_model, settings, seed, threads
-    )
+    matcher = in_own_process(find_matches, database, work / "images", lenses, settings, seed, threads)
     matches = count_matches(database)
     logger.info("%s: %s mapping", name, settings.mapper)
     models = map_views(database, work / "images", work / "models", settings.mapper, seed)

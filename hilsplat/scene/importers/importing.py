@@ -16,7 +16,7 @@ from hilsplat.base.processes import in_own_process
 from hilsplat.base.progress import track
 from hilsplat.scene.assemble import PosedView, split_views, undistort, write_scene
 from hilsplat.scene.colmap import pycolmap, sparse_points
-from hilsplat.scene.features import EXIF_ORIENTATION, features_and_matches, import_images, incremental_options
+from hilsplat.scene.features import EXIF_ORIENTATION, find_matches, incremental_options
 from hilsplat.scene.importers.known_views import KnownView, read_source
 from hilsplat.scene.layouts import KnownPoses
 from hilsplat.scene.view_names import view_names
@@ -189,11 +189,8 @@ def triangulate(
     if len(views) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.uint8)
     folder, database = views[0].image.parent, work / "triangulation.db"
-    pycolmap.Database.open(database).close()
-    for view in views:
-        import_images(database, folder, [view.view], view.camera.model_name, view.camera)
-    names = [view.view for view in views]
-    in_own_process(features_and_matches, database, folder, names, settings, seed, threads)
+    lenses = [([view.view], view.camera.model_name, view.camera.params.tolist()) for view in views]
+    in_own_process(find_matches, database, folder, lenses, settings, seed, threads)
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
         for view in views:

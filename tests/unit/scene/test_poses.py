@@ -12,7 +12,7 @@ from PIL.TiffImagePlugin import IFDRational
 from hilsplat.base.errors import ImageError, RegistrationError, SceneError
 from hilsplat.base.images import read_image, resize_to_fit
 from hilsplat.scene.colmap import pycolmap
-from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, camera_groups, exif_focal_px, prepare_images
+from hilsplat.scene.features import EXIF_ORIENTATION, WorkImage, exif_focal_px, lenses_of, prepare_images
 from hilsplat.scene.poses import MAX_ROWS, check_registration, name_neighbours, plot_lost, run_poses
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import view_name, view_names
@@ -163,11 +163,12 @@ def test_photographs_share_a_camera_when_size_and_focal_length_agree(tmp_path):
         WorkImage(f"{row}.png", tmp_path / f"{row}.jpg", size, focal)
         for row, (size, focal) in enumerate([((3, 4), None), ((4, 3), None), ((3, 4), None), ((3, 4), 5.0)])
     ]
-    names = [[image.view for image in group] for group in camera_groups(images, "auto")]
-    assert names == [["0.png", "2.png"], ["1.png"], ["3.png"]]
-    assert len(camera_groups(images, "no")) == 4
+    model = "SIMPLE_PINHOLE"
+    guessed = [(["0.png", "2.png"], model, None), (["1.png"], model, None)]
+    assert lenses_of(images, model, "auto") == [*guessed, (["3.png"], model, [5.0, 2.0, 1.5])]
+    assert [views for views, _, _ in lenses_of(images, model, "no")] == [[f"{row}.png"] for row in range(4)]
     with pytest.raises(SceneError, match="several sizes"):
-        camera_groups(images, "yes")
+        lenses_of(images, model, "yes")
 
 
 def found(registered, models):
