@@ -165,12 +165,11 @@ def build_contributions(world: TwoBoxes) -> Path:
     return out
 
 
-def reverse_masks(world: TwoBoxes, view: str, *, record: bool = True) -> None:
-    """Reverse the order of a view's masks, with or without recording their digest in the index."""
+def reverse_masks(world: TwoBoxes, view: str) -> None:
+    """Reverse the order of a view's masks, and record their digest in the index."""
     path = world.masks / f"{view}.npz"
     masks = HierarchicalMasks.load(path)
     masks = masks.take(np.arange(len(masks))[::-1])
     masks.save(path)
-    if record:
-        index = read_index(world.masks)
-        write_index(world.masks, {**index.pop("views"), view: index_entry(masks)}, **index)
+    index = read_index(world.masks)
+    write_index(world.masks, {**index.pop("views"), view: index_entry(masks)}, **index)
