@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import ArtifactError
 from hilsplat.configuration import RunSettings
 from hilsplat.datasets.classes import SCANNET200_INSTANCES
@@ -17,7 +18,7 @@ from hilsplat.evaluate.tables.build import TABLES, published_values, run_table
 from hilsplat.evaluate.tables.formats import latex_text
 from hilsplat.evaluate.tables.point_tables import bootstrap_mean
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, read_published
-from hilsplat.segment.origin import label_of_index, made_from_truth
+from hilsplat.segment.origin import made_from_truth, masks_label
 from tests.conftest import PROJECT
 from tests.unit.evaluate.builders import score
 
@@ -354,11 +355,16 @@ def test_a_row_with_true_masks_is_marked_and_not_ranked(tmp_path):
     assert " 90.0 " in stand_in and "**90.0**" not in stand_in
 
 
-def test_masks_are_named_after_the_model_the_segmenter_or_their_label():
-    index = {"segmenter": "sam", "model": "models/sam-tiny"}
-    assert label_of_index(index) == "sam-tiny"
-    assert label_of_index({**index, "model": None}) == "sam"
-    assert label_of_index({**index, "label": TRUE_MASKS}) == TRUE_MASKS
+@pytest.mark.parametrize(
+    ("entries", "expected"),
+    [({}, "sam-tiny"), ({"model": None}, "sam"), ({"label": TRUE_MASKS}, TRUE_MASKS)],
+)
+def test_masks_are_named_after_the_model_the_segmenter_or_their_label(tmp_path, entries, expected):
+    write_index(tmp_path, {}, **{"segmenter": "sam", "model": "models/sam-tiny", **entries})
+    assert masks_label(tmp_path) == expected
+
+
+def test_masks_made_from_the_labels_are_known_by_their_label():
     assert made_from_truth(TRUE_MASKS)
     assert not any(map(made_from_truth, ("sam-tiny", "graph", "truth")))
 
