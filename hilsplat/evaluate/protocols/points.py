@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import Level
 from hilsplat.datasets.classes import SCANNET200_INSTANCES, ClassSet, splits_of
 from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
@@ -50,7 +49,7 @@ def measure_points(
     card: ProtocolCard,
     method: str,
     truth: Int[np.ndarray, " P"],
-    prediction: Int[np.ndarray, " Q"],  # Q = P, checked below
+    prediction: Int[np.ndarray, " P"],
     classes: ClassSet,
     carried: str,
 ) -> Iterator[Measured]:
@@ -60,22 +59,7 @@ def measure_points(
     Classes absent from ground truth and prediction have no row; a scene without ground truth has no rows.
     Labels are 1 .. K in the order of `classes`; 0 is ignored in ground truth and is a miss in the prediction.
     `carried` names the mode that transferred predictions to the points.
-
-    Raises:
-        MisalignedArtifactError: prediction and ground truth have different numbers of points, or the classes
-            are not the protocol's.
     """
-    if card.classes != classes.name:
-        raise MisalignedArtifactError(
-            f"{card.full_name} is not defined on these classes", expected=card.classes, found=classes.name
-        )
-    if len(prediction) != len(truth):
-        raise MisalignedArtifactError(
-            "predictions do not fit the scene's points",
-            expected=f"{len(truth)} points",
-            found=len(prediction),
-            fix="transfer the predictions to the points of the ground truth",
-        )
     counts = ClassCounts.of(truth, prediction, len(classes))
     protocol = card.labelled([f"points: {carried}"])
     for metric, values, points in (
