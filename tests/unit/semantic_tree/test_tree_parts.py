@@ -80,32 +80,21 @@ def test_a_pixel_shows_the_node_that_makes_up_more_than_half_of_it():
     assert shown.labels((2, 2)).tolist() == [[2, -1], [-1, -1]]
 
 
-@pytest.fixture
-def ply(tmp_path):
-    path = tmp_path / "gaussians.ply"
-    save_ply(path, round_gaussians(np.arange(12.0).reshape(4, 3)))
-    return path
-
-
-def tree_of(ply):
+def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(tmp_path):
+    ply, out, means = tmp_path / "gaussians.ply", tmp_path / "tree.ply", np.arange(12.0).reshape(4, 3)
+    save_ply(ply, round_gaussians(means))
     nodes = np.array([[0, -1, 3], [0, 2, -1], [1, -1, -1], [-1, -1, -1]], np.int32)
-    return plain_tree([1, 1, 2, 3], [-1, -1, 0, 0], nodes, gaussians_sha256=sha256_of_file(ply))
-
-
-def test_an_exported_tree_or_selection_is_a_valid_3dgs_ply(ply, tmp_path):
-    out = tmp_path / "tree.ply"
-    write_tree_ply(ply, tree_of(ply), out)
+    tree = plain_tree([1, 1, 2, 3], [-1, -1, 0, 0], nodes, gaussians_sha256=sha256_of_file(ply))
+    write_tree_ply(ply, tree, out)
     vertex = PlyData.read(out)["vertex"]
-    assert vertex["node_whole"].tolist() == [0, 0, 1, -1]
-    assert vertex["node_part"].tolist() == [-1, 2, -1, -1]
-    assert vertex["node_subpart"].tolist() == [3, -1, -1, -1]
-    np.testing.assert_array_equal(load_ply(out).means, load_ply(ply).means)
+    for level in Level:
+        assert np.array_equal(vertex[f"node_{level.label}"], nodes[:, level.index])
+    np.testing.assert_array_equal(load_ply(out).means, means)
     write_selection_ply(ply, np.array([1, 3]), tmp_path / "selection.ply")
     assert load_ply(tmp_path / "selection.ply").means[:, 0].tolist() == [3, 9]
-    other = tree_of(ply)
-    save_ply(ply, round_gaussians(np.arange(12.0).reshape(4, 3) + 1))  # as many Gaussians
+    save_ply(ply, round_gaussians(means + 1))  # as many Gaussians
     with pytest.raises(MisalignedArtifactError, match=r"made for another .*\.ply"):
-        write_tree_ply(ply, other, tmp_path / "tree.ply")
+        write_tree_ply(ply, tree, out)
 
 
 def test_a_node_that_nesting_emptied_is_dropped_and_the_others_keep_their_order():

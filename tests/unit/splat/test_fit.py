@@ -48,39 +48,42 @@ def test_fit_improves_held_out_views(scene, strategy):
     assert np.array_equal(morton_order(last.means), np.arange(len(last)))
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_threads_and_interruptions_do_not_change_the_bytes(scene, tmp_path, monkeypatch, strategy):
-    settings = SETTINGS.model_copy(update={"strategy": strategy, "background": "random"})
+@pytest.fixture
+def stage(scene, tmp_path, monkeypatch):
+    """A function that runs the stage, up to a step, and returns its files; and the steps of its last run."""
+    step, steps = fit.fit_step, []
 
-    def stage(name: str, threads: int) -> dict[str, bytes]:
-        out = tmp_path / name
-        fit.run_gaussians(
-            scene.folder, out / "g.ply", out / "report", tmp_path / "cache", settings, 3, threads
-        )
+    def run(name: str, settings: GaussiansSettings, threads: int = 1, stop: int = 60) -> dict[str, bytes]:
+        def counted(state, *rest):
+            if state.step == stop:
+                raise KeyboardInterrupt
+            steps.append(state.step)
+            step(state, *rest)
+
+        steps.clear()
+        monkeypatch.setattr(fit, "fit_step", counted)
+        out, cache = tmp_path / name, tmp_path / "cache"
+        fit.run_gaussians(scene.folder, out / "g.ply", out / "report", cache, settings, 3, threads)
         return {path.name: path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
-    undisturbed = stage("one", threads=1)
-    assert undisturbed == stage("two", threads=2)
+    return run, steps
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_threads_and_interruptions_do_not_change_the_bytes(stage, tmp_path, strategy):
+    settings = SETTINGS.model_copy(update={"strategy": strategy, "background": "random"})
+    run, steps = stage
+    undisturbed = run("one", settings)
+    assert undisturbed == run("two", settings, threads=2)
     assert set(undisturbed) == {
         *("g.ply", "g.json", "report.json", "curves.png", "test_views.png"),
         *("flyaround.png", "flyaround.mp4", "index.json"),
     }
     assert not list((tmp_path / "cache").rglob("*.npz"))
-
-    step = fit.fit_step
-
-    def stops_at_40(state, *arguments):
-        if state.step == 40:
-            raise KeyboardInterrupt
-        step(state, *arguments)
-
-    monkeypatch.setattr(fit, "fit_step", stops_at_40)
     with pytest.raises(KeyboardInterrupt):
-        stage("stopped", threads=1)
+        run("stopped", settings, stop=40)
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
-    steps = []
-    monkeypatch.setattr(fit, "fit_step", lambda state, *rest: (steps.append(state.step), step(state, *rest)))
-    assert stage("resumed", threads=1) == undisturbed
+    assert run("resumed", settings) == undisturbed
     assert steps[0] == 25
     assert not list((tmp_path / "cache").rglob("*.npz"))
     index = read_index(tmp_path / "resumed" / "report")
@@ -94,30 +97,18 @@ def test_threads_and_interruptions_do_not_change_the_bytes(scene, tmp_path, monk
     assert coordinates["origin"] == {"kind": "fitted", "strategy": strategy, "iterations": 60, "seed": 3}
 
 
-def test_a_fit_does_not_resume_on_another_device(scene, tmp_path, monkeypatch):
-    draw, step, steps = fit.draw, fit.fit_step, []
-
-    def stage(name: str, device: str = "cpu", stop: int = 60) -> bytes:
-        def counted(state, *rest):
-            if state.step == stop:
-                raise KeyboardInterrupt
-            steps.append(state.step)
-            step(state, *rest)
-
-        monkeypatch.setattr(fit, "choose_device", lambda requested: device)
-        monkeypatch.setattr(fit, "fit_step", counted)
-        out = tmp_path / name
-        fit.run_gaussians(scene.folder, out, tmp_path / "report", tmp_path / "cache", SETTINGS, 3, 1)
-        return out.read_bytes()
-
+def test_a_fit_does_not_resume_on_another_device(stage, tmp_path, monkeypatch):
+    (run, steps), draw = stage, fit.draw
     # the second device draws as the CPU does
     monkeypatch.setattr(fit, "draw", lambda *arguments, **more: draw(*arguments, **more | {"device": "cpu"}))
-    on_the_cpu = stage("whole.ply")
+    monkeypatch.setattr(fit, "choose_device", lambda requested: "cpu")
+    on_the_cpu = run("whole", SETTINGS)
+    monkeypatch.setattr(fit, "choose_device", lambda requested: "cuda")
     with pytest.raises(KeyboardInterrupt):
-        stage("stopped.ply", "cuda", stop=40)
+        run("stopped", SETTINGS, stop=40)
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 1
-    steps.clear()
-    assert stage("other.ply") == on_the_cpu
+    monkeypatch.setattr(fit, "choose_device", lambda requested: "cpu")
+    assert run("other", SETTINGS) == on_the_cpu
     assert steps[0] == 0
 
 

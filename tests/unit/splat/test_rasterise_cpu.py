@@ -28,18 +28,14 @@ def everything(threads: int) -> list[np.ndarray]:
     return [seen.image, seen.alpha, *vars(gradients).values(), *sparse]
 
 
-@pytest.mark.parametrize("threads", [2, 3, 7])
-def test_any_number_of_threads_gives_the_same_bytes(threads):
-    for one, several in zip(everything(1), everything(threads), strict=True):
-        np.testing.assert_array_equal(one, several)
-
-
-@pytest.mark.parametrize("max_entries", [1, 50, 1000])
-def test_bands_of_tiles_give_the_same_bytes(monkeypatch, max_entries):
+@pytest.mark.parametrize(
+    ("threads", "max_entries"), [(2, 2**21), (3, 2**21), (7, 2**21), (2, 1), (2, 50), (2, 1000)]
+)
+def test_threads_and_bands_of_tiles_give_the_same_bytes(monkeypatch, threads, max_entries):
     whole = everything(1)
     monkeypatch.setattr(binning, "MAX_ENTRIES", max_entries)
-    for one, in_bands in zip(whole, everything(2), strict=True):
-        np.testing.assert_array_equal(one, in_bands)
+    for one, other in zip(whole, everything(threads), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_gaussians_in_any_memory_order_give_the_same_bytes():
