@@ -18,7 +18,7 @@ from hilsplat.configuration import SECTIONS
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN
 from hilsplat.evaluate.tables.ablation import PAPER_DATA, component_cells
-from hilsplat.evaluate.tables.measured import ANSWERS, kind_and_title, row_name, with_seeds
+from hilsplat.evaluate.tables.measured import kind_and_title, row_name, row_place, with_seeds
 from hilsplat.evaluate.tables.rows import Block, Cell, Row, Sources, Table
 
 PREPARATION = ("masks", "coverage_tree", "clip")
@@ -298,19 +298,13 @@ def time_cells(costs: list[Cost]) -> dict[str, Cell]:
 
 
 def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
-    """Return (variant, method, costs of the scenes) in row order, by data set."""
-    order = ["default", *sources.labels]
+    """Return (variant, method, costs of the scenes) in row order, by data set, sorted by name."""
     found: dict[tuple[str, str, str], list[Cost]] = {}
     for cost in sorted(sources.costs, key=lambda cost: cost.scene):
         for method in cost.query_s:
             found.setdefault((cost.dataset, cost.variant, method), []).append(cost)
 
-    def place(key: tuple[str, str, str]) -> tuple:
-        data, variant, method = key
-        known = order.index(variant) if variant in order else len(order)
-        return data, known, variant, list(ANSWERS).index(method)
-
     rows: dict[str, list[tuple[str, str, list[Cost]]]] = {}
-    for data, variant, method in sorted(found, key=place):
+    for data, variant, method in sorted(found, key=lambda key: row_place(*key[1:], sources.labels)):
         rows.setdefault(data, []).append((variant, method, found[data, variant, method]))
-    return rows
+    return {data: rows[data] for data in sorted(rows)}

@@ -66,7 +66,6 @@ def measured_blocks(
     """
     if sources.scores.empty:
         return []
-    order = ["default", *sources.labels]
     blocks = []
     for data, of_data in with_seeds(sources.scores).groupby("dataset", sort=True):
         placed: list[tuple[tuple, Row]] = []
@@ -89,9 +88,7 @@ def measured_blocks(
             place = (
                 from_truth,
                 list(PROTOCOLS).index(label) if label in PROTOCOLS else -1,
-                order.index(variant) if variant in order else len(order),
-                variant,
-                list(ANSWERS).index(method) if method in ANSWERS else len(ANSWERS),
+                *row_place(variant, method, sources.labels),
                 masks,
                 label,
             )
@@ -134,6 +131,13 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
     for row in rows:
         seen.setdefault((*row.names.values(), *(cell.text for cell in row.cells.values())), row)
     return tuple(seen.values())
+
+
+def row_place(variant: str, method: str, labels: Mapping[str, str]) -> tuple[int, str, int]:
+    """Return the sort key of a row: the default, then variants in the order of their labels, then others."""
+    order, methods = ["default", *labels], list(ANSWERS)
+    known = order.index(variant) if variant in order else len(order)
+    return known, variant, methods.index(method) if method in methods else len(methods)
 
 
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
