@@ -1,7 +1,5 @@
 """A small world drawn by hand, written as the world stage writes it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,9 +38,10 @@ def draw_labels(view: int) -> dict[Level, np.ndarray]:
     return {level: labels[level.index] for level in Level}
 
 
-def make_world(folder: Path) -> TrueWorld:
-    """Write images, annotations and cameras; the table is not annotated."""
-    generator = np.random.default_rng(0)
+@pytest.fixture
+def true_world(tmp_path) -> TrueWorld:
+    """Write images, annotations and cameras to a folder; the table is not annotated."""
+    folder, generator = tmp_path / "world", np.random.default_rng(0)
     labels, annotated = {}, {}
     poses = np.tile(np.eye(4), (len(NAMES), 1, 1))
     for row, name in enumerate(NAMES):
@@ -58,9 +57,3 @@ def make_world(folder: Path) -> TrueWorld:
     write_hierarchy(folder / "truth", NODES, labels, annotated)
     cameras.save(folder / "truth" / "cameras.npz")
     return TrueWorld.open(folder)
-
-
-@pytest.fixture
-def true_world(tmp_path) -> TrueWorld:
-    """The world, in its own folder."""
-    return make_world(tmp_path / "world")

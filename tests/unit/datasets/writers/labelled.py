@@ -40,10 +40,12 @@ class TrueWorld:
     @staticmethod
     def open(folder: Path) -> "TrueWorld":
         """Read a folder that the world stage wrote: `images/` and `truth/`."""
-        truth = folder / "truth"
+        truth, points = folder / "truth", np.zeros((0, 3))
         cameras, annotations = Cameras.load(truth / "cameras.npz"), HierarchyAnnotations.load(truth)
-        mesh = truth / "mesh.ply"
-        points = _mesh_points(mesh) if mesh.is_file() else np.zeros((0, 3))
+        if (truth / "mesh.ply").is_file():
+            mesh = PlyMesh(truth / "mesh.ply", 3)
+            points = mesh.xyz[mesh.column("vertex", "views") > 0].astype(np.float64)
+            points = points[:: max(1, -(-len(points) // MAX_POINTS))]
         return TrueWorld(folder / "images", cameras, annotations, points)
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
@@ -66,12 +68,6 @@ class TrueWorld:
         return np.any([self.annotations.mask(view, [node]) for node in nodes], axis=0)
 
 
-def _mesh_points(path: Path) -> Float64[np.ndarray, "P 3"]:
-    mesh = PlyMesh(path, 3)
-    xyz = mesh.xyz[mesh.column("vertex", "views") > 0].astype(np.float64)
-    return xyz[:: max(1, -(-len(xyz) // MAX_POINTS))]
-
-
 def write_jpeg(path: Path, pixels: UInt8[np.ndarray, "H W 3"]) -> None:
     """Write an image at quality 95."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,11 +82,6 @@ def write_sparse(
     pairs = zip(names, cameras, strict=True)
     images = [PosedImage(name, folder, each.cam_from_world, each.K, each.size_hw) for name, each in pairs]
     pinhole_model(images, points_xyz, np.full(points_xyz.shape, 128, np.uint8)).write(folder)
-
-
-def stems_from(world: TrueWorld, pattern: str, first: int) -> Mapping[str, str]:
-    """New stem per view, numbered in camera order: ("frame_{:05d}", 1) gives frame_00001, ..."""
-    return {view: pattern.format(row) for row, view in enumerate(world.cameras.names, start=first)}
 
 
 def flat_images(
@@ -108,8 +99,8 @@ def flat_images(
     return images
 
 
-LERF_STEMS = ("frame_{:05d}", 1)
-OVS_STEMS = ("{:02d}", 0)
+LERF_STEMS, OVS_STEMS = ("frame_{:05d}", 1), ("{:02d}", 0)
+"""Pattern of the stems, which are numbered in camera order, and the first number."""
 
 
 def write_lerf_ovs(world: TrueWorld, root: Path, scene: str, views: Sequence[str]) -> None:
@@ -154,10 +145,12 @@ def write_3d_ovs(world: TrueWorld, root: Path, scene: str, views: Sequence[str],
             mask = world.mask(view, texts[text]) if text in texts else empty
             _write_mask(folder / "segmentations" / stems[view] / f"{text}.png", mask)
     write_text(folder / "segmentations" / "classes.txt", "\n".join(classes) + "\n")
-    cameras = world.cameras
-    sizes = np.column_stack([cameras.size_hw, cameras.K[:, 0, 0]]).astype(np.float64)
-    depths = np.stack([_depth_range(world, pose) for pose in cameras.cam_from_world])
-    write_poses_bounds(folder / POSES_BOUNDS, cameras.cam_from_world, sizes, depths)
+    # LLFF's file, the inverse of `known_views.read_llff`; the two depths are not read, so they are 0.
+    world_from_cam = np.linalg.inv(world.cameras.cam_from_world)
+    right, down, forward, centre = (world_from_cam[:, :3, column] for column in range(4))
+    sizes = np.column_stack([world.cameras.size_hw, world.cameras.K[:, 0, 0]])
+    matrices = np.stack([down, right, -forward, centre, sizes], axis=2).reshape(-1, 15)
+    np.save(folder / POSES_BOUNDS, np.pad(matrices, ((0, 0), (0, 2))))
 
 
 def write_hi(
@@ -180,7 +173,8 @@ def write_hi(
 def _write_images(
     world: TrueWorld, folder: Path, pattern: tuple[str, int], sparse: bool = True
 ) -> Mapping[str, str]:
-    stems = stems_from(world, *pattern)
+    form, first = pattern
+    stems = {view: form.format(row) for row, view in enumerate(world.cameras.names, start=first)}
     for view, stem in stems.items():
         write_jpeg(folder / "images" / f"{stem}.jpg", world.image(view))
     if sparse:
@@ -200,13 +194,6 @@ def _write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
     write_png(path, mask.astype(np.uint8) * np.uint8(255))
 
 
-def _depth_range(world: TrueWorld, cam_from_world: np.ndarray) -> np.ndarray:
-    """Return the nearest and farthest depth of the points in front of a camera; 0 and 1 without points."""
-    depth = world.points_xyz @ cam_from_world[2, :3] + cam_from_world[2, 3]
-    depth = depth[depth > 0]
-    return np.array([depth.min(), depth.max()]) if len(depth) else np.array([0.0, 1.0])
-
-
 def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys: Any) -> dict[str, Any]:
     """Return the keys of one object as the tool writes them: a single polygon is not nested."""
     points = np.concatenate(polygons)
@@ -222,17 +209,3 @@ def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys:
         "note": "",
         **keys,
     }
-
-
-def write_poses_bounds(
-    path: Path,
-    cam_from_world: Float64[np.ndarray, "N 4 4"],
-    height_width_focal: Float64[np.ndarray, "N 3"],
-    bounds: Float64[np.ndarray, "N 2"],
-) -> None:
-    """Write LLFF's file, the inverse of `known_views.read_llff`."""
-    world_from_cam = np.linalg.inv(cam_from_world)
-    right, down, forward = (world_from_cam[:, :3, column] for column in range(3))
-    matrices = np.stack([down, right, -forward, world_from_cam[:, :3, 3], height_width_focal], axis=2)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, np.concatenate([matrices.reshape(-1, 15), bounds], axis=1), allow_pickle=False)
