@@ -13,13 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64
 
-from hilsplat.base.artifacts import (
-    atomic_folder,
-    read_index,
-    write_index,
-    write_json,
-    write_npz,
-)
+from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_json, write_npz
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log
 from hilsplat.contributions.rows import Contributions
@@ -59,9 +53,7 @@ logger = logging.getLogger(__name__)
 
 
 def crop_ranks(
-    node: Int32[np.ndarray, " M"],
-    score: Float32[np.ndarray, " M"],
-    directions: Float[np.ndarray, "M 3"],
+    node: Int32[np.ndarray, " M"], score: Float32[np.ndarray, " M"], directions: Float[np.ndarray, "M 3"]
 ) -> Int32[np.ndarray, " M"]:
     """Rank the masks of each node by score, reduced for directions close to those already ranked.
 

@@ -20,14 +20,7 @@ from hilsplat.semantic_tree.nodes import (
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import SemanticTreeSettings
 from tests.unit.artifact_changes import change_index
-from tests.unit.two_boxes_world import (
-    HEIGHT,
-    NUM_GAUSSIANS,
-    REGIONS,
-    WIDTH,
-    region_mask,
-    reverse_masks,
-)
+from tests.unit.two_boxes_world import HEIGHT, NUM_GAUSSIANS, REGIONS, WIDTH, region_mask, reverse_masks
 
 
 def test_gaussians_join_the_node_with_the_largest_share(monkeypatch):

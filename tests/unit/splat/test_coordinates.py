@@ -15,13 +15,7 @@ from hilsplat.base.errors import ArtifactError, HilsplatError, SceneError
 from hilsplat.scene.assemble import move_cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
-from hilsplat.splat.coordinates import (
-    decompose,
-    import_gaussians,
-    move_gaussians,
-    sh_basis,
-    write_source_ply,
-)
+from hilsplat.splat.coordinates import decompose, import_gaussians, move_gaussians, sh_basis, write_source_ply
 from hilsplat.splat.fit import run_gaussians
 from hilsplat.splat.gaussians import FIELDS
 from hilsplat.splat.ply import load_ply, save_ply
