@@ -226,9 +226,9 @@ def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
 
 def _files_of(protocols: Sequence[cards.ProtocolCard]) -> list[str]:
     """Return the names, without suffix, of the files read under point protocols."""
-    names = ["instances"] if cards.INSTANCES in protocols else []
+    names: list[str] = []
     for card in protocols:
-        names += [card.classes, class_set(card.classes)[0]] if card is not cards.INSTANCES else []
+        names += ["instances"] if card is cards.INSTANCES else [card.classes, class_set(card.classes)[0]]
     return list(dict.fromkeys(names))
 
 
