@@ -214,6 +214,8 @@ def write_segment(
         ("lidar_segmentation", "LiDARSegmentationLabelComponent", "labels", np.int32),
         ("lidar_camera_projection", "LiDARCameraProjectionComponent", "projection", np.float32),
     ):
+        if getattr(frames[0].returns[0], part) is None:  # a component that is optional
+            continue
         images = [[getattr(each, part).astype(kind) for each in frame.returns] for frame in frames]
         write(tag, [_cells(component, *pair) for pair in zip(frames, images, strict=True)])
     write("lidar_pose", [_cells("LiDARPoseComponent", frame, [frame.pixel_pose]) for frame in frames])
@@ -333,7 +335,7 @@ def write_street_as_waymo(world: Path, split: Path, segment: str) -> None:
         view = int(np.linalg.norm(centres - origin, axis=1).argmin())
         rows = scan["pose_index"] == pose
         turn = {name: scan[name][rows] for name in ("points", "range_m", "beam")}
-        frames.append(_lidar_frame(turn, labels[rows], origin, inclinations, shots[view]))
+        frames.append(_lidar_frame(turn, labels[rows], origin, inclinations, shots[view].timestamp_micros))
     write_segment(split, segment, frames, shots)
 
 
@@ -354,7 +356,7 @@ def _lidar_frame(
     labels: np.ndarray,
     origin: Float[np.ndarray, " 3"],
     inclinations: Float[np.ndarray, " H"],
-    shot: CameraShot,
+    time: int,
 ) -> LidarFrame:
     """Return one revolution of the scan as a range image; the vehicle heads along the world's x axis."""
     height, width = len(inclinations), AZIMUTH_STEPS
@@ -375,18 +377,6 @@ def _lidar_frame(
     image[*place, 0] = scan["range_m"]
     of_pixel = np.zeros((height, width, 2), dtype=np.int32)
     of_pixel[place] = labels
-    in_camera = shot.camera.cam_from_world(shot.world_from_vehicle)
-    local = scan["points"].astype(np.float64) @ in_camera[:3, :3].T + in_camera[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = (local @ shot.camera.K.T)[:, :2] / local[:, 2:]  # the front camera has no distortion
-    rows, columns = shot.camera.size_hw
-    inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < [columns, rows]).all(axis=1)
-    cells = np.zeros((height, width, 6), dtype=np.int32)
-    cells[place] = np.where(
-        inside[:, None], np.stack([inside, *np.floor(pixel.T), *np.zeros((3, len(pixel)))], axis=1), 0
-    )
     pose = np.tile(np.float32([0, 0, 0, *world_from_vehicle[:3, 3]]), (height, width, 1))
-    returns = (LidarReturn(image, of_pixel, cells),)
-    return LidarFrame(
-        shot.timestamp_micros, world_from_vehicle, vehicle_from_lidar, inclinations, pose, returns
-    )
+    returns = (LidarReturn(image, of_pixel, None),)
+    return LidarFrame(time, world_from_vehicle, vehicle_from_lidar, inclinations, pose, returns)
