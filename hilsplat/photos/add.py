@@ -1,6 +1,5 @@
 """Inspection of a folder of photographs, and its addition to the scene sheet."""
 
-import hashlib
 import shutil
 from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from hilsplat.base.artifacts import atomic_folder, write_text
+from hilsplat.base.artifacts import atomic_folder, sha256_of_file, write_text
 from hilsplat.base.errors import ImageError, SceneError
 from hilsplat.base.files import NAME_RULE, list_images, name_problem
 from hilsplat.base.images import open_image, read_image, resize_to_fit
@@ -125,19 +124,17 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
             num_rotated += image.getexif().get(EXIF_ORIENTATION, 1) not in (0, 1)
         grey = cv2.cvtColor(resize_to_fit(pixels, CHECK_SIDE_PX), cv2.COLOR_RGB2GRAY)
         checked.append(CheckedPhoto(path.name, size_hw, exif_focal_px(path, size_hw), grey))
-        with path.open("rb") as stream:
-            by_digest[hashlib.file_digest(stream, "sha256").hexdigest()].append(path.name)
+        by_digest[sha256_of_file(path)].append(path.name)
     copies = {name for names in by_digest.values() for name in names[1:]}
     distinct = [photo for photo in checked if photo.name not in copies]
     suffixes = Counter(path.suffix.lower() for path in where.iterdir() if path.is_file())
-    passed_over = {suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES}
     return PhotoReport(
         folder=where,
         sizes=dict(sizes),
         unreadable=tuple(unreadable),
         num_rotated=num_rotated,
         duplicates=tuple(tuple(names) for names in by_digest.values() if len(names) > 1),
-        passed_over=passed_over,
+        passed_over={suffix: count for suffix, count in suffixes.items() if suffix in OTHER_PHOTO_SUFFIXES},
         doubts=tuple(photo_doubts(distinct, have_poses=has_known_poses(folder, poses))),
     )
 
