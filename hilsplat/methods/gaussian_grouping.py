@@ -30,7 +30,7 @@ from hilsplat.contributions.rows import Contributions
 from hilsplat.methods.common.groups import features_of_groups, group_means, nearest
 from hilsplat.methods.common.training import one_torch_thread, product, train
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
-from hilsplat.semantic_tree.nodes import MIN_VISIBLE_PX, level_nodes
+from hilsplat.semantic_tree.nodes import linked_nodes
 from hilsplat.settings import MethodSettings, SemanticTreeSettings
 
 CHANNELS = 16
@@ -44,17 +44,12 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
 
     Masks of other levels have none.
     """
-    mass = contributions.mass()
-    visible = mass > MIN_VISIBLE_PX
-    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
-    rows = contributions.rows_of(level)
-    weights, view = contributions.matrix("S")[rows], contributions.view[rows]
-    total = mass.sum(axis=0, dtype=np.float64)
+    S, mass, rows = contributions.matrix("S"), contributions.mass(), contributions.rows_of(level)
     settings = SemanticTreeSettings()
     settings = settings.model_copy(update={"min_views": min(settings.min_views, len(mass))})
-    found = level_nodes(weights, view, mass, visible, importance, total, settings, threads)
+    nodes_of = linked_nodes(S, mass, contributions.view, settings, threads)
     identity = np.full(len(contributions), NONE, np.int64)
-    identity[rows] = found.of_mask
+    identity[rows] = nodes_of(level, rows).of_mask
     return identity
 
 

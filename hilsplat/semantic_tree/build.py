@@ -7,11 +7,10 @@ tree only scores each node's crops. The clip stage embeds the best; their averag
 """
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, Int64
+from jaxtyping import Float, Float32, Int32
 
 from hilsplat.base.artifacts import atomic_folder, read_index, write_index, write_json, write_npz
 from hilsplat.base.levels import LEVELS, NONE, Level
@@ -20,9 +19,8 @@ from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import require_same_masks
 from hilsplat.semantic_tree.export import readable_nodes
 from hilsplat.semantic_tree.nodes import (
-    MIN_VISIBLE_PX,
-    LevelNodes,
-    level_nodes,
+    NodesOf,
+    linked_nodes,
     mask_fits,
     nearest_gaussians,
     nest_nodes,
@@ -45,9 +43,6 @@ RANKED = 32
 
 MIN_IOU = 1e-3
 """Lower bound of the IoU in `crop_score`, so that each linked mask has a positive score."""
-
-NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
-"""Function from a level and the rows of its masks to its nodes."""
 
 logger = logging.getLogger(__name__)
 
@@ -99,9 +94,7 @@ def build_tree(
     """
     S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
     view = contributions.view
-    visible = mass > MIN_VISIBLE_PX
     total_mass = mass.sum(axis=0, dtype=np.float64)
-    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
 
     level: list[int] = []
     quality: list[float] = []
@@ -109,13 +102,10 @@ def build_tree(
     node_of_gaussian = np.full((S.shape[1], len(LEVELS)), NONE, np.int32)
     membership = np.zeros((S.shape[1], len(LEVELS)), np.float32)
     nearest = None if nodes_of else nearest_gaussians(means, threads)
+    find = nodes_of or linked_nodes(S, mass, view, settings, threads)
     for each in LEVELS:
         rows = contributions.rows_of(each)
-        if nodes_of:
-            found = nodes_of(each, rows)
-        else:
-            masses = mass, visible, importance, total_mass
-            found = level_nodes(S[rows], view[rows], *masses, settings, threads)
+        found = find(each, rows)
         if join_wholes and each is Level.WHOLE:
             whole = joined_regions(found.of_gaussian, len(found.quality), means, mass, settings.whole_side)
             found = found.joined(whole)

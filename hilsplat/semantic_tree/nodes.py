@@ -1,12 +1,13 @@
 """Nodes: masks linked across views, the Gaussians and parent of each node, and the masks that show it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
-from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.semantic_tree.evidence import mask_evidence
 from hilsplat.semantic_tree.linkage import pooled_linkage
 from hilsplat.settings import SemanticTreeSettings
@@ -62,47 +63,57 @@ class LevelNodes:
         )
 
 
-def level_nodes(
-    weights: sp.csr_matrix,
-    view: Int32[np.ndarray, " m"],
+NodesOf = Callable[[Level, Int64[np.ndarray, " m"]], LevelNodes]
+"""Function from a level and the rows of its masks to its nodes."""
+
+
+def linked_nodes(
+    S: sp.csr_matrix,
     mass: Float32[np.ndarray, "V N"],
-    visible: Bool[np.ndarray, "V N"],
-    importance: Float64[np.ndarray, " N"],
-    total_mass: Float64[np.ndarray, " N"],
+    view_of_mask: Int32[np.ndarray, " M"],
     settings: SemanticTreeSettings,
     threads: int,
-) -> LevelNodes:
-    """Link the masks of one level into nodes and assign Gaussians to them.
+) -> NodesOf:
+    """Return the function that links the masks of a level into nodes and assigns Gaussians to them.
 
     A cluster whose Gaussians all belong to other clusters, such as a duplicate, would select nothing. A
     cluster therefore becomes a node only if it is the best fit of at least `min_views` masks.
 
-    `weights` is S of the masks, `mass` the visible mass of each Gaussian in each view, `importance` its mean
-    over the views that see the Gaussian, and `total_mass` its sum (px).
+    `S` and `mass`, the visible mass of each Gaussian in each view, are in px.
     """
-    place = view[_row_of(weights)], weights.indices
-    shares = weights.astype(np.float64)
-    shares.data /= np.where(visible[place], mass[place], np.inf)
-    shares.eliminate_zeros()
-    del place
-    evidence = mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
-    del shares
-    cluster, quality = pooled_linkage(evidence, settings.link_threshold)
-    del evidence
-    pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
-    kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
+    visible = mass > MIN_VISIBLE_PX
+    total_mass = mass.sum(axis=0, dtype=np.float64)
+    importance = np.einsum("vn,vn->n", mass, visible, dtype=np.float64) / np.maximum(visible.sum(axis=0), 1)
 
-    def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        of_cluster = np.full(len(quality) + 1, NONE, np.int64)
-        of_cluster[kept] = np.arange(len(kept))
-        return of_cluster, *gaussian_nodes(of_cluster[cluster], len(kept), weights, view, mass, total_mass)
+    def nodes_of(_: Level, rows: Int64[np.ndarray, " m"]) -> LevelNodes:
+        weights, view = S[rows], view_of_mask[rows]
+        place = view[_row_of(weights)], weights.indices
+        shares = weights.astype(np.float64)
+        shares.data /= np.where(visible[place], mass[place], np.inf)
+        shares.eliminate_zeros()
+        del place
+        evidence = mask_evidence(shares, importance, visible, view, MIN_COVISIBLE, threads)
+        del shares
+        cluster, quality = pooled_linkage(evidence, settings.link_threshold)
+        del evidence
+        pairs = np.unique(np.stack([cluster, view.astype(np.int64)], axis=1), axis=0)
+        kept = np.flatnonzero(np.bincount(pairs[:, 0], minlength=len(quality)) >= settings.min_views)
 
-    fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
-    kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
-    of_cluster, node, share = winners(kept)
-    renumber = renumbered_without_empty(node, len(kept))
-    of_mask = renumber[of_cluster[cluster]].astype(np.int64)
-    return LevelNodes(of_mask, renumber[node], share, quality[kept[renumber[:-1] != NONE]])
+        def winners(kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            of_cluster = np.full(len(quality) + 1, NONE, np.int64)
+            of_cluster[kept] = np.arange(len(kept))
+            return of_cluster, *gaussian_nodes(
+                of_cluster[cluster], len(kept), weights, view, mass, total_mass
+            )
+
+        fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
+        kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
+        of_cluster, node, share = winners(kept)
+        renumber = renumbered_without_empty(node, len(kept))
+        of_mask = renumber[of_cluster[cluster]].astype(np.int64)
+        return LevelNodes(of_mask, renumber[node], share, quality[kept[renumber[:-1] != NONE]])
+
+    return nodes_of
 
 
 def _row_of(matrix: sp.csr_matrix) -> Int64[np.ndarray, " E"]:
@@ -126,7 +137,8 @@ def gaussian_nodes(
     masks sometimes cover it. Masks of one view may overlap, and a node may have several masks there, so a
     Gaussian's weight in a view is capped at its visible mass there.
 
-    `cluster` is the node of each mask, -1 for none; the other arguments are as in `level_nodes`.
+    `cluster` is the node of each mask, -1 for none; the other arguments are those of its masks, as in
+    `linked_nodes`; `total_mass` is the sum of `mass` over views.
 
     Returns:
         node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.

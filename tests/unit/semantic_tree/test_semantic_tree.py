@@ -8,11 +8,12 @@ import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, read_json, read_npy, sha256_of_path, write_index, write_npy
 from hilsplat.base.errors import MisalignedArtifactError
+from hilsplat.base.levels import Level
 from hilsplat.semantic_tree import nodes
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import (
     gaussian_nodes,
-    level_nodes,
+    linked_nodes,
     nearest_gaussians,
     node_parents,
     without_strays,
@@ -69,10 +70,9 @@ def test_a_duplicate_cluster_is_not_a_node():
     double = np.repeat((np.arange(10) < 4)[None], 3, axis=0)
     weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
     view = np.array([0, 1, 2, 3, 0, 1, 2], np.int32)
-    mass, once = np.ones((4, 10), np.float32), np.ones(10)
-    seen = mass > 0
+    mass, rows = np.ones((4, 10), np.float32), np.arange(7)
 
-    found = level_nodes(weights, view, mass, seen, once, 4 * once, SemanticTreeSettings(), 1)
+    found = linked_nodes(weights, mass, view, SemanticTreeSettings(), 1)(Level.WHOLE, rows)
     assert found.of_mask.tolist() == [0, 0, 0, 0, -1, -1, -1]
     assert found.of_gaussian.tolist() == [0] * 10
     assert found.membership == pytest.approx(np.where(np.arange(10) == 3, 0.5, 1.0))
@@ -80,7 +80,7 @@ def test_a_duplicate_cluster_is_not_a_node():
 
     whole[:2, :4] = 0  # now it wins all four, and is a node
     weights = sp.csr_matrix(np.concatenate([whole, double]).astype(np.float32))
-    found = level_nodes(weights, view, mass, seen, once, 4 * once, SemanticTreeSettings(), 1)
+    found = linked_nodes(weights, mass, view, SemanticTreeSettings(), 1)(Level.WHOLE, rows)
     assert found.of_gaussian.tolist() == [1] * 4 + [0] * 6
 
 
