@@ -67,14 +67,9 @@ def dataparser_of(ply: Path, source: Path) -> Path | None:
 
 
 def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
-    """Return the transforms file with a folder's poses; None if they are in a COLMAP model or missing."""
-    if named is not None and named.suffix == ".json":
-        return named
-    folder = named or folder
-    if (folder / "sparse").is_dir():
-        return None
-    found = (path for path in map(folder.joinpath, TRANSFORMS) if path.is_file())
-    return next(found, None)
+    """Return the transforms file with a folder's poses (`find_known_poses`); None if they are elsewhere."""
+    known = find_known_poses(folder, named)
+    return known.files[0] if known is not None and known.kind == "transforms" else None
 
 
 def langsplat_features(folder: Path) -> Path | None:
