@@ -10,6 +10,7 @@ from scipy.special import expit, logit
 from hilsplat.base.artifacts import read_index, read_json
 from hilsplat.base.errors import SceneError
 from hilsplat.base.rotations import rotation_matrices
+from hilsplat.scene.scene import Scene
 from hilsplat.settings import GaussiansSettings
 from hilsplat.splat import fit
 from hilsplat.splat.densify import (
@@ -30,11 +31,16 @@ from hilsplat.splat.optimise import Adam, means_rate
 from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.cpu import Gradients
 from tests.unit.round_gaussians import round_gaussians
-from tests.unit.splat.three_gaussians_world import mean_psnr
+from tests.unit.splat.three_gaussians_world import mean_psnr, three_gaussians_scene
 
 SETTINGS = GaussiansSettings(
     iterations=60, densify_every=10, checkpoint_every=25, sh_degree=1, max_gaussians=400
 )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    return three_gaussians_scene(tmp_path_factory.mktemp("three") / "scene")
 
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
