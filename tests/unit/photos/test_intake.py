@@ -263,9 +263,6 @@ def test_a_video_becomes_photographs_in_the_project(tmp_path, sheet):
     assert sorted(path.name for path in folder.glob("[!.]*"))[:2] == ["0001.jpg", "0002.jpg"]
     assert json.loads((folder / "origin.json").read_text())["settings"]["frames"] == 12
     assert "12 frames of walk.MP4 are in" in str(report)
-    with pytest.raises(SceneError, match="photos/desk is already in"):
-        add_scene(sheet, "desk", video)
-    assert len(list(folder.glob("*.jpg"))) == 12
 
 
 def test_a_folder_of_videos_is_one_capture_and_a_static_one_leaves_no_files(tmp_path, sheet):
