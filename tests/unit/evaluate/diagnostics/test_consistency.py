@@ -89,7 +89,7 @@ def test_two_views_by_hand():
     masks_a = np.stack([columns(2, 6), columns(6, 10)])  # 20 points each
     none = np.zeros((0, HEIGHT, WIDTH), bool)
     same = view_agreement(masks_a, np.stack([columns(0, 4), columns(4, 10)]), *pixels)
-    assert same == Agreement(2, 1, 0, 0)
+    assert same == Agreement(2, 1.0, 0.0, 0.0)
     # B's border lies one column further right: 25 and 15 points. IoU 20/25 and 15/20
     moved = view_agreement(masks_a, np.stack([columns(0, 5), columns(5, 10)]), *pixels)
     # together in A: 2 * 190 = 380; in B: 300 + 105 = 405; in both: 190 + 10 + 105 = 305; of 780 pairs
