@@ -17,7 +17,7 @@ from hilsplat.models.folder import ModelFolder
 from hilsplat.splat.rasterise import api, parity
 from hilsplat.workflow import doctor
 from hilsplat.workflow.resources import is_installed
-from tests.unit.models.test_store import lay
+from tests.unit.models.test_store import write_model
 
 CPU = "CPUExecutionProvider"
 
@@ -102,7 +102,7 @@ def test_kernels_that_render_a_different_image_are_a_fault(monkeypatch):
 
 def test_a_broken_model_is_a_fault_and_missing_real_ones_are_noted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    lay(tmp_path / "models/sam-vit-base", "sam")
+    write_model(tmp_path / "models/sam-vit-base", "sam")
     states = {finding.state: finding.found for finding in doctor.models()}
     assert "sam-vit-base" in states["fault"] and "no CLIP" in states["note"]
 

@@ -12,6 +12,7 @@ from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
 from hilsplat.workflow.plan import Plan, any_of, some
 from hilsplat.workflow.records import expected_artifacts
+from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
 
 ROWS = (
@@ -286,19 +287,12 @@ def test_a_segmenter_without_weights_and_a_missing_model_have_no_digest(tmp_path
 OF_PHOTOGRAPHS = {"photos": {"masks": {"segmenter": "auto", "model": "auto"}, "clip": {"model": "auto"}}}
 
 
-def lay_model(name: str, kind: str, embedded: bool = False) -> None:
-    folder = Path("models") / name
-    folder.mkdir(parents=True)
-    (folder / "a.onnx").write_text(name)
-    (folder / "config.json").write_text(json.dumps({"model_type": kind, "world_only": embedded}))
-
-
 @pytest.fixture
 def embedded_models(tmp_path, monkeypatch) -> None:
     """A project that has only the embedded models."""
     monkeypatch.chdir(tmp_path)
-    lay_model("sam-tiny", "sam", embedded=True)
-    lay_model("clip-tiny", "clip", embedded=True)
+    write_model(Path("models/sam-tiny"), "sam", embedded=True)
+    write_model(Path("models/clip-tiny"), "clip", embedded=True)
 
 
 @pytest.mark.usefixtures("embedded_models")
@@ -312,8 +306,8 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path):
     own = tmp_path / "config/config.yaml"
     own.write_text(json.dumps({"overrides": OF_PHOTOGRAPHS}))
     assert models_of_photographs(own, "desk") == [photo.removeprefix("photos/desk: "), doubt]
-    lay_model("clip-vit-base-patch16", "clip")
-    lay_model("sam-vit-base", "sam")
+    write_model(Path("models/clip-vit-base-patch16"), "clip")
+    write_model(Path("models/sam-vit-base"), "sam")
     line = "masks by sam-vit-base; text queries by clip-vit-base-patch16"
     assert plan(tmp_path, **config).model_lines()[1:] == [f"photos/desk: {line}"]
     for file in (own, tmp_path / "nowhere.yaml"):  # the installed one

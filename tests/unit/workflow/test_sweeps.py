@@ -10,7 +10,6 @@ from hilsplat.methods.registry import OURS
 from hilsplat.workflow import targets
 from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.scene_data import of_variant
-from tests.conftest import PROJECT
 
 LISTS = ("main", "theta", "omega", "pruning", "ablation", "component")
 BY_LEVELS = ("masks", "coverage_tree", "contributions", "semantic_tree", "clip", "autoencoder")
@@ -35,10 +34,9 @@ def jobs(seeds: int = 1, **variants: str) -> Counter[str]:
     return Counter(**counted, table=len(targets.tables(plan)), sweep_plot=len(plots))
 
 
-@pytest.fixture
-def base(monkeypatch) -> Counter[str]:
+@pytest.fixture(scope="module")
+def base() -> Counter[str]:
     """Jobs of a run without sweeps."""
-    monkeypatch.chdir(PROJECT)
     return jobs()
 
 
