@@ -218,7 +218,7 @@ def time_queries(
     answers.encode_texts([texts[0]])
     answers.pixel_weights(view)
     shared_s = time.perf_counter() - start
-    seconds = {}
+    seconds: dict[str, float] = {}
     for method, query in (("field", by_field), ("tree", by_tree)):
         if method not in settings.methods:
             continue

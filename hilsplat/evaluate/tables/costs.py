@@ -305,6 +305,6 @@ def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
             found.setdefault((cost.dataset, cost.variant, method), []).append(cost)
 
     rows: dict[str, list[tuple[str, str, list[Cost]]]] = {}
-    for data, variant, method in sorted(found, key=lambda key: row_place(*key[1:], sources.labels)):
+    for data, variant, method in sorted(found, key=lambda key: row_place(key[1], key[2], sources.labels)):
         rows.setdefault(data, []).append((variant, method, found[data, variant, method]))
     return {data: rows[data] for data in sorted(rows)}
