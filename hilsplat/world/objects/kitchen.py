@@ -80,11 +80,9 @@ def cake(b: Builder) -> None:
     profile = [(r2, top2 - 0.07), (r2 + 0.03, top2 - 0.06)]
     profile += [(r2 + 0.03, top2), (r2 - 0.02, top2 + 0.03), (0, top2 + 0.03)]
     upper.subpart("glaze, topping", "snow", lathe(profile))
-    cherries = lower.subpart("cherries, berries")
-    for i in range(6):
-        a = 2 * np.pi * i / 6
-        place = ((r + r2) / 2 * np.cos(a) * 1.02, (r + r2) / 2 * np.sin(a) * 1.02, top + 0.075)
-        cherries.put(cherry, sphere(0.068, place, 16))
+    away, angles = (r + r2) / 2, [2 * np.pi * i / 6 for i in range(6)]
+    places = [(away * np.cos(a) * 1.02, away * np.sin(a) * 1.02, top + 0.075) for a in angles]
+    lower.subpart("cherries, berries", cherry, *[sphere(0.068, place, 16) for place in places])
     candle = b.part("candle", "ceramic", cylinder(0.062, top2 + 0.02, top2 + 0.25))
     shape = lathe([(0, 0), (0.09, 0.07), (0.065, 0.14), (0, 0.24)]).moved(z=top2 + 0.25)
     candle.subpart("flame, fire", "plain yellow orange", shape)
