@@ -286,8 +286,8 @@ def test_dead_gaussians_move_onto_live_ones_and_moments_are_reset():
         opacity, number = [0.9, None, 0.5][source], len(members)
         assert 1 - np.prod(1 - opacities(adam)[members]) == pytest.approx(opacity, rel=1e-4)
         shared = shared_opacity(np.array([opacity]), np.array([number]))
-        factor = scale_factor(np.array([opacity]), shared, np.array([number]))
-        np.testing.assert_allclose(np.exp(adam.parameters["log_scales"][members]), 0.2 * factor, rtol=1e-4)
+        scale = 0.2 * scale_factor(np.array([opacity]), shared, np.array([number])).item()
+        np.testing.assert_allclose(np.exp(adam.parameters["log_scales"][members]), scale, rtol=1e-4)
         touched = source in moved
         assert (adam.first["means"][members] == (0 if touched else 1)).all()
 
