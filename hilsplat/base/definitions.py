@@ -95,7 +95,7 @@ def _parse(text: str, package: str) -> Module:
                 facts.bindings.update({name: Statement(imports=imports) for name in imports})
             continue
         statement = _statement(node, package)
-        names = sorted(_bound_in([node]))
+        names = sorted(_bound_in([node], package))
         for name in names:
             if (earlier := facts.bindings.get(name)) is not None:  # bound twice: both count
                 statement = earlier + statement
@@ -221,10 +221,9 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 @dataclass
 class _Scope:
-    """Names of a function, comprehension or class, and the targets of its imports."""
+    """Names that a function, comprehension or class binds, with the target of each imported one."""
 
-    names: set[str]
-    imports: dict[str, Import]
+    bound: dict[str, Import | None]
     is_class: bool = False
 
 
@@ -251,15 +250,14 @@ class _Names:
             for outside in (*getattr(node, "decorator_list", ()), *filter(None, defaults)):
                 self._visit(outside)
             body = node.body if isinstance(node.body, list) else [node.body]
-            bound = {each.arg for each in _arguments(node.args)} | _bound_in(body)
-            self._inside(_Scope(bound, self._imported(body)), body)
+            arguments: dict[str, Import | None] = {each.arg: None for each in _arguments(node.args)}
+            self._inside(_Scope(arguments | _bound_in(body, self.package)), body)
         elif isinstance(node, ast.ClassDef):
             for outside in (*node.decorator_list, *node.bases, *node.keywords):
                 self._visit(outside)
-            scope = _Scope(_bound_in(node.body), self._imported(node.body), is_class=True)
-            self._inside(scope, node.body)
+            self._inside(_Scope(_bound_in(node.body, self.package), is_class=True), node.body)
         elif isinstance(node, _COMPREHENSIONS):
-            self._inside(_Scope(_bound_in([node]), {}), list(_children(node)))
+            self._inside(_Scope(_bound_in([node], self.package)), list(_children(node)))
         else:
             for child in _children(node):
                 self._visit(child)
@@ -274,19 +272,13 @@ class _Names:
         for depth, scope in enumerate(reversed(self.scopes)):
             if scope.is_class and depth:
                 continue  # names of a class are not in scope in its methods
-            if chain[0] in scope.imports:
-                self.inner[scope.imports[chain[0]], chain[1:]] = None
+            target = scope.bound.get(chain[0])
+            if target is not None:
+                self.inner[target, chain[1:]] = None
                 return
-            if chain[0] in scope.names and not scope.is_class:
+            if chain[0] in scope.bound and not scope.is_class:
                 return
         self.names[chain] = None
-
-    def _imported(self, body: Sequence[ast.AST]) -> dict[str, Import]:
-        found: dict[str, Import] = {}
-        for node in _own(body):
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                found |= _imports(node, self.package)
-        return found
 
 
 def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
@@ -299,9 +291,10 @@ def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
             waiting += _children(node)
 
 
-def _bound_in(body: Iterable[ast.AST]) -> set[str]:
-    """Return the names that a block binds in its own scope."""
+def _bound_in(body: Iterable[ast.AST], package: str) -> dict[str, Import | None]:
+    """Return the names that a block binds in its own scope, with the target of each imported one."""
     names: set[str] = set()
+    imports: dict[str, Import] = {}
     declared_global: set[str] = set()
     for node in _own(body):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store | ast.Del):
@@ -309,11 +302,11 @@ def _bound_in(body: Iterable[ast.AST]) -> set[str]:
         elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             names.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):
-            names |= {alias.asname or alias.name.split(".")[0] for alias in node.names}
+            imports |= _imports(node, package)
         elif isinstance(node, ast.ExceptHandler | ast.MatchAs | ast.MatchStar) and node.name:
             names.add(node.name)
         elif isinstance(node, ast.MatchMapping) and node.rest:
             names.add(node.rest)
         elif isinstance(node, ast.Global):
             declared_global |= set(node.names)
-    return names - declared_global
+    return {**dict.fromkeys(names - declared_global), **imports}
