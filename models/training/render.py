@@ -158,8 +158,9 @@ def world_vocabulary() -> str:
     things: set[str] = set()
     parts: set[str] = set()
     for seed in range(TRAINING_SEEDS.start, TRAINING_SEEDS.start + DRAWS):
-        scenes = [build_scene(kind, seed, 1) for kind in KINDS]
-        for world in (*objects_of_every_class(seed), *scenes):
+        worlds: list[ObjectModel | WorldScene] = [*objects_of_every_class(seed)]
+        worlds += [build_scene(kind, seed, 1) for kind in KINDS]
+        for world in worlds:
             for node in world.nodes:
                 (things if node.level == int(Level.WHOLE) else parts).add(node.text)
     sections = {"things": things - SURFACES, "parts": parts, "surfaces": things & SURFACES}
