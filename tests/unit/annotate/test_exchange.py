@@ -55,6 +55,14 @@ def test_exported_files_are_read_back_with_levels_and_parents(kind, known, camer
             np.testing.assert_array_equal(theirs.mask(SIZE), ours.mask(SIZE))
 
 
+def test_exported_coco_has_the_masks_boxes_and_areas_that_pycocotools_reads(known, cameras):
+    content = json.loads(exported("coco", known, cameras))
+    for each, ours in zip(content["annotations"], known["DSC_1.png"], strict=False):
+        runs = coco_masks.frPyObjects(each["segmentation"], *SIZE)
+        np.testing.assert_array_equal(coco_masks.decode(runs).astype(bool), ours.mask(SIZE))
+        assert coco_masks.toBbox(runs).tolist() == each["bbox"] and coco_masks.area(runs) == each["area"]
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_compressed_run_lengths_are_those_of_pycocotools(seed, cameras):
     mask = np.random.default_rng(seed).random(SIZE) < (0.5, 0.02, 0.98)[seed % 3]

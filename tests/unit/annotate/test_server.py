@@ -34,9 +34,7 @@ def labels(tmp_path) -> Path:
 
 
 def opened(desk: Path, labels: Path) -> TestClient:
-    app = Annotator(OpenedScene(desk, labels, "default", 1)).app(TOKEN)
-    assert TestClient(app, base_url=ADDRESS).get("/api/labels").status_code == 403
-    return browser_of(app)
+    return browser_of(Annotator(OpenedScene(desk, labels, "default", 1)).app(TOKEN))
 
 
 @pytest.fixture
@@ -54,6 +52,22 @@ def mask_of(polygons) -> np.ndarray:
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
     return np.count_nonzero(a & b) / np.count_nonzero(a | b)
+
+
+def test_requests_of_strangers_other_hosts_and_other_sites_are_refused(desk, labels, client):
+    stranger = TestClient(Annotator(OpenedScene(desk, labels, "default", 1)).app(TOKEN), base_url=ADDRESS)
+    for path in ("/", "/api/labels", "/static/annotate.js", f"/api/labels?token={TOKEN}"):
+        assert stranger.get(path).status_code == 403, path
+    for headers in (
+        {"host": "evil.example"},
+        {"origin": "http://evil.example"},
+        {"origin": ""},
+        {"sec-fetch-site": "cross-site"},
+        {"content-type": "text/plain"},
+    ):
+        sent = client.put("/api/labels/0", json={"labels": [MUG]}, headers={"if-match": '"none"', **headers})
+        assert sent.status_code == 403, headers
+    assert not labels.exists()
 
 
 @pytest.mark.parametrize("path", ["/api/labels/99", "/api/labels/-1", "/api/labels/..%2f..%2fx"])
