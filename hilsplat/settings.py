@@ -235,7 +235,8 @@ class MasksSettings(Section):
     )
     nms_inner: Share = knob(0.5, "threshold for suppressing inner masks", origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
-        (0.12, 0.04, 0.015), "graph: minimum segment at whole, part, subpart, as a share of the image side"
+        (0.12, 0.04, 0.015),
+        "graph: minimum segment size at whole, part, subpart, as a share of the image side",
     )
 
 

@@ -253,7 +253,7 @@ def _from_coco(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
             if pieces:
                 found[view].append(_label(name, number, pieces, has_ids))
     except (TypeError, KeyError) as error:
-        raise SceneError(f"{name} is not a COCO file: {error!r} is missing or of another type") from error
+        raise SceneError(f"{name} is not a COCO file: {error!r} is missing or has the wrong type") from error
     return {view: labels for view, labels in found.items() if labels}
 
 
@@ -264,7 +264,9 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
     counts = value["counts"]
     if tuple(value["size"]) != tuple(size_hw):
         raise SceneError(
-            f"{where} does not fit its photograph", expected=f"size {list(size_hw)}", found=value["size"]
+            f"{where} does not have the size of its photograph",
+            expected=f"size {list(size_hw)}",
+            found=value["size"],
         )
     runs = unpacked_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
     if sum(runs) != size_hw[0] * size_hw[1] or min(runs, default=0) < 0:
@@ -306,7 +308,7 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
     size_hw = cameras[view].size_hw
     if (height, width) != (None, None) and (height, width) != tuple(size_hw):
         raise SceneError(
-            f"{name} does not fit its photograph",
+            f"{name} does not have the size of its photograph",
             expected=f"{size_hw[1]} x {size_hw[0]} px (width x height), undistorted",
             found=f"{width} x {height} px",
         )

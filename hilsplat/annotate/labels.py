@@ -133,7 +133,7 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
     found = read_isat(path)
     if found.size_hw != tuple(size_hw):
         raise SceneError(
-            f"label file {path} does not fit its photograph",
+            f"label file {path} does not have the size of its photograph",
             expected=f"{size_hw[1]} x {size_hw[0]} px (width x height)",
             found=f"{found.size_hw[1]} x {found.size_hw[0]} px",
             fix="annotate the scene that it was drawn on, or move the file away",

@@ -122,7 +122,7 @@ class Proposals:
     def carried(
         self, known: Mapping[str, Sequence[Label]], ids: Sequence[int], view: str
     ) -> list[tuple[Label, list[list[tuple[int, int]]]]]:
-        """Transfer things of other views to a view by their Gaussians, parents before children.
+        """Transfer objects annotated in other views to a view by their Gaussians, parents before children.
 
         A Gaussian belongs to a thing if more than half of its weight in the thing's annotated views is inside
         the thing's regions. Gaussians that none of those views sees are ignored. Children are cut to their
@@ -251,7 +251,7 @@ class Clicks:
     def outlines(
         self, view: str, clicks: Sequence[tuple[int, int, bool]], box: tuple[int, int, int, int] | None
     ) -> list[Proposal]:
-        """Return the outlines of the thing at clicks or in a box, best first.
+        """Return the outlines of the object at clicks or in a box, best first.
 
         Masks are ranked by the number of clicks that they satisfy, then by SAM's predicted IoU (with a box,
         times the IoU of the mask's box and the given one).

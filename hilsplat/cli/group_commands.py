@@ -267,7 +267,7 @@ def datasets_fits(
         str | None,
         typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own of this scene"),
     ] = None,
-    variant: Annotated[str, typer.Option(help="variant whose masks and tree to measure")] = "default",
+    variant: Annotated[str, typer.Option(help="variant whose masks and tree are measured")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     threads: Threads = 2,

@@ -57,7 +57,10 @@ def new(
         Path | None, typer.Option(help="3DGS PLY; none: fit Gaussians; default: 3DGS output in the folder")
     ] = None,
     features: Annotated[
-        Path | None, typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: those found")
+        Path | None,
+        typer.Option(
+            help="LangSplat's features; none: use SAM and CLIP; default: use features if any are found"
+        ),
     ] = None,
     labels: Annotated[
         Path | None, typer.Option(help="LERF-OVS labels, for scores; none: no labels; default: those found")

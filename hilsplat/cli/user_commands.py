@@ -163,7 +163,7 @@ def export(
     """
     folder = scene_folder(scene, results)
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ArtifactError(f"--out {out} exists", fix="name a new folder, or remove it first")
+        raise ArtifactError(f"--out {out} exists", fix="name a new folder, or remove this one first")
     name = form.value if variant == "default" else f"{form.value}-{variant}"
     typer.echo(_write(form, folder, out or folder / "export" / name, variant, data_root, threads))
 

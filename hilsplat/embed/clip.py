@@ -234,7 +234,7 @@ def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
         seen[place] = model.digest
     raise ModelError(
         f"the CLIP model that embedded the masks in {clip_folder} was not found",
-        expected=f"a model folder with digest {expected[:12]}; it was {recorded}",
+        expected=f"a model folder with digest {expected[:12]}, such as {recorded} at that time",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
         or f"no CLIP model at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
         fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "

@@ -97,7 +97,7 @@ def provider_disagreement(folder: Path) -> str | None:
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
     """Return the timings of a model, from an earlier measurement in `cache` if available.
 
-    `precision` is "fp32", or "auto" or "int8" for int8 where possible.
+    `precision`: "fp32"; "auto" and "int8" both mean int8 where possible.
     """
     model = open_model_folder(folder, variant=variant)
     requested = "int8" if precision != "fp32" and may_be_int8(model) else "fp32"

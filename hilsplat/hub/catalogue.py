@@ -75,7 +75,7 @@ class HubFile:
     path: str
     size: int
     digest: str  # SHA-256 of the bytes (64 digits), or git's SHA-1 of a small file (40 digits)
-    cached: Path | None = None  # the file in the hub's local cache, if the listing is that of the cache
+    cached: Path | None = None  # the file in the hub's local cache, if the listing was read from the cache
 
     def digest_of(self, path: Path) -> str:
         """Return the digest of a local file, of the same kind as the listed one."""

@@ -55,7 +55,7 @@ RELEASES = (
         "clip-vit-b-16-laion2b",
         "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",
         600,
-        "queries as in LangSplat and the paper; exported here (extra export)",
+        "queries as in LangSplat and the paper; exported on this machine by the extra `export`",
         "clip",
         "MIT",
     ),
@@ -142,7 +142,7 @@ def _folders() -> list[Path]:
 def model_digest(folder: Path, cache: Path) -> str:
     """Return the digest of a model folder, or "... is missing"; the stage reports how to fix it.
 
-    Digests are kept in `cache` by the sizes and modification times of the files: reading ViT-H takes seconds.
+    Digests are kept in `cache`, keyed by file sizes and modification times: reading ViT-H takes seconds.
     """
     if not folder.is_dir():
         return f"{folder} is missing"

@@ -47,7 +47,7 @@ class PhotoReport:
     Attributes:
         sizes: number of readable photographs per upright size (height, width), px.
         unreadable: (file name, reason) of each image that cannot be read.
-        num_rotated: number of photographs that an EXIF flag rotates.
+        num_rotated: number of photographs that are rotated according to their EXIF orientation.
         duplicates: groups of file names with identical bytes.
         passed_over: number of skipped files in unsupported photograph formats, by suffix.
         doubts: likely problems and what to do about them (`check`).
@@ -78,7 +78,7 @@ class PhotoReport:
         for (height, width), count in sorted(self.sizes.items(), key=lambda item: (-item[1], item[0])):
             lines.append(f"  {count:>5}  of {width} x {height} px (width x height)")
         if self.num_rotated:
-            lines.append(f"  {self.num_rotated:>5}  turned upright by their EXIF flag")
+            lines.append(f"  {self.num_rotated:>5}  rotated upright according to their EXIF orientation")
         for names in self.duplicates:
             lines.append(f"  {len(names):>5}  are the same file: {', '.join(names)}")
         for suffix, count in sorted(self.passed_over.items()):

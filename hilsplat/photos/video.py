@@ -114,9 +114,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
             )
     chosen = choose_frames(candidates, count)
     if len(chosen) < count:
-        notes.append(
-            f"{len(chosen)} frames instead of {count}: no more of them differ enough from each other"
-        )
+        notes.append(f"{len(chosen)} frames instead of {count}: the others are too similar")
     named = {f"{row:04d}.jpg": frame for row, frame in enumerate(chosen, start=1)}
     for position, video in enumerate(videos):
         names = {frame.number: name for name, frame in named.items() if frame.video == position}

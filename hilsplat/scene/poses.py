@@ -271,7 +271,7 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
         return f"too few matches: no other view shares {MIN_INLIERS} verified ones"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
-            return f"in model {number} of {len(names)} views, not in the largest"
+            return f"in model {number} ({len(names)} views), not in the largest model"
     best = entry["best_pair_matches"]
     return f"no pose found: too few matches with posed views (best pair: {best} matches)"
 

@@ -282,7 +282,7 @@ def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, 
 @compiled
 @no_type_check
 def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k, s, scaled, top, sums):
-    """Add a block to an attention of tokens to pixels whose keys and values are sums of factors.
+    """Add a block to token-to-pixel attention, where keys and values are sums of factored terms.
 
     Args:
         sizes, b, i: as in `read_image`; indices of block and prompt.

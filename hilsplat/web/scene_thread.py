@@ -144,7 +144,7 @@ class SceneThread(Generic[Shown]):
         return handle
 
     async def do_behind(self, request: Request, work: Callable[[Shown], Made]) -> Made:
-        """Run as `do`, but one at a time: other requests then wait for at most one of these.
+        """Run like `do`, but one call at a time, so that other requests wait for at most one of them.
 
         The outline requests a hundred crops when the page opens.
         """

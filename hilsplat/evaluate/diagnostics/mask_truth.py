@@ -50,7 +50,7 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
         labels = truth.label_image(view, level)
         if labels.shape != tuple(masks.size_hw):
             raise MisalignedArtifactError(
-                f"masks of view {view} do not fit its label images",
+                f"masks of view {view} do not have the size of its label images",
                 expected=f"{labels.shape[0]} x {labels.shape[1]} (height x width)",
                 found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
                 fix="run poses without shrinking the images (poses.max_side_px), then masks again",

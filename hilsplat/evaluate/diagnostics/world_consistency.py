@@ -232,7 +232,7 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         expected = cameras[view].size_hw
         if masks.size_hw != expected:
             raise MisalignedArtifactError(
-                f"masks of view {view} do not fit its ground-truth camera",
+                f"masks of view {view} do not have the size of its ground-truth camera",
                 expected=f"{expected[0]} x {expected[1]} (height x width)",
                 found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
                 fix="run poses without shrinking the images (poses.max_side_px), then masks again",

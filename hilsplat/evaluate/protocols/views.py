@@ -48,7 +48,7 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
 
 
 def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) -> str:
-    """Return the protocol name of a row: the card's name and deviating settings that affect this method."""
+    """Return the protocol name of a row: the card's name and non-default settings that affect it."""
     if method == "truth":
         return card.labelled()
     rule = rule_of(settings)

@@ -79,7 +79,7 @@ def test_a_resting_camera_gives_one_frame_despite_jitter(tmp_path):
     video = write_video(tmp_path / "a.mp4", pan(tremble))
     _, notes, origin = extracted([video], tmp_path, 20)
     assert len(origin["frames"]) == 1
-    assert notes == ["1 frames instead of 20: no more of them differ enough from each other"]
+    assert notes == ["1 frames instead of 20: the others are too similar"]
 
 
 def test_frames_are_spread_over_the_path_rather_than_time(tmp_path):
