@@ -82,7 +82,7 @@ def with_models(section: Settings) -> Settings:
     """Replace `auto` in a section by existing models, so that records name the models that were used.
 
     `masks.segmenter: auto` selects the SAM model in `masks.model` or, if that is also auto, the best
-    pretrained SAM; without one, it selects the graph segmenter. `masks.model: auto` and `clip.model: auto`
+    pretrained SAM; if there is none, the graph segmenter. `masks.model: auto` and `clip.model: auto`
     select the best pretrained model, else the embedded one. Other sections are returned unchanged.
     """
     if isinstance(section, settings.ClipSettings) and section.model == AUTO:
@@ -100,7 +100,7 @@ def with_models(section: Settings) -> Settings:
 
 
 def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:
-    """Convert pydantic's error to one line per key: its place, the problem, and what is allowed."""
+    """Convert pydantic's error to one line per key: location, problem, and what is allowed."""
     lines = []
     for problem in error.errors():
         path = [str(part) for part in problem["loc"]]
@@ -142,10 +142,10 @@ UPSTREAM: dict[str, tuple[str, ...]] = {
 """Stage -> sections on which it depends, directly or through its inputs; see `upstream`."""
 
 RESERVED = ("annotations", "benchmarks", "export", "gaussians", "logs", "queries", "scene", "world")
-"""Names of files and folders in a scene folder, which variants cannot have."""
+"""Names of files and folders in a scene folder; a variant cannot have such a name."""
 
 SEEDED = re.compile(r"(.+)\.seed([0-9]+)")
-"""Name of a variant with a seed other than the first: the variant, and the number of the seed."""
+"""Name of a variant with a seed other than the first: the variant and the seed's number."""
 
 
 class RunSettings(StageSettings):
@@ -158,7 +158,7 @@ class RunSettings(StageSettings):
     only: tuple[str, ...] = knob(
         (), "the only scenes to run, from any group: table-1, or synthetic/table-1; empty: all in the groups"
     )
-    # The report shows the data root and cannot escape it.
+    # The report shows the data root without escaping special characters.
     data_root: str = knob(
         "", "folder of the published data sets; empty: their scenes are skipped", pattern="^[^<>]*$"
     )
@@ -190,13 +190,13 @@ class RunSettings(StageSettings):
         return (value,) if isinstance(value, str) else value
 
     def every_variant(self) -> list[str]:
-        """Return all variants, tabulated or not, per seed: "default", then in the order of `variants`."""
+        """Return all variants, tabulated or not, once per seed: "default", then as in `variants`."""
         return [
             name for first in dict.fromkeys(["default", *self.variants]) for name in self._all_seeds(first)
         ]
 
     def variant_names(self) -> list[str]:
-        """Return the variants in the run's tables, "default" first; with several seeds, each per seed."""
+        """Return the variants in the run's tables, "default" first; with several seeds, each once per seed."""
         names = [
             *("default", *self.main_variants, *self.ablation_variants, *self.component_variants),
             *(*self.theta_variants, *self.omega_variants, *self.pruning_variants),
@@ -204,7 +204,7 @@ class RunSettings(StageSettings):
         return [name for first in dict.fromkeys(names) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
-        """Return the names of a variant per seed: its own, then, if it is random, `<name>.seed1`, ..."""
+        """Return a variant's name and, if the variant is random, its names for further seeds: `<name>.seed1`, ..."""
         is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
         return self._all_seeds(variant) if is_random else [variant]
 
@@ -254,7 +254,7 @@ class RunSettings(StageSettings):
 
 
 def _parts_of(name: str) -> tuple[str, int]:
-    """Split a variant name into the variant and the number of the seed (0 if the name has none)."""
+    """Split a variant name into the variant and its seed number (0 if the name has none)."""
     found = SEEDED.fullmatch(name)
     return (found[1], int(found[2])) if found else (name, 0)
 
@@ -307,7 +307,7 @@ def require_known(where: str, keys: Iterable[str], known: Collection[str]) -> No
 
 
 class _UniqueKeys(yaml.SafeLoader):
-    """YAML loader that refuses duplicate keys, because the first of them would be ignored."""
+    """YAML loader that refuses duplicate keys, because all but the last would be ignored."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -334,7 +334,7 @@ def read_config(path: Path) -> dict[str, Any]:
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct the path") from error
-    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: a date, not UTF-8
+    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:  # ValueError: bad date or UTF-8
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
     if not isinstance(found, dict):
         kind = "nothing" if found is None else type(found).__name__

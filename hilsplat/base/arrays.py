@@ -1,6 +1,6 @@
-"""Validation of an artifact's arrays against its dataclass, when it is opened.
+"""Validation of an artifact's arrays against its dataclass when the artifact is opened.
 
-Compiled loops do not check bounds, so an offset out of range would crash the process.
+Compiled loops do not check bounds, so an out-of-range offset would crash the process.
 """
 
 import json
@@ -25,7 +25,7 @@ Limits = Mapping[str, tuple[int | float, int | float]]  # array name -> minimum 
 def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Limits) -> None:
     """Check arrays, by field name, against the jaxtyping annotations of a dataclass.
 
-    Sizes with the same name must agree.
+    Dimensions with the same name must have the same size.
 
     Raises:
         ArtifactError: an array has the wrong type or shape, or a value that is not finite or is out of range.
@@ -58,7 +58,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
 
 
 def described(declared: type[AbstractArray]) -> str:
-    """Return a jaxtyping annotation in readable form: `Float32[N 3]`."""
+    """Return a jaxtyping annotation in readable form, such as `Float32[N 3]`."""
     return f"{declared.__name__.partition('[')[0]}[{declared.dim_str.strip()}]"
 
 
@@ -93,11 +93,11 @@ def made(
 
 
 TENSORS_KEY = "hilsplat"
-"""Metadata key of a .safetensors file: JSON with information about its arrays and their checksum."""
+"""Metadata key in a .safetensors file; its value is JSON that describes the arrays, with their checksum."""
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
-    """Write a .safetensors file atomically; the same arrays give the same bytes."""
+    """Write a .safetensors file atomically; identical arrays produce identical bytes."""
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     known = json.dumps({**about, "crc32": _checksum(arrays, about)}, sort_keys=True)
     with atomic_path(path) as temporary:
@@ -105,7 +105,7 @@ def write_tensors(path: Path, arrays: Mapping[str, np.ndarray], **about: Any) ->
 
 
 def read_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read what `write_tensors` wrote: arrays and information; raise ArtifactError for any other file."""
+    """Return the arrays and information from a `write_tensors` file; raise ArtifactError for other files."""
     try:
         with safe_open(path, framework="np") as file:
             about = parse_json(file.metadata()[TENSORS_KEY])

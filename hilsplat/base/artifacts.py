@@ -81,7 +81,7 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def _keep_mode(path: Path) -> Iterator[None]:
-    """Create a file with the umask's mode, and restore that mode, because safetensors changes it to 0600."""
+    """Create a file with the umask's mode, and restore it at the end: safetensors sets 0600."""
     path.touch()
     mode = path.stat().st_mode & 0o777
     yield
@@ -150,17 +150,17 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 FULL_DISK = ("No space left on device", "disk is full", "Disk quota exceeded")
-"""Parts of messages from C++ and Rust libraries with their own error types: safetensors, SQLite."""
+"""Parts of disk-full messages from C++ and Rust libraries with their own error types: safetensors, SQLite."""
 
 LIBRARY_ERRORS = (RuntimeError, ChildProcessError)
-"""Errors of C++ libraries, and of libraries that end their process."""
+"""Errors from C++ libraries, and from libraries that terminate their process."""
 FULL_BELOW_MIB = 1.0
-"""Free space below which they are attributed to a full disk: COLMAP does not report full disks."""
+"""Free space below which `LIBRARY_ERRORS` are attributed to a full disk, which COLMAP does not report."""
 
 
 @contextmanager
 def explain_full_disk(path: Path) -> Iterator[None]:
-    """Raise DiskSpaceError, with disk and fix, if writing `path` fails because the disk is full."""
+    """Raise DiskSpaceError, naming the disk and a fix, if writing `path` fails because the disk is full."""
     try:
         yield
     except HilsplatError:
@@ -240,7 +240,7 @@ def _readable(
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
-    """Write a compressed .npz file atomically, with fixed time stamps: same arrays, same bytes."""
+    """Write a compressed .npz file atomically; identical arrays give identical bytes (fixed timestamps)."""
     _write_zip(path, arrays, zipfile.ZIP_DEFLATED)
 
 
@@ -250,7 +250,7 @@ def _write_zip(path: Path, arrays: dict[str, np.ndarray], method: int, *, durabl
         zipfile.ZipFile(temporary, "w", method, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # Entries opened by name get the time stamp 1980-01-01. They are written in pieces, because a
+            # Entries opened by name get the timestamp 1980-01-01. They are written in pieces, because a
             # copy of a large array or its compressed form may not fit into memory.
             large = array.nbytes > ZIP64_BYTES
             with archive.open(f"{name}.npy", "w", force_zip64=large) as stream:
@@ -280,7 +280,7 @@ def write_npy(path: Path, array: np.ndarray) -> None:
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """Read an array of numbers from an .npy file, never pickles; raise ArtifactError for anything else."""
+    """Read a numeric array from an .npy file without unpickling; raise ArtifactError for anything else."""
     with _readable(path):
         array = np.load(path, allow_pickle=False)
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
@@ -319,14 +319,14 @@ def sha256_of_path(path: Path) -> str:
 
 
 def visible_files(folder: Path) -> list[Path]:
-    """Return the files below a folder, sorted, without hidden files and files in hidden folders."""
+    """Return the files in a folder and its subfolders, sorted; skip hidden files and hidden folders."""
     folder = Path(folder)
     files = (path for path in folder.rglob("*") if path.is_file())
     return sorted(f for f in files if not any(part[0] == "." for part in f.relative_to(folder).parts))
 
 
 def write_index(folder: Path, views: Mapping[str, Any], **more: Any) -> None:
-    """Complete a folder artifact by writing its index: an entry per view, and checksums of all files."""
+    """Complete a folder artifact by writing its index, with an entry per view and checksums of all files."""
     folder = Path(folder)
     files = sorted(path for path in folder.rglob("*") if path.suffix in SEALED)
     sums = {path.relative_to(folder).as_posix(): _crc32_of_file(path) for path in files}
@@ -366,7 +366,7 @@ def _index(folder: Path) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=16)
 def _unsealed(path: Path, *_: int) -> dict[str, Any]:
-    """Read an index and compare it with its seal; cached until the file changes."""
+    """Read an index and compare it with its seal; the result is cached until the file changes."""
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
         raise ArtifactError(
@@ -378,7 +378,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
 
 
 def sealed(folder: Path, name: str) -> Path:
-    """Return the path of an artifact's file; raise ArtifactError if its bytes are not those in the index."""
+    """Return the path of an artifact's file; raise ArtifactError if its checksum is not in the index."""
     path = Path(folder) / name
     sums = _index(Path(folder))["crc32"]
     if not path.is_file():
@@ -410,12 +410,12 @@ def _crc32_of_file(path: Path) -> int:
 
 
 class ViewCache:
-    """Finished views of a stage, as .npz files outside its output; the rerun of a killed stage reuses them.
+    """Cache of a stage's finished views, as .npz files outside its output, reused if a killed stage reruns.
 
     Keys must cover all inputs of the result: the digests of image, model and code, and the settings.
 
     Args:
-        folder: such as `results/.cache/masks`.
+        folder: cache folder, such as `results/.cache/masks`.
         compressed: compress entries; not useful for floating-point numbers, which shrink little.
     """
 
@@ -425,7 +425,7 @@ class ViewCache:
         self.hits = 0
 
     def path(self, key: str) -> Path:
-        """Return the file of a key; it may not exist."""
+        """Return the path of a key's file, which may not exist."""
         return self.folder / key[:2] / f"{key}.npz"
 
     def get(self, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -452,7 +452,7 @@ class ViewCache:
     def put(self, key: str, arrays: dict[str, np.ndarray]) -> None:
         """Store an entry, replacing any existing one."""
         # A power failure may truncate entries or fill them with zeros. Reading detects this by checksums, and
-        # the entry is recomputed, so entries are not flushed to the disk (milliseconds each).
+        # the entry is recomputed, so entries are not flushed to disk (milliseconds each).
         _write_zip(self.path(key), arrays, self._method, durable=False)
 
 
@@ -460,8 +460,8 @@ class ViewCache:
 def output_lock(output: Path) -> Iterator[None]:
     """Lock an output for writing; raise ArtifactError if another process is writing it.
 
-    If a writer fails or is killed, its lock file is left non-empty: the output may then match neither its
-    provenance nor the inputs of that writer.
+    If a writer fails or is killed, its lock file stays non-empty, because the output may then match
+    neither its provenance nor that writer's inputs.
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)

@@ -12,11 +12,11 @@ VIEW_CACHES = ("masks", "clip", "contributions")
 
 CHECKPOINTS = "gaussians"  # cache of fit checkpoints
 FIT_DAYS = 1.0
-"""Age below which a checkpoint is kept: its fit may still be running. Fits write them far more often."""
+"""Age below which a checkpoint is kept, because its fit may still be running; fits save more often."""
 
 
 def caches(folder: Path) -> dict[str, list[Path]]:
-    """Return the complete entries of each cache in a cache folder, by name of its folder or file."""
+    """Map the folder or file name of each cache in a cache folder to the cache's complete entries."""
     places = sorted(Path(folder).glob("[!.]*"))
     return {place.name: visible_files(place) if place.is_dir() else [place] for place in places}
 
@@ -34,12 +34,12 @@ def size_table(folder: Path) -> str:
 def prune_cache(
     folder: Path, stages: list[str], *, days: float | None = None, max_mib: float | None = None
 ) -> tuple[int, float]:
-    """Delete unfinished files of killed jobs, and cache entries starting with the least recently used.
+    """Delete unfinished files of killed jobs, then cache entries, least recently used first.
 
     Args:
         stages: caches to prune; an empty list selects the view caches and, with `days`, the checkpoints.
         days: delete entries not used for this many days.
-        max_mib: then delete entries until at most this much is left. Without limits, no entries are deleted.
+        max_mib: then delete entries down to this total size. If both limits are None, no entries are deleted.
 
     Returns:
         Number of deleted entries, and their size in MiB.

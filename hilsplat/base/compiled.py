@@ -16,10 +16,10 @@ logger = logging.getLogger(__name__)
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Apply `numba.njit` without the GIL, cached on disk until code that the loop uses changes.
+    """Apply `numba.njit` without the GIL, and cache the result on disk until code that the loop uses changes.
 
-    By default, numba recompiles a cached loop if and only if the loop's own file changes: it would miss edits
-    to a function in another file that the loop calls, and recompile after a comment is edited.
+    By default, numba recompiles a cached loop if and only if the loop's own file changes. It would miss edits
+    to functions that the loop calls from other files, and recompile after an edit to a comment.
     """
     if function is None:
         return lambda later: compiled(later, **options)
@@ -35,7 +35,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 class _Stamp:
     """Digest of the imported code that a loop is compiled from, computed when numba first opens its cache.
 
-    It is falsy if the package was edited since its import: numba then neither reads nor writes the cache.
+    It is falsy if the package was edited after its import; numba then neither reads nor writes the cache.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:

@@ -14,14 +14,14 @@ NEUTRAL_DECORATORS = {
     *("cache", "cached_property", "compiled", "contextmanager", "dataclass", "lru_cache"),
     *("no_type_check", "overload"),
 }
-"""Decorators that do not register anything: a definition with only these counts only if it is reached."""
+"""Decorators that register nothing: a definition that has no others counts only if it is reached."""
 
 PROSE = {
     "knob": ("unit", "origin"),
     "Dataset": ("licence", "terms", "citation", "layout"),
     "Segments": ("licence", "terms", "citation", "layout"),
 }
-"""Called name -> keyword arguments that are documentation only."""
+"""Name of a called function or class -> its keyword arguments that are documentation only."""
 
 LOG_METHODS = {"debug", "info", "warning", "error", "exception"}
 
@@ -39,11 +39,11 @@ class Statement:
     """A statement at the top of a module.
 
     Attributes:
-        text: the parts that count.
-        names: dotted names that it looks up in the module.
+        text: the parts that can change a result.
+        names: dotted names that the statement looks up in the module.
         inner: imports inside its functions, each with the attributes used from it.
         imports: for import statements, the target of each name.
-        signature: names in the annotations of a function's arguments, or of a class's methods.
+        signature: names in the argument annotations of a function, or of a class's methods.
     """
 
     text: bytes = b""
@@ -177,7 +177,7 @@ def _strip(top: ast.AST) -> None:
             for inner in ast.walk(node):
                 if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
                     inner.value = ""
-                elif isinstance(inner, ast.JoinedStr):  # its literal parts also separate its values
+                elif isinstance(inner, ast.JoinedStr):  # even empty literals would change the digest
                     inner.values = [part for part in inner.values if isinstance(part, ast.FormattedValue)]
         elif isinstance(node, ast.Call):
             called = (_chain(node.func) or ("",))[-1]
@@ -282,7 +282,7 @@ class _Names:
 
 
 def _own(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
-    """Yield the nodes of a block, without those inside functions and classes that it defines."""
+    """Yield the nodes of a block, except those inside functions and classes that the block defines."""
     waiting = list(body)
     while waiting:
         node = waiting.pop()

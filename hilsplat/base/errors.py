@@ -54,7 +54,7 @@ def require_working_directory() -> None:
 
 
 NO_MEMORY = ("can't start new thread", "failed to map segment", "Could not find/load shared object")
-"""Parts of error messages if `ulimit -v` prevents a library from starting a thread or being loaded."""
+"""Parts of error messages that appear if `ulimit -v` keeps a library from loading or starting a thread."""
 
 PLACES = {
     errno.EACCES: "cannot be read or written: permission denied",
@@ -112,7 +112,7 @@ class EmptyMaskError(HilsplatError):
 
 
 class DiskSpaceError(HilsplatError):
-    """The disk is full, or too full for what a stage is about to write."""
+    """The disk is full, or has too little free space for a stage's output."""
 
 
 class DeviceError(HilsplatError):

@@ -1,4 +1,4 @@
-"""Rules for names used as folder names, images in a folder, and files of the installed project."""
+"""Rules for names in paths, lists of the images in a folder, and paths in the installed project."""
 
 import re
 from collections.abc import Collection
@@ -21,7 +21,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 def project_path(path: str | Path) -> Path:
-    """Return a project path: in the working folder if it exists there, else in the installed project.
+    """Return the path in the working folder if it exists there, else in the installed project.
 
     A path that exists in neither is returned unchanged, so that messages show what the user wrote.
     """
@@ -30,12 +30,12 @@ def project_path(path: str | Path) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Return the image files in a folder, sorted, without hidden files."""
+    """Return the image files in a folder, sorted; skip hidden files."""
     return list_files(folder, IMAGE_SUFFIXES)
 
 
 def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """Return the files in a folder with one of these suffixes, sorted, without hidden files."""
+    """Return the files in a folder with one of these suffixes, sorted; skip hidden files."""
     return sorted(
         path
         for path in Path(folder).iterdir()
@@ -46,7 +46,7 @@ def list_files(folder: Path, suffixes: Collection[str]) -> list[Path]:
 
 
 def name_problem(name: str) -> str | None:
-    """Return what is wrong with a name, or None."""
+    """Return the problem with a name, or None if the name is valid."""
     if not name:
         return "it is empty"
     if len(name) > MAX_NAME:

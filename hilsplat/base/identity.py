@@ -10,7 +10,7 @@ classes and module-level statements of this package. Parts that cannot change a 
 - function annotations, except those of roots, whose arguments come from outside;
 - the entries of a `Plugins` table: a stage that uses one adds it to its roots.
 
-A class that is reached counts as a whole. If anything in a module is reached, its statements that bind no
+A class that is reached counts as a whole. If anything in a module is reached, the statements that bind no
 name also count, as do definitions whose decorators may register them: importing the module runs both.
 """
 
@@ -74,7 +74,7 @@ def _digest(roots: tuple[str, ...], root: Path) -> str:
 
 
 def _read_state(root: Path) -> str:
-    """Return a digest of the names, times and sizes of all modules; Python detects changes the same way."""
+    """Return a digest of all modules' paths, times and sizes; Python also detects changes by these."""
     found, folders = [], [str(root)]
     for folder in folders:
         with os.scandir(folder) as entries:
@@ -128,7 +128,7 @@ def _place(code: Code) -> str:
 
 
 def _reach(roots: tuple[str, ...], root: Path) -> dict[Key, list[bytes]]:
-    """Return every definition that is reached, with the parts of its text that count."""
+    """Return every reachable definition, with the parts of its text that can change a result."""
     found: dict[Key, list[bytes]] = {}
     waiting: list[tuple[str, str]] = []
 

@@ -52,7 +52,7 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """Read an image as upright sRGB.
 
     The EXIF orientation is applied. Colours with an embedded profile (Display P3 from phones, Adobe RGB) and
-    CMYK are converted, alpha is dropped, grey is copied to all channels, and 16 bits become 8.
+    CMYK are converted, alpha is dropped, grey is copied to all channels, and 16-bit values become 8-bit.
 
     Raises:
         ImageError: the file is missing, empty, truncated or not an image.
@@ -122,7 +122,7 @@ def _srgb_profile() -> ImageCms.ImageCmsProfile:
 def write_png(
     path: Path, pixels: np.ndarray, compression: int = 6, text: Mapping[str, str] | None = None
 ) -> None:
-    """Write an image (H W 3 or H W; 16-bit only if grey) as PNG, with text metadata by key, atomically."""
+    """Write an image (H W 3 or H W; 16-bit only if grey) as PNG atomically, with `text` as its metadata."""
     metadata = PngImagePlugin.PngInfo()
     for key, value in (text or {}).items():
         metadata.add_text(key, value)
@@ -143,7 +143,7 @@ def to_uint8(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]
 
 
 def resize_to_fit(pixels: UInt8[np.ndarray, "H W 3"], max_side_px: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Shrink so that the longer side is at most `max_side_px` (area filter); never enlarge."""
+    """Shrink an image so that its longer side is at most `max_side_px` (area filter); never enlarge it."""
     import cv2
 
     height, width = pixels.shape[:2]

@@ -1,4 +1,4 @@
-"""Matrix products of a few rows with 16 or 32 columns, with all sums in registers."""
+"""Products of a matrix with few rows and one with 16 or 32 columns; all sums stay in registers."""
 
 from typing import Any
 
@@ -27,9 +27,9 @@ def rows_of_products(rows: int) -> Any:
     added in the order of k. A plain numba loop would spill this many sums to memory.
 
     Returns:
-        a numba function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide): flat float32
-        arrays, each with the index of its first element and the step between rows; the number of products;
-        whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
+        A numba function of (y, y0, y_step, a, a0, a_step, x, x0, x_step, inner, begin, wide): flat float32
+        arrays, each followed by the index of its first element and the step between rows; the number of terms
+        per sum; whether y starts at zero; whether there are `WIDE_COLUMNS` columns or `WIDTH`.
     """
 
     @intrinsic

@@ -29,12 +29,12 @@ _INTS = ir.VectorType(_INT, WIDTH)
 # A product and a sum may be fused into one operation with one rounding; reordering is not allowed.
 _FLAGS = ("contract",)
 _RECIPROCAL_BITS = 0x7EF311C7
-"""Twice the exponent bits of 1, minus a correction that balances errors of both signs in the first guess."""
+"""Twice the exponent bits of 1, minus a correction that balances the signs of the first guess's errors."""
 _MASKED_STORE = f"llvm.masked.store.v{WIDTH}f32.p0"
 
 
 class LanesType(types.Type):
-    """Numba type of 16 numbers with one element type."""
+    """Numba type of a vector of 16 numbers of the same type."""
 
     def __init__(self, dtype: types.Float) -> None:
         self.dtype = dtype
@@ -61,7 +61,7 @@ def _all_equal(
 
 
 def _binary(python_operator: Any, emit: Any) -> None:
-    """Register an operator with numba, between two lane values or a lane value and a scalar."""
+    """Register an operator with numba for two lane values, or for a lane value and a scalar."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
@@ -124,7 +124,7 @@ def lanes(typingctx, scalar):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Load 16 consecutive numbers of a flat float32 or float64 array."""
+    """Load 16 consecutive numbers from a flat float32 or float64 array."""
     if not _is_flat(array):
         return None
 
@@ -309,7 +309,7 @@ def column_bits(typingctx, words, index, bit):
 
 @intrinsic
 def first_bit(typingctx, bits):
-    """Return the number of the lowest bit that is set; `bits` must not be 0."""
+    """Return the index of the lowest set bit; `bits` must not be 0."""
 
     def codegen(context, builder, sig, args):
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -321,8 +321,8 @@ def first_bit(typingctx, bits):
 def store_sums(typingctx, array, index, vectors):
     """Store the lane sums of up to 16 vectors (a tuple) at consecutive indices.
 
-    Each step merges two vectors into one with groups of half the width, which takes half as many instructions
-    as a `lane_sum` of each.
+    Each step merges pairs of vectors and halves the number of lanes per partial sum. This takes half as many
+    instructions as a `lane_sum` of each vector.
     """
     if not isinstance(vectors, types.UniTuple) or vectors.dtype != LANES or not 2 <= len(vectors) <= WIDTH:
         return None

@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 logger = logging.getLogger(__name__)
 
 PARENT = "HILSPLAT_PARENT"
-"""Environment variable with the id of the process whose jobs must end with it (rules/common.smk)."""
+"""Environment variable with the id of the process that its jobs must end with (rules/common.smk)."""
 
 PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 
@@ -36,7 +36,7 @@ def end_with_parent(parent: int) -> None:
     """Kill this process as soon as the process that started it ends for any reason.
 
     Otherwise jobs of a killed Snakemake process would continue, and write outputs with old settings during
-    the next run. Linux kills the process if no shell is in between; otherwise a thread checks every second.
+    the next run. Linux does this unless a shell is in between; otherwise, a thread checks every second.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -62,8 +62,8 @@ def end_with_workflow() -> None:
 UNFINISHED = re.compile(r"\.writing-(?P<host>[0-9a-f]{8})-.*", re.DOTALL)
 """Name of a folder of unfinished files; it is hidden, so digests ignore it."""
 
-LOCK = ".lock"  # in such a folder, the file that its writer locks
-FORMER = ".former"  # and a folder for the version that is being replaced
+LOCK = ".lock"  # file in such a folder; its writer locks it
+FORMER = ".former"  # subfolder for the version that is being replaced
 
 
 @functools.cache
@@ -82,7 +82,7 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
     """Create a folder for unfinished files, and delete it at the end.
 
     A locked file in it shows `remove_leftovers` that the writer is alive: the system releases the lock when
-    the writer ends, even if it is killed. Process ids have no meaning in other containers and after a reboot.
+    the writer ends, even if it is killed. Process ids have no meaning in other containers or after a reboot.
     The folder itself is not locked, because NFS can lock only files.
     """
     is_locked = False
@@ -100,7 +100,7 @@ def unfinished_folder(parent: Path) -> Iterator[Path]:
 
 
 def _discard(folder: Path, lock: IO[bytes]) -> None:
-    """Delete a folder of unfinished files; restore a previous version in it that was not replaced."""
+    """Delete a folder of unfinished files after restoring any previous version that was not replaced."""
     former = folder / FORMER
     if former.is_dir():
         for version in former.iterdir():
@@ -113,7 +113,7 @@ def _discard(folder: Path, lock: IO[bytes]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete unfinished files that dead processes of this host left below a folder; return their folders.
+    """Delete unfinished files that dead processes of this host left under a folder; return what was deleted.
 
     Files of live processes, including those in other containers, are kept. So are files of other hosts that
     share the folder, because their locks may be invisible here.
@@ -126,7 +126,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
                 continue
             path = Path(place) / name
             with suppress(BlockingIOError, FileNotFoundError, PermissionError):
-                with (path / LOCK).open("ab") as stream:  # created if missing, as a writer may be about to
+                with (path / LOCK).open("ab") as stream:  # a new folder may not contain it yet
                     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     _discard(path, stream)
                 removed.append(path)
@@ -204,7 +204,7 @@ def _threads(number: int) -> ThreadPoolExecutor:
 
 
 def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *arguments: Any) -> list[Any]:
-    """Call `work(begin, end, *arguments)` for neighbouring `edges` on threads; return results in order."""
+    """Call `work(begin, end, *arguments)` for adjacent `edges` in threads; return the results in order."""
     if threads <= 1:
         return [work(begin, end, *arguments) for begin, end in itertools.pairwise(edges)]
     return list(_threads(threads).map(lambda begin, end: work(begin, end, *arguments), edges[:-1], edges[1:]))
@@ -213,7 +213,7 @@ def over_edges(work: Callable[..., Any], edges: list[int], threads: int, *argume
 def in_order(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
     """Yield the results of `work` in the order of `items`, computed by up to `threads` threads.
 
-    At most `2 * threads` results are pending. If an item fails, those not yet started are cancelled. Under a
+    At most `2 * threads` results are pending. If an item fails, items not yet started are cancelled. Under a
     debugger, items are computed in the calling thread.
     """
     if sys.gettrace() is not None:  # debuggers stop only at breakpoints in this thread

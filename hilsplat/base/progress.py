@@ -29,7 +29,7 @@ WARNING = re.compile(r"^\d{4}-\S+ \S+ WARNING \S+ (?P<text>.+?)(?=\n\d{4}-|\Z)",
 
 
 def last_progress(log: Path) -> tuple[str, int, int] | None:
-    """Return the last progress in a stage's log (loop, items done, total items), or None."""
+    """Return the last progress reported in a stage's log (loop, items done, total items), or None."""
     found = list(PROGRESS.finditer(_tail(log)))
     return (found[-1]["what"], int(found[-1]["done"]), int(found[-1]["total"])) if found else None
 

@@ -30,11 +30,11 @@ LIBRARIES = (
 """Libraries that affect results."""
 
 SOFTWARE = {"Software": "hilsplat"}
-"""Metadata of the PNGs that commands draw for users; these files have no provenance."""
+"""Metadata of the PNGs that commands draw for users; these files have no provenance record."""
 
 
 class Inputs:
-    """Inputs of a stage and their digests from before it ran; a missing input raises HilsplatError."""
+    """Inputs of a stage, with digests computed before the stage ran; a missing input raises HilsplatError."""
 
     def __init__(self, stage: str, paths: Mapping[str, Path | Sequence[Path]]) -> None:
         self.stage = stage
@@ -100,7 +100,7 @@ def write_provenance(
     plugins: Sequence[str] = (),
     device: str | None = None,
 ) -> None:
-    """Write an artifact's provenance record: how and from what it was made, and the digests of the outputs.
+    """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs.
 
     Args:
         beside: further outputs.
@@ -139,7 +139,7 @@ class Written(BaseModel):
 
 
 class Read(BaseModel):
-    """An input as a stage read it: its digest, or that of each file of a list; None if empty or missing."""
+    """An input as a stage read it: its digest, or one digest per listed file; None if empty or missing."""
 
     path: str
     sha256: str | None = None
@@ -173,7 +173,7 @@ def read_provenance(artifact: Path) -> Provenance | None:
 
 
 def sizes_of(path: Path) -> dict[str, int]:
-    """Return the size in bytes of each file of an artifact, by relative path ("." for a single file)."""
+    """Map the relative path of each file of an artifact ("." for a single file) to its size in bytes."""
     path = Path(path)
     return {file.relative_to(path).as_posix(): file.stat().st_size for file in files_of(path)}
 
@@ -235,10 +235,10 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
-    """Check the name of a picture, and that neither it nor `beside` would replace a foreign file.
+    """Check a picture's name, and that writing it and `beside` would not replace files from other programs.
 
     Raises:
-        ArtifactError: the name does not end in .png, or there is a file that hilsplat did not draw.
+        ArtifactError: the name does not end in .png, or a file exists that hilsplat did not draw.
     """
     if path.suffix.lower() != ".png":
         raise ArtifactError(f"output {path} is not a PNG file", expected="a name that ends in .png")

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from hilsplat.base.compiled import compiled
 
 RIGID_TOLERANCE = 1e-3
-"""Largest deviation of a camera's R R' from the identity; poses in text files may have only four digits."""
+"""Maximum deviation of a camera's R R' from the identity; poses in text files may have only four digits."""
 
 
 @compiled(inline="always")

@@ -10,7 +10,7 @@ from hilsplat.base.errors import ArtifactError
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a header and rows; the same rows give the same bytes."""
+    """Write a header and rows; identical rows produce identical bytes."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows([columns, *rows])
     write_text(path, stream.getvalue())
@@ -42,7 +42,7 @@ def plain_markdown(text: str) -> str:
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], words: int) -> str:
-    """Format a Markdown table; the first `words` columns are text, the others numbers."""
+    """Format a Markdown table; the first `words` columns are text, the others are numbers."""
     numbers = len(columns) - words
     lines = [columns, ["---"] * words + ["---:"] * numbers, *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)

@@ -1,4 +1,4 @@
-"""Groups of commands: the synthetic world, model folders, caches, and published data sets."""
+"""Command groups: the synthetic world, model folders, caches, and published data sets."""
 
 from pathlib import Path
 from typing import Annotated
@@ -98,7 +98,7 @@ def world_masks(
         Path | None, typer.Option(help="PNG, with a CSV and a PDF beside it; default: beside the masks")
     ] = None,
 ) -> None:
-    """Compare masks with the ground-truth regions by level, and draw where they fail."""
+    """Compare masks with the ground-truth regions by level, and draw the errors."""
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
@@ -236,7 +236,7 @@ def datasets_check(
     data_root: DataRoot,
     scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
-    """Read all labels of a data set and report what was found and what is wrong, scene by scene."""
+    """Read all labels of a data set and report what was found, and any problems, scene by scene."""
     from hilsplat.datasets.registry import check, dataset_of
 
     report, num_failed = check(dataset_of(name), data_root, scene or ())

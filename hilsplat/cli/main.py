@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 # The summation order of linear algebra libraries depends on the number of threads. Stages use several cores
-# through numba or our own pools, whose results do not depend on it.
+# through numba or our own pools, whose results do not depend on that number.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 

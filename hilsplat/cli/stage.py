@@ -1,4 +1,4 @@
-"""The command's groups, options shared by commands, and the log, lock and provenance of each stage."""
+"""Command groups, options shared by commands, and the log, lock and provenance of each stage."""
 
 import logging
 import os
@@ -94,9 +94,9 @@ def stage(
         out: output; its provenance is written next to it.
         settings: the section that the stage uses, or several sections by name. If it has the setting
             `device`, provenance records the device that `auto` resolves to.
-        seed: None if nothing is random.
+        seed: None if the stage is deterministic.
         inputs: files and folders that the stage reads, or lists of files, by name; None for those not given.
-        plugins: import paths of the readers or baselines that it uses (`base.plugins`).
+        plugins: import paths of the readers or baselines that the stage uses (`base.plugins`).
 
     Raises:
         ArtifactError: an output would replace something other than an earlier output of the stage.
@@ -159,20 +159,20 @@ def _recorded(settings: Any) -> dict[str, Any]:
 
 
 def section_of(name: str, text: str) -> Any:
-    """Read one section of the settings from JSON; `auto` becomes the installed models."""
+    """Read one section of the settings from JSON, and replace `auto` by the installed models."""
     from hilsplat.configuration import parse_section, with_models
 
     return with_models(parse_section(name, text))
 
 
 def model_input(section: Any) -> dict[str, Path]:
-    """Return the model folder of a section as an input; empty if missing, which the stage reports."""
+    """Return a section's model folder as an input, or {} if it is missing, which the stage then reports."""
     folder = model_path(section.model)
     return {"model": folder} if folder.is_dir() else {}
 
 
 def json_option(option: str, text: str, kind: type) -> Any:
-    """Parse a JSON option: a list of texts, or texts by name. Raise SettingsError for anything else."""
+    """Parse a JSON option, a list or dict of strings; raise SettingsError for anything else."""
     try:
         value = parse_json(text)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""One command per stage, from poses to figures; `hilsplat.workflow.stages` names the function of each."""
+"""One command per stage, from poses to figures; `hilsplat.workflow.stages` names each stage's function."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -47,7 +47,7 @@ def query(
     Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
     answers' Gaussians (selection.ply).
     """
-    gc.disable()  # garbage collection would take a tenth of the query time, two seconds
+    gc.disable()  # garbage collection would take two seconds, a tenth of the query time
     try:
         from hilsplat.query.answer import answer
 

@@ -9,10 +9,10 @@ from jaxtyping import Int, Int32
 
 @dataclass(frozen=True)
 class ClassSet:
-    """K classes in a fixed order: label k of a prediction is row k - 1 here; 0 means no class.
+    """K classes in a fixed order: label k of a prediction is the class in row k - 1; 0 means no class.
 
     Attributes:
-        name: such as `scannet-19`.
+        name: name of the set, such as `scannet-19`.
         source: origin of the list.
         ids: label of each class in the data set's own files.
         texts: query of each class.
@@ -35,7 +35,7 @@ class ClassSet:
         return len(self.ids)
 
     def labels(self, file_labels: Int[np.ndarray, " P"]) -> Int32[np.ndarray, " P"]:
-        """Map the data set's point labels to 1 .. K; 0 for classes that the set lacks."""
+        """Map the data set's point labels to 1 .. K, or to 0 if their class is not in the set."""
         order = np.argsort(self.ids)
         known = np.asarray(self.ids)[order]
         place = np.minimum(np.searchsorted(known, file_labels), len(known) - 1)
@@ -54,14 +54,14 @@ _NYU40 = """
     otherstructure, otherfurniture, otherprop
 """
 NYU40: dict[int, str] = dict(enumerate(words_of(_NYU40), start=1))
-"""NYU40 id, as in `<scan>_vh_clean_2.labels.ply` -> query. ScanNet's tsv spells 24 `refridgerator`; the paper
-writes 28 as two words."""
+"""NYU40 id, as in `<scan>_vh_clean_2.labels.ply` -> query. ScanNet's tsv spells class 24 `refridgerator`;
+the paper writes class 28 as two words."""
 
 BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
 """Classes of ScanNet's own benchmark."""
 
-# The sets of 19, 15 and 10 are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`), also listed
-# in the paper.
+# The sets of 19, 15 and 10 classes are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`); the
+# paper also lists them.
 SCANNET_19 = ClassSet.of(
     "scannet-19",
     "OpenGaussian, paper: without otherfurniture",
@@ -119,7 +119,7 @@ SPLITS: dict[str, str] = {
 """Id and name of each class, by split: 66 head, 68 common, 66 tail.
 
 Source: ScanNet/ScanNet `BenchmarkScripts/ScanNet200`. Ids, up to 1191, are those in the `id` column of
-`scannetv2-labels.combined.tsv`; several raw categories may share one.
+`scannetv2-labels.combined.tsv`; several raw categories may share an id.
 """
 
 _ENTRIES = [(split, entry.split(" ", 1)) for split, listed in SPLITS.items() for entry in words_of(listed)]
@@ -139,7 +139,7 @@ SCANNET200_INSTANCES = ClassSet.of(
 
 
 def splits_of(classes: ClassSet) -> dict[str, tuple[bool, ...]]:
-    """Return which classes of a set are head, common and tail, in the set's order."""
+    """Return, for each split, which classes of a set belong to it, in the set's order."""
     split_of = {label: split for label, _, split in CLASSES}
     return {split: tuple(split_of[label] == split for label in classes.ids) for split in SPLITS}
 
@@ -170,13 +170,13 @@ REPLICA_EVALUATED_51: tuple[int, ...] = (
     16, 23, 79,
 )
 # fmt: on
-"""The 51 classes of opennerf/opennerf, in its order."""
+"""The 51 classes of opennerf/opennerf, in that repository's order."""
 
 _QUERIES = {label: name.replace("-", " ") for label, name in REPLICA_NAMES.items()}
-"""Class id -> query: hyphens become spaces. OpenYOLO3D keeps them."""
+"""Class id -> query: hyphens become spaces. OpenYOLO3D keeps hyphens."""
 
 REPLICA_51 = ClassSet.of("replica-51", "OpenNeRF", _QUERIES, REPLICA_EVALUATED_51)
-# The 48 are those of aminebdj/OpenYOLO3D, which matches the paper's number.
+# The 48 classes are those of aminebdj/OpenYOLO3D; the paper states the same number.
 REPLICA_48 = ClassSet.of(
     "replica-48",
     "OpenYOLO3D, paper: without wall, floor, ceiling",

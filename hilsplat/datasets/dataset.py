@@ -27,7 +27,7 @@ class Dataset:
     """A benchmark in its published layout.
 
     Attributes:
-        name: key in the registry, and data set in rows and paths.
+        name: key in the registry, and name in table rows and paths.
         title: name as written in papers.
         labels: "images" if image pixels are labelled, "points" if points of a mesh or scan are.
         folder: the data set's folder below `data_root`; all other paths are relative to it.
@@ -37,7 +37,7 @@ class Dataset:
         required: paths that a scene needs.
         open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
         open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
-        protocols: protocols that score it (`evaluate.protocols.cards`), besides those for any labelled image.
+        protocols: protocols for this data set (`evaluate.protocols.cards`), besides those for all image labels.
         label_places: glob patterns of a scene's files that only evaluation reads.
     """
 
@@ -116,7 +116,7 @@ class Dataset:
             )
 
     def _has_begun(self, root: Path) -> bool:
-        """Return whether a folder has a required path of a known scene or, without known scenes, a scene."""
+        """Return whether a folder has a required path of a known scene or, if none are known, any scene."""
         if not self.scenes:
             return bool(self.found(root))
         return any(
@@ -128,7 +128,7 @@ class Dataset:
 
 
 def _at(root: Path, place: str) -> Path:
-    """Return a path relative to a folder; with `..`, the folder need not exist."""
+    """Return a path relative to a folder; if it contains `..`, the folder need not exist."""
     return Path(os.path.normpath(Path(root) / place))
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
 
 ROUNDING_PX = 1.0
-"""A label counts as a scaled copy of its image if, after scaling, their sides differ by at most this."""
+"""Maximum difference, after scaling, between the sides of an image and of a label that fits it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class LabelledRegion:
         pixels: reads the region at the label's size; called whenever the mask is needed.
         boxes_xyxy: annotated boxes, borders included, label px; None if the data set has none.
         level: None if the data set has no levels.
-        path: texts from the whole down to this region; just its text without levels.
+        path: texts from the whole down to this region; only its own text if there are no levels.
         any_grey: reads all non-black pixels, the ground truth of some protocols; None if equal to `pixels`.
     """
 
@@ -90,7 +90,7 @@ class LabelledScene:
     """One scene of an image-labelled data set.
 
     Attributes:
-        images: image file of each view, for all images of the scene.
+        images: all image files of the scene, by view.
         poses: folder in which `find_known_poses` finds poses; None if the scene has none.
         views: labelled regions by view, in label order.
         warnings: one sentence for each item that was reinterpreted.
@@ -114,7 +114,7 @@ class LabelledScene:
         return sum(len({region.text for region in regions}) for regions in self.views.values())
 
     def check_posed(self, names: Collection[str]) -> None:
-        """Raise SceneError, listing the labelled views without a pose, if there are any."""
+        """Raise SceneError, which lists the views, if any labelled view has no pose."""
         missing = [view for view in self.views if view not in names]
         if missing:
             shown = [*sorted(names)[:5], *(["..."] if len(names) > 5 else [])]
@@ -193,7 +193,7 @@ def mask_region(
     Args:
         foreground: lowest grey value of the region.
         share: as in `check_label_size`.
-        least_grey: lowest value for protocols whose ground truth is any grey, if it differs.
+        least_grey: lowest value of the region under protocols with `any_grey`, if it differs.
     """
     size_hw = image_size_hw(path)
     warnings += check_label_size(f"mask {path}", size_hw, image_hw, share)
@@ -203,7 +203,7 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return which pixels of a grey mask file are at least `least`; raise ImageError if it is damaged."""
+    """Return which pixel values of a grey mask file are at least `least`; raise ImageError if it is damaged."""
     with _opened("mask", path) as image:
         return np.asarray(image.convert("L")) >= least
 
@@ -226,8 +226,8 @@ def check_label_size(
 ) -> list[str]:
     """Compare a label's size with its image's; return a sentence, starting with `where`, if it is resized.
 
-    `share` is the height difference that is tolerated at equal widths, as a share of the height; rounding
-    is always tolerated.
+    `share` is the tolerated difference in height after scaling to the same width, relative to the height;
+    rounding is always tolerated.
 
     Raises:
         SceneError: one is not a scaled copy of the other.

@@ -1,4 +1,4 @@
-"""Protocols that score a scene: those of its data set, or of the benchmarks that it substitutes for."""
+"""Protocols that score a scene: its data set's, or those of the benchmarks that it substitutes for."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ STAND_INS: Mapping[str, tuple[str, ...]] = {
     ),
     "street": ("waymo/segmentation",),
 }
-"""Kind of synthetic scene -> protocols of the benchmarks that it substitutes for, besides LERF-OVS and the
-level protocols."""
+"""Kind of synthetic scene -> protocols of the benchmarks that the kind substitutes for, besides LERF-OVS and
+the level protocols."""
 
 
 @dataclass(frozen=True)
 class ExtraProtocols:
     """Protocols beyond those that score every labelled image (`protocols.views`).
 
-    `level` is the level whose texts the flat protocols query; None if the labels have no levels.
+    Flat protocols query only texts of `level`; None if the labels have no levels.
     """
 
     flat: tuple[ProtocolCard, ...] = ()
@@ -36,7 +36,7 @@ class ExtraProtocols:
 
     @staticmethod
     def of_world(kind: str) -> "ExtraProtocols":
-        """Return the protocols of a synthetic scene, none for kind ""; raise SceneError for unknown kinds."""
+        """Return a synthetic scene's protocols, empty for kind ""; raise SceneError for unknown kinds."""
         if kind and kind not in STAND_INS:
             raise SceneError(
                 f"unknown kind of synthetic scene: {kind!r}",
@@ -54,6 +54,6 @@ class ExtraProtocols:
 
     @staticmethod
     def open(name: str, data_root: Path) -> "tuple[str, LabelledScene | PointScene, ExtraProtocols]":
-        """Return data set, labels and protocols of a scene with a name such as "lerf_ovs/figurines"."""
+        """Return the data set, labels and protocols of a scene, by a name such as "lerf_ovs/figurines"."""
         dataset = name.partition("/")[0]
         return dataset, open_labels(name, data_root), ExtraProtocols.of(dataset_of(dataset).protocols)

@@ -33,16 +33,16 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 METHOD = "files"
-"""Method in the rows; their variant names the program."""
+"""Method in the score rows; their variant names the program."""
 
 WORDS = "masks of files"
-"""Bracketed suffix of a protocol's name: masks were supplied, so its map rule was not applied."""
+"""Bracketed suffix of a protocol's name: masks were supplied, so the protocol's map rule was not applied."""
 
 MASK_METRICS = (*cards.MASK, "acc_25", "acc_50")
-"""Metrics of masks; those of maps cannot be computed."""
+"""Mask metrics; metrics of relevancy maps cannot be computed."""
 
 FOREGROUND = 128
-"""Grey values above this are foreground, as in Gaussian Grouping's script."""
+"""Pixels with a grey value above this are foreground, as in Gaussian Grouping's script."""
 
 Masks = Mapping[tuple[str, str], Bool[np.ndarray, "h w"]]
 
@@ -64,8 +64,8 @@ def run_evaluate_files(
     """Score masks or point labels written by any program (see `read_view_masks` for the format).
 
     Masks without a level are scored under the text protocols, masks with levels under
-    `hierarchy/level-given`, point labels under the point protocols for which there is a file. A text without
-    a mask counts as 0, except under the protocol that omits such texts.
+    `hierarchy/level-given`, and point labels under each point protocol that has a file. A text without a mask
+    counts as 0, except under the protocol that omits such texts.
 
     Args:
         out: `scores.csv`; `instances.npz` is written beside it.
@@ -77,7 +77,7 @@ def run_evaluate_files(
 
     Raises:
         ArtifactError: a view has no predictions, or a file cannot be read.
-        MisalignedArtifactError: a prediction differs in size from its labels, or its text is unknown.
+        MisalignedArtifactError: a prediction and its labels differ in size, or the labels lack its text.
         SettingsError: neither labels nor truth and scene are given, or both are.
     """
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
@@ -126,7 +126,7 @@ def run_evaluate_files(
 def _mask_rows(
     predictions: Path, views: Mapping[str, Callable[[], ViewTruth]], extra: ExtraProtocols
 ) -> Iterator[tuple[str, Measured]]:
-    """Yield the rows of all views, whose files are read first, so that a missing one is reported at once."""
+    """Yield the rows of all views; all files are read first, so that a missing file is reported at once."""
     found = {view: read_view_masks(predictions, view) for view in views}
     truths = {view: load() for view, load in views.items()}
     levels = {level for masks in found.values() for level, _ in masks}
@@ -172,7 +172,7 @@ def _check(view: str, masks: Masks, truth: ViewTruth, texts: Mapping[str, set[st
 
 
 def _flat_rows(masks: Masks, truth: ViewTruth, extra: ExtraProtocols) -> Iterator[Measured]:
-    """Yield rows of masks without a level, under LERF's protocols for all texts, then the data set's own."""
+    """Yield rows of masks without a level: LERF's protocols for all texts, then the data set's protocols."""
     for query in truth.categories:
         for card in (cards.LERF_LANGSPLAT, cards.LERF_OPENGAUSSIAN):
             yield from _text_rows(card, query, masks.get(("", query.text)), [WORDS])
@@ -204,7 +204,7 @@ def _text_rows(
 def _cosine(
     masks: Masks, texts: Sequence[str], pixels: Int64[np.ndarray, " P"]
 ) -> Float64[np.ndarray, "K 1 P"]:
-    """Return 1 in the mask of a text and -inf elsewhere, so that a pixel in no mask is a miss."""
+    """Return 1 inside a text's mask and -inf elsewhere, so that a pixel in no mask is a miss."""
     nothing = np.zeros(len(pixels), dtype=bool)
     given = [masks["", text].reshape(-1)[pixels] if ("", text) in masks else nothing for text in texts]
     return np.where(np.stack(given), 1.0, -np.inf)[:, None]
@@ -235,7 +235,7 @@ def _files_of(protocols: Sequence[cards.ProtocolCard]) -> list[str]:
 def _point_rows(
     predictions: Path, truth: Mapping[str, LabelledPoints], extra: ExtraProtocols
 ) -> Iterator[Measured | InstanceMatches]:
-    """Yield the rows of points under each protocol whose file exists, and the matches of instances."""
+    """Yield the rows of points under each protocol whose file exists, and the instance matches."""
     scored = []
     for card in extra.points:
         labelling, classes = class_set(card.classes)
@@ -265,14 +265,14 @@ def _point_rows(
 
 
 def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.ndarray, "h w"]]:
-    """Return the masks of one view by (level, text); the level is "" for masks without one.
+    """Return the masks of one view by (level, text); the level is "" for masks without a level.
 
     Files are `<view>/<text>.png`, `<view>/<level>/<text>.png` (level whole, part or subpart), or `<view>.npz`
     with an array per text, "<text>" or "<level>/<text>". The view is named without its suffix. A view without
     predictions has an empty folder.
 
     Raises:
-        ArtifactError: the view has neither folder nor file, or both, or one of them cannot be used.
+        ArtifactError: the view has neither folder nor file, or both, or a file cannot be used.
     """
     stem = Path(view).stem
     place, packed = Path(folder) / stem, Path(folder) / f"{stem}.npz"
@@ -298,7 +298,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
 
 
 def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
-    """Read class ids of points from ScanNet's text format, one integer per line; 0 means none.
+    """Read class ids of points from ScanNet's text format, one integer per line; 0 means no class.
 
     Raises:
         ArtifactError: the file is missing or malformed.

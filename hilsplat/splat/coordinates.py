@@ -104,8 +104,8 @@ def sh_rotation(rotation: Float64[np.ndarray, "3 3"], degree: int) -> Float64[np
 def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dict[str, Any]) -> None:
     """Write the transform between a PLY's coordinates (the scene's) and those of its source.
 
-    The JSON file beside the PLY applies to no other PLY, so it contains the PLY's digest. The coordinates
-    used by our own structure from motion are recorded only here.
+    The JSON file beside the PLY contains the PLY's digest, because it is valid for that PLY only. It is the
+    only record of the coordinates used by our own structure from motion.
     """
     scale, rotation, translation = decompose(scene.scene_from_source)
     registration = read_json(scene.folder / "registration.json")
@@ -132,7 +132,7 @@ def write_coordinates(ply: Path, scene: Scene, gaussians: Gaussians, origin: dic
 
 
 def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
-    """Return the transform from a PLY of this package to its source's coordinates; None without a JSON file.
+    """Return the transform from this package's PLY to its source's coordinates; None without a JSON file.
 
     Raises:
         ArtifactError: if the JSON file belongs to another PLY, or its transform cannot be used.
@@ -162,9 +162,9 @@ def import_gaussians(
 ) -> tuple[Gaussians, dict[str, Any]]:
     """Read a 3DGS PLY, by default in the coordinates of the scene's source poses.
 
-    A PLY of this package is moved to the source's coordinates by the transform in the JSON file beside it. A
+    A PLY written by this package is transformed to the source's coordinates with the JSON file beside it. A
     PLY in nerfstudio's training coordinates needs its `dataparser_transforms.json`, and the `transforms.json`
-    with the source's poses.
+    that contains the source's poses.
 
     Returns:
         The Gaussians in the scene's coordinates, and their origin for the report.
@@ -201,7 +201,7 @@ def import_gaussians(
 
 
 def write_source_ply(ply: Path, out: Path) -> int:
-    """Write the Gaussians of a scene in the coordinates of its source, and return their number.
+    """Write a scene's Gaussians in the coordinates of the scene's source, and return their number.
 
     Raises:
         ArtifactError: if `ply` or the JSON file beside it is missing or damaged.

@@ -2,12 +2,12 @@
 
 Adaptive density control (3DGS; `strategy: default`) clones, splits and prunes Gaussians and resets opacities.
 Its criterion is the gradient of the loss with respect to a Gaussian's projected mean, in the units of 3DGS:
-x times half the image width and y times half the height (as in normalised device coordinates), with the
-length averaged over the steps in which the Gaussian was drawn.
+x times half the image width and y times half the height (as in normalised device coordinates). The length of
+the gradient is averaged over the steps in which the Gaussian was drawn.
 
 3DGS as Markov Chain Monte Carlo (Kheradmand et al. 2024; `strategy: mcmc`) moves transparent (dead) Gaussians
-onto opaque ones, increases the number by a fixed share up to the cap, and lets noise move transparent
-Gaussians. Two regularisers make unneeded Gaussians transparent and small.
+onto opaque ones, increases the number of Gaussians by a fixed share up to the cap, and moves transparent ones
+randomly. Two regularisers make unneeded Gaussians transparent and small.
 "Paper" below means Kheradmand et al.
 """
 
@@ -27,10 +27,10 @@ from hilsplat.splat.rasterise.cpu import Gradients, over_ranges
 SMALL = 0.01
 """Gaussians whose largest axis exceeds this (in units of the extent) are split; others are cloned (3DGS)."""
 SPLIT_FACTOR = 1.6
-"""Divisor of the scales of a split Gaussian's halves (3DGS: 0.8 x 2)."""
+"""The halves of a split Gaussian get its scales divided by this (3DGS: 0.8 x 2)."""
 HUGE = 0.5
 """Gaussians with a larger axis, in units of the extent, are pruned (3DGS: 0.1, after the first
-opacity reset; here walls of rooms are flat, wide Gaussians)."""
+opacity reset; larger here, because walls of rooms consist of flat, wide Gaussians)."""
 RESET_OPACITY = 0.01  # 3DGS
 
 MAX_TOGETHER = 51
@@ -38,14 +38,14 @@ MAX_TOGETHER = 51
 MAX_OPACITY = 1 - 1e-6
 """Maximum opacity; opacity 1 has no logit."""
 NOISE_SHARPNESS = 100.0
-"""Rate at which noise decreases with opacity (paper: k = 100): at opacity 0.1 its factor is e^-9.5."""
+"""Rate at which noise decreases with opacity (paper: k = 100): the noise factor at opacity 0.1 is e^-9.5."""
 MIN_GATE = 1e-6
-"""Noise whose factor is smaller than this is skipped."""
+"""Gaussians whose noise factor is smaller than this get no noise."""
 
 
 @compiled
 def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
-    """Add the lengths of the rows of `means_px`, in half images, to `total`, and count the rows in `seen`."""
+    """Add each drawn Gaussian's gradient length, in the units of 3DGS, to `total`, and 1 to `seen`."""
     for i in range(len(total)):
         if drawn[i]:
             x, y = half_width * means_px[i, 0], half_height * means_px[i, 1]
@@ -55,14 +55,14 @@ def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
 
 @dataclass
 class ScreenGradients:
-    """Sum of the lengths of each Gaussian's screen-space gradients, and the steps in which it was drawn."""
+    """Summed screen-space gradient lengths of each Gaussian, and the number of steps that drew it."""
 
     total: Float64[np.ndarray, " N"]
     seen: Int32[np.ndarray, " N"]
 
     @staticmethod
     def start(n: int) -> "ScreenGradients":
-        """Return the sums before the first step."""
+        """Return zero sums for n Gaussians."""
         return ScreenGradients(np.zeros(n), np.zeros(n, np.int32))
 
     def add(self, means_px: Float32[np.ndarray, "N 2"], drawn: np.ndarray, size_hw: tuple[int, int]) -> None:
@@ -70,7 +70,7 @@ class ScreenGradients:
         _add_lengths(means_px, drawn, size_hw[1] / 2, size_hw[0] / 2, self.total, self.seen)
 
     def mean(self) -> Float64[np.ndarray, " N"]:
-        """Return the average lengths; 0 for Gaussians never drawn."""
+        """Return the average lengths; 0 for Gaussians that were never drawn."""
         return self.total / np.maximum(self.seen, 1)
 
 
@@ -128,12 +128,12 @@ def shared_opacity(opacity: Float[np.ndarray, " N"], number: Int[np.ndarray, " N
 def scale_factor(
     opacity: Float[np.ndarray, " N"], shared: Float[np.ndarray, " N"], number: Int[np.ndarray, " N"]
 ) -> Float[np.ndarray, " N"]:
-    """Return the factor on the scales of coincident Gaussians that preserves their profile's integral.
+    """Return the scale factor for coincident Gaussians that preserves the integral of their profile.
 
-    n Gaussians of opacity o and standard deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. Its
-    integral is sqrt(2 pi) s times the sum over k = 1..n of C(n, k) (-1)^(k-1) o^k / sqrt(k); one
-    Gaussian of opacity `opacity` and deviation 1 has sqrt(2 pi) opacity. (Paper, Eq. 9, whose double
-    sum is this one, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
+    n Gaussians of opacity o and standard deviation s cover 1 - (1 - o exp(-x^2 / 2s^2))^n along a line. The
+    integral of this profile is sqrt(2 pi) s times the sum over k = 1..n of C(n, k) (-1)^(k-1) o^k / sqrt(k).
+    For one Gaussian of opacity `opacity` and deviation 1, it is sqrt(2 pi) opacity. (Paper, Eq. 9, whose
+    double sum equals this sum, because C(k-1, k-1) + ... + C(n-1, k-1) = C(n, k).)
 
     `shared` is `shared_opacity(opacity, number)` of the original Gaussian; 1 to MAX_TOGETHER coincide.
     """
@@ -146,7 +146,7 @@ def scale_factor(
 
 @compiled(error_model="numpy")
 def _noise_rows(begin, end, means, log_scales, quats, logits, normal, dead_below, weight, extent):
-    """Add noise to rows begin..end: weight x gate x covariance x normal, in units of the extent.
+    """Add weight x gate x covariance x normal, in units of the extent, to the means of rows begin..end.
 
     The gate is 1/2 at the opacity threshold of dead Gaussians, and 0 for opaque ones (paper, Eq. 8).
     """
@@ -245,7 +245,7 @@ def _share(
 ) -> dict[str, Float32[np.ndarray, "M ..."]]:
     """Draw rows with replacement, with probabilities proportional to `weights`, and return copies.
 
-    The drawn rows are reduced to their share of the original coverage, like the copies.
+    The drawn rows are changed, so that a row and its copies together cover what the row covered before.
     """
     p, edges = adam.parameters, np.cumsum(weights)
     source = np.searchsorted(edges, generator.uniform(0, edges[-1], number), side="right")
@@ -254,8 +254,8 @@ def _share(
     old = np.minimum(expit(p["opacity_logits"][rows].astype(np.float64)), MAX_OPACITY)
     new = shared_opacity(old, together)
     p["log_scales"][rows] += np.log(scale_factor(old, new, together)).astype(np.float32)[:, None]
-    # Rows at or below the threshold would be relocated again in the next round. The nearest float32 to the
-    # threshold's logit may be below it (that of 0.005 has opacity 0.0049999995), by at most 6e-8 of its size.
+    # Rows at or below the threshold would be relocated again in the next round. The float32 nearest to the
+    # threshold's logit may be too low by at most 6e-8 of its size (for 0.005, the opacity is 0.0049999995).
     exact = float(logit(settings.min_opacity))
     alive = np.float32(exact + 1e-6 * max(abs(exact), 1.0))
     p["opacity_logits"][rows] = np.maximum(logit(new).astype(np.float32), alive)

@@ -49,7 +49,7 @@ logger = logging.getLogger(__name__)
 CURVE_EVERY = 20
 """Steps between two points of the training curve."""
 MIN_SIDE_PX = 64
-"""Images are not shrunk below this shorter side."""
+"""Minimum shorter side of shrunk images."""
 MAX_SHOWN = 8
 """Maximum number of views on the contact sheet of test views."""
 SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
@@ -57,7 +57,7 @@ SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
 ERROR_GAIN = 4
 """Factor by which displayed errors are magnified."""
 TABLES = ("parameters", "first", "second")
-"""Tables of `Adam` in a checkpoint."""
+"""Names of the tables of `Adam` in a checkpoint."""
 
 
 @dataclass
@@ -66,7 +66,7 @@ class FitState:
 
     Attributes:
         gradients: screen gradients since the last densification.
-        generator: source of view order, splits and random backgrounds.
+        generator: random generator for view order, splits and backgrounds.
         order: indices of the remaining views in this epoch.
         step: completed steps.
         curve: rows of (step, loss, training PSNR in dB, number of Gaussians).
@@ -167,7 +167,7 @@ def steps_of(settings: GaussiansSettings, num_views: int) -> int:
 
 
 def scale_at(settings: GaussiansSettings, progress: float, side_px: int) -> float:
-    """Return the scale of the training images after a share of the iterations, from coarse to fine.
+    """Return the scale of the training images at `progress` (a share of the iterations), coarse to fine.
 
     Coarse images are cheaper, and their wider gradients move Gaussians over larger distances.
     `side_px` is the shorter side of the images at full size.
@@ -218,7 +218,7 @@ def fit_gaussians(
         key: digest of all inputs of the fit; checkpoints with another key are ignored.
 
     Returns:
-        The Gaussians, along a Morton curve (frozen ones in the order of their points), and the
+        The Gaussians in Morton order (frozen ones in the order of their points), and the
         training curve: rows of (step, loss, training PSNR, number of Gaussians).
 
     Raises:
@@ -269,8 +269,8 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the report folder and return the contents of report.json.
 
-    The training views are scored if the scene has no held-out views. `curve` is that of `fit_gaussians`; None
-    for imported Gaussians.
+    The training views are scored if the scene has no held-out views. `curve` is the training curve from
+    `fit_gaussians`, or None for imported Gaussians.
     """
     background = (float(settings.background == "white"),) * 3
 
@@ -353,7 +353,7 @@ def run_gaussians(
 
     Args:
         existing: a 3DGS PLY in the coordinates of the scene's source, used instead of a fit.
-        dataparser, transforms: for a PLY in nerfstudio's training coordinates (`import_gaussians`).
+        dataparser, transforms: for a PLY in nerfstudio's training coordinates (see `import_gaussians`).
 
     Raises:
         SceneError: if there are no training views to fit.
@@ -365,7 +365,7 @@ def run_gaussians(
             gaussians, origin = import_gaussians(existing, scene, dataparser, transforms)
             curve = None
         else:
-            # a resumed fit must stay on one device, because sums differ between CPU and CUDA
+            # a fit must resume on the same device, because sums differ between CPU and CUDA
             settings = settings.model_copy(update={"device": choose_device(settings.device)})
             inputs = [settings.model_dump(mode="json"), seed, sha256_of_path(scene_folder)]
             key = sha256_of_json([*inputs, code_digest(fit_gaussians)])

@@ -20,7 +20,7 @@ FRAMES = 120
 FRAMES_PER_S = 24
 SHEET_FRAMES = 12
 MAX_STOPS = 80
-"""Maximum number of cameras that the path visits; if there are more, it visits every n-th."""
+"""Maximum number of cameras that the path visits; if there are more, only every n-th is visited."""
 SMOOTHING = 1 / 40
 """Width of the smoothing as a share of the tour; smoothing removes the shake of hand-held cameras."""
 
@@ -33,7 +33,7 @@ OPTIONS = {"crf": "20", "preset": "veryfast", "x264-params": "threads=1:mbtree=0
 
 
 def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
-    """Return cameras along a closed tour of the given cameras that is short in position and direction.
+    """Return cameras along a closed tour of the given cameras with little translation and rotation.
 
     The speed is constant. Position, viewing direction and up vector are smoothed along the tour. Lens and
     image size are those of the first camera. A single camera is repeated.
@@ -45,7 +45,7 @@ def closed_path(cameras: list[Camera], frames: int) -> list[Camera]:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     order = short_round(cdist(*[np.concatenate([centres / spread, ahead], axis=1)] * 2))
     poses = np.concatenate([centres, spread * ahead, spread * down], axis=1)[order]
-    # sample far more finely than the frames at constant speed, smooth cyclically, then pick the frames
+    # sample at constant speed and far more finely than the frames, smooth cyclically, then pick the frames
     steps = np.linalg.norm(np.diff(poses, axis=0, append=poses[:1]), axis=1) + 1e-9 * spread
     at = np.concatenate([[0], np.cumsum(steps)])
     fine = frames * 8
@@ -83,7 +83,7 @@ def _camera(row: Float64[np.ndarray, " 9"], like: Camera) -> Camera:
     """Build a camera from its centre, viewing direction and down direction, which need not be orthogonal."""
     forward = row[3:6] / max(np.linalg.norm(row[3:6]), 1e-12)
     down = row[6:] - forward * (row[6:] @ forward)
-    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel; use the first camera's
+    if np.linalg.norm(down) < 1e-9:  # directions of opposite cameras cancel out; use the first camera's
         down = like.cam_from_world[1, :3] - forward * (like.cam_from_world[1, :3] @ forward)
     down = down / max(np.linalg.norm(down), 1e-12)
     pose = np.eye(4)
@@ -121,7 +121,7 @@ def write_flyaround(
 ) -> None:
     """Write `flyaround.mp4` and a contact sheet of every tenth frame, `flyaround.png`.
 
-    Frames are rendered on threads while others are encoded; the bytes do not depend on the number of threads.
+    Frames are rendered while earlier ones are encoded; the bytes do not depend on the number of threads.
     """
     shown: list[UInt8[np.ndarray, "H W 3"]] = []
     path = closed_path(cameras, FRAMES)
@@ -138,17 +138,17 @@ def write_flyaround(
 
 
 def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
-    """Encode one or more equally sized frames as MP4, as `encoded_film`."""
+    """Encode one or more frames of the same size as MP4 (see `encoded_film`)."""
     for _ in encoded_film(path, frames, per_second):
         pass
 
 
 def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> Iterator[None]:
-    """Encode one or more equally sized frames as MP4; with one PyAV version, equal frames give equal bytes.
+    """Encode one or more frames of the same size as MP4.
 
-    An odd last row or column is cropped: yuv420p needs even sides. Frames are consumed one by one, with a
-    yield after each, so that a long video needs little memory. The file is complete when the iterator ends.
-    `path` is in a temporary folder, or a file of an atomic writer.
+    With a given PyAV version, identical frames produce identical bytes. An odd last row or column is cropped,
+    because yuv420p needs even sides. Frames are consumed one by one, with a yield after each, to save memory.
+    The file is complete when the iterator ends; `path` is in a temporary folder or from an atomic writer.
     """
     frames = iter(frames)
     first = next(frames)
@@ -167,7 +167,7 @@ def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_s
 
 
 def contact_sheet(pictures: list[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Arrange pictures on a white sheet, row by row, shrunk by whole factors to at most MAX_SIDE_PX."""
+    """Arrange pictures on a white sheet, row by row, shrunk by integer factors to at most MAX_SIDE_PX."""
     cells = [_shrunk(picture, -(-max(picture.shape[:2]) // MAX_SIDE_PX)) for picture in pictures]
     height, width = (max(cell.shape[axis] for cell in cells) + GAP_PX for axis in (0, 1))
     rows = -(-len(cells) // columns)

@@ -53,11 +53,11 @@ BITS = 21
 
 
 def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """Return the rows of points in the order of a Z-shaped curve (Morton 1966) through their box.
+    """Return the rows of points in the order of a Z-order curve (Morton 1966) through their bounding box.
 
-    Loops over Gaussians and their neighbours, such as G of the language field, then mostly hit the
-    processor's cache. The box excludes the outermost hundredth on each side: otherwise a few distant
-    Gaussians would cause all others to share one cell. Rows in one cell keep their relative order.
+    Loops over Gaussians and their neighbours, such as products with the language field's G, then mostly hit
+    the processor's cache. The box excludes the outermost 1 % of points on each side: otherwise, a few distant
+    Gaussians could force all others into one cell. Rows in one cell keep their relative order.
     """
     if not len(means):
         return np.zeros(0, np.int64)
@@ -69,7 +69,7 @@ def morton_order(means: Float[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
 
 
 def _every_third(values: UInt64[np.ndarray, " N"]) -> UInt64[np.ndarray, " N"]:
-    """Move bit b of each value to 3 b."""
+    """Move bit b of each value to position 3 b."""
     out = np.zeros_like(values)
     for bit in range(BITS):
         out |= (values >> bit & 1) << 3 * bit

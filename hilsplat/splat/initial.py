@@ -48,7 +48,7 @@ def load_views(scene: Scene, split: str, image_scale: float) -> list[TrainingVie
 
 
 def camera_extent(cameras: list[Camera]) -> float:
-    """Return 1.1 times the largest distance of a camera from their common centre (3DGS); scene units."""
+    """Return 1.1 times the largest distance of a camera from the cameras' mean (3DGS); scene units."""
     centres = np.stack([camera.centre for camera in cameras])
     radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     return float(1.1 * radius) if radius > 0 else 1.0
@@ -57,7 +57,7 @@ def camera_extent(cameras: list[Camera]) -> float:
 def first_gaussians(
     scene: Scene, cameras: list[Camera], settings: GaussiansSettings, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return round Gaussians at the sparse points; width: mean distance to the 3 nearest points (3DGS).
+    """Return round Gaussians at the sparse points, as wide as the mean distance to 3 neighbours (3DGS).
 
     If there are fewer than MIN_POINTS sparse points, random grey points in front of random cameras are added.
     If `settings.initial` is "random", random points replace all sparse points. If it is "frozen", every
@@ -109,7 +109,7 @@ def first_gaussians(
 def _random_points(
     cameras: list[Camera], known: np.ndarray, number: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Sample points in front of random cameras, at depths of known points or else of the cameras' extent."""
+    """Sample points in front of random cameras, at depths based on known points or the cameras' extent."""
     extent = camera_extent(cameras)
     depths = []
     for camera in cameras:

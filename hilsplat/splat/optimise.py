@@ -14,7 +14,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15  # 3DGS
 
 OPACITY_RATE = 0.05  # 3DGS
 SH_REST_SHARE = 1 / 20
-"""Step size of view-dependent harmonics relative to the constant ones (3DGS)."""
+"""Step size of view-dependent harmonics relative to that of the constant ones (3DGS)."""
 
 
 def means_rate(settings: GaussiansSettings, progress: float) -> float:
@@ -74,7 +74,7 @@ class Adam:
         return len(self.parameters["means"])
 
     def as_gaussians(self) -> Gaussians:
-        """Return the current values (shared memory)."""
+        """Return Gaussians that share memory with the current values."""
         return Gaussians(**self.parameters)
 
     def step(
@@ -83,7 +83,7 @@ class Adam:
         """Take one step; `rate_of_means` is in scene units."""
         self.steps += 1
         of_rest = SH_REST_SHARE * settings.sh_rate
-        rates: dict[str, list[float]] = {  # per number of one Gaussian, cyclic
+        rates: dict[str, list[float]] = {  # for each number of one Gaussian, repeated cyclically
             "means": [rate_of_means],
             "log_scales": [settings.scales_rate],
             "quats": [settings.quats_rate],
@@ -107,7 +107,7 @@ class Adam:
                 table[name][rows] = 0
 
     def append(self, more: dict[str, np.ndarray]) -> None:
-        """Add Gaussians with moments at zero."""
+        """Add Gaussians with zero moments."""
         for name, rows in more.items():
             zeros = np.zeros_like(rows)
             for table, added in ((self.parameters, rows), (self.first, zeros), (self.second, zeros)):

@@ -1,4 +1,4 @@
-"""Photometric loss of a rendered view, L1 and D-SSIM in one pass with its gradient; PSNR and SSIM.
+"""Photometric loss of a rendered view (L1 and D-SSIM) and its gradient, in one pass; PSNR and SSIM.
 
 SSIM is computed as in 3DGS: an 11x11 Gaussian window of sigma 1.5 px, applied as two 11-tap passes to each
 channel, with zeros beyond the border and the constants 0.01^2 and 0.03^2 for values in [0, 1].
@@ -26,7 +26,7 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
     """Compute SSIM and L1 sums of padded rows begin..end and, in `slopes`, SSIM's derivatives.
 
     `slopes` (3 padded maps, flat) receives dSSIM/dE[x] (directly and through the variances), dSSIM/dE[x^2]
-    and dSSIM/dE[x y] of every pixel's window. If it is empty, only values are computed.
+    and dSSIM/dE[x y] of every pixel's window. If `slopes` is empty, no derivatives are computed.
     """
     groups = (num + _LANES - 1) // _LANES
     row_length = groups * _LANES + 2 * _SIDE
@@ -96,7 +96,7 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
 
 @compiled
 def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ssim_weight, gradient):
-    """Compute dL/dimage of rows begin..end: slopes spread over their windows, and the sign for L1."""
+    """Compute dL/dimage of rows begin..end from the slopes of all windows and the sign of the error."""
     groups = (num + _LANES - 1) // _LANES
     row_length = groups * _LANES + 2 * _SIDE
     rows = np.zeros(3 * row_length, np.float32)
@@ -134,7 +134,7 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
 
 
 def _padded(image: Float32[np.ndarray, "H W 3"]) -> tuple[np.ndarray, int]:
-    """Return the rows padded with zeros, flat, and their length."""
+    """Return the rows padded with zeros, as a flat array, and the padded length of a row."""
     height, width, _ = image.shape
     stride = -(-3 * width // _LANES) * _LANES + 2 * _SIDE
     out = np.zeros((height + 2 * RADIUS, stride), np.float32)

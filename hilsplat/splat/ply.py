@@ -27,7 +27,7 @@ def _names(num_bases: int) -> list[str]:
 
 
 def save_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians as a binary little-endian 3DGS PLY, atomically; equal Gaussians give equal bytes.
+    """Write a binary little-endian 3DGS PLY atomically; identical Gaussians produce identical bytes.
 
     Parameters are stored unconverted: log scales, opacity logits, and wxyz quaternions of any length.
     Normals are zero, as in 3DGS.
@@ -50,7 +50,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
 
 
 def vertex_count(path: Path) -> int | None:
-    """Return the number of Gaussians in a PLY's header; None if unreadable (readers report the error)."""
+    """Return the number of Gaussians in a PLY's header; None if unreadable (`load_ply` reports the error)."""
     try:
         with Path(path).open("rb") as stream:
             header = stream.read(HEADER_BYTES)
@@ -61,10 +61,10 @@ def vertex_count(path: Path) -> int | None:
 
 
 def load_ply(path: Path, fix: str = "") -> Gaussians:
-    """Read a 3DGS PLY of this or another package; the number of f_rest columns determines the degree.
+    """Read a 3DGS PLY from this or another package; the number of f_rest columns determines the degree.
 
     The file may be binary or ASCII, with properties in any order and of any numeric type. Normals and
-    properties not in 3DGS (colours, labels) are ignored. `fix` is the errors' fix; "": rerun the stage.
+    properties not in 3DGS (colours, labels) are ignored. `fix` is the fix that errors suggest; "": a rerun.
 
     Raises:
         ArtifactError: if the file is missing, damaged or not a 3DGS PLY, or contains non-finite numbers.

@@ -2,8 +2,8 @@
 
 A gzip stream of a 16-byte header and six columns: positions in 24-bit fixed point, then opacity, colour,
 log scales, rotation and harmonics in one byte each, with axes x right, y up, z backwards. The format fixes
-the quantisation of all but positions and harmonics. A render of a synthetic scene of degree 2 has a PSNR of
-43 dB against the original at 17 bytes per Gaussian.
+the quantisation of all but positions and harmonics. At 17 bytes per Gaussian, renders of a synthetic scene of
+degree 2 have a PSNR of 43 dB compared with the original.
 """
 
 import gzip
@@ -19,7 +19,7 @@ HEADER = struct.Struct("<IIIBBBB")
 """Magic number, version, count, degree of harmonics, fractional bits of positions, flags, reserved."""
 
 STEPS_PER_SPREAD = 8192
-"""Minimum number of position steps in the Gaussians' median distance from their centre."""
+"""Minimum number of position steps per median distance of the Gaussians from their centre."""
 LARGEST_STEP = 2**23 - 1
 HARMONIC_STEP = 8
 """Step size of harmonics in 1/128 (5 bits). The usual 4 bits beyond degree 1 lose 2 dB and save 1 byte."""
@@ -40,10 +40,10 @@ def fractional_bits(gaussians: Gaussians) -> int:
 
 
 def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) -> bytes:
-    """Return some Gaussians as an SPZ file; equal Gaussians give equal bytes.
+    """Return the given Gaussians as an SPZ file; identical Gaussians produce identical bytes.
 
     Positions beyond 2**(23 - bits), a thousand times the spread of the scene, are clipped, and harmonics
-    beyond degree 3 omitted. Spatially sorted rows compress best. `bits` is the output of `fractional_bits`.
+    beyond degree 3 are omitted. Spatially sorted rows compress best. `bits` is from `fractional_bits`.
     """
     degree = min(gaussians.sh_degree, 3)
     sh = gaussians.sh[rows, : (degree + 1) ** 2]

@@ -1,9 +1,9 @@
-"""Labels at three levels: Hi-LERF and Hi-3DOVS, on images of LERF-OVS and 3D-OVS, and your own scenes.
+"""Labels at three levels: Hi-LERF and Hi-3DOVS (on images of LERF-OVS and 3D-OVS), and your own scenes.
 
 The paper publishes frames and levels but neither labels nor a format. We use LERF-OVS's label format with
 three more keys per object: `id`, unique in the file; `level`, 1 whole, 2 part, 3 subpart; `parent`, the
-id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes it
-for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
+id of an object one level up, or null. `segmentation` may be a list of polygons. `hilsplat annotate` writes
+this format for your own scenes (data set `annotated`) and adds `origin`: drawn, edited, accepted or proposed.
 
 A frame without an image or a label, an invalid parent, or a child outside its parent causes a warning.
 Missing files, invalid ids and levels, and unusable label files raise SceneError.
@@ -31,11 +31,11 @@ PROPOSED = "proposed"
 """`origin` of an object that a program proposed; it is ignored until the user accepts it."""
 
 OUTSIDE_SHARE = 0.01
-"""Share of a child that may be outside its parent, because borders are rasterised."""
+"""Share of a child's area that may be outside its parent, to allow for rasterised borders."""
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene of `dataset`: one region per object; several objects may share a text."""
+    """Read the labels of a scene of `dataset`: one region per object; several objects may have the same text."""
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
     images = images_by_view(source / "images")
@@ -56,8 +56,8 @@ def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
 def open_annotated(root: Path, scene: str) -> LabelledScene:
     """Read your annotations of a scene, such as "photos/desk": one region per drawn or accepted object.
 
-    Files whose objects have no level are read like those of LERF-OVS: one region per text. The photographs
-    are the scene's own undistorted ones; evaluation compares the labels' size with the scene's cameras.
+    Files whose objects have no level are read like those of LERF-OVS: one region per text. The images are
+    the scene's own undistorted photographs; evaluation compares the labels' size with the scene's cameras.
     """
     ANNOTATED.require(root, scene)
     warnings: list[str] = []

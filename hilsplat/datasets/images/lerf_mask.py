@@ -1,7 +1,7 @@
 """LERF-Mask: three scenes of LERF with the masks of Gaussian Grouping.
 
 Test views are the posed images missing from `images_train`, sorted by name; the folder `test_mask/0` contains
-the masks of the first, `test_mask/1` those of the second. Every mask file is named after its prompt. Missing
+the masks of the first view, `test_mask/1` those of the second. Every mask file is named after its prompt. Missing
 parts, and mask folders that don't match the test views, raise SceneError.
 """
 
@@ -22,7 +22,7 @@ from hilsplat.datasets.labelled import (
 from hilsplat.datasets.published import differences
 
 FOREGROUND = 129
-"""Lowest grey value of the foreground: the published evaluation thresholds above 128."""
+"""Lowest grey value of the foreground; in the published evaluation, foreground is any value above 128."""
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
@@ -64,7 +64,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
 
 
 def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
-    """Return the mask folder of each test view: number i belongs to the i-th view."""
+    """Return the mask folder of each test view; folder i belongs to `test[i]`."""
     places = [place for place in folder.iterdir() if place.is_dir() and not place.name.startswith(".")]
     numbers = sorted((int(place.name), place) for place in places if place.name.isdecimal())
     strange = sorted(place.name for place in places if not place.name.isdecimal())

@@ -22,16 +22,16 @@ from hilsplat.scene.layouts import POSES_BOUNDS
 from hilsplat.scene.view_names import view_name
 
 FOREGROUND = 255
-"""The original loader computes int8(value / 255)."""
+"""The original loader computes int8(value / 255), which is 0 for smaller values."""
 
 SHAPE_TOLERANCE = 0.01
-"""Relative tolerance, because mask and photograph of a view differ slightly in aspect ratio."""
+"""Relative tolerance for the aspect ratios of a view's masks and photograph, which differ slightly."""
 
 
 def open_scene(root: Path, scene: str) -> LabelledScene:
     """Read the segmentations of a scene, such as "bed"; pixels are read when needed.
 
-    The regions of a view are ordered like the sorted prompts; some may have no pixels.
+    The regions of a view are in the order of the sorted prompts; a region may have no pixels.
     """
     DATASET.require(root, scene)
     folder = root / scene

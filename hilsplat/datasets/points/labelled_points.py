@@ -1,4 +1,4 @@
-"""Points labelled by a benchmark (mesh vertices or lidar returns), and readers for file formats.
+"""Points labelled by a benchmark (mesh vertices or lidar returns), and readers for their file formats.
 
 Each reader raises SceneError if its file is missing or damaged.
 """
@@ -46,9 +46,9 @@ class LabelledPoints:
     Attributes:
         xyz: positions, metres.
         class_id: class number in the data set's files; 0 if undefined.
-        instance_id: instance number from 1, unrelated between files; 0 for none.
+        instance_id: instance number from 1, unrelated to numbers in other files; 0 for none.
         labelling: meaning of `class_id`, a key of `LABELLINGS`.
-        faces: corners of triangles, as rows of `xyz`; None if the points are not a mesh.
+        faces: corners of triangles, as row indices of `xyz`; None if the points are not a mesh.
         visible: whether the point is visible to a camera; None if unknown.
     """
 
@@ -63,7 +63,7 @@ class LabelledPoints:
         return len(self.xyz)
 
     def labels(self, classes: ClassSet) -> Int32[np.ndarray, " P"]:
-        """Return labels 1 .. K in the order of a class set, 0 for classes that the set lacks.
+        """Return labels 1 .. K in the order of a class set, or 0 for classes that are not in the set.
 
         Raises:
             MisalignedArtifactError: the set is not defined on this labelling.
@@ -193,7 +193,7 @@ class PlyMesh:
 
     @cached_property
     def faces(self) -> Int32[np.ndarray, "F corners"]:
-        """Corners of all faces; each must be a vertex."""
+        """Vertex indices of the corners of all faces."""
         faces = self.column("face", "vertex_indices").astype(np.int32)
         count = len(self._content["vertex"].data)
         if faces.size and (faces.min() < 0 or faces.max() >= count):
@@ -207,7 +207,7 @@ class PlyMesh:
 
 
 def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]:
-    """Sort files by the number in their stem, after a prefix: 2 comes before 10."""
+    """Sort files by the number that follows a prefix in their stem, so that 2 comes before 10."""
     numbered = []
     for path in paths:
         stem = path.stem.removeprefix(prefix)

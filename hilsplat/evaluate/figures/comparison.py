@@ -1,4 +1,4 @@
-"""Figures of the paper: queries by method, one query over four views, features at three levels."""
+"""The paper's figures: queries by method, one query over four views, features at three levels."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -26,9 +26,9 @@ from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 WIDTH_IN = 13.0
 MAX_COLUMNS = 8
-"""Maximum number of methods drawn as columns in the figure of queries; more are drawn as rows."""
+"""Maximum number of methods drawn as columns in the query figure; if there are more, all become rows."""
 VIEWS = 4
-"""Number of views in the figure of one query."""
+"""Number of views in the one-query figure."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Answerer:
     scene: LanguageScene
 
     def masks(self, rows: Sequence[Shown], evaluate: EvaluateSettings) -> list[Bool[np.ndarray, "H W"]]:
-        """Return the answers to queries in their views, at their levels if they have one."""
+        """Return the answer to each query in its view, at its level if it has one."""
         if self.method == "tree":
             return [shown.tree_mask(self.scene) for shown in rows]
         rule, texts_of = rule_of(evaluate), defaultdict[str, list[str]](list)
@@ -70,12 +70,12 @@ def run_comparison(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the three figures of a scene as PNG and PDF, from ground-truth regions or else given queries.
+    """Draw the three figures of a scene as PNG and PDF, from ground-truth regions, or else `queries`.
 
     Args:
         folder: `results/<dataset>/<scene>`, finished under every variant.
-        variants: variants to compare, each with the settings it was evaluated with; "default" has rows for
-            its tree and its field, others for their field.
+        variants: variants to compare, each with the settings it was evaluated with. "default" has rows for
+            its tree and its field, other variants only for the field.
         names: variant -> its name in tables.
         out: PNG of the comparison; `views.png` and `features.png` are written beside it.
         evaluate: settings for ground-truth regions and for converting maps to masks.
@@ -122,7 +122,7 @@ def over_views(
 ) -> list[Shown]:
     """Return one query in several views: the first part or subpart in `rows`, else the first query.
 
-    Views with known ground truth come first, in order; then others, evenly spaced over the scene.
+    Views with known ground truth are first, in order, then other views, evenly spaced over the scene.
     """
     if not rows:
         return []
@@ -206,7 +206,7 @@ def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
 
 
 def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
-    """Colour each pixel by its node: the node's CLIP vector along the level's three principal directions."""
+    """Colour each pixel by its node's CLIP vector, projected on the level's three principal directions."""
     vectors = scene.tree.clip.astype(np.float64)
     nodes = scene.tree.nodes_of(level)
     colours = np.zeros((len(vectors) + 1, 3))

@@ -37,7 +37,7 @@ from hilsplat.settings import EvaluateSettings, FiguresSettings
 
 WIDTH_IN = 13.0
 RING = {"markersize": 9, "markerfacecolor": "none", "markeredgecolor": "white", "markeredgewidth": 1.8}
-"""Mark of the localization point."""
+"""Marker style of the localization point."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Shown:
     """One row of the panel: a query in a view."""
 
     text: str  # texts separated by ">" form a path
-    path: tuple[str, ...]  # texts from the whole down; without annotations, those of the query
+    path: tuple[str, ...]  # texts from the whole down; without annotations, the query's texts
     level: Level | None  # of the annotation, if any
     view: str
     truth: Bool[np.ndarray, "H W"] | None  # ground-truth region; None if unknown
@@ -64,7 +64,7 @@ class Shown:
         return self.view if self.truth is None else f"truth, {self.view}"
 
     def score(self, mask: Bool[np.ndarray, "H W"]) -> str:
-        """Return the IoU of an answer with the ground truth, for its title; empty if that is unknown."""
+        """Return the IoU of an answer, for its title; empty if the ground truth is unknown."""
         return "" if self.truth is None else f"IoU {iou(mask, self.truth):.2f}"
 
     def tree_mask(self, answers: LanguageScene, *, by_path: bool = False) -> Bool[np.ndarray, "H W"]:
@@ -85,7 +85,7 @@ def run_figures(
     queries: Sequence[str] = (),
     threads: int = 1,
 ) -> None:
-    """Draw the panel from ground-truth regions or else queries; copy pictures of poses and fit beside it.
+    """Draw the panel from ground-truth regions, or else queries; copy the pose and fit pictures beside it.
 
     Args:
         fit: report folder of the fit; None copies nothing.
@@ -113,7 +113,7 @@ def shown_truths(
 
 
 def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: FiguresSettings) -> list[Shown]:
-    """Return texts of each level, from large to small regions, in the annotated views where they are largest.
+    """Return texts per level, from large to small regions, each in the annotated views where it is largest.
 
     Labels without levels form one group.
     """
@@ -132,7 +132,7 @@ def annotated_rows(truths: Mapping[str, Callable[[], ViewTruth]], settings: Figu
         ordered = sorted(texts, key=lambda text: (-texts[text][0][0], text))
         limit = settings.queries_per_level * (len(LEVELS) if level is None else 1)
         count = min(limit, len(ordered))
-        for number in range(count):  # the largest, then evenly down the list
+        for number in range(count):  # the largest, then evenly spaced down the list
             places = texts[ordered[number * len(ordered) // count]]
             rows += [shown for _, shown in places[: settings.views]]
     return rows
@@ -152,7 +152,7 @@ def free_rows(answers: LanguageScene, queries: Sequence[str], settings: FiguresS
 def draw_panel(
     answers: LanguageScene, masks_folder: Path, rows: Sequence[Shown], evaluate: EvaluateSettings
 ) -> Figure:
-    """Draw masks of a training view, the field in a held-out view, then one row per query."""
+    """Draw masks in a training view, the field in a held-out view, then one row per query."""
     scene = answers.scene
     masked = next(iter(read_index(masks_folder)["views"]))
     held_out = rows[0].view if rows else (scene.views("test") or scene.views("train"))[0]
@@ -196,7 +196,7 @@ def draw_queries(
 ) -> None:
     """Draw one row per query: ground truth, answers of tree and field, field relevancy at three levels.
 
-    The level of the answer is framed. A ring marks the field's localization point.
+    A frame marks the level of the answer, a ring the field's localization point.
     """
     grid = figure.subplots(len(rows), columns, squeeze=False)
     rule = rule_of(evaluate)

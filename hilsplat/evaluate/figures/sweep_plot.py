@@ -1,4 +1,4 @@
-"""Plots of the sweeps over theta and Omega, from their finished tables."""
+"""Plots of the sweeps over theta and Omega, drawn from the finished tables."""
 
 import csv
 import re
@@ -12,7 +12,7 @@ from hilsplat.query.pictures import save_png_and_pdf
 
 SETTINGS = {"theta": "coverage threshold theta", "omega": "similarity degree Omega"}
 DEFAULTS = {"theta": 0.9, "omega": 10.0}
-"""Values of the default variant, which its row doesn't state."""
+"""Settings of the default variant; its table row doesn't state them."""
 
 COLUMNS = ("Hi-LERF mIoU", "Hi-LERF HC", "3D-OVS mIoU", "LERF mIoU")
 
@@ -21,7 +21,7 @@ Lines = Mapping[tuple[str, str], list[tuple[float, float]]]
 
 
 def run_sweep_plot(name: str, table: Path, out: Path) -> None:
-    """Draw a sweep as PNG and PDF, from the finished CSV of the table with this name.
+    """Draw a sweep as PNG and PDF, from the finished CSV of the table called `name`.
 
     Raises:
         ArtifactError: the sweep is unknown, or the table is missing.

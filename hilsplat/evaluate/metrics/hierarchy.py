@@ -13,7 +13,7 @@ READINGS: tuple[Reading, ...] = ("containment", "literal", "anchored")
 
 @dataclass(frozen=True)
 class Family:
-    """Predicted masks of one annotated parent and of its annotated children (at least one), in one view.
+    """Predicted masks of one annotated parent and its annotated children (at least one) in one view.
 
     `true_parent` is the parent's annotated region, used by the reading `anchored`.
     """
@@ -42,13 +42,13 @@ def children_consistency(family: Family, reading: Reading) -> list[float]:
 def hierarchical_consistency(
     transitions: Sequence[Sequence[Family]], reading: Reading = "containment"
 ) -> tuple[float, float]:
-    """Return the HC of one view (paper, Sec. IV, Eq. 7), and its mean over all parents of all levels at once.
+    """Return the HC of one view (paper, Sec. IV, Eq. 7), and the mean over the parents of all levels pooled.
 
     HC is averaged over children, parents and levels in turn, so every parent of a level has the same weight,
     regardless of its number of children. A scene's value is the mean over its views with at least one parent;
     then scenes are averaged.
 
-    Departs: the printed normaliser uses N_l outside the sum over l, where it is undefined; here it is the
+    Departs: the printed normaliser uses N_l outside the sum over l, where it is undefined; here HC is the
     mean over the parents of each level, then over the L - 1 transitions. A transition without parents
     contributes 0, as max(N_l, 1) implies: in a view without subparts, even perfect nesting scores 0.5.
 

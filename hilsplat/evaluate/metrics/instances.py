@@ -45,14 +45,14 @@ def match_instances(
 ) -> InstanceMatches:
     """Match the predictions of one scan to its ground-truth instances, per class and threshold.
 
-    Instances are visited in order. Each unused prediction of the class that overlaps an instance by more
-    than the threshold matches it. If there are several, the most confident remains the match and the others
+    Instances are visited in order. Each unused prediction of the class whose IoU with an instance exceeds
+    the threshold matches that instance. If several match, the most confident remains the match and the others
     are false positives with their own confidences. Only the first match of an instance marks its prediction
     as used. A prediction without sufficient overlap with any ground-truth instance is a false positive,
     unless the share of its points in void or in instances that are too small exceeds the threshold.
 
     Args:
-        truth: per point class * 1000 + instance; values below 1000 or of other classes are void.
+        truth: class * 1000 + instance for each point; values below 1000 or of other classes are void.
         masks: predicted instances over the same points; they may overlap.
 
     Raises:
@@ -110,7 +110,7 @@ def _matches(
     is_ignored: Bool[np.ndarray, " M"],
     confidence: Float64[np.ndarray, " M"],
 ) -> tuple[list[tuple[float, bool]], int]:
-    """Return (confidence, is match) entries of one class at one threshold, and the number of misses."""
+    """Return the (confidence, is match) entries for one class and threshold, and the number of misses."""
     used = np.zeros(len(fits), dtype=bool)
     entries, missed = [], 0
     for instance in np.flatnonzero(large):
@@ -132,9 +132,9 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
     """Return the area under one precision-recall curve, integrated as in the benchmark.
 
     For each distinct confidence, precision P and recall R are computed from the entries with at least that
-    confidence; matches below it and unmatched instances reduce recall. The point (1, 0) ends the curve. The
-    area is the sum of P_k (R_(k-1) - R_(k+1)) / 2 with R_(-1) = R_0 and 0 after the last, without an
-    interpolation envelope. Without entries it is 0.
+    confidence; less confident matches and unmatched instances reduce recall. The point (1, 0) ends the curve.
+    The area is the sum of P_k (R_(k-1) - R_(k+1)) / 2, with R_(-1) = R_0 and R = 0 after the last point, and
+    no interpolation envelope. Without entries, the area is 0.
     """
     if not len(confidence):
         return 0.0
@@ -153,7 +153,8 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
 def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "K T"]:
     """Return the average precision per class and threshold over all scans.
 
-    It is nan for classes without ground-truth instances, and 0 for those with instances but no prediction.
+    The value is nan for classes without ground-truth instances, and 0 for classes with instances but no
+    prediction.
     """
     result = np.full_like(scans[0].misses, np.nan, dtype=np.float64)
     misses = np.sum([scan.misses for scan in scans], axis=0)
@@ -172,17 +173,17 @@ def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "
 
 
 def ap(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean over the nine thresholds 0.50 .. 0.90 and the classes with ground-truth instances."""
+    """Return the mean AP over thresholds 0.50 .. 0.90 (nine) and classes with ground-truth instances."""
     return _mean_of(precisions[:, :-1])
 
 
 def ap50(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean over the classes with ground-truth instances, at an IoU above 0.5."""
+    """Return the mean AP over the classes with ground-truth instances, at an IoU above 0.5."""
     return _mean_of(precisions[:, :1])
 
 
 def ap25(precisions: Float64[np.ndarray, "K T"]) -> float:
-    """Return the mean over the classes with ground-truth instances, at an IoU above 0.25."""
+    """Return the mean AP over the classes with ground-truth instances, at an IoU above 0.25."""
     return _mean_of(precisions[:, -1:])
 
 

@@ -1,4 +1,4 @@
-"""Metrics of masks against ground-truth regions, and of localization (peaks of maps on the object)."""
+"""Metrics for masks (against ground-truth regions) and for localization (map peaks on the object)."""
 
 import math
 
@@ -20,7 +20,7 @@ def iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> 
 def iou_matrix(
     regions: Bool[np.ndarray, "R P"], masks: Bool[np.ndarray, "M P"]
 ) -> Float64[np.ndarray, "R M"]:
-    """Return the IoU of every region with every mask, 0 for two empty ones; both may overlap."""
+    """Return the IoU of every region with every mask, 0 if both are empty; regions or masks may overlap."""
     shared = regions.astype(np.float32) @ masks.T.astype(np.float32)  # counts exactly up to 2**24 px
     union = regions.sum(axis=1)[:, None] + masks.sum(axis=1)[None] - shared
     return np.divide(shared, union, out=np.zeros(shared.shape), where=union > 0)
@@ -34,7 +34,7 @@ def boundary_width_px(size_hw: tuple[int, int]) -> int:
 def boundary(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
     """Return the pixels of the mask that an erosion by `width_px` removes.
 
-    Outside the image counts as background, so mask pixels along the image border are boundary.
+    The outside of the image counts as background, so mask pixels along the image border are boundary.
     """
     import cv2
 
@@ -55,7 +55,7 @@ def boundary_iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H
 
 
 def best_threshold_iou(score: Float[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
-    """Return the largest IoU of any threshold on the score map: a diagnostic that uses the ground truth.
+    """Return the largest IoU over all thresholds on the score map: a diagnostic that uses the ground truth.
 
     The result is exact: lowering the threshold between two scores of ground-truth pixels adds only false
     positives, so testing those scores is sufficient.
@@ -73,10 +73,10 @@ def exceeds(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"],
 
 
 def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K H W"]:
-    """Return one mask per class, the pixels where its cosine is largest (Kunhao-Liu/3D-OVS `renderer.py`).
+    """Return one mask per class: the pixels where its cosine is largest (Kunhao-Liu/3D-OVS `renderer.py`).
 
     The first class wins ties; a pixel whose values are all -inf has no class. The IoU of a class absent from
-    prediction and ground truth is 0 (scikit-learn's default, used by that code).
+    prediction and ground truth is 0 (scikit-learn's default, used by `renderer.py`).
     """
     winner = similarity.argmax(axis=0)
     answered = similarity.max(axis=0) > -np.inf
@@ -86,7 +86,7 @@ def argmax_masks(similarity: Float[np.ndarray, "K H W"]) -> Bool[np.ndarray, "K 
 def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray, "K H W"]) -> float:
     """Return the share of pixels whose predicted classes exactly match the ground truth.
 
-    A pixel with two ground-truth classes or none is never correct, because the prediction has one class.
+    A pixel with no ground-truth class or two is never correct, because the prediction has one class.
     """
     return float((prediction == truth).all(axis=0).mean())
 

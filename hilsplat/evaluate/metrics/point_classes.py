@@ -1,7 +1,7 @@
 """Semantic segmentation of points: ScanNet, ScanNet200, Replica and Waymo.
 
-Labels are 1 .. K; 0 means none, which is ignored in the ground truth and a miss in the prediction. The
-benchmarks differ in which counts are summed first (of one scene or of all) and which classes are averaged.
+Labels are 1 .. K; 0 means no class, which is ignored in the ground truth and a miss in the prediction.
+Benchmarks differ in whether counts are summed per scene or over all scenes, and in the classes averaged.
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 
 @dataclass(frozen=True)
 class ClassCounts:
-    """Points per class, among labelled ones: correct, labelled (even if predicted 0), and predicted."""
+    """Labelled points per class: correctly predicted, of that ground truth (any prediction), and predicted."""
 
     hits: Int64[np.ndarray, " K"]
     truth: Int64[np.ndarray, " K"]
@@ -36,7 +36,7 @@ class ClassCounts:
 
     @property
     def union(self) -> Int64[np.ndarray, " K"]:
-        """Points labelled or predicted as the class."""
+        """Number of points labelled or predicted as each class."""
         return self.truth + self.predicted - self.hits
 
 
@@ -48,7 +48,7 @@ def pooled(counts: Iterable[ClassCounts]) -> ClassCounts:
 
 
 def class_iou(counts: ClassCounts) -> Float[np.ndarray, " K"]:
-    """Return TP / (TP + FP + FN) per class; nan if it is in neither ground truth nor prediction."""
+    """Return TP / (TP + FP + FN) per class; nan if the class is in neither ground truth nor prediction."""
     return _ratio(counts.hits, counts.union)
 
 
@@ -58,7 +58,7 @@ def class_accuracy(counts: ClassCounts) -> Float[np.ndarray, " K"]:
 
 
 def miou_over_present(counts: ClassCounts) -> float:
-    """Return the mean IoU over the ground-truth classes, nan if there are none (OpenGaussian, per scene).
+    """Return the mean IoU over the ground-truth classes; nan if there are none (OpenGaussian, per scene).
 
     A wrong prediction of an absent class lowers only the true class's IoU.
     """
@@ -66,7 +66,7 @@ def miou_over_present(counts: ClassCounts) -> float:
 
 
 def macc_over_present(counts: ClassCounts) -> float:
-    """Return the mean accuracy over the ground-truth classes, nan if none (OpenGaussian, per scene)."""
+    """Return the mean accuracy over the ground-truth classes; nan if none (OpenGaussian, per scene)."""
     return _mean(class_accuracy(counts)[counts.truth > 0])
 
 
@@ -86,7 +86,7 @@ def miou_over_all(counts: ClassCounts) -> float:
 
 
 def macc_over_all(counts: ClassCounts) -> float:
-    """Return the mean accuracy over all K classes; one without ground truth counts as 0 (OpenNeRF)."""
+    """Return the mean accuracy over all K classes; a class without ground truth counts as 0 (OpenNeRF)."""
     return _mean(np.nan_to_num(class_accuracy(counts), nan=0.0))
 
 
@@ -94,7 +94,7 @@ def miou_absent_as_one(counts: ClassCounts) -> float:
     """Return the mean IoU over all K classes; a class that doesn't occur counts as 1.
 
     Source: waymo-research/waymo-open-dataset `metrics/segmentation_metrics.cc`. The value is inflated for
-    subsets that lack classes; report `miou_over_present` beside it.
+    subsets that lack classes; also report `miou_over_present`.
     """
     return _mean(np.nan_to_num(class_iou(counts), nan=1.0))
 

@@ -1,4 +1,4 @@
-"""Rules of LangSplat and its successors that turn relevancy maps of three levels into one mask.
+"""Rules by which LangSplat and its successors turn relevancy maps of three levels into one mask.
 
 Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
@@ -23,13 +23,13 @@ Border = Literal["langsplat", "inside"]
 
 @dataclass(frozen=True)
 class RelevancyRule:
-    """How a map becomes a mask, and which level's mask is used. The defaults are LangSplat's code.
+    """How a map becomes a mask, and which level's mask is used. The defaults follow LangSplat's code.
 
-    LangSplat's mean filter has 30 px at an image height of 730; its text and the paper state 20. Level rules:
-    `max`: the level whose (mixed) map has the highest value; `mean_in_mask`: the highest mean inside its own
-    mask (LangSplat's text on 3D-OVS). The finest level wins ties, because LangSplat stacks its levels from
-    fine to coarse. At the border, `langsplat` reflects in the mean filter and ignores the last row and column
-    in the majority filter; `inside` averages the part of the window inside the image (LangSplatV2).
+    LangSplat's mean filter is 30 px wide at an image height of 730 px; its text and the paper state 20. Level
+    rules: `max` takes the level whose (mixed) map has the highest value, `mean_in_mask` the highest mean
+    inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because LangSplat stacks
+    levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and ignores the last row
+    and column in the majority filter; `inside` averages the window's part inside the image (LangSplatV2).
     """
 
     filter_px: int = 0  # side of the mean filter; 0 scales 30 with the height of the map
@@ -41,7 +41,7 @@ class RelevancyRule:
     level_rule: LevelRule = "max"
     border: Border = "langsplat"
     levels: tuple[Level, ...] = LEVELS  # candidates (LangSplatV2 on 3D-OVS: whole and part)
-    # Under `mean_in_mask`, an empty mask is chosen first (LangSplatV2: torch's argmax prefers NaN) or last.
+    # Under `mean_in_mask`, an empty mask ranks first (LangSplatV2: torch's argmax prefers NaN) or last.
     empty_wins: bool = False
 
     def departures(self, reference: "RelevancyRule") -> tuple[str, ...]:
@@ -58,14 +58,14 @@ class RelevancyRule:
 
 
 def filter_side_px(filter_px: int, height_px: int) -> int:
-    """Return the side of the mean filter; 0 means 30 px at a height of 730 px, scaled, at least 1."""
+    """Return the side of the mean filter; 0 scales 30 px at a height of 730 px to this height, at least 1."""
     return filter_px or max(1, round(30 * height_px / 730))
 
 
 def mean_filter(
     relevancy: Float[np.ndarray, "H W"], side_px: int, border: Border = "langsplat"
 ) -> Float32[np.ndarray, "H W"]:
-    """Average over a square window, by OpenCV's default or `inside` the image only.
+    """Average over a square window, with OpenCV's default border or only `inside` the image.
 
     OpenCV reflects borders without repeating the edge pixel, and the anchor of an even window is right of its
     centre: for side 30, output y averages rows y - 15 .. y + 14.
@@ -107,7 +107,7 @@ def majority_smooth(mask: Bool[np.ndarray, "H W"], border: Border = "langsplat")
 def _majority_windows(
     shape: tuple[int, int], border: Border
 ) -> tuple[UInt8[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
-    """Return the pixels used, and the number of them in each window."""
+    """Return the pixels used, and their number in each window."""
     seen = np.ones(shape, np.uint8)
     if border == "langsplat":
         seen[-1, :] = seen[:, -1] = 0
@@ -152,8 +152,8 @@ def relevancy_mask(
 ) -> tuple[Bool[np.ndarray, "H W"], Level]:
     """Return the mask of a level, or of the level that the rule chooses if `level` is None.
 
-    `united` is the unfiltered relevancy of another text, whose mask is merged with this one's before the
-    majority filter; the level is chosen by the first text alone.
+    `united` is the unfiltered relevancy of another text, whose mask is merged with the first text's mask
+    before the majority filter; the level is chosen by the first text alone.
     """
 
     def mask_of(level: Level) -> np.ndarray:
@@ -180,7 +180,7 @@ def level_by_mean_in_mask(
     levels: tuple[Level, ...] = LEVELS,
     empty_wins: bool = False,
 ) -> Level:
-    """Return the level with the highest mean relevancy in its mask; empty ones lose unless `empty_wins`."""
+    """Return the level with the highest mean relevancy in its mask; empty masks lose unless `empty_wins`."""
     empty = np.inf if empty_wins else -np.inf
     means = [
         float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else empty

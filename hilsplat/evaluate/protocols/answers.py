@@ -1,4 +1,4 @@
-"""Answers of a scene in one view, cached, and their score rows."""
+"""Cached answers of a scene in one view, and their score rows."""
 
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from hilsplat.query.language_scene import LanguageScene
 
 NO_POINTS = np.zeros((0, 2), np.int64)
-"""Peaks of answers without localization."""
+"""Peak points of an answer without localization."""
 
 
 def relevancy_of(
     scene: "LanguageScene", method: str, texts: Sequence[str], view: str
 ) -> Float32[np.ndarray, "T 3 H W"]:
-    """Return the relevancy maps of texts by "field" or "tree".
+    """Return the relevancy maps of texts, computed by `method` "field" or "tree".
 
     Raises:
-        ArtifactError: a relevancy is not a number.
+        ArtifactError: a relevancy is NaN.
     """
     render = scene.field_relevancy if method == "field" else scene.node_relevancy_map
     found = np.asarray(render(tuple(texts), view), dtype=np.float32)
@@ -68,7 +68,7 @@ class Selections:
     def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:
         """Return the ids of the nodes that answer the last text of a path, ordered from coarse to fine.
 
-        The tree chooses the level if it is None. With a view, only nodes visible in it compete, as in maps.
+        If `level` is None, the tree chooses it. With a view, only nodes visible in the view compete, as in maps.
         """
         key = (path, level, view)
         if key not in self._of:
@@ -76,7 +76,7 @@ class Selections:
         return self._of[key]
 
     def mask(self, view: str, ids: np.ndarray, size_hw: tuple[int, int]) -> np.ndarray:
-        """Return the union of the given nodes in a view; each is rendered once, for all protocols."""
+        """Return the union mask of the given nodes in a view; each set is rendered once for all protocols."""
         if len(ids) == 0:
             return np.zeros(size_hw, dtype=bool)
         masks, key = self._masks.setdefault(view, PackedMasks(size_hw)), ids.tobytes()
@@ -93,7 +93,7 @@ def mask_rows(
     points_xy: Int[np.ndarray, "P 2"] = NO_POINTS,
     metrics: Sequence[str] = LERF_LANGSPLAT.metrics,
 ) -> Iterator[Measured]:
-    """Yield a row per metric of one mask; `points_xy` are the relevancy peaks, for localization."""
+    """Yield one row per metric for a mask; `points_xy` are the relevancy peaks, for localization."""
     level = query.level.label if query.level else ""
     values = {
         "iou": lambda: masks.iou(mask, query.truth),

@@ -1,8 +1,8 @@
-"""Protocols: name, version and everything that determines a number measured under them.
+"""Protocols: name, version and everything else that determines a number measured under a protocol.
 
-The same model scores 51.4 under `lerf/langsplat` and 9.66 under `lerf/opengaussian`, so a row of `scores.csv`
-carries the full name, such as `lerf/langsplat@2`, followed by deviating settings in brackets. A change to a
-card that affects its numbers requires a new version; a test checks this.
+The same model scores 51.4 under `lerf/langsplat` and 9.66 under `lerf/opengaussian`, so each row of
+`scores.csv` has the full name, such as `lerf/langsplat@2`, then non-default settings in brackets. A change to
+a card that affects its numbers requires a new version; a test checks this.
 """
 
 from collections.abc import Iterable
@@ -20,19 +20,18 @@ RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""A node answers a text if its cosine margin is below that of the best node in the view by at most
-1 - NODE_SELECT of the range of margins at its level, or three times that if the two nodes' cosine is at least
-0.9."""
+"""A node answers a text if its cosine margin is at most (1 - NODE_SELECT) times its level's range of margins
+below the margin of the view's best node, or three times that if the two nodes' cosine is at least 0.9."""
 
 ANCESTORS = 0.2
-"""Share of the mean margin of a node's ancestors that is added to its own, except on paths."""
+"""Fraction of the ancestors' mean margin that is added to a node's own margin, except on paths."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
-"""How rows are averaged into a number in a table.
+"""How rows are averaged to one number in a table.
 
 pairs: mean over the (view, query) pairs of a scene, then over scenes.
 classes: mean over the views of a query, then over the queries of a scene, then over scenes.
-levels: as `pairs` for each level; Avg is the mean of the levels.
+levels: like `pairs` for each level; Avg is the mean of the levels.
 views: mean over the views of a scene, then over scenes.
 scenes: one number per scene, mean over scenes.
 pooled: counts of all scenes are summed first, so each scene is weighted by its number of points.
@@ -48,7 +47,7 @@ class ProtocolCard:
     metrics: tuple[str, ...]
     averaging: Averaging
     selection: str  # how a prediction is chosen, threshold and level, in words
-    source: str  # origin and departures from it; begins with "none" if there is no public code
+    source: str  # source code and departures from it; begins with "none" if no code is public
     rule: RelevancyRule | None = None  # how relevancy maps become masks, if they do
     missing: Literal["zero", "left out"] = "zero"  # for pairs without a prediction; omission inflates scores
     classes: str = ""  # name of the queried `ClassSet`, if it is fixed
@@ -64,7 +63,7 @@ class ProtocolCard:
         return f"{self.name}@{self.version}"
 
     def labelled(self, departures: Iterable[str] = ()) -> str:
-        """Return the name used in rows: the full name and any deviating settings."""
+        """Return the name used in rows: the full name and any non-default settings."""
         words = ", ".join(departures)
         return f"{self.full_name} ({words})" if words else self.full_name
 
@@ -232,7 +231,7 @@ OVS_LANGSPLAT_V2 = ProtocolCard(
 def _maps(
     name: str, source: str, selection: str, metrics: tuple[str, ...], public: str = "", **rule
 ) -> ProtocolCard:
-    """Return a protocol that differs from LangSplat's only in its rule."""
+    """Return a protocol that differs from LangSplat's protocol only in its map rule."""
     return ProtocolCard(name, 2, metrics, "pairs", selection, source, RelevancyRule(**rule), public=public)
 
 
@@ -371,7 +370,7 @@ PROTOCOLS: dict[str, ProtocolCard] = {card.full_name: card for card in CARDS}
 
 
 def card_of(label: str) -> ProtocolCard:
-    """Return the protocol that a row names, ignoring deviating settings.
+    """Return the protocol that a row names, ignoring non-default settings.
 
     Raises:
         ArtifactError: no protocol has that name and version.

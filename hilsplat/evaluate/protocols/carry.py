@@ -4,11 +4,11 @@
 |---|---|
 | `frozen` | the Gaussian with the point's index, fitted without moving (OpenGaussian) |
 | `nearest` | the nearest Gaussian that is opaque enough |
-| `vote` | a vote of the k nearest within a radius, weighted by opacity; none beyond the radius |
-| `density` | the mean of the k nearest, weighted by opacity times Gaussian falloff at the point |
+| `vote` | an opacity-weighted vote of the k nearest Gaussians within a radius; none beyond the radius |
+| `density` | the mean of the k nearest Gaussians, weighted by opacity times Gaussian falloff at the point |
 
-The numbers depend on the mode, so every row names it. The search tree breaks ties between equidistant
-Gaussians, deterministically for the same input and any number of threads.
+Scores depend on the mode, so every row names it. The search tree breaks ties between equidistant Gaussians
+deterministically, for the same input and any number of threads.
 """
 
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ from hilsplat.splat.gaussians import Gaussians
 Mode = Literal["frozen", "nearest", "vote", "density"]
 
 OPACITY_MIN = 0.1
-"""Gaussians below this opacity are transparent; OpenGaussian excludes them from the evaluation."""
+"""Gaussians below this opacity count as transparent; OpenGaussian excludes them from the evaluation."""
 
 NEIGHBOURS = {"nearest": 1, "vote": 5, "density": 8}
-"""Number of Gaussians assigned to a point."""
+"""Number of Gaussians assigned to each point, by mode."""
 
 CHUNK_POINTS = 65536
 """Number of points processed at once; bounds memory use."""
@@ -45,7 +45,7 @@ class CarriedPoints:
     def labels(self, of_gaussian: Int[np.ndarray, " N"]) -> Int32[np.ndarray, " P"]:
         """Return the label with the largest total weight among each point's Gaussians; the lowest wins ties.
 
-        Label 0 means none and has no weight; a point whose Gaussians are unlabelled gets 0.
+        Label 0 means no label and has no weight; a point whose Gaussians are all unlabelled gets 0.
         """
         result = np.zeros(len(self.index), dtype=np.int32)
         for rows in _chunks(len(self.index)):
@@ -75,14 +75,14 @@ class CarriedPoints:
 def carried_to(
     points: Float[np.ndarray, "P 3"], gaussians: Gaussians, mode: Mode, radius: float, threads: int = 1
 ) -> CarriedPoints:
-    """Assign Gaussians to points; positions and the radius of a vote are in scene units.
+    """Assign Gaussians to points; positions and the vote radius are in scene units.
 
     `frozen`: the fit must not have moved, split or dropped any Gaussian. As in OpenGaussian's
     `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
     `vote`: a point without a Gaussian within the radius has no prediction, which counts as a miss.
-    `density`: the weight opacity * exp(-d**2 / 2), d the Mahalanobis distance, is the alpha that 3DGS blends
-    at the point. Candidates are the nearest centres, so a large Gaussian with a distant centre has no weight.
-    Relative weights are used even far from all Gaussians, so every point has a prediction.
+    `density`: the weight opacity * exp(-d**2 / 2), where d is the Mahalanobis distance, is the alpha that 3DGS
+    blends at the point. Candidates are the nearest centres, so a large Gaussian with a distant centre has no
+    weight. Weights are relative, so every point has a prediction, even far from all Gaussians.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough, or under `frozen`, the numbers of Gaussians and
@@ -115,8 +115,8 @@ def carried_to(
 def _densities(
     points: np.ndarray, gaussians: Gaussians, opacities: np.ndarray, index: np.ndarray, distance: np.ndarray
 ) -> np.ndarray:
-    """Return opacity times Gaussian falloff at each point, up to a factor per point; 0 if out of reach."""
-    # Matrices (N, 3, 3) that map an offset from the centre to standard deviations.
+    """Return opacity times Gaussian falloff at each point, up to a factor per point; 0 if out of range."""
+    # Matrices (N, 3, 3) that map an offset from the centre to units of standard deviations.
     turns = rotation_matrices(gaussians.quats).transpose(0, 2, 1)
     whiten = turns / gaussians.scales.astype(float)[:, :, None]
     weight = np.empty(index.shape)
@@ -125,7 +125,7 @@ def _densities(
         squared = (np.einsum("pkij,pkj->pki", whiten[index[rows]], offset) ** 2).sum(axis=2)
         log_weight = np.log(opacities[index[rows]].astype(float)) - squared / 2
         log_weight = np.where(np.isfinite(distance[rows]), log_weight, -np.inf)
-        # Subtracting the maximum preserves the ratios and prevents underflow of all weights to zero.
+        # Subtracting the maximum preserves the ratios and keeps the weights from all underflowing to zero.
         weight[rows] = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
     return weight
 
@@ -133,12 +133,12 @@ def _densities(
 def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]) -> Int32[np.ndarray, " P"]:
     """Return labels 1 .. K by the largest cosine with the class texts (unit vectors); the first wins ties.
 
-    There are no canonical phrases and no "other". Departs: OpenGaussian's argmax assigns points without a
-    feature (all zero) to its first class, wall; here they get 0, a miss.
+    Canonical phrases and a class "other" are not used. Departs: OpenGaussian's argmax assigns points without
+    a feature (all zero) to its first class, wall; here they get label 0, a miss.
     """
     labels = np.zeros(len(features), dtype=np.int32)
     for rows in _chunks(len(features)):
-        # A feature's length does not change which cosine is largest.
+        # The norm of a feature does not change which cosine is largest.
         scores = features[rows] @ texts.T
         labels[rows] = np.where(scores.any(axis=1), scores.argmax(axis=1) + 1, 0)
     return labels
@@ -147,7 +147,7 @@ def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]
 def _neighbours(
     points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return index and distance (P, k) of the nearest opaque Gaussians; the distance is infinite if missing.
+    """Return index and distance (P, k) of the nearest opaque Gaussians; infinite if there are fewer than k.
 
     Raises:
         MisalignedArtifactError: no Gaussian is opaque enough.

@@ -1,6 +1,6 @@
-"""Protocols for images without levels, scored beside LangSplat's: 3D-OVS, LERF-Mask and other map rules.
+"""Protocols for images without levels, in addition to LangSplat's: 3D-OVS, LERF-Mask and other map rules.
 
-On a stand-in with levels, only texts of whole objects are queried, because those benchmarks do not name
+On a stand-in with levels, only texts of whole objects are queried, because these benchmarks do not name
 parts; the protocol names then include `wholes`.
 """
 
@@ -61,8 +61,8 @@ class FlatProtocols:
     ) -> Iterator[Measured]:
         """Yield the rows of one text, merged over levels (`category`) or at one of its levels (`queries`).
 
-        `nodes_mask` is the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`; if it is None, LERF-Mask uses
-        the mask from the relevancy maps.
+        `nodes_mask` is the tree's mask, for LERF-Mask and `3d-ovs/tree-nodes`. If it is None, LERF-Mask
+        derives the mask from the relevancy maps.
         """
         query = category if self.level is None else next((q for q in queries if q.level is self.level), None)
         if query is None:
@@ -71,7 +71,7 @@ class FlatProtocols:
 
         @functools.cache
         def smoothed_by(filter_px: int, mix: bool, border: Border) -> SmoothedRelevancy:
-            """Smooth once for all rules with the same filter, because it takes most of the time."""
+            """Smooth once for all rules with the same filter, because smoothing takes most of the time."""
             return SmoothedRelevancy.of(relevancy, RelevancyRule(filter_px, mix, border=border))
 
         masks_only = (LERF_MASK, LERF_MASK_SKIPPING)
@@ -116,12 +116,12 @@ def argmax_rows(
     words: Sequence[str],
     is_stand_in: bool,
 ) -> Iterator[Measured]:
-    """Yield the rows of 3D-OVS by argmax at an eighth of the image's size; the first text wins ties.
+    """Yield the rows of 3D-OVS by argmax at one eighth of the image's size; the first text wins ties.
 
     Args:
-        cosine_of: cosine of texts with pixels (row * width + column) at any number of levels; -inf for none.
+        cosine_of: returns cosines of texts with pixels (row * width + column) at any number of levels, or -inf.
         words: departures, for the protocol's name.
-        is_stand_in: whether pixels around the objects have no text, in which case they are not compared.
+        is_stand_in: whether pixels around the objects have no text; such pixels are then not compared.
     """
     if not queries:
         return

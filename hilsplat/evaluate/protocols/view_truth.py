@@ -19,10 +19,10 @@ from hilsplat.scene.scene import Scene
 logger = logging.getLogger(__name__)
 
 EIGHTH = 8
-"""3D-OVS compares masks at an eighth of the image's size."""
+"""3D-OVS compares masks at one eighth of the image's height and width."""
 
 SHAPE_TOLERANCE = 0.01
-"""Tolerated relative difference in shape between labels and view, due to rounding in earlier stages."""
+"""Tolerated relative difference in aspect ratio between labels and view, due to earlier rounding."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class Query:
     """One annotated text in one view."""
 
     text: str
-    level: Level | None  # of its annotation; None if merged over levels
-    paths: tuple[tuple[str, ...], ...]  # distinct chains of texts that lead to its nodes
+    level: Level | None  # of the annotation; None if merged over levels
+    paths: tuple[tuple[str, ...], ...]  # distinct chains of texts that lead to the annotated nodes
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]  # of each annotated node, borders included
-    eighth: Bool[np.ndarray, "h w"]  # at an eighth of the image's size, read from the label
+    eighth: Bool[np.ndarray, "h w"]  # at one eighth of the image's size, resized from the label
     any_grey: Bool[np.ndarray, "H W"] | None = None  # region for ground truth `any grey`, if it differs
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
-        """Return the ground-truth region for protocols with this `truth`, `labels` or `any grey`."""
+        """Return the ground-truth region for protocols with the given `truth`: `labels` or `any grey`."""
         return self.any_grey if truth == "any grey" and self.any_grey is not None else self.truth
 
 
@@ -49,7 +49,7 @@ class ViewTruth:
     queries: tuple[Query, ...]  # one per (text, level)
     categories: tuple[Query, ...]  # one per text, merged over levels
     regions: dict[tuple[str, ...], Bool[np.ndarray, "H W"]]  # of each path that is large enough
-    # Texts that the labels list but the view doesn't show compete in an argmax, and may have `any_grey`.
+    # Texts that are labelled but not visible in the view compete in an argmax, and may have `any_grey`.
     absent: tuple[Query, ...]
 
     @staticmethod
@@ -94,7 +94,7 @@ class ViewTruth:
 
         Args:
             size_hw: size of the predictions; labels of another size are resized by nearest neighbour.
-            image_hw: size of the image, if different.
+            image_hw: size of the image, if it differs from `size_hw`.
             min_px: texts and paths with fewer pixels in the view are omitted.
         """
         small_hw = eighth_of(image_hw or size_hw)
@@ -120,9 +120,9 @@ class ViewTruth:
         )
 
     def own_part(self, path: tuple[str, ...], answer: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-        """Return the answer to a part without the area of other annotated wholes that have the same part.
+        """Return the answer to a part, minus the area of other annotated wholes that have the same part.
 
-        The answer to "leg" covers legs of chair and table; those in the annotated table aren't the chair's.
+        The answer to "leg" covers chair and table legs; the chair's part excludes the annotated table.
         """
         parent = path[:-1]
         named_alike = [
@@ -186,8 +186,8 @@ def truths_of(
 ) -> dict[str, Callable[[], ViewTruth]]:
     """Return the ground-truth regions by view, loaded on demand.
 
-    Those of a synthetic scene (a ground-truth folder) are in annotated test views and have at least
-    `min_region_px` pixels; those of a published data set are all regions in all labelled views.
+    For a synthetic scene (a ground-truth folder), these are the regions of at least `min_region_px` pixels in
+    annotated test views; for a published data set, all regions in all labelled views.
     """
     truths: dict[str, Callable[[], ViewTruth]] = {}
     if isinstance(known, Path):

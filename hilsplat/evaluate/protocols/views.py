@@ -1,9 +1,9 @@
 """Score a scene's answers in one view: LERF-OVS, 3D-OVS, Hi-LERF and Hi-3DOVS.
 
-The protocols `lerf/*` query every distinct text, with its regions merged over levels, and `hierarchy/*` every
-(text, level); their cards state how a method answers. `hierarchy/annotations` has only the HC of the
+Protocols `lerf/*` query every distinct text, with its regions merged over levels; `hierarchy/*` query every
+(text, level). Protocol cards state how a method answers. `hierarchy/annotations` has only the HC of the
 annotations themselves, the score of perfect masks. `hierarchy/path` queries the chain of texts from the whole
-down, which contains more information than the paper's protocol. A missing or empty prediction counts as 0.
+down, which gives more information than the paper's protocol. A missing or empty prediction counts as 0.
 Only Gaussians and nodes visible in the view compete, except for nodes under `hierarchy/scene-wide`.
 """
 
@@ -32,7 +32,7 @@ from hilsplat.evaluate.scores import Measured
 from hilsplat.settings import EvaluateSettings
 
 RELEVANCY_CHUNK_MIB = 512
-"""Memory for relevancy maps held at once; each chunk of texts decodes the view again."""
+"""Memory limit for relevancy maps, which sets the chunk size; each chunk of texts decodes the view again."""
 
 
 def rule_of(settings: EvaluateSettings) -> RelevancyRule:
@@ -48,7 +48,7 @@ def rule_of(settings: EvaluateSettings) -> RelevancyRule:
 
 
 def label_of(card: cards.ProtocolCard, method: str, settings: EvaluateSettings) -> str:
-    """Return the protocol name of a row: the card's name and non-default settings that affect it."""
+    """Return the protocol name of a row: the card's name and the non-default settings that affect the row."""
     if method == "truth":
         return card.labelled()
     rule = rule_of(settings)
@@ -89,7 +89,7 @@ def measure_view(
     settings: EvaluateSettings,
     extra: ExtraProtocols,
 ) -> Iterator[Measured]:
-    """Yield all rows of one view, in no particular order; store the answers in `masks`."""
+    """Yield all rows of one view, in arbitrary order, and store the answers in `masks`."""
     answers, scene = _ViewAnswers(selections, view, settings, masks), selections.scene
     flat_views = FlatProtocols(scene, view, extra.flat, extra.level, relevancy_departures(settings))
     rule = rule_of(settings)
@@ -153,9 +153,9 @@ class _ViewAnswers:
         category: Query,
         queries: Sequence[Query],
     ) -> Iterator[Measured]:
-        """Yield the rows of one text, merged over levels (`category`, under the protocol `flat`) and at each.
+        """Yield a text's rows merged over levels (`category`, under protocol `flat`) and at each level.
 
-        `answer` maps a level, or None if the method chooses it, to the mask of the text.
+        `answer` returns the text's mask at a level; None lets the method choose the level.
         """
         united, given, auto = (
             label_of(card, method, self.settings) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)
@@ -175,7 +175,7 @@ class _ViewAnswers:
             self.masks.put(given_key(method, query, self.settings), given_mask)
 
     def scene_wide_rows(self, queries: Sequence[Query]) -> Iterator[Measured]:
-        """Yield the rows of the tree's answers for the whole scene, without localization (per view)."""
+        """Yield the rows of the tree's scene-wide answers, without localization, which is per view."""
         protocol = label_of(cards.SCENE_WIDE, "tree", self.settings)
         for query in queries:
             mask = self.of_nodes((query.text,), query.level, scene_wide=True)
@@ -204,7 +204,7 @@ class _ViewAnswers:
             yield from mask_rows("tree-path", query, protocol, mask, points)
 
     def consistency_rows(self, truth: ViewTruth) -> Iterator[Measured]:
-        """Yield the HC of every method and of the annotations; nothing for a view without parents."""
+        """Yield the HC of every method and the annotations; nothing for a view without parents."""
         of_methods = {
             "truth": (cards.ANNOTATIONS,),
             "field": (cards.LEVEL_AUTO, cards.LEVEL_GIVEN),

@@ -44,7 +44,7 @@ def ablation_table(sources: Sources) -> Table:
 
 
 def component_table(sources: Sources) -> Table:
-    """Build our own ablation: the contribution of each part of the default field and of its code."""
+    """Build our own ablation: the contribution of each part of the default field and its code."""
     note = "Rows name the losses that are switched on; d is the size of a latent."
     return _table(sources, "components", "Parts of the default field", "parts", note)
 
@@ -83,7 +83,7 @@ def _table(
 
 
 def component_blocks(sources: Sources, methods: tuple[str, ...]) -> list[Block]:
-    """Return one row per variant and method, with all protocols of the ablation side by side."""
+    """Return blocks with one row per variant and method, and the ablation's protocols side by side."""
     scores = measured.with_seeds(sources.scores)
     blocks = measured.measured_blocks(
         replace(sources, scores=sources.scores[sources.scores["method"].isin(methods)]),
@@ -99,7 +99,7 @@ def component_blocks(sources: Sources, methods: tuple[str, ...]) -> list[Block]:
 def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:
     """Return the values of one row from its scores under all protocols.
 
-    Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS, whose own labels are used for the other columns.
+    Hi-LERF and Hi-3DOVS label images of LERF and 3D-OVS; the other columns use the labels of LERF and 3D-OVS.
     """
     own = part.iloc[0]["dataset"]
     lerf, ovs3d = ("lerf_ovs", "3d_ovs") if own in LEVELLED else (own, own)
@@ -117,9 +117,9 @@ def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, C
 
 
 def against_default(scores: "pd.DataFrame", part: "pd.DataFrame") -> Cell:
-    """Return a row's mIoU, over all its seeds, minus that of the default field, paired by scene.
+    """Return a row's mIoU over all seeds minus the default field's mIoU, paired by scene.
 
-    Scenes differ more than rows, so the spread of the paired differences shows whether one row is better.
+    Scenes differ more than rows do, so the spread of paired differences shows whether one row is better.
     """
     first = part.iloc[0]
     default = (scores["variant"] == "default") & (scores["method"] == "field")

@@ -33,7 +33,7 @@ LEVELLED = ("tabletop", "lerf_ovs", "3d_ovs")
 class TableKind:
     """One table: its builder, the kinds of scenes and data sets that it covers, and its variants.
 
-    `variants` is the configuration key that lists them; `shows_costs` also reads times of jobs and queries.
+    `variants` is the configuration key that lists the variants; `shows_costs` also reads job and query times.
     """
 
     build: Callable[[Sources], Table]
@@ -43,7 +43,7 @@ class TableKind:
 
     @property
     def is_sweep(self) -> bool:
-        """Whether it is measured only on the scenes of `sweep_scenes`."""
+        """Whether the table is measured only on the scenes in `sweep_scenes`."""
         return self.variants != "main_variants"
 
 
@@ -73,7 +73,7 @@ TABLES: dict[str, TableKind] = {
 
 
 def published_values(table: str) -> Path:
-    """Return the file with the paper's values for a table; `-seconds` tables share that of the main table."""
+    """Return the file with the paper's values for a table; a `-seconds` table uses the main table's file."""
     return project_path(f"config/published/{table.removesuffix(SECONDS)}.csv")
 
 
@@ -89,7 +89,7 @@ def run_table(
 
     Args:
         published: file with the paper's values, `published_values(name)`.
-        labels: variant -> its name in the table; other variants keep their own.
+        labels: variant -> its name in the table; other variants keep their own names.
         absent: a sentence with the reason for each data set that was not measured.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Time and memory of jobs and queries: records beside artifacts, and the tables of cost made from them.
+"""Time and memory of jobs and queries: records beside artifacts, and the cost tables built from them.
 
-They differ from run to run, so they are not in `scores.csv`, and the tables that show them have names with
-the suffix `-seconds`: all other files are reproducible byte for byte.
+Times and memory differ from run to run, so they are not in `scores.csv`, and tables that show them have the
+name suffix `-seconds`. All other files are reproducible byte for byte.
 """
 
 import math
@@ -27,7 +27,7 @@ TIMES = "times.csv"
 TIME_COLUMNS = ("dataset", "scene", "variant", "method", "seconds")
 
 SECONDS = "-seconds"
-"""Suffix of the names of tables that are not reproducible byte for byte."""
+"""Name suffix of tables that are not reproducible byte for byte."""
 
 COST_NOTE = (
     "Measured rows, on this machine, means over scenes: preparation is masks, trees of the views and CLIP; "
@@ -39,14 +39,14 @@ COST_NOTE = (
 
 @dataclass(frozen=True)
 class Job:
-    """One finished job. Data set, scene and variant are empty where it has none."""
+    """One finished job. Data set, scene and variant are empty if they don't apply."""
 
     stage: str
     dataset: str
     scene: str
     variant: str
     elapsed_s: float  # wall-clock time
-    cpu_s: float  # of the job and its children; 0 if the job was too short to be sampled
+    cpu_s: float  # of the job and its child processes; 0 if the job was too short to be sampled
     peak_mib: float  # peak resident memory; 0 if the job was too short to be sampled
 
 
@@ -57,7 +57,7 @@ class Cost:
     dataset: str
     scene: str
     variant: str
-    prepare_s: float  # wall-clock time of masks, trees of the views and CLIP
+    prepare_s: float  # wall-clock time of masks, coverage trees and CLIP
     train_s: float  # wall-clock time of contributions, semantic tree, autoencoder and field
     peak_mib: float  # peak resident memory of the training jobs
     query_s: Mapping[str, float]  # per method, seconds from a text to a mask in a view
@@ -70,7 +70,7 @@ def write_times(scores: Path, dataset: str, scene: str, variant: str, seconds: M
 
 
 def read_costs(scores: Iterable[Path]) -> list[Cost]:
-    """Return the costs of the scenes and variants of score files, from the records beside their artifacts."""
+    """Return the costs of the scenes and variants in score files, from the records beside the artifacts."""
     found = []
     for path in scores:
         rows = read_csv(Path(path).with_name(TIMES), TIME_COLUMNS, "run the evaluate stage again")
@@ -93,7 +93,7 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
 
 
 def jobs_of(scores: Path) -> dict[str, Job | None]:
-    """Return the jobs behind a score file by stage, of whichever variant ran them; None without a record.
+    """Map each stage behind a score file to its job, whichever variant ran it, or to None without a record.
 
     The score file's provenance lists the artifacts that `evaluate` read; the field's provenance lists the
     rest. Stages whose output was not read are absent, such as trees for a baseline.
@@ -115,7 +115,7 @@ def _inputs(artifact: Path) -> dict[str, Path]:
 
 
 def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
-    """Return the wall-clock time of the needed stages, s; nan if one has no record or none is known."""
+    """Return the wall-clock time of `stages`, s; nan if a job has no record or `jobs` has none of them."""
     needed = [jobs[stage] for stage in stages if stage in jobs]
     if not needed:
         return math.nan
@@ -123,7 +123,7 @@ def _seconds(jobs: Mapping[str, Job | None], stages: tuple[str, ...]) -> float:
 
 
 def run_efficiency(results: Path, out: Path) -> str:
-    """Write a CSV of all jobs below `results`, and a Markdown table of stages beside it, which is returned.
+    """Write a CSV of all jobs below `results` and, beside it, a Markdown table of stages; return the table.
 
     Raises:
         ArtifactError: there is no benchmark file, one is unreadable, or an output path has another file.
@@ -182,7 +182,7 @@ def read_benchmark(path: Path, results: Path) -> list[Job]:
 
 
 def _number(value: object) -> float:
-    """Return a sampled value; Snakemake writes "-" or null for values that it could not sample."""
+    """Return a sampled value, or 0 for "-" or null, which Snakemake writes if it could not sample."""
     return float(value) if isinstance(value, int | float) else 0.0
 
 
@@ -258,9 +258,9 @@ def costs_of(columns: Iterable[str]) -> frozenset[str]:
 def quality_blocks(
     sources: Sources, time_columns: tuple[str, ...], methods: tuple[str, ...] = ("field", "tree")
 ) -> list[Block]:
-    """Return mIoU and HC at given levels beside times, for each data set with queries at levels.
+    """Return mIoU and HC at given levels beside times, for each data set whose queries have levels.
 
-    Labels with levels have their own data set (Hi-LERF), or are the scenes' own.
+    Labels with levels are a separate data set (Hi-LERF) or belong to the scene's own data set.
     """
     if sources.scores.empty:
         return []
@@ -289,7 +289,7 @@ def quality_blocks(
 
 
 def time_cells(costs: list[Cost]) -> dict[str, Cell]:
-    """Return mean times over scenes and the maximum memory."""
+    """Return the mean times and the maximum memory over scenes."""
     return {
         "Preparation (min)": Cell.number(statistics.fmean(cost.prepare_s for cost in costs) / 60),
         "Training (min)": Cell.number(statistics.fmean(cost.train_s for cost in costs) / 60),
@@ -298,7 +298,7 @@ def time_cells(costs: list[Cost]) -> dict[str, Cell]:
 
 
 def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
-    """Return (variant, method, costs of the scenes) in row order, by data set, sorted by name."""
+    """Map each data set, sorted by name, to (variant, method, costs of the scenes) in row order."""
     found: dict[tuple[str, str, str], list[Cost]] = {}
     for cost in sorted(sources.costs, key=lambda cost: cost.scene):
         for method in cost.query_s:

@@ -45,7 +45,7 @@ HTML_STYLE = """<style>
 
 
 def as_csv(table: Table) -> str:
-    """Return all blocks in one sheet; measured values with two decimals, reported ones as printed."""
+    """Return all blocks as one CSV: measured values with two decimals, reported values as printed."""
     names = list(dict.fromkeys(name for block in table.blocks for name in block.names()))
     values = list(dict.fromkeys(column for block in table.blocks for column in block.columns))
     stream = io.StringIO()
@@ -99,7 +99,7 @@ def as_markdown(table: Table) -> str:
 
 
 def _plain(note: str) -> str:
-    """Return a note without HTML or links; our own emphasis is kept."""
+    """Return a note with HTML and links disabled; Markdown emphasis is kept."""
     return " ".join(note.replace("<", "&lt;").replace("](", "]\\(").splitlines())
 
 

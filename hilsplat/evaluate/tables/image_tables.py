@@ -1,4 +1,4 @@
-"""Tables of labelled images: LERF, 3D-OVS, and queries at three levels with the scored frames."""
+"""Tables of labelled images: LERF, 3D-OVS, queries at three levels, and the scored frames."""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ COLUMNS = (
 )
 
 OVS_SCENES = ("bed", "bench", "room", "sofa", "lawn")
-"""Scenes of the paper's table, averaged in its column Overall."""
+"""Scenes in the paper's table; its column Overall is their average."""
 
 
 def hierarchy_table(sources: Sources) -> Table:
@@ -75,7 +75,7 @@ def column_of_data(data: str, column: str) -> str | None:
 
 
 def frames_table(sources: Sources, data: str) -> Table:
-    """Build a table of the paper's frames and of the views queried at levels, with the texts per view."""
+    """Build a table of the paper's frames and the views queried at levels, with the texts per view."""
     texts: dict[tuple[str, str, str], set] = {}
     for row in sources.scores.itertuples():
         if row.metric == "iou" and row.protocol.startswith(LEVEL_GIVEN.full_name):

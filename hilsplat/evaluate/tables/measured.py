@@ -1,6 +1,6 @@
-"""Averages of scores, in the order that their protocol defines, and blocks of measured rows.
+"""Averages of scores, in the order that the protocol defines, and blocks of measured rows.
 
-Scores are a frame of `scores.csv` (`evaluate.scores.read_scores`). A (view, query) pair without a prediction
+Scores are a data frame of `scores.csv` (`evaluate.scores.read_scores`). A (view, query) pair without a prediction
 has a row with value 0 unless its protocol omits such pairs.
 """
 
@@ -21,7 +21,7 @@ SYNTHETIC = "synthetic"
 """Prefix of the names of synthetic data sets."""
 
 SEED = re.compile(r"(?P<variant>.+)\.seed(?P<seed>[0-9]+)")
-"""A variant's name with a seed; all seeds of a variant share a row."""
+"""Variant name with a seed; all seeds of a variant share a row."""
 
 ANSWERS = {"field": "field", "tree": "tree", "tree-path": "tree, path", "truth": "annotations"}
 """Method -> its name in rows, in row order."""
@@ -43,7 +43,7 @@ STAND_INS = {
 """Synthetic data set -> its description in headings."""
 
 TRUE_MASKS = "diagnostic, true masks: "
-"""Prefix of the method's name in rows whose masks were made from ground-truth labels."""
+"""Prefix of the method name in rows whose masks were made from ground-truth labels."""
 
 
 def measured_blocks(
@@ -60,7 +60,7 @@ def measured_blocks(
 
     Args:
         protocols: prefixes of the protocols that have rows.
-        cells_of: computes a row's values from the scores of one seed, `over_seeds` from those of all seeds.
+        cells_of: computes a row's values from the scores of one seed; `over_seeds` uses all seeds at once.
         columns_of: returns the value columns, from the scores of a data set.
         label_of: maps protocols to labels; those with the same label share a row.
     """
@@ -111,7 +111,7 @@ def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Return mean and standard deviation (n - 1) of each cell over seeds; one seed is unchanged."""
+    """Return mean and standard deviation (n - 1) of each cell over seeds; cells of a single seed unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
@@ -134,7 +134,7 @@ def without_repeats(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def row_place(variant: str, method: str, labels: Mapping[str, str]) -> tuple[int, str, int]:
-    """Return the sort key of a row: the default, then variants in the order of their labels, then others."""
+    """Return the sort key of a row: the default variant, then variants in label order, then others."""
     order, methods = ["default", *labels], list(ANSWERS)
     known = order.index(variant) if variant in order else len(order)
     return known, variant, methods.index(method) if method in methods else len(methods)
@@ -143,7 +143,7 @@ def row_place(variant: str, method: str, labels: Mapping[str, str]) -> tuple[int
 def row_name(variant: str, method: str, labels: Mapping[str, str]) -> str:
     """Return the name of a row: `hilsplat (field)` and `hilsplat (tree)` for the default variant.
 
-    The label of any other variant refers to its field. Predictions from files are named after their program.
+    The label of any other variant refers to its field. Predictions from files have their program's name.
     """
     if method == "truth":
         return "annotations"
@@ -164,7 +164,7 @@ def kind_and_title(dataset: str) -> tuple[str, str, str]:
 def scene_cells(
     part: "pd.DataFrame", metrics: Mapping[str, str], average: str = "Average"
 ) -> dict[str, Cell]:
-    """Return the columns `<scene> <name>` of every scene, and their mean; `metrics` maps names to metrics."""
+    """Return `<scene> <name>` for every scene, and the mean over scenes; `metrics` maps names to metrics."""
     cells = {}
     for name, metric in metrics.items():
         values = scene_values(part, metric)
@@ -186,7 +186,7 @@ def same_row(
 ) -> "pd.DataFrame":
     """Return the scores (with seeds) of the same variant, seed, method and masks under other protocols.
 
-    `protocols` are prefixes; the data set is the row's own unless it is given.
+    `protocols` are prefixes; `dataset` defaults to the row's own data set.
     """
     first = part.iloc[0]
     same = scores["protocol"].str.startswith(protocols) & (scores["dataset"] == (dataset or first["dataset"]))
@@ -198,8 +198,8 @@ def same_row(
 def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) -> "pd.Series":
     """Return one number per scene, by name; scenes without a row are omitted.
 
-    The number is the mean over the scene's rows, of one level if it is given; under a protocol with averaging
-    `classes`, the mean over the views of each query, then over queries.
+    The number is the mean over the scene's rows (at `level`, if given). Under a protocol with averaging
+    `classes`, it is the mean over the views of each query, then over queries.
     """
     kept = rows[rows["metric"] == metric]
     if level is not None:
@@ -214,28 +214,28 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
 
 
 def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
-    """Return the unweighted mean of the scenes' numbers; nan without a row."""
+    """Return the unweighted mean of the scenes' numbers; nan if there are no rows."""
     return float(scene_values(rows, metric, level).mean())
 
 
 def share_above(rows: "pd.DataFrame", metric: str, threshold: float) -> float:
-    """Return the share of rows above a threshold, such as Acc@0.25, averaged like the values themselves."""
+    """Return the share of rows above a threshold, such as Acc@0.25, averaged like other values."""
     return table_value(rows.assign(value=(rows["value"] > threshold).astype(float)), metric)
 
 
 def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:
-    """Return the number of each level, L1 to L3; nan for a level without a row."""
+    """Return the table value of each level, L1 to L3; nan for a level without rows."""
     return {level: table_value(rows, metric, level.label) for level in LEVELS}
 
 
 def mean_over_levels(values: Iterable[float]) -> float:
-    """Return the mean of the levels that have a number (column Avg); nan if none has."""
+    """Return the mean over the levels that have a value (column Avg); nan if no level has one."""
     present = [value for value in values if value == value]
     return sum(present) / len(present) if present else float("nan")
 
 
 def level_averages_of_scenes(rows: "pd.DataFrame", metric: str) -> "pd.Series":
-    """Return one number per scene, to pair two rows: mean over a level's rows, then levels, then seeds."""
+    """Return one number per scene, for paired comparisons: mean over a level's rows, levels, then seeds."""
     kept = rows[rows["metric"] == metric]
     of_level = kept.groupby(["scene", "seed", "level"], sort=True)["value"].mean()
     of_seed = of_level.groupby(level=["scene", "seed"], sort=True).mean()

@@ -1,7 +1,7 @@
 """Tables of labelled points, with bootstrap intervals over scenes and class names.
 
-A room has about twenty names, most of them entirely right or wrong, so one node changes the mean by several
-points.
+A room has about twenty class names, and most are entirely right or wrong, so one node changes the mean by
+several points.
 """
 
 from collections.abc import Mapping
@@ -91,7 +91,7 @@ def scannet_table(sources: Sources) -> Table:
         (*SCANNET_COLUMNS, BENCHMARK),
         partial(scannet_cells, sources),
         lambda _: columns,
-        label_of=lambda protocol: protocol.partition("(")[2].rstrip(")"),  # how points got their class
+        label_of=lambda protocol: protocol.partition("(")[2].rstrip(")"),  # how points were classified
     )
     footnotes = (
         "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
@@ -184,11 +184,11 @@ def bootstrap_mean(
     present: Bool[np.ndarray, "S K"],
     pooled: bool,
 ) -> tuple[float, float]:
-    """Return the 95 % interval of a mean IoU when scenes, and names within them, are resampled.
+    """Return the 95 % bootstrap interval of a mean IoU, resampling scenes and the class names within them.
 
     Args:
         hits: correctly predicted points of each class, per scene.
-        union: points labelled or predicted as the class; 0 where it doesn't occur.
+        union: points labelled or predicted as the class, per scene; 0 if the class doesn't occur.
         present: classes included in the mean.
         pooled: whether counts of all scenes are summed first; otherwise scenes are averaged.
     """
@@ -216,7 +216,7 @@ def bootstrap_mean(
 
 
 def interval_cells(part: "pd.DataFrame", name: str, pooled: bool) -> dict[str, Cell]:
-    """Return interval, scenes and names of one protocol, method and seed; empty without class rows."""
+    """Return interval, scenes and names for one protocol, method and seed; empty if no row is per class."""
     ious = part[part["metric"] == "class_iou"]
     true = part[part["metric"] == "class_accuracy"]
     if ious.empty or true.empty:

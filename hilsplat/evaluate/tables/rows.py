@@ -34,7 +34,7 @@ SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; nothing
 
 @dataclass(frozen=True)
 class Cell:
-    """One value of a table: text, number for ranking (if any), footnote, and the number after ± (if any)."""
+    """One table cell: text, number for ranking (if any), footnote, and the number after ± (if any)."""
 
     text: str = "-"
     value: float | None = None
@@ -43,12 +43,12 @@ class Cell:
 
     @staticmethod
     def percent(value: float) -> "Cell":
-        """Format a share in [0, 1] as a percentage with one decimal; nan as a dash."""
+        """Format a fraction in [0, 1] as a percentage with one decimal, and nan as a dash."""
         return Cell() if value != value else Cell(f"{100 * value:.1f}", 100 * value)
 
     @staticmethod
     def number(value: float) -> "Cell":
-        """Format a number with two decimals; nan as a dash."""
+        """Format a number with two decimals, and nan as a dash."""
         return Cell() if value != value else Cell(f"{value:.2f}", value)
 
     @staticmethod
@@ -67,7 +67,7 @@ class Row:
     ranked_with: str | None = ""
 
     def cell(self, column: str) -> Cell:
-        """Return the value of a column; a dash if the row has none."""
+        """Return the cell of a column; a dash if the row has no value there."""
         return self.cells.get(column, Cell())
 
 
@@ -104,7 +104,7 @@ class Block:
             for number, row in enumerate(self.rows):
                 cell = row.cell(column)
                 if row.ranked_with is not None and cell.value is not None:
-                    # Displayed values are compared, so that equal texts get equal marks.
+                    # Displayed values are compared, so that equal texts get the same rank.
                     shown = float(cell.text.partition(" ")[0])
                     groups.setdefault(row.ranked_with, {})[number] = shown
             for values in groups.values():
@@ -145,7 +145,7 @@ class Sources:
     published: Sequence[Mapping[str, str]]  # the paper's values (`read_published`)
     scores: "pd.DataFrame"
     labels: Mapping[str, str]  # variant -> its name in tables
-    costs: Sequence["Cost"] = ()  # of scenes and variants, if the table contains them
+    costs: Sequence["Cost"] = ()  # by scene and variant, if the table contains costs
     # by (data set, scene, variant, masks, method), if scans have instances
     instances: Mapping[tuple[str, ...], "InstanceMatches"] = field(default_factory=dict)
     absent: Sequence[str] = ()  # a sentence with the reason for each data set that was not measured
@@ -160,7 +160,7 @@ class Sources:
         """Return a block with the paper's rows.
 
         Args:
-            title: what the heading names; by default the data set.
+            title: name used in the heading; by default the data set.
             rename: maps the paper's columns to ours, or to None to omit them.
             families: whether to include the family of each method.
         """
@@ -181,7 +181,7 @@ class Sources:
         return Block("reported", data, f"Reported in the paper: {title or data}", shown, tuple(columns))
 
     def finished(self, name: str, title: str, blocks: Iterable[Block], footnotes: Sequence[str]) -> Table:
-        """Return a table with the warnings required by its rows."""
+        """Return a table with its footnotes and the warnings that its rows require."""
         blocks = tuple(block for block in blocks if block.rows)
         warnings = []
         rows = [row for block in blocks for row in block.rows]

@@ -105,8 +105,8 @@ def pixel_weights(
 ) -> csr_matrix:
     """Return the blending weight alpha_i T_i of each Gaussian at each pixel: a float32 matrix (H W, N).
 
-    Rows are row-major pixels; columns are sorted. Weights below `min_weight` are omitted; with 0, rows sum to
-    the view's alpha.
+    Rows are row-major pixels; columns are sorted. Weights below `min_weight` are omitted; if that is 0,
+    rows sum to the view's alpha.
     """
     if device == "cuda":
         from hilsplat.splat.rasterise import cuda

@@ -15,10 +15,10 @@ BLOCK_X = np.tile(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 BLOCK_Y = np.repeat(np.arange(4, dtype=np.float32) * 4, 4) + np.float32(0.5)
 """Centre of the first pixel of each 4x4 block, relative to the tile's corner."""
 _SLACK, _RELATIVE = np.float32(1e-2), np.float32(1e-6)
-"""A block is skipped if the exponent is below the cut by more than an absolute slack plus one relative to the
-squared terms of the exponent (float32 rounding: 6e-8)."""
+"""A block is skipped if the exponent is below the cut by more than an absolute slack plus one proportional
+to the squared terms of the exponent (float32 rounding: 6e-8)."""
 AHEAD = 16
-"""Number of list entries by which row prefetching is ahead."""
+"""Rows are prefetched this many list entries ahead."""
 MAX_ENTRIES = 2**21
 """Maximum number of tile list entries in memory: 8 MiB, and 72 MiB of gradients for 3 channels."""
 
@@ -31,8 +31,8 @@ _CUT = np.float32(np.log2(MIN_ALPHA))
 class Tiles:
     """Depth order and list sizes from which a view's tile lists are built.
 
-    Tile t in row y and column x has index y * tiles_x + x. Its list contains Gaussians whose box
-    touches it, front to back, in at most tile_start[t + 1] - tile_start[t] entries.
+    The tile in row y and column x has index t = y * tiles_x + x. Its list contains Gaussians whose box
+    touches the tile, front to back, in at most tile_start[t + 1] - tile_start[t] entries.
 
     Attributes:
         order: rows of the drawn Gaussians, front to back; ties in row order.
@@ -117,9 +117,9 @@ def _least(a, b, c, u, v):
 def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
     """Return the bits of the blocks in which a Gaussian's alpha can reach MIN_ALPHA.
 
-    The minimum exponent over a block is at the mean, if the block contains it. Otherwise it is on an edge
-    that faces the mean: where the slope along the edge is zero (along_x v and along_y u from the mean), or at
-    the nearer corner.
+    The quadratic form's minimum over a block is at the mean if the block contains the mean. Otherwise it is
+    on an edge that faces the mean: where the slope along the edge is zero (along_x v and along_y u from the
+    mean), or at the nearer corner.
     """
     left, upper = load(BLOCK_X, 0) - lanes(mean_x), load(BLOCK_Y, 0) - lanes(mean_y)
     right, lower = left + lanes(_SPAN), upper + lanes(_SPAN)
@@ -136,7 +136,7 @@ def _reach(mean_x, mean_y, a, b, c, top, along_x, along_y):
 def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaussian, reach, tile_end):
     """Write the lists of tiles begin..end and their ends; entry e is written to gaussian[e - base].
 
-    reach[e - base] has a bit for each block that the Gaussian can reach; Gaussians without any are omitted.
+    reach[e - base] has a bit for each block that the Gaussian can reach; Gaussians without bits are omitted.
     """
     tile_end[begin:end] = tile_start[begin:end]
     for k in range(len(order)):
@@ -161,7 +161,7 @@ def fill_lists(begin, end, base, tiles_x, order, tile_start, box, geometry, gaus
 def bin_gaussians(box: Int32[np.ndarray, "N 4"], depths: np.ndarray, size_hw: tuple[int, int]) -> Tiles:
     """Sort the drawn Gaussians by depth (positive float32) and count them per tile.
 
-    `box` is the first and last pixel column, and the first and last pixel row; last < first: not drawn.
+    `box` contains the first and last pixel column, then row; last < first for Gaussians that are not drawn.
     """
     tiles_y, tiles_x = ((side + TILE - 1) // TILE for side in size_hw)
     # positive floats and their bits have the same order

@@ -3,11 +3,11 @@
 A tile is 16x16 pixels in sixteen 4x4 blocks; a block is one vector of 16 lanes. Lanes outside the image
 start with zero transmittance. Lists are processed in chunks of CHUNK entries: their Gaussians are copied to
 contiguous memory; each entry has a bit for every block that it can reach (the sixteen blocks are also one
-vector). The forward pass blends each block's own Gaussians, with the sums in registers. The backward pass
+vector). The forward pass blends each block's own Gaussians and keeps the sums in registers. The backward pass
 sums the gradient of each Gaussian over its blocks.
 
-The backward pass runs front to back and repeats the forward pass, so its transmittance is exactly
-the forward's. It keeps one number per pixel, R = sum over channels of (contribution of the remaining
+The backward pass runs front to back and repeats the forward pass, so both have exactly the same
+transmittance. It keeps one number per pixel, R = sum over channels of (contribution of the remaining
 Gaussians) x (gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha). Each list entry has
 its own slot for the sums, so the result does not depend on the distribution of tiles over threads.
 
@@ -58,9 +58,9 @@ BLOCKS = 16
 LANES = 16
 PIXELS = BLOCKS * LANES
 RECORD = 8
-"""Numbers of a copied Gaussian: mean x and y from the tile's corner, a, b, c, log2 of the peak alpha."""
+"""Numbers per copied Gaussian: mean x and y from the tile's corner, a, b, c, log2 of the peak alpha."""
 GROUP = 4
-"""Channels that are summed in registers together."""
+"""Number of channels that are summed together in registers."""
 
 _NUMBERS = np.arange(LANES, dtype=np.float32)
 _X = np.repeat(BLOCK_X, LANES) + np.tile(_NUMBERS % 4, BLOCKS)
@@ -113,7 +113,7 @@ def _exponent(records, at, px, py):
 
 @compiled(inline="always")
 def _shine(exponent, light):
-    """Return a Gaussian's unclipped alpha, alpha and weight at transmittance `light`, and the light left."""
+    """Return a Gaussian's unclipped alpha, alpha, weight at transmittance `light`, and remaining light."""
     uncut = exp2_negative(exponent)
     alpha = keep_ge(exponent, lanes(_CUT), smaller(uncut, lanes(_TOP)))
     weight = light * alpha
@@ -458,7 +458,7 @@ def write_weights(
 
 @compiled(inline="always")
 def _rank(held, first, size, rank):
-    """Count the smaller columns of each entry of a row; their bits keep their order as floats."""
+    """Count, for each entry of a row, the smaller columns; as floats, the columns' bits keep their order."""
     for begin in range(0, size, LANES):
         own, smaller = load(held, first + begin), lanes(_ZERO)
         for k in range(first, first + size):

@@ -44,7 +44,7 @@ class Projected:
         geometry: see `project.GEOMETRY`.
         box: pixel box of each Gaussian; last < first if it is not drawn.
         colours: RGB in this view.
-        only_band: the filled lists, if one band contains all of them and was already filled.
+        only_band: the filled lists if one band contains all tiles and was already filled.
     """
 
     camera: Float64[np.ndarray, " 25"]
@@ -78,7 +78,7 @@ class Drawn:
         image: premultiplied RGB, then features, without background.
         alpha: coverage.
         drawn: whether a Gaussian reaches a pixel of the view.
-        gradients: function from the gradients of image and alpha to those of the parameters.
+        gradients: function that maps gradients of image and alpha to gradients of the parameters.
     """
 
     image: Float32[np.ndarray, "H W C"]
@@ -88,7 +88,7 @@ class Drawn:
 
 
 def refuse_broken(broken: int, total: int) -> None:
-    """Raise HilsplatError if the number of Gaussians that cannot be drawn is not 0."""
+    """Raise HilsplatError if any Gaussian cannot be drawn."""
     if broken:
         raise HilsplatError(
             f"{broken} of {total} Gaussians cannot be drawn: not finite, or a zero quaternion",
@@ -176,7 +176,7 @@ def blend_gradients(
     grad_alpha: Float32[np.ndarray, "H W"],
     threads: int,
 ) -> Gradients:
-    """Compute gradients from those of `blend_forward`; `channels` are colours, then features."""
+    """Compute gradients from those of `blend_forward`'s outputs; `channels` are colours, then features."""
     p, n = gaussians, len(gaussians)
     columns = MOMENTS + channels.shape[1]
     width = (columns + WIDTH - 1) // WIDTH * WIDTH

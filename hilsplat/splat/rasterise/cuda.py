@@ -1,6 +1,6 @@
 """CUDA backend: gsplat (extra `gpu`) with the functions and conventions of the CPU backend.
 
-Tests run it on the CPU with gsplat's reference implementation in torch, and on a device if there is one.
+Tests run this backend on the CPU with gsplat's reference implementation in torch, and on a GPU if present.
 CUDA sums are atomic, so gradients are reproducible only up to rounding.
 
 gsplat works in float32 throughout: a Gaussian wider than about 1e9 px overflows.
@@ -30,7 +30,7 @@ EVERYTHING = 2**31 - 1
 
 
 def on_device(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Copy the fields of Gaussians to the device, unless some cannot be drawn (`refuse_broken`)."""
+    """Copy the fields of Gaussians to the device; raise an error if any cannot be drawn (`refuse_broken`)."""
     g = {name: torch.from_numpy(getattr(gaussians, name)).to(DEVICE) for name in FIELDS}
     broken = (g["quats"] == 0).all(dim=1)
     for values in g.values():

@@ -47,7 +47,7 @@ def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting selects on this machine, and log it the first time.
 
     `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test matches the CPU.
-    Without gsplat and a driver, or for `cpu`, torch isn't imported (1.3 to 3 s).
+    If gsplat or a driver is missing, or for `cpu`, torch isn't imported (1.3 to 3 s).
 
     Raises:
         DeviceError: if `cuda` was requested and cannot be used. There is no fallback.

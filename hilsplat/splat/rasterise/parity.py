@@ -1,4 +1,4 @@
-"""Self-test that the CUDA backend draws the same as the CPU, cached for this machine."""
+"""Self-test that the CUDA backend draws the same as the CPU backend; its result is cached per machine."""
 
 import numpy as np
 import platformdirs
@@ -11,7 +11,7 @@ from hilsplat.splat.rasterise import api
 from hilsplat.splat.rasterise.device import Device
 
 MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
-"""Maximum differences attributed to rounding. That of gradients is relative and covers all Gaussians."""
+"""Maximum differences attributed to rounding. The one of gradients is relative and covers all Gaussians."""
 
 
 def cuda_disagreement() -> str | None:

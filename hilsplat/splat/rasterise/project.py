@@ -38,11 +38,11 @@ NEAR = 0.01
 LOW_PASS_PX2 = 0.3
 """Variance added to the projected covariance, px^2 (3DGS, gsplat: 0.3)."""
 MIN_ALPHA = 1.0 / 255.0
-"""A smaller alpha is not drawn (3DGS, gsplat: 1 / 255)."""
+"""Smaller alphas are not drawn (3DGS, gsplat: 1 / 255)."""
 MAX_LOG_SCALE = np.float32(20.0)
 """Scales are clipped at exp(20), 5e8 scene units; clipped scales get no gradient. A Gaussian that wide covers
 any view evenly along that axis; at exp(40) the columns of its pixel box would overflow 64-bit integers.
-It is float32, since a float64 would make the scales' whole computation float64 and change their last bits."""
+The limit is float32: a float64 would make the scales' computation float64 and change its last bits."""
 _LEAST_LOG = np.float32(-60.0)
 LOG2_E, LN_2 = 1.4426950408889634, 0.6931471805599453
 LOG2_MIN_ALPHA = math.log2(MIN_ALPHA)
@@ -152,7 +152,7 @@ def _read(table, width, first, count, rows, columns, column):
         for block in range(blocks):
             at = first * width + block * LANES
             transpose(table, at, width, columns, (column + block * LANES) * LANES, LANES)
-    else:  # a vector load would pass the end of the table
+    else:  # a vector load would read past the end of the table
         for k in range(count * width):
             rows[k] = table[first * width + k]
         for block in range(blocks):
@@ -179,7 +179,7 @@ def _write(columns, column, width, rows, table, first, count, last):
 
 @compiled(inline="always")
 def _exp(value):
-    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible beside the low-pass."""
+    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible compared with the low pass."""
     exponent = wide(smaller(larger(value, lanes(_LEAST_LOG)), lanes(MAX_LOG_SCALE))) * LOG2_E - 32.0
     near = narrow(exponent)
     return wide(exp2_negative(near)) * (1.0 + (exponent - wide(near)) * LN_2) * 2.0**32
@@ -203,7 +203,7 @@ def _wide_column(columns, k):
 
 @compiled(inline="always")
 def _place(columns, camera):
-    """Return means in camera space, unit quaternions, unit directions, and the inverse lengths of both."""
+    """Return means in camera space, and unit quaternions and directions, each with its inverse length."""
     mx, my, mz = _wide_column(columns, 0), _wide_column(columns, 1), _wide_column(columns, 2)
     x = camera[0] * mx + camera[1] * my + camera[2] * mz + camera[9]
     y = camera[3] * mx + camera[4] * my + camera[5] * mz + camera[10]
@@ -219,7 +219,7 @@ def _place(columns, camera):
 
 @compiled(inline="always")
 def _axis(camera, scale, i, j, k):
-    """Return an axis (i, j, k) of Gaussians in camera space, times their scale along it."""
+    """Return an axis (i, j, k) of Gaussians in camera space, times the scale along that axis."""
     return (
         (camera[0] * i + camera[1] * j + camera[2] * k) * scale,
         (camera[3] * i + camera[4] * j + camera[5] * k) * scale,
