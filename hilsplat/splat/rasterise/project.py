@@ -179,7 +179,7 @@ def _write(columns, column, width, rows, table, first, count, last):
 
 @compiled(inline="always")
 def _exp(value):
-    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible compared with the low pass."""
+    """Return exp of lanes clipped to [-60, MAX_LOG_SCALE]; exp(-60) is negligible next to LOW_PASS_PX2."""
     exponent = wide(smaller(larger(value, lanes(_LEAST_LOG)), lanes(MAX_LOG_SCALE))) * LOG2_E - 32.0
     near = narrow(exponent)
     return wide(exp2_negative(near)) * (1.0 + (exponent - wide(near)) * LN_2) * 2.0**32
