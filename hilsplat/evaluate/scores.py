@@ -1,6 +1,6 @@
 """Rows of `scores.csv`, one number each, and matches of predicted instances in `instances.npz`.
 
-The official average precision pools the matches of all scans, so one number per scan is not enough.
+The official average precision pools the matches of all scans, so a number per scan would not suffice.
 """
 
 from collections.abc import Iterable, Mapping
@@ -23,7 +23,7 @@ INSTANCES = "instances.npz"
 
 @dataclass(frozen=True)
 class Measured:
-    """One number, without the scene and variant that it belongs to (see `Score`)."""
+    """One number, without its scene and variant (see `Score`)."""
 
     method: str
     query: str
@@ -41,22 +41,22 @@ class Score:
     dataset: str
     scene: str
     variant: str
-    masks: str  # their origin, such as `sam-tiny`; see `made_from_truth`
+    masks: str  # origin of the masks, such as `sam-tiny`; see `made_from_truth`
     method: str  # `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC
     view: str
     query: str  # empty if the number describes a whole view
     level: str  # of the annotation; empty if the protocol has no levels
     metric: str
-    protocol: str  # full name, with deviating settings (`protocols.cards`)
+    protocol: str  # full name, with non-default settings (`protocols.cards`)
     value: float
-    n: int  # number of items that the value averages
+    n: int  # number of items averaged
 
 
 COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
 
 
 def write_scores(path: Path, scores: Iterable[Score]) -> None:
-    """Write sorted rows, values with six decimals, so that equal rows give identical files."""
+    """Write sorted rows, with six-decimal values, so that equal rows produce identical files."""
     rows = []
     for score in scores:
         assert score.metric in card_of(score.protocol).metrics, (score.metric, score.protocol)
@@ -96,7 +96,7 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
 
 
 def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
-    """Write matches by (data set, scene, variant, masks, method), possibly none, beside a score file."""
+    """Write matches, keyed by (data set, scene, variant, masks, method), beside a score file."""
     arrays = {
         "/".join([*key, name]): array for key, found in matches.items() for name, array in vars(found).items()
     }
@@ -104,7 +104,7 @@ def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMat
 
 
 def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMatches"]:
-    """Read the matches beside score files by (data set, scene, variant, masks, method)."""
+    """Read the matches beside score files, keyed by (data set, scene, variant, masks, method)."""
     from hilsplat.evaluate.metrics.instances import InstanceMatches
 
     found: dict[tuple[str, ...], dict] = {}
@@ -117,7 +117,7 @@ def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMat
 
 
 def score_summary(scene: str, files: Mapping[str, Path]) -> list[str]:
-    """Return a user-facing table of mean IoU and localization from the score files by variant name."""
+    """Return a user-facing table of mean IoU and localization; `files` maps variants to score files."""
     lines = []
     for name, path in files.items():
         scores = read_scores([path])

@@ -32,13 +32,13 @@ from hilsplat.settings import EvaluateSettings
 logger = logging.getLogger(__name__)
 
 MAX_CAMERA_ERROR_M = 0.1
-"""Median camera error above which point scores are meaningless; a warning is logged."""
+"""Median camera error above which point scores are meaningless; a larger error logs a warning."""
 
 TIMED_TEXTS = 3
-"""Number of queries timed, all in one view."""
+"""Number of timed queries, all in one view."""
 
 MIN_SHARED = 3
-"""Minimum number of cameras from which ground-truth and scene coordinates are aligned."""
+"""Minimum number of shared cameras needed to align ground-truth and scene coordinates."""
 
 Annotations = LabelledScene | PointScene | Path
 """Labels of a published data set, or the ground-truth folder of a synthetic scene."""
@@ -66,15 +66,15 @@ def run_evaluate(
 
     Args:
         parts: the finished scene; its test views were held out from all earlier stages.
-        dataset: data set in every row, like `scene` and `variant`.
+        dataset: data set recorded in every row, as are `scene` and `variant`.
         truth: ground-truth folder of a synthetic scene.
         kind: kind of synthetic scene, which determines its benchmarks (`ExtraProtocols.of_world`).
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
     Raises:
         MisalignedArtifactError: label images and cameras differ in size.
-        SceneError: a data set or a kind is unknown, a labelled view has no pose, or labels differ in shape
-            from their view.
+        SceneError: a data set or kind is unknown, a labelled view has no pose, or labels differ from their
+            view in aspect ratio.
     """
     scores: list[Score] = []
     matches: dict[tuple[str, ...], InstanceMatches] = {}
@@ -110,7 +110,7 @@ def run_evaluate(
                     if not seconds and of_view.categories:
                         texts = [query.text for query in of_view.categories[:TIMED_TEXTS]]
                         seconds = time_queries(answers, view, texts, settings)
-                    answers.forget(view)  # reused memory need not be cleared again
+                    answers.forget(view)  # the freed memory is reused, which avoids clearing new pages
                 if isinstance(known, Path) and truths and settings.view_consistency:
                     for view, row in measure_world_consistency(selections, truths, kept, known, settings):
                         keep(data, view, row)
@@ -132,7 +132,7 @@ def point_rows(
     settings: EvaluateSettings,
     threads: int,
 ) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Yield rows of labelled points and matches of instances; nothing if no protocol scores points."""
+    """Yield rows of labelled points and instance matches; nothing if no protocol scores points."""
     if not extra.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
@@ -157,10 +157,10 @@ def point_rows(
 def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, "4 4"], float]:
     """Return the similarity that maps ground-truth to scene coordinates, and the median camera error.
 
-    Cameras are matched by name. The rotation is the mean of those between the cameras' orientations
+    Cameras are matched by name. The rotation is the mean of the rotations between paired orientations
     (orthogonal Procrustes), so that it is determined even for cameras on a straight line; scale and offset
-    are least squares over the centres. The error is the distance of estimated from true centres, in the units
-    of the ground truth.
+    are least-squares fits to the centres. The error is the distance between estimated and true centres, in
+    ground-truth units.
 
     Raises:
         MisalignedArtifactError: fewer than three cameras are shared, or all have the same position.
@@ -202,8 +202,8 @@ def time_queries(
 ) -> dict[str, float]:
     """Return the seconds per query of field and tree: text encoding, view weights, relevancy and mask.
 
-    The view's weights and the text's vector are timed once and added, because later queries reuse them. Of
-    the remaining times, with weights and vectors cached, the median over the texts is used.
+    The view's weights and the text's vector are timed once and added, because later queries reuse them. The
+    rest is timed with weights and vectors cached, as the median over the texts.
     """
     rule = rule_of(settings)
 

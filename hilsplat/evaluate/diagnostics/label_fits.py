@@ -40,7 +40,7 @@ class Fits:
     containment: list[float] = field(default_factory=list)
 
     def row(self) -> list[str]:
-        """Return number of regions, mean IoUs, and shares with an IoU of at least 0.5."""
+        """Return the number of regions, mean IoUs, shares with an IoU of at least 0.5, and containment."""
         best, anywhere = np.array(self.best), np.array(self.anywhere)
         shares = [best.mean(), (best >= FIT_IOU).mean(), anywhere.mean(), (anywhere >= FIT_IOU).mean()]
         nested = f"{np.mean(self.containment):.3f}" if self.containment else ""
@@ -66,7 +66,7 @@ def add_view(
         fits[level].anywhere.append(max(float(ious[each][row].max(initial=0)) for each in LEVELS))
         if own.max(initial=0) > 0:
             bests[region.path] = found[level][int(own.argmax())]
-    for region, _ in regions:  # if two objects share a path, it refers to the last of them
+    for region, _ in regions:  # if two objects share a path, the path refers to the last object
         parent, child = bests.get(region.path[:-1]), bests.get(region.path)
         if region.level is not None and len(region.path) > 1:
             inside = 0.0 if parent is None or child is None else float((parent & child).sum() / child.sum())
@@ -74,7 +74,7 @@ def add_view(
 
 
 def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.ndarray]:
-    """Return, by level, the pixels in which each visible node has more than half of the weight."""
+    """Return the pixels in which each visible node has more than half of the weight, by level."""
     found = {}
     for level in LEVELS:
         nodes = tree.node_of_gaussian[:, level.index]
@@ -91,13 +91,13 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
 def run_label_fits(
     folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
 ) -> str:
-    """Write and return a table: masks in annotated views with masks, nodes in all annotated views.
+    """Write and return a table of fits: masks in annotated views with masks, nodes in all annotated views.
 
-    The scene folder has `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`. The labels
-    must have levels, such as "annotated/photos/desk".
+    The scene folder contains `scene`, `gaussians.ply` and the variant's `masks` and `semantic_tree`. The
+    labels, such as "annotated/photos/desk", must have levels.
 
     Raises:
-        SceneError: the labels cannot be read, or do not fit the scene.
+        SceneError: the labels cannot be read or do not fit the scene.
     """
     folder, scene = Path(folder), Scene.load(folder / "scene")
     labelled, masks = open_labelled(labels, data_root), folder / variant / "masks"

@@ -1,4 +1,4 @@
-"""Fit of a synthetic scene's masks to the ground-truth regions: a diagnostic that appears in no table."""
+"""Fit of a synthetic scene's masks to the ground-truth regions, a diagnostic that isn't used in tables."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,12 +31,12 @@ COLOURS = "RdYlGn"
 
 @dataclass(frozen=True)
 class ViewFit:
-    """Masks of one level of one view against the ground-truth regions of that level."""
+    """Fit of one view's masks at one level to the ground-truth regions of that level."""
 
     ids: Int64[np.ndarray, " r"]  # true nodes with a region of at least `MIN_PX`
-    best: Float32[np.ndarray, " r"]  # IoU of the best mask of each, 0 if there is no mask
+    best: Float32[np.ndarray, " r"]  # IoU of each node's best mask, 0 if there are no masks
     masks: int  # number of masks
-    fitting: int  # number of masks with an IoU of at least 0.5 with some region of any size
+    fitting: int  # number of masks with an IoU of at least 0.5 with a region of any size
 
 
 def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
@@ -65,9 +65,9 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
 
 
 def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, out: Path) -> str:
-    """Write a table of all views and a picture of the median and the worst view; return a Markdown table.
+    """Write a table of all views and a picture of the median and worst views; return a Markdown table.
 
-    The PDF and the table as CSV are written beside the PNG.
+    The PDF and the CSV table are written beside the PNG.
     """
     scene, index = Scene.load(scene_folder), read_index(masks_folder)
     truth = HierarchyAnnotations.load(truth_folder)

@@ -1,4 +1,4 @@
-"""Fit of the 3D semantic tree to the nodes of a synthetic world, counted in Gaussians."""
+"""Fit of the 3D semantic tree to the nodes of a synthetic world, measured over Gaussians."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -30,14 +30,14 @@ class TreeMeasure:
     """Results for one level of a tree."""
 
     nodes: int
-    true_nodes: int  # ground-truth nodes that have any Gaussian
+    true_nodes: int  # number of ground-truth nodes that have any Gaussian
     precision: float  # share of nodes matched one to one with a true node at IoU 0.5
     recall: float  # share of true nodes matched
     mean_iou: float  # mean over true nodes of the matched node's IoU, 0 if unmatched
     purity: float  # share of the nodes' mass that belongs to each node's main true node
-    parent_accuracy: float  # share of matches whose parent mainly covers the true parent; nan if none has one
+    parent_accuracy: float  # share of matches whose parent mainly covers the true parent; nan without parents
     view_consistency: float  # mean pooled IoU of the nodes' masks across views
-    pairs: tuple[tuple[int, int], ...] = ()  # each matched node with its true node
+    pairs: tuple[tuple[int, int], ...] = ()  # (matched node, its true node)
 
 
 def measure_tree(
@@ -45,8 +45,8 @@ def measure_tree(
 ) -> dict[Level, TreeMeasure]:
     """Compare the tree's nodes with ground-truth ("true") nodes.
 
-    At each level a Gaussian belongs to the true node with most of its visible weight, and is weighted by its
-    total weight in labelled pixels. `votes` is the visible weight of each Gaussian in each true node, by id.
+    At each level, a Gaussian belongs to the true node that has most of its visible weight, and is weighted by
+    its total weight in labelled pixels. `votes` has the visible weight of each Gaussian in each true node.
     """
     true_level = np.array([node.level for node in truth.nodes])
     true_parent = np.array([node.parent for node in truth.nodes])

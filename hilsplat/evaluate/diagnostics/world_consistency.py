@@ -1,4 +1,4 @@
-"""View consistency of masks and answers on a synthetic scene, by its exact geometry."""
+"""View consistency of masks and answers on a synthetic scene, measured with the exact geometry."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ COLUMNS = (
 )
 
 DEPTH_TOLERANCE = 0.01
-"""Two views show the same point if its depths differ by at most this share."""
+"""Two views show the same point if its depths differ relatively by at most this much."""
 
 MIN_POINTS = 16
 """Masks with fewer shared points are not compared."""
@@ -45,25 +45,25 @@ MAX_POINTS = 50_000
 
 METHODS = ("field", "tree")
 TEXTS_PER_LEVEL = 4
-"""Texts per level and view, each queried in two views."""
+"""Number of texts per level and view; each is queried in two views."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of the masks of one level between two views, or the mean over pairs of views."""
+    """Agreement between the masks of one level in two views A and B, or the mean over pairs of views."""
 
     masks: int  # number of masks of A compared, over all pairs
 
     best_iou: float
-    """Highest IoU of a mask of A with any mask of B, in shared points (0 if B has none), mean over the masks
-    of A; 1 is perfect, nan if A has none."""
+    """Highest IoU of a mask of A with any mask of B, in shared points (0 if B has no mask), averaged over the
+    masks of A; 1 is perfect, nan if A has no mask."""
 
     disagreement: float
-    """Share of all pairs of shared points that are in the same mask in one view and not in the other (1 minus
-    the Rand index); 0 is perfect. If most pairs are in different masks in both views, it is always small."""
+    """Share of all pairs of shared points that are in the same mask in one view only (1 minus the Rand
+    index); 0 is perfect. The value is always small if most pairs are in different masks in both views."""
 
     joined_disagreement: float
-    """The same share among pairs in the same mask in at least one view (a Jaccard distance); nan if none."""
+    """The same share among pairs in one mask in at least one view (a Jaccard distance); nan if none."""
 
 
 def shared_points(
@@ -78,9 +78,9 @@ def shared_points(
 
     At most `max_points` of A's pixel centres are used, evenly spaced.
 
-    A point is lifted by A's depth and projected into B. It is visible there if B's depth at the projection
+    A point is lifted by A's depth and projected into B. It is visible in B if B's depth at the projection
     equals its own up to `tolerance`. B's depth between pixel centres is interpolated as inverse depth, which
-    is exact on planes of any slant; next to a depth jump the interpolated value belongs to neither side, so
+    is exact on planes of any slant. Next to a depth jump the interpolated value belongs to neither side, so
     points at occluding borders are dropped. Depths are along the optical axis, inf without a surface.
     """
     pixel = np.flatnonzero(np.isfinite(depth_a))
@@ -117,7 +117,7 @@ def shared_points(
 def best_ious(
     inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
 ) -> Float[np.ndarray, " m"]:
-    """Return, for each mask of A with enough shared points, the highest IoU with a mask of B, in points."""
+    """Return the highest IoU, in points, of each large enough mask of A with any mask of B."""
     large = inside_a[inside_a.sum(axis=1) >= min_points]
     return iou_matrix(large, inside_b).max(axis=1, initial=0)
 
@@ -125,9 +125,9 @@ def best_ious(
 def pair_disagreement(
     labels_a: Int[np.ndarray, " P"], labels_b: Int[np.ndarray, " P"]
 ) -> tuple[float, float]:
-    """Return the shares of pairs of points that are in the same mask in one view and not in the other.
+    """Return two shares of point pairs that are in the same mask in one view only.
 
-    The first is the share among all pairs of points, the second among those in the same mask in at least one
+    The first share is among all pairs of points, the second among pairs in the same mask in at least one
     view; nan if there is no such pair. Points in no mask have label -1 and differ from all other points.
     All pairs are counted, via the contingency table of the labels.
     """
@@ -150,9 +150,9 @@ def _pairs(counts: Int[np.ndarray, " n"]) -> int:
 
 
 def painted(inside: Bool[np.ndarray, "M P"], area_px: Int[np.ndarray, " M"]) -> Int32[np.ndarray, " P"]:
-    """Return the mask at each point, -1 for none: masks are painted from large to small, as in a label map.
+    """Return the mask at each point, or -1, painting masks from large to small as in a label map.
 
-    Of two equally large masks the one in the lower row is painted last.
+    Of two equally large masks, the one with the lower row index is painted last.
     """
     labels = np.full(inside.shape[1], NONE, dtype=np.int32)
     for row in np.lexsort((-np.arange(len(area_px)), -area_px)):
@@ -168,7 +168,7 @@ def view_agreement(
 ) -> Agreement:
     """Return the agreement of the masks of one level between two views, at shared points.
 
-    Masks of a view may overlap. `best_iou` uses them as they are, the disagreements use the smallest mask at
+    Masks of a view may overlap. `best_iou` uses them unchanged; the disagreements use the smallest mask at
     each point (`painted`), like the language field.
     """
     inside_a = masks_a.reshape(len(masks_a), np.prod(masks_a.shape[1:], dtype=int))[:, pixel_a]
@@ -192,7 +192,7 @@ def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
 
 
 def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple[str, str]]:
-    """Return each view with each of its `count` nearest views, by camera centre; the earlier wins ties."""
+    """Pair each view with its `count` nearest views by camera centre; the earlier view wins ties."""
     centres = np.array([cameras[view].centre for view in views])
     pairs = []
     for row, view in enumerate(views):
@@ -206,8 +206,8 @@ def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple
 def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
     """Measure how consistently masks of neighbouring views divide the same surface; return a Markdown table.
 
-    Each view is compared with its `count` nearest views. The CSV has a row per level for the masks and for
-    the ground-truth regions.
+    Each view is compared with its `count` nearest views. The CSV has one row per level for the masks and one
+    for the ground-truth regions.
 
     Raises:
         ArtifactError: fewer than two views have masks.
@@ -272,9 +272,9 @@ def measure_world_consistency(
     truth: Path,
     settings: EvaluateSettings,
 ) -> Iterator[tuple[str, Measured]]:
-    """Yield the rows of `world/view-consistency`: each annotated view and its nearest neighbour.
+    """Yield the rows of `world/view-consistency`: each annotated view with its nearest neighbour.
 
-    The IoU is that of the answers in both views, over shared surface points; `n` is the number of points in
+    The IoU compares the answers in the two views over shared surface points; `n` is the number of points in
     the union, and texts without an answer are omitted. Nothing is yielded without a ground-truth mesh (as for
     photographed scenes). `answered` contains the stored answers by view (`views.measure_view`).
     """

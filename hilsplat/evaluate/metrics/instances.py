@@ -153,8 +153,7 @@ def curve_area(confidence: Float[np.ndarray, " E"], is_match: Bool[np.ndarray, "
 def average_precision(scans: Sequence[InstanceMatches]) -> Float64[np.ndarray, "K T"]:
     """Return the average precision per class and threshold over all scans.
 
-    The value is nan for classes without ground-truth instances, and 0 for classes with instances but no
-    prediction.
+    It is nan for classes without ground-truth instances, and 0 for classes with instances but no prediction.
     """
     result = np.full_like(scans[0].misses, np.nan, dtype=np.float64)
     misses = np.sum([scan.misses for scan in scans], axis=0)

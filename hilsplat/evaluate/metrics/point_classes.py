@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int64
 
 @dataclass(frozen=True)
 class ClassCounts:
-    """Labelled points per class: correctly predicted, of that ground truth (any prediction), and predicted."""
+    """Labelled points per class: correctly predicted, in the ground truth, and predicted."""
 
     hits: Int64[np.ndarray, " K"]
     truth: Int64[np.ndarray, " K"]

@@ -28,7 +28,7 @@ class RelevancyRule:
     LangSplat's mean filter is 30 px wide at an image height of 730 px; its text and the paper state 20. Level
     rules: `max` takes the level whose (mixed) map has the highest value, `mean_in_mask` the highest mean
     inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because LangSplat stacks
-    levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and ignores the last row
+    levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and omits the last row
     and column in the majority filter; `inside` averages the window's part inside the image (LangSplatV2).
     """
 

@@ -68,7 +68,7 @@ class Selections:
     def nodes(self, path: tuple[str, ...], level: Level | None, view: str | None) -> np.ndarray:
         """Return the ids of the nodes that answer the last text of a path, ordered from coarse to fine.
 
-        If `level` is None, the tree chooses it. With a view, only nodes visible in the view compete, as in maps.
+        If `level` is None, the tree chooses it. With a view, only nodes visible there compete, as in maps.
         """
         key = (path, level, view)
         if key not in self._of:

@@ -80,7 +80,7 @@ def carried_to(
     `frozen`: the fit must not have moved, split or dropped any Gaussian. As in OpenGaussian's
     `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
     `vote`: a point without a Gaussian within the radius has no prediction, which counts as a miss.
-    `density`: the weight opacity * exp(-d**2 / 2), where d is the Mahalanobis distance, is the alpha that 3DGS
+    `density`: the weight opacity * exp(-d**2 / 2), with Mahalanobis distance d, is the alpha that 3DGS
     blends at the point. Candidates are the nearest centres, so a large Gaussian with a distant centre has no
     weight. Weights are relative, so every point has a prediction, even far from all Gaussians.
 

@@ -119,7 +119,7 @@ def argmax_rows(
     """Yield the rows of 3D-OVS by argmax at one eighth of the image's size; the first text wins ties.
 
     Args:
-        cosine_of: returns cosines of texts with pixels (row * width + column) at any number of levels, or -inf.
+        cosine_of: cosines of texts with pixels (row * width + column), at any number of levels; -inf if none.
         words: departures, for the protocol's name.
         is_stand_in: whether pixels around the objects have no text; such pixels are then not compared.
     """

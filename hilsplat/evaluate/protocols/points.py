@@ -2,11 +2,11 @@
 
 | method | class of a point |
 |---|---|
-| `tree` | the class text with the highest cosine to the node of its Gaussian at level whole |
+| `tree` | the class text with the highest cosine to the node of the point's Gaussian at level whole |
 | `field` | the class text with the highest cosine to the latent transferred to the point at level whole |
 
-Instances (ScanNet200) are the tree's nodes at level whole; a field has none. `carry` transfers predictions
-from Gaussians to points. Every row names the mode.
+Instances (ScanNet200) are the tree's nodes at level whole; a field has no instances. `carry` transfers
+predictions from Gaussians to points; every row names its mode.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -36,13 +36,13 @@ MEANS: dict[str, Callable[[ClassCounts], float]] = {
     "miou_absent_as_one": point_classes.miou_absent_as_one,
     "frequency_weighted_iou": point_classes.frequency_weighted_iou,
 }
-"""Metrics with one number per scene, or one for all scenes under a pooled protocol."""
+"""Metrics with one number per scene, or one number for all scenes under a pooled protocol."""
 
 VOTE_RADIUS_M = 0.1
-"""Radius of votes; 10 cm."""
+"""Vote radius: 10 cm."""
 
 LEVEL = Level.WHOLE
-"""The classes of these data sets are things and surfaces, not parts."""
+"""Level of all predictions: the classes of these data sets are objects and surfaces, not parts."""
 
 
 def measure_points(
@@ -76,7 +76,7 @@ def measure_points(
 
 
 def pooled_points(card: ProtocolCard, scenes: Iterable[Iterable[Any]], classes: ClassSet) -> dict[str, float]:
-    """Return the means of a pooled protocol, from the class rows of each scene (or similar named tuples)."""
+    """Return the means of a pooled protocol from each scene's class rows (or similar named tuples)."""
     counts = pooled(_counts_of(rows, classes) for rows in scenes)
     values = {metric: MEANS[metric](counts) for metric in card.metrics if metric in MEANS}
     if "miou_head" in card.metrics:
@@ -103,8 +103,8 @@ def measure_instances(
 ) -> Iterator[Measured]:
     """Yield AP, AP50 and AP25 over all scans, and AP of each split; `n` is the number of scans.
 
-    Scans without predictions must be included: their instances are misses. Nothing is yielded if no scan has
-    an instance.
+    Include scans without predictions: their instances are misses. Nothing is yielded if no scan has an
+    instance.
     """
     precisions = instances.average_precision(list(scans.values()))
     if np.isnan(precisions).all():
@@ -124,12 +124,12 @@ def measure_instances(
 def classes_of_points(
     scene: "LanguageScene", carried: CarriedPoints, method: str, texts: Sequence[str]
 ) -> Int32[np.ndarray, " P"]:
-    """Return labels 1 .. K of points by "tree" or "field"; 0 if no Gaussian is assigned to a point."""
+    """Return point labels 1 .. K from the "tree" or "field"; 0 if a point has no Gaussian."""
     vectors = scene.text_vectors(texts)
     if method == "tree":
         of_node = classify(scene.tree.clip.astype(np.float32), vectors)
         node = scene.tree.node_of_gaussian[:, LEVEL.index]
-        return carried.labels(np.append(of_node, 0)[node])  # -1 is none
+        return carried.labels(np.append(of_node, 0)[node])  # -1 means no node
     language, code = scene.trained()
     latents = carried.features(np.ascontiguousarray(language.features[:, LEVEL.index]))
     fitted = np.flatnonzero(latents.any(axis=1))
@@ -192,8 +192,8 @@ def measure_scene_points(
     Protocols whose labelling is absent are skipped.
     """
     radius = VOTE_RADIUS_M * float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
-    carried_of: dict[int, CarriedPoints] = {}  # labellings of a mesh share its vertices
-    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # protocols share classes
+    carried_of: dict[int, CarriedPoints] = {}  # labellings of the same mesh share its vertices
+    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # several protocols have the same classes
     for card in cards:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:

@@ -1,7 +1,7 @@
 """Averages of scores, in the order that the protocol defines, and blocks of measured rows.
 
-Scores are a data frame of `scores.csv` (`evaluate.scores.read_scores`). A (view, query) pair without a prediction
-has a row with value 0 unless its protocol omits such pairs.
+Scores are a frame of `scores.csv` rows (`evaluate.scores.read_scores`). A (view, query) pair without a
+prediction has a row with value 0 unless its protocol omits such pairs.
 """
 
 import re
@@ -111,7 +111,7 @@ def with_seeds(scores: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def mean_over_seeds(seeds: Sequence[Mapping[str, Cell]]) -> dict[str, Cell]:
-    """Return mean and standard deviation (n - 1) of each cell over seeds; cells of a single seed unchanged."""
+    """Return mean and standard deviation (n - 1) of each cell over seeds; a single seed is unchanged."""
     if len(seeds) == 1:
         return dict(seeds[0])
     cells = {}
