@@ -16,7 +16,7 @@ MIN_LATENT_SHARE = 0.5
 
 
 def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
-    """Divide the weights of each pixel by their sum, the accumulated alpha; the memory is overwritten.
+    """Divide the weights of each pixel by their sum, the accumulated alpha, in place.
 
     The weights then sum to 1, so that a rendered feature is an average of features; pixels with an alpha
     below `MIN_ALPHA` become empty rows. The sum excludes weights that the rasteriser dropped as too small.
@@ -62,8 +62,8 @@ def rendered_latents(
 ) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
     """Return, per level, the pixels dominated by Gaussians with a latent, and their rendered latents.
 
-    Gaussians without a latent contain zeros, which a code would decode like any latent. They are omitted, and
-    the remaining normalised weights are divided by their sum. The bytes equal those of sparse products.
+    Gaussians without a latent have zeros, which a code would decode like any latent. They are omitted, and
+    the remaining normalised weights are divided by their sum. Results are bit-identical to sparse products.
     """
     rows = weights.indptr, weights.indices, weights.data
     shares = np.zeros((weights.shape[0], features.shape[1]), np.float32)

@@ -18,12 +18,12 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
     Args:
         runs, offsets: as in `HierarchicalMasks`.
         labels: painted mask of each pixel and level, -1 for none.
-        half: whether a pixel is in the random half.
+        half: whether each pixel is in the random half.
         indptr, indices, data: W; pixels without weights are ignored.
 
     Returns:
-        pixel counts (masks x 2): painted pixels and those in the half; row sizes, columns, and sums over the
-        raw mask, its painted pixels and their half (entries x 3, float64, summed in pixel order).
+        pixel counts (masks x 2): painted pixels, and those in the half; row sizes; columns; sums over raw
+        masks, painted pixels, and those in the half (entries x 3, float64, in pixel order).
     """
     sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
     counts = np.zeros((last - first, 2), np.int64)
@@ -64,7 +64,7 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
 
 @compiled
 def move_to_front(rows, indptr, indices, data):
-    """Move the weights of some rows of W to the front of its arrays, and return their number."""
+    """Move the weights of some rows of W to the front of its arrays, and return the number of weights."""
     done = 0
     for row in rows:
         for k in range(indptr[row], indptr[row + 1]):
@@ -90,7 +90,7 @@ def transpose(indptr, indices, begins, pixels, places):
 
 @intrinsic
 def add_products(typingctx, sums, at, whole, part, subpart, value):
-    """Add three numbers times `value`, and 1, to the sums at `at`, as one vector; nothing is fused.
+    """Add `value` times three numbers, and 1, to the sums at `at`, as one vector and without fusing.
 
     Returns the number of previous additions.
     """
@@ -138,10 +138,10 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
     Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output.
 
     Args:
-        part: row starts, columns and values of W, and whether a pixel counts at each level.
+        part: row starts, columns and values of W, and whether each pixel has a mask at each level.
         columns: output of `transpose` for the part: starts, pixels and places.
         rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
-        sums: zero before and after the call; SUMS for each Gaussian.
+        sums: SUMS numbers per Gaussian, zero before and after the call.
         fresh: buffer for all columns.
         out_indptr, out_indices, out_values: late pairs; columns are sorted within rows.
 

@@ -18,10 +18,10 @@ SIDE_PX = 200
 """Longer side of the renders in which visibility is measured."""
 
 MIN_WEIGHT = 1 / 255
-"""Smaller weights of a Gaussian at a pixel don't count."""
+"""Smaller weights of a Gaussian at a pixel are ignored."""
 
 MIN_VISIBLE_PX = 0.02
-"""A Gaussian is visible in a view if its mass there exceeds this; equals 0.3 px in a view of 800 px."""
+"""A Gaussian is visible in a view if its mass there exceeds this: 0.3 px if the view were 800 px wide."""
 
 
 def run_key_masks(
@@ -39,7 +39,7 @@ def run_key_masks(
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
-    """Choose a share of the training views (rounded up) by the Gaussians that each adds; in camera order.
+    """Return a share of the training views (rounded up), chosen by the Gaussians each adds, in camera order.
 
     A Gaussian is weighted by its mean visible mass, halved by each chosen view that shows it, so that views
     of uncovered regions are preferred. The result does not depend on `threads`.
@@ -65,7 +65,7 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
 def most_covering(seen: Bool[np.ndarray, "V N"], worth: Float64[np.ndarray, " N"], number: int) -> list[int]:
     """Choose rows greedily by the total worth of their visible columns; the first row wins ties.
 
-    Each chosen row halves the worth of its columns. The result is in the order of selection.
+    Each chosen row halves the worth of its visible columns. Rows are returned in the order of selection.
     """
     worth = worth.copy()
     chosen: list[int] = []

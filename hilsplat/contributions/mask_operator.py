@@ -22,14 +22,14 @@ BLOCK = 2**15
 """Gaussians per pass of a wide product with A, so that their features stay in the processor's cache."""
 
 SPREAD_PARTS = 4
-"""Number of Gaussian ranges per thread; several balance the load (masks show some Gaussians more often)."""
+"""Number of Gaussian ranges per thread; several balance the load (some Gaussians are in more masks)."""
 
 
 @dataclass(frozen=True)
 class MaskOperator:
     """Products with A for all levels: from features of Gaussians to means of masks, and back.
 
-    A (CSR; rows are masks, with sorted columns) is used in place, for example mapped from its file. The order
+    A (CSR; rows are masks, with sorted columns) is used in place, for example memory-mapped. The order
     of sums does not depend on the number of threads. `level_index` is each mask's level, from 0.
     """
 
@@ -86,7 +86,7 @@ def lifted_average(
     pixels: Float32[np.ndarray, " M"],
     latents: Float32[np.ndarray, "M D"],
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Average the latents of the pixels that show each Gaussian, weighted by its share; 0 without any.
+    """Average the latents of the pixels that show each Gaussian, weighted by its weight there; 0 if unseen.
 
     This needs only one sparse product and is within about 10 % of the regression's optimum.
     """
@@ -101,10 +101,10 @@ def lifted_median(
     start: Float32[np.ndarray, "N 3 D"],
     steps: int = 15,
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Compute the geometric median of the same latents and weights, to which LangSplat's L1 loss converges.
+    """Compute the geometric median of the latents averaged by `lifted_average`, with the same weights.
 
-    Masks that merge or miss objects shift an average much more than a median. Each Weiszfeld iteration,
-    one pass over A, averages with the weights divided by the distance to the latest estimate; 15 iterations
+    LangSplat's L1 loss converges to it. Masks that merge or miss objects shift an average much more. Each
+    Weiszfeld iteration, one pass over A, divides weights by the distance to the latest estimate; 15 of them
     give about three correct digits. Gaussians that no mask shows keep `start`, the lifted average.
     """
     features = np.array(start, np.float32, order="C")

@@ -28,23 +28,23 @@ from hilsplat.contributions.quadratic import Gram, Quadratic, StackedWeights
 logger = logging.getLogger(__name__)
 
 BLOCKS = 64
-"""G is built in this many blocks of rows, one per thread at a time; the result does not depend on it. Blocks
+"""G is built in this many blocks of rows, one per thread at a time; any number gives the same result. Blocks
 without Gaussians visible in a part are skipped; Morton order makes such blocks frequent."""
 
 MERGE_AT = 8
-"""Late pairs of a block are merged with its rows once they exceed 1 in this many pairs."""
+"""Late pairs of a block are merged with its rows once there is more than one per this many row pairs."""
 
 CHUNK_WEIGHTS = 2**25
-"""Non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""
+"""Number of non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""
 
 LARGE_PART = 2**23
-"""Parts with this many non-zeros are added to G directly: copying them would gain little."""
+"""Parts with at least this many non-zeros are added to G directly, as copying them first gains little."""
 
 MAX_WEIGHTS = 2**28
 """Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
 
 CLEARLY_MORE = 2
-"""W is dropped once it has this many times the non-zeros of G: W grows linearly with the views, G slower."""
+"""W is dropped once it has this many times the non-zeros of G: G grows more slowly with the views than W."""
 
 CHECKPOINT_SECONDS = 300.0
 """Seconds between checkpoints of a long pass; short passes write none."""
@@ -89,9 +89,9 @@ class GramBuilder:
     """Sum of G over parts of W, such as one view after another; its memory grows only with G.
 
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
-    pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene:
-    sums of known pairs are updated in place, and only pairs that were added late are rewritten, until there
-    are enough to merge.
+    pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
+    so sums of known pairs are updated in place, and only late pairs are rewritten for each part, until enough
+    of them have accumulated to be merged.
     """
 
     def __init__(self, num_gaussians: int, threads: int) -> None:
@@ -142,7 +142,7 @@ class GramBuilder:
         return rows
 
     def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return each Gaussian's weights in W: the start of its list, and lists of pixels and places.
+        """Return where each Gaussian's list begins, and lists of the pixels and places of its weights in W.
 
         A place is where the upper triangle's columns begin in the pixel's row of W. The lists are reused
         for the next part, because allocating memory takes longer than filling it.
@@ -185,7 +185,7 @@ class GramBuilder:
 
 
 class _Waiting:
-    """Stacked parts of W in reused memory, because new memory takes longer to fill."""
+    """Stacked parts of W, in reused memory because new memory takes longer to fill."""
 
     def __init__(self, num_gaussians: int) -> None:
         self._num_gaussians = num_gaussians
@@ -219,9 +219,9 @@ class _Waiting:
 class QuadraticBuilder:
     """Builder of G or W, part by part; the matrix with fewer non-zeros is kept.
 
-    A product reads each non-zero of either equally often. W is dropped and G is kept as soon as W has more
+    A product reads each non-zero of G or W equally often. W is dropped and G is kept as soon as W has more
     than `MAX_WEIGHTS` non-zeros, or more than `CLEARLY_MORE` times those of G so far. `keep` is "auto", or
-    "gram" or "weights" to force one.
+    "gram" or "weights" to force G or W.
     """
 
     def __init__(self, num_gaussians: int, keep: str, threads: int) -> None:
@@ -321,7 +321,7 @@ class QuadraticCheckpoint:
         return int(index["summed"])
 
     def offer(self, builder: QuadraticBuilder, summed: int) -> None:
-        """Write a checkpoint if the last one is old enough and views remain."""
+        """Write a checkpoint if the last one is old enough and some views are not yet summed."""
         if summed == len(self._keys) or time.monotonic() - self._last < CHECKPOINT_SECONDS:
             return
         state = builder.state()

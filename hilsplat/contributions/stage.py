@@ -56,7 +56,7 @@ WEIGHTS_PER_PIXEL = 40
 """Weights per pixel of a typical scene."""
 
 MAX_WEIGHTS_TOGETHER = 2**25
-"""Views with more weights are prepared one at a time; each needs 256 MiB, and up to four may be waiting."""
+"""Views with more weights than this (256 MiB) are prepared one at a time; up to four views may be waiting."""
 
 
 class ArrayStream:
@@ -72,7 +72,7 @@ class ArrayStream:
         self._write_header()
 
     def _write_header(self) -> None:
-        # its size does not depend on the number of rows
+        # the header's size does not depend on the number of rows
         shape = (self._rows, *self._row_shape)
         header = {"descr": self._dtype.str, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(self._stream, header)
@@ -94,7 +94,7 @@ class ArrayStream:
 
 
 def views_together(scene: Scene, threads: int) -> int:
-    """Return how many views to prepare at once: half of the work is single-threaded, but W takes memory."""
+    """Return how many views to prepare at once: two if W fits, as half of the work is single-threaded."""
     most_px = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
     return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 
@@ -111,9 +111,9 @@ def run_contributions(
     """Write A, A_half, S, mass, and G or W, in one pass over the training views.
 
     One or two views are prepared while rows of previous views are written and added to G. Memory contains
-    them, the sum of G so far, and the weights waiting to be added to it (`quadratic_builder`). After an
-    interruption, a rerun reads the matrices of finished views from the cache, and G as of at most
-    `CHECKPOINT_SECONDS` (and one view) earlier; it rasterises W again for views missing from that G.
+    these views, the sum of G so far, and weights not yet added to G (`quadratic_builder`). After an
+    interruption, a rerun reads the matrices of finished views from the cache, and G from a checkpoint at most
+    `CHECKPOINT_SECONDS` (and one view) old; it rasterises W again for views missing from that G.
 
     Raises:
         MisalignedArtifactError: if masks and images differ in size, or the masks of a view differ from those
