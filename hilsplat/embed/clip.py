@@ -22,14 +22,14 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SIGLIP_TOKENS = 64
-"""Text length of a SigLIP model whose configuration does not specify one."""
-MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # of model folders in `models/`
+"""Text length (tokens) of a SigLIP model whose configuration does not specify it."""
+MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the models in `models/`
 
 
 class ClipModel:
     """A loaded CLIP model; each text replaces `{}` in the prompt template."""
 
-    precision: str = "fp32"  # or "int8", of the vision network
+    precision: str = "fp32"  # precision of the vision network: "fp32" or "int8"
 
     def __init__(self, model: ModelFolder, template: str = "{}") -> None:
         self.model = model
@@ -88,7 +88,7 @@ class ClipModel:
         self.__dict__["vision"], self.precision = network, "int8"
 
     def _pad_id(self, text_config: dict[str, Any]) -> int:
-        """Return the padding token in the tokenizer, else in its configuration, else in the model's."""
+        """Return the padding token's id from the tokenizer, else its configuration, else the model's."""
         named = (self.tokenizer.padding or {}).get("pad_id")
         beside = self.model.tokenizer.with_name("tokenizer_config.json")
         if named is None and beside.is_file():
@@ -205,14 +205,14 @@ def unit(vectors: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, "N C"]:
 
 
 def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
-    """Open the CLIP model that embedded the masks of a clip artifact, even if its folder was moved.
+    """Open the CLIP model that embedded the masks of a clip artifact, even if the model folder was moved.
 
-    The model is identified by its digest. The search covers the recorded path and every folder in `models/`,
-    each relative to the working directory, to the parent folders of the artifact (such as the project of the
-    results) and to the installation, and the user's models. The vision network is opened on first use.
+    The model is identified by its digest. The recorded path and every folder in `models/` are searched
+    relative to the working directory, the artifact's parent folders (such as the project of the results) and
+    the installation, then the user's models. The vision network is opened on first use.
 
     Raises:
-        ModelError: no CLIP model was found with the digest of the one that embedded the masks.
+        ModelError: no CLIP model has the digest of the model that embedded the masks.
     """
     index = read_index(clip_folder, "model", "model_sha256")
     recorded, expected = Path(index["model"]), index["model_sha256"]

@@ -3,8 +3,8 @@
 Each image, such as `a.jpg`, has two plain arrays:
     a_s.npy  float32 (4, H, W): row of `a_f.npy` at each pixel, -1 for none;
     a_f.npy  float32 (N, C): a CLIP vector per mask.
-The four maps are default, s, m, l: all heads mixed, then each head from fine to coarse. Rows are numbered
-across all four maps. File names are truncated at their first dot.
+The four maps are default (all heads mixed), s, m and l (one head each, from fine to coarse). Rows are
+numbered across all four maps. File names are truncated at their first dot.
 """
 
 import logging
@@ -27,12 +27,12 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Maximum relative difference between aspect ratios of maps and view that is attributed to rounding."""
+"""Maximum relative difference between the aspect ratios of maps and view attributed to rounding."""
 LEAST_SHARE = 0.5
 """Share of the training views that must have files; with fewer, the files are likely from another scene."""
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
-"""Number of masks embedded again as a check, and the minimum median cosine similarity of their vectors. The
-same CLIP model reaches 0.99; a different model of the same width, about 0."""
+"""Number of masks embedded again as a check, and the minimum median cosine similarity to the vectors read.
+The same CLIP model reaches 0.99; a different model of the same width, about 0."""
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the four maps, in order; the first map mixes all levels."""
 
@@ -43,7 +43,7 @@ def stem_of(view: str) -> str:
 
 
 def stems_of(views: list[str]) -> dict[str, str]:
-    """Return the stem of each view, or raise an ArtifactError if two views have the same one."""
+    """Return the stem of each view, or raise an ArtifactError if two views have the same stem."""
     stems = {view: stem_of(view) for view in views}
     if twins := [view for view in views if list(stems.values()).count(stems[view]) > 1]:
         shared = f"these views would use the same LangSplat files: {', '.join(twins[:4])}"
@@ -56,9 +56,9 @@ def read_view(
 ) -> tuple[HierarchicalMasks, Float16[np.ndarray, "M C"]]:
     """Read the masks and vectors of one view, with rows in `content_order`.
 
-    The mixed-level map is ignored. Where masks of one level overlap, the files contain only the one
-    painted last. They contain no scores, so predicted IoU and stability are set to 1. Maps of a different
-    size but equal aspect ratio, such as LangSplat's 1080 rows, are resampled to the nearest pixel.
+    The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
+    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of another
+    size but the same aspect ratio, such as LangSplat's 1080 rows, are resampled by nearest neighbour.
 
     Raises:
         ArtifactError: a file is missing, damaged, pickled, or not as described above.
@@ -147,7 +147,7 @@ def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
 def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
     """Write LangSplat's vectors in the format of the clip stage: `<view>.npy`, with rows as in `read_masks`.
 
-    A MisalignedArtifactError is raised unless `settings.model`, which embeds the texts, computed them.
+    A MisalignedArtifactError is raised unless `settings.model`, which embeds texts, computed the vectors.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)

@@ -1,4 +1,4 @@
-"""Checks and descriptions of model folders, and measurements of their speed on this machine."""
+"""Checks and descriptions of model folders, and speed measurements of models on this machine."""
 
 import time
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from hilsplat.models.store import broken_models, present_models
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
-"""Folder for measured timings, and for int8 networks if the models are read-only."""
+"""Folder for measured timings, and for int8 networks if the folder of the models is read-only."""
 LARGEST_PROVIDER_DIFFERENCE = 0.02
 """Maximum relative difference attributed to rounding, such as TF32 products on CUDA."""
 Seconds = dict[str, float]
@@ -97,7 +97,7 @@ def provider_disagreement(folder: Path) -> str | None:
 def seconds_of(folder: Path, variant: str, precision: str, cache: Path) -> Seconds:
     """Return the timings of a model, from an earlier measurement in `cache` if available.
 
-    `precision`: "fp32"; "auto" and "int8" both mean int8 where possible.
+    `precision` is "fp32", or "auto" or "int8", which both mean int8 where possible.
     """
     model = open_model_folder(folder, variant=variant)
     requested = "int8" if precision != "fp32" and may_be_int8(model) else "fp32"

@@ -14,7 +14,7 @@ UNIT_TOLERANCE = 2e-3
 
 
 def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C"]:
-    """Read the CLIP vectors of all masks, in the row order of `folder`; zero for masks without a vector.
+    """Read the CLIP vectors of all masks, in the row order of artifact `folder`; zero for missing vectors.
 
     Raises:
         ArtifactError: a file is missing or damaged, or its vectors differ in width or do not have length 1.

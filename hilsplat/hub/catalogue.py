@@ -1,4 +1,4 @@
-"""Models by name, the files of their repositories on the hub, and which of these a model needs."""
+"""Models by name, the files in their hub repositories, and the choice of files that a model needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""
 class ModelRequest:
     """A model to download."""
 
-    name: str  # of its folder
+    name: str  # name of the model folder
     repository: str  # owner/name on the hub
     release: Release | None
 
@@ -59,7 +59,7 @@ class ModelRequest:
 
 
 def networks_of(kind: str) -> list[tuple[str, ...]]:
-    """Return the possible paths of each network without `.onnx`, the usual one first."""
+    """Return the possible paths of each network, without `.onnx`; the usual path is first."""
     return [spec.places[::-1] for spec in LAYOUTS[kind].networks.values()]
 
 
@@ -78,7 +78,7 @@ class HubFile:
     cached: Path | None = None  # the file in the hub's local cache, if the listing was read from the cache
 
     def digest_of(self, path: Path) -> str:
-        """Return the digest of a local file, of the same kind as the listed one."""
+        """Return the digest of a local file, computed in the same way as the listed digest."""
         return sha256_of_file(path) if len(self.digest) == 64 else git_hash(path.read_bytes())
 
 
@@ -124,7 +124,7 @@ def read_listing(repository: str, revision: str | None) -> Listing:
     files = {}
     for each in info.siblings or ():
         if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
-            continue  # no hub has such a path, and the file would be written elsewhere
+            continue  # no hub has such a path, and the file would be written outside the folder
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
             problem = f"{constants.ENDPOINT} reports no size or digest of {each.rfilename} (?blobs=true)"
@@ -181,7 +181,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             listing.require(*layout.described)
             plain = [*layout.described, *(path for path in layout.beside if path in listing.files)]
             files = {f"{place}{ending}.onnx": f"{place}.onnx" for place in places}
-            # external weights keep the names under which the networks refer to them
+            # external weights keep their names, because the networks refer to them by name
             prefixes = tuple(f"{network}{mark}data" for network in files for mark in "_.")
             weights = [path for path in listing.files if path.startswith(prefixes)]
             return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)

@@ -54,7 +54,7 @@ ORIGIN = "origin.json"
 """File in a model folder that records its origin."""
 KEPT = "transferred data is kept, and the transfer resumes"
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
-"""Waits between attempts to download a file."""
+"""Waiting times between attempts to download a file."""
 CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
 """Errors of a broken connection."""
 SPARE_BYTES = 200_000_000
@@ -78,7 +78,7 @@ class Prepared:
     target: Path
 
     def num_bytes(self, *, missing: bool = False) -> int:
-        """Return the total size of the required files, or of those that have not been transferred."""
+        """Return the total size of the required files, or only of those not transferred yet."""
         paths = [path for path in self.choice.files if not (missing and (self.staging / path).is_file())]
         return sum(self.listing.files[path].size for path in paths)
 
@@ -86,12 +86,12 @@ class Prepared:
 def get_models(
     names: Sequence[str], models: Path | None = None, revision: str | None = None, variant: str = ""
 ) -> str:
-    """Download, check and install models; return a report on each, and which are used for photographs.
+    """Download, check and install models; return a report that also lists the models used for photographs.
 
     Args:
         names: released models, or owner/name; empty for the recommended pair.
-        models: parent folder of the models; None for the user's.
-        revision: branch, tag or commit of a single model; None for the hub's default.
+        models: parent folder of the models; None for the user's models.
+        revision: branch, tag or commit of a single model; None for the hub's default branch.
         variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
 
     Raises:
@@ -149,7 +149,7 @@ def _is_present(target: Path, listing: Listing) -> bool:
 
 
 def _listing(requested: ModelRequest, revision: str | None) -> Listing:
-    """Return the listing of the hub or, if it is unreachable, that of its cache on this machine."""
+    """Return the listing from the hub or, if the hub is unreachable, from its cache on this machine."""
     try:
         return read_listing(requested.repository, revision)
     except OUT_OF_REACH:
@@ -186,7 +186,7 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
 
 
 def _install(found: Prepared) -> str:
-    """Download all files, prepare the model folder beside its target, check it, and rename it."""
+    """Download all files, prepare and check the model folder beside its target, and rename it."""
     listing, choice = found.listing, found.choice
     for path in track(list(choice.files), f"files of {found.requested.name}"):
         _fetch(listing, listing.files[path], found.staging)
@@ -210,7 +210,7 @@ def _install(found: Prepared) -> str:
 
 
 def _fetch(listing: Listing, file: HubFile, staging: Path) -> Path:
-    """Fetch one file or the rest of it; delete and refuse it if its digest is wrong."""
+    """Fetch a file or its missing part; delete the file and raise an error if its digest is wrong."""
     target = staging / file.path
     with explain_full_disk(target):
         if file.cached is None:

@@ -1,4 +1,4 @@
-"""Finding and checking model folders in the layouts of published ONNX exports.
+"""Find and check model folders in the layouts of published ONNX exports.
 
 A folder contains `config.json`, the preprocessing configuration and the networks as `.onnx` files
 (`layouts.LAYOUTS`). Everything needed to convert a photograph into a network's input is read from the folder,
@@ -161,7 +161,7 @@ def variants_of(folder: Path, layout: str) -> list[str]:
 def _preprocessing_of(path: Path) -> dict[str, Any]:
     """Read the image preprocessing; keys of open_clip are converted.
 
-    A ModelError is raised if the file cannot be read, disables a step, or has an invalid mean or deviation.
+    A ModelError is raised if the file cannot be read, disables a step, or has an invalid mean or std.
     """
     try:
         found = {key: value for key, value in read_json(path).items() if value is not None}
@@ -190,7 +190,7 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
 
 
 def external_weights(network: Path, folder: Path) -> list[Path]:
-    """Return the weight files beside a network that its graph names, without reading the weights.
+    """Return the external weight files named in a network's graph, without reading the weights.
 
     A ModelError is raised if such a file is missing or outside the model folder.
     """
@@ -233,7 +233,7 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def side_px(size: Any, default: int) -> int:
-    """Return the side of a square input, given a preprocessor's size (a number or a dict in any form)."""
+    """Return the side of a square input from a preprocessor's size (a number, or a dict in any form)."""
     if isinstance(size, dict):
         size = next((size[key] for key in ("longest_edge", "shortest_edge", "height") if key in size), None)
     return int(size) if size else default

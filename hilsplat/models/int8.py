@@ -27,9 +27,9 @@ WORDS = (
 """Texts ranked for each crop: the canonical phrases of LERF and everyday words."""
 
 LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
-"""Minimum agreement of both precisions: mean IoU of masks from the same prompts, mean cosine of vectors,
-and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views differ
-by more."""
+"""Minimum agreement of int8 with float32: mean IoU of masks from the same prompts, mean cosine of vectors,
+and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views agree
+less."""
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
 """Numbers of crops for checking a CLIP model, and of views and prompts per side for a SAM model."""
 
@@ -52,7 +52,7 @@ def int8_network(
 ) -> Network:
     """Open the int8 version of a model's network, which `hilsplat models get` or the first use computes.
 
-    It is stored beside the model folder, in `.int8`, under a digest of its source.
+    The int8 version is stored beside the model folder, in `.int8`, under a digest of its source.
 
     Args:
         cache: folder to use instead if the model's parent folder is read-only.
@@ -106,9 +106,9 @@ def use_int8(
     """Return whether to use int8 (`precision` is "auto" or "int8"), and log the measured agreement.
 
     Args:
-        what: the network, for the log.
-        inputs: digests of the model and of the data that `measure` reads; results are cached under them.
-        measure: measures the agreement of both precisions, by keys of `LEAST`.
+        what: name of the network in the log.
+        inputs: digests of the model and of the data that `measure` reads, the key of cached results.
+        measure: function that returns the agreement of int8 with float32, by keys of `LEAST`.
     """
     kept = ViewCache(Path(cache) / "int8").get(
         sha256_of_json([RECIPE, inputs]),
@@ -124,7 +124,7 @@ def use_int8(
 def agreement_of_vectors(
     full: Float[np.ndarray, "B C"], quantised: Float[np.ndarray, "B C"], texts: Float[np.ndarray, "T C"]
 ) -> dict[str, float]:
-    """Compare the crops' unit vectors of both precisions, directly and by how they rank texts."""
+    """Compare the crops' unit vectors in both precisions, directly and by their rankings of texts."""
     ranks = [np.argsort(np.argsort(vectors @ texts.T, axis=1), axis=1) for vectors in (full, quantised)]
     centred = [rank - rank.mean(axis=1, keepdims=True) for rank in ranks]
     order = (centred[0] * centred[1]).sum() / max(float(np.square(centred[0]).sum()), 1e-12)
@@ -134,6 +134,6 @@ def agreement_of_vectors(
 def agreement_of_masks(
     full: Bool[np.ndarray, "K h w"], quantised: Bool[np.ndarray, "K h w"]
 ) -> dict[str, float]:
-    """Compare the masks of both precisions for the same prompts; pairs of empty masks are ignored."""
+    """Compare the masks in both precisions for the same prompts; pairs of empty masks are ignored."""
     union, shared = (full | quantised).sum(axis=(1, 2)), (full & quantised).sum(axis=(1, 2))
     return {"mask IoU": float((shared[union > 0] / union[union > 0]).mean()) if union.any() else 0.0}

@@ -11,13 +11,13 @@ PROCESS_MIB = 1500
 """Memory of a stage without its networks: libraries, images, candidates, masks."""
 MIB = 2**20
 ATTENTION_COPIES = 3.5
-"""Number of arrays of the size of a layer's attention weights that exist at once. Measured: 2615 MiB for an
-image in SAM ViT-B, whose attention weights take 768 MiB."""
+"""Number of arrays as large as a layer's attention weights that are in memory at once. Measured: 2615 MiB for
+an image in SAM ViT-B, whose attention weights take 768 MiB."""
 ACTIVATIONS = 35
 """Memory of an image in SAM with row-wise attention, in multiples of all patch features. Measured: 475 MiB in
 ViT-B, whose patch features take 12 MiB."""
 PROMPT_MIB = 64
-"""Memory per prompt in SAM's exported decoder, for a 1024 px image. Measured: 507 MiB for 8 in ViT-B."""
+"""Memory per prompt in SAM's exported decoder, for a 1024 px image. Measured: 507 MiB for 8 (ViT-B)."""
 FACTORED_MIB = 250
 """Memory of all prompts of a 1024 px image in the factored decoder. Measured: 104 MiB while 1024 prompts are
 previewed, plus the masks of the prompts that are kept."""
@@ -92,7 +92,7 @@ CGROUP_FILES = {
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     2: ("memory.max", "memory.current", "inactive_file"),
 }
-"""Control group version -> files with limit and use, and the key of reclaimable pages in `memory.stat`."""
+"""Control group version -> files with memory limit and use, and key of reclaimable pages in `memory.stat`."""
 
 
 def machine_mib(system: Path = SYSTEM) -> float:

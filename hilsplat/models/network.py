@@ -36,7 +36,7 @@ def execution_providers() -> list[str]:
 def one_thread_session(network: bytes | str, providers: list[str]) -> onnxruntime.InferenceSession:
     """Open a network (its graph or path) that runs in one thread per call.
 
-    Stages are faster if they process several views at once, and results then don't depend on threads.
+    Stages are faster if they process several views at once; results don't depend on the number of threads.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -54,7 +54,7 @@ class Network:
         provider: the only execution provider to use, or None for the first that works.
 
     Raises:
-        ModelError: it cannot be read, or its inputs or outputs have unexpected names or axes.
+        ModelError: the network cannot be read, or its inputs or outputs have unexpected names or axes.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarr
 
 
 def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:
-    """Raise a ModelError if the two networks of a CLIP return vectors of known, different widths."""
+    """Raise a ModelError if the two networks of a CLIP model return vectors of known, different widths."""
     if None not in (image_numbers, text_numbers) and image_numbers != text_numbers:
         raise ModelError(
             f"the two networks of {folder} do not belong together",

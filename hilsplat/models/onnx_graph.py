@@ -25,7 +25,7 @@ OPTIONAL = {"attention_mask"}
 
 
 def keep_only(model: Any, outputs: Sequence[str]) -> None:
-    """Reduce a model to the nodes that compute the given values, and make these its outputs."""
+    """Reduce a model to the nodes that compute the given values, and make these values its outputs."""
     import onnx
 
     graph = model.graph
@@ -65,7 +65,7 @@ def _inputs(node: Any) -> list[str]:
 def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: int) -> bytes | None:
     """Return the graph of SAM's encoder with global attention computed for one row of patches at a time.
 
-    The result is None if a layer has another form, or weights are external or 16-bit.
+    The result is None if a layer has an unexpected form, or weights are external or 16-bit.
 
     As exported, such a layer writes the weights of all pairs of patches (800 MB) and reads them four times.
     The weights of one row fit into the processor's cache. onnxruntime loops over rows (operator Scan);
@@ -105,7 +105,7 @@ def with_rowwise_attention(path: Path, layers: Iterable[int], heads: int, side: 
 
 
 def _scores(softmax: Any, makers: dict[str, Any]) -> tuple[list[str], list[str]] | None:
-    """Return the inputs of the product and the two positional terms whose sum a softmax reads, or None."""
+    """Return the inputs of the product and the two positional terms in the sum before a softmax, or None."""
     product, positions, waiting = None, [], [softmax.input[0]]
     while waiting:
         node = makers.get(waiting.pop())
@@ -132,7 +132,7 @@ def _row_loop(
     heads: int,
     side: int,
 ) -> list[Any]:
-    """Return the nodes of an attention that loops over rows of queries; positions have rows on axis 1."""
+    """Return the nodes of attention in a loop over rows of queries; positions have rows on axis 1."""
     from onnx import TensorProto, helper, numpy_helper
 
     def shape(of: str, *sides: int) -> Any:

@@ -1,6 +1,6 @@
 """Model folders: released models, models that are present, and the models that `auto` selects.
 
-This module is fast to import when a run is planned, because it opens no network.
+This module opens no networks, so that importing it to plan a run is fast.
 """
 
 import functools
@@ -31,7 +31,7 @@ EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
 class Release:
     """A released model that `hilsplat models get` accepts by name."""
 
-    name: str  # of its folder
+    name: str  # name of the model folder
     repository: str
     megabytes: int  # approximate size of the download; the exact size is reported before a transfer
     use: str
@@ -64,12 +64,12 @@ RELEASES = (
 """Released models, in the order of preference of `auto` within each family."""
 
 RECOMMENDED = ("sam2.1-hiera-small", "clip-vit-base-patch16")
-"""Models that `hilsplat models get` downloads without a name; docs/models.md gives the reasons."""
+"""Models that `hilsplat models get` downloads if no name is given; docs/models.md gives the reasons."""
 
 
 @dataclass(frozen=True)
 class PresentModel:
-    """An existing model folder; only opening it checks that it is complete."""
+    """An existing model folder, which is checked for completeness only when it is opened."""
 
     folder: Path
     family: str  # "sam" or "clip"
@@ -142,7 +142,7 @@ def _folders() -> list[Path]:
 def model_digest(folder: Path, cache: Path) -> str:
     """Return the digest of a model folder, or "... is missing"; the stage reports how to fix it.
 
-    Digests are kept in `cache`, keyed by file sizes and modification times: reading ViT-H takes seconds.
+    Digests are cached in `cache`, keyed by file sizes and modification times, as reading ViT-H takes seconds.
     """
     if not folder.is_dir():
         return f"{folder} is missing"
@@ -166,7 +166,7 @@ def real_model(family: str) -> Path | None:
 
 
 def models_table() -> str:
-    """Return a table of released and installed models, with those that are used for photographs."""
+    """Return a table of released and installed models that marks those used for photographs."""
     here = {model.folder.name: model for model in present_models()}
     chosen = (real_model("sam"), real_model("clip"))
 
@@ -197,7 +197,7 @@ def models_table() -> str:
 
 
 def meaningless(name: str) -> str:
-    """Return the warning for queries of photographs with an embedded CLIP."""
+    """Return the warning for queries of photographs with an embedded CLIP model."""
     return (
         f"{name} was trained only on the synthetic world: its answers about photographs are meaningless. "
         "To use a pretrained model, run `hilsplat models get` and rerun."
