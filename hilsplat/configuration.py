@@ -196,7 +196,7 @@ class RunSettings(StageSettings):
         ]
 
     def variant_names(self) -> list[str]:
-        """Return the variants in the run's tables, "default" first; with several seeds, each once per seed."""
+        """Return the variants in the run's tables, "default" first, each once per seed."""
         names = [
             *("default", *self.main_variants, *self.ablation_variants, *self.component_variants),
             *(*self.theta_variants, *self.omega_variants, *self.pruning_variants),
@@ -204,7 +204,7 @@ class RunSettings(StageSettings):
         return [name for first in dict.fromkeys(names) for name in self._all_seeds(first)]
 
     def seeded(self, variant: str, scopes: tuple[str, ...] = ()) -> list[str]:
-        """Return a variant's name and, if the variant is random, its names for further seeds: `<name>.seed1`, ..."""
+        """Return a variant's name and, if it is random, the names for other seeds: `<name>.seed1`, ..."""
         is_random = self.stages(variant, scopes).depends_on_seed("evaluate")
         return self._all_seeds(variant) if is_random else [variant]
 

@@ -37,7 +37,7 @@ class Dataset:
         required: paths that a scene needs.
         open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
         open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
-        protocols: protocols for this data set (`evaluate.protocols.cards`), besides those for all image labels.
+        protocols: its own protocols (`evaluate.protocols.cards`), besides those for all image labels.
         label_places: glob patterns of a scene's files that only evaluation reads.
     """
 

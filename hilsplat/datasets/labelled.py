@@ -203,7 +203,7 @@ def mask_region(
 
 
 def read_mask_file(path: Path, least: int) -> Bool[np.ndarray, "H W"]:
-    """Return which pixel values of a grey mask file are at least `least`; raise ImageError if it is damaged."""
+    """Return where a grey mask file's values are at least `least`; raise ImageError if it is damaged."""
     with _opened("mask", path) as image:
         return np.asarray(image.convert("L")) >= least
 

@@ -22,14 +22,14 @@ PROMPTS: dict[str, dict[str, list[str]]] = _LISTS["prompts"]
 """Prompts by data set and scene, sorted."""
 
 PAIRS: dict[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
-"""Number of (frame, category) pairs of LERF-OVS, derived: the smallest counts for which whole numbers of hits
-give all published localization figures."""
+"""Number of (frame, category) pairs of LERF-OVS, derived as the smallest counts for which whole numbers of
+hits give all published localization figures."""
 
 
 def differences(
     dataset: str, scene: str, present: Mapping[str, Iterable[str]], texts: Iterable[str] = ()
 ) -> list[str]:
-    """Return sentences about published frames that are missing, and texts that the published list lacks.
+    """Return sentences about published frames that are missing, and texts that are not in the published list.
 
     `present` maps a kind of file, such as "label", to the views that have one.
     """

@@ -65,7 +65,7 @@ def open_labels(name: str, data_root: Path) -> "LabelledScene | PointScene":
 
 
 def dataset_of(name: str) -> Dataset:
-    """Return a data set by name; raise SceneError, with the known names, if there is none."""
+    """Return a data set by name; raise SceneError, which lists the known names, if it is unknown."""
     if name not in DATASETS:
         raise SceneError(
             f"data set {name!r} is unknown", expected=f"one of {', '.join(DATASETS)}", fix=LISTED
@@ -107,7 +107,7 @@ def _presence(dataset: Dataset, data_root: Path) -> list[str]:
 
 
 def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
-    """Read whole scenes of a data set, by default those at least partly present.
+    """Read whole scenes of a data set, by default all that are at least partly present.
 
     Return a report of what was found, and the number of scenes that cannot be read. Raise SceneError if the
     data set's folder is missing.

@@ -1,6 +1,6 @@
 """Published data sets named in rows of the scene sheet: which parts are present, and which files are labels.
 
-The workflow uses this module at start-up, so it reads no data and imports nothing heavy at module level.
+The workflow uses this module at start-up, so it reads no data and imports no heavy library at module level.
 """
 
 from collections.abc import Collection
@@ -18,7 +18,7 @@ LEVELLED = tuple(LABELS_ON.values())
 
 
 def published(source: str) -> tuple[str, str] | None:
-    """Return data set and scene of a source such as `data:lerf_ovs/figurines`; None for anything else."""
+    """Return the data set and scene of a source such as `data:lerf_ovs/figurines`; None for anything else."""
     name, _, scene = source.removeprefix(DATA_PREFIX).partition("/")
     return (name, scene) if source.startswith(DATA_PREFIX) and scene and name in DATASETS else None
 
@@ -58,9 +58,9 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
 
 def label_sets(source: str, data_root: str, row: str) -> tuple[str, ...]:
-    """Return the labels, as `data set/scene`, that score a row's scene (`dataset/scene`), its own first.
+    """Return the label sets (`data set/scene`) for scoring a row's scene (`dataset/scene`), its own first.
 
-    Without `data_root`, your own annotations may be in the working folder.
+    If `data_root` is empty, your own annotations may be in the working folder.
     """
     drawn = (Path(data_root).expanduser() / "annotated" / row).glob("*.json")
     own = (f"annotated/{row}",) if any(drawn) else ()
@@ -81,7 +81,7 @@ def _folder(dataset: Dataset, data_root: str) -> Path:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Return the files of `data set/scene`, sorted, that only evaluation reads; edits rerun only that."""
+    """Return the files of `data set/scene`, sorted, that only evaluation reads and depends on."""
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
     root = _folder(dataset, data_root)
@@ -110,10 +110,10 @@ def is_exported(source: str) -> bool:
 
 
 def export_images(name: str, data_root: Path, out: Path) -> int:
-    """Write images and poses of `data set/scene` to a folder for `poses`; return the number of images.
+    """Write images and poses of `data set/scene` to a folder for the `poses` stage; return the image count.
 
     The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (optionally
-    frozen) positions of Gaussians. Lidar points are not, because the sky and distant objects have none.
+    frozen) positions of Gaussians. Lidar points are not: the sky and distant objects have no lidar points.
 
     Raises:
         SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.

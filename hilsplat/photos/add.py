@@ -37,7 +37,7 @@ from hilsplat.scene.sheet import (
 from hilsplat.scene.view_names import view_names
 
 OTHER_PHOTO_SUFFIXES = frozenset({".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".gif", ".jxl"})
-"""Suffixes of unsupported photograph formats; skipped files are reported instead of "no images"."""
+"""Suffixes of unsupported photograph formats; such files are reported as skipped, not as "no images"."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class PhotoReport:
         duplicates: groups of file names with identical bytes.
         passed_over: number of skipped files in unsupported photograph formats, by suffix.
         doubts: likely problems and what to do about them (`check`).
-        notes: how the folder was made (`intake`), and which further files are used.
+        notes: how the folder was made (`intake`), and which other files are used.
     """
 
     folder: Path
@@ -93,7 +93,7 @@ class PhotoReport:
 def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     """Read every photograph in a folder (or its `images/`) in full, and report contents and likely problems.
 
-    Other `poses` may replace those in the folder (`has_known_poses`).
+    If given, `poses` are used instead of those in the folder (`has_known_poses`).
 
     Raises:
         SceneError: a photograph has an unusable name, or two differ only in their suffix.
@@ -153,7 +153,7 @@ def add_scene(
 
     A folder is used in place: the sheet refers to it, with a relative path if it is inside the project.
     Frames of a video and the contents of an archive are written to `photos/<name>/` in the project. For the
-    last four arguments, None uses what is found in the folder, and `NO_POSES` ("none") ignores it.
+    last four arguments, None uses the files found in the folder; `NO_POSES` ("none") ignores them.
 
     Args:
         photos: folder of photographs or of videos, a video, or a zip archive of photographs.
@@ -167,7 +167,7 @@ def add_scene(
 
     Raises:
         SceneError: the name is invalid or taken, photographs cannot be read, or there are fewer than three
-            different ones and no known poses. The sheet is then unchanged.
+            different photographs and no known poses. The sheet is then unchanged.
     """
     sheet, photos = Path(sheet), Path(photos).expanduser().resolve()
     if problem := name_problem(name):
@@ -206,7 +206,7 @@ def add_scene(
 
 
 def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
-    """Return the user's paths, else those of other programs' files in the folder, by sheet column.
+    """Map sheet columns to the user's paths or, by default, to other programs' files in the folder.
 
     Without known poses, the coordinates of another program's Gaussians are unknown, so they are not used.
     """
@@ -239,7 +239,7 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
 
 
 def _labels(folder: Path, named: Path | None) -> list[Path]:
-    """Return the label files given by the user, or else those found."""
+    """Return the label files given by the user, or else those found in the folder."""
     if named is None or named == NO_POSES:
         return label_files(folder) if named is None else []
     files = sorted(named.glob("*.json"))
@@ -285,7 +285,7 @@ def _append(sheet: Path, name: str, photos: Path, extra: dict[str, Path]) -> Non
         first = content_lines(sheet)[0][1]
         header = [cell.strip() for cell in first.split("\t")]
         if new := [column for column in extra if column not in header]:
-            header += new  # existing rows may lack them
+            header += new  # existing rows may lack new columns
             text = text.replace(first, "\t".join(header), 1)
         if not text.endswith("\n"):
             text += "\n"

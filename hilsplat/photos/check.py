@@ -1,4 +1,4 @@
-"""Checks of a set of photographs for likely problems, before it is processed.
+"""Checks of a set of photographs for likely problems, before the set is processed.
 
 Thresholds were chosen on three sets of real photographs that all register, on blurred, darkened and
 over-exposed copies of them, and on pictures of a camera that only rotates (values: docs/scene.md).
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 FEW_PHOTOS = 10
-"""Number of photographs below which large parts of a scene are visible at most once."""
+"""Number of photographs below which large parts of a scene are in at most one photograph."""
 
 CHECK_SIDE_PX = 800
 FEATURE_SIDE_PX = 640
@@ -36,7 +36,7 @@ SAME_PLACE = 0.01
 the same. The median would be too small: around a centred object, half of the matches may barely move."""
 
 MAX_PAIRS = 60
-"""Maximum number of pairs of neighbours that are matched, spread evenly: 5 s at 80 ms per photograph."""
+"""Maximum number of evenly spread pairs of neighbours to match (5 s at 80 ms per photograph)."""
 
 NUM_FEATURES = 1000
 RATIO = 0.8
@@ -58,7 +58,7 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class CheckedPhoto:
-    """The data of a photograph that the checks use.
+    """A photograph's data for the checks.
 
     `focal_px` is the focal length from EXIF, px of the full picture, or None; `grey` an upright grey copy
     with a longer side of at most `CHECK_SIDE_PX`.
@@ -112,7 +112,7 @@ def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
 
 
 def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
-    """Return problems of the camera's motion, measured by matching neighbours."""
+    """Return problems with the camera's motion, measured by matching neighbouring photographs."""
     last = len(photos) - 1
     rows = sorted(set(np.linspace(0, last - 1, min(last, MAX_PAIRS)).round().astype(int))) if last > 0 else []
     features: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -157,8 +157,8 @@ def _listed(names: Sequence[str], photos: Sequence[CheckedPhoto]) -> str:
 def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that another blur preserves.
 
-    Crete et al., "The blur effect" (2007), with a box of 11 px: the larger of the values along x and y.
-    Unlike the variance of the Laplacian, it hardly depends on the content. A flat picture has blur 1.
+    Crete et al., "The blur effect" (2007), with a box of 11 px; the result is the larger of the values along
+    x and y. It depends less on the content than the variance of the Laplacian. A flat picture has blur 1.
     """
     values = grey.astype(np.float32)
     shares = []
@@ -178,7 +178,7 @@ def _feature_size(grey: UInt8[np.ndarray, "h w"]) -> tuple[int, int]:
 def _features(
     grey: UInt8[np.ndarray, "h w"],
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
-    """Compute SIFT positions, in px of the feature size, and RootSIFT descriptors."""
+    """Compute SIFT positions, in px of the shrunk picture, and RootSIFT descriptors."""
     height, width = _feature_size(grey)
     small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     points, descriptors = cv2.SIFT.create(NUM_FEATURES).detectAndCompute(small, None)
@@ -193,10 +193,10 @@ def pair_motion(
     other: tuple[Float32[np.ndarray, "m 2"], Float32[np.ndarray, "m 128"]],
     size_hw: tuple[int, int],
 ) -> tuple[float, float] | None:
-    """Measure the motion between two pictures; None if too few matches agree with an epipolar geometry.
+    """Measure the motion between two pictures, or return None if too few matches fit an epipolar geometry.
 
     Return the displacement of the verified matches (90th percentile, as a share of the diagonal) and the
-    share of them that is explained by a rotation of the camera about its centre. A homography would also
+    share of these matches explained by a rotation of the camera about its centre. A homography would also
     explain a camera that moves in front of a wall or a carpet (measured: up to 0.97 of the matches), so a
     rotation (three parameters) is fitted, with the best of several focal lengths.
     """

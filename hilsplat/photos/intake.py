@@ -27,8 +27,8 @@ POSE_SUFFIXES = frozenset({".json", ".txt", ".bin", ".npy", ".ply"})
 def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tuple[Path, list[str]]]:
     """Yield a scene's folder, with notes on its conversion and on skipped files.
 
-    It is the source itself or, for videos and archives, is made at `target`. The source is a folder of
-    photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most `frames` frames are
+    The folder is the source itself or, for videos and archives, is made at `target`. The source is a folder
+    of photographs or of videos only, a video, or a .zip (or Record3D's .r3d). At most `frames` frames are
     extracted from videos. If the block raises an error, the converted folder is removed.
 
     Raises:
@@ -73,7 +73,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
             notes = make(folder)
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} already exists, from the same files"]  # an earlier run was killed afterwards
+        notes = [f"{target} already exists, from the same files"]  # an earlier run was killed later
     else:
         fix = "choose another name for the scene, or move that folder away"
         raise SceneError(f"{target} already exists", fix=fix)
@@ -85,7 +85,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
 
 
 def _videos_of(source: Path) -> list[Path]:
-    """Return the videos to take frames from: the source itself, or those in a folder without photographs."""
+    """Return the videos to extract frames from: the source, or those in a folder without photographs."""
     if source.is_file():
         return [source] if source.suffix.lower() in VIDEO_SUFFIXES else []
     if list_images(photo_folder(source)) or has_known_poses(source):

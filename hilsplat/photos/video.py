@@ -27,7 +27,7 @@ CANDIDATES_PER_FRAME = 4
 
 MIN_STEP = 0.01
 """Displacement between two frames, as a share of the diagonal, below which they count as the same: about 0.7
-of a phone's 70 degrees. The noise of a static camera is below 0.001."""
+degrees for a phone's 70-degree view. The noise of a static camera is below 0.001."""
 
 GREY_SIDE_PX = 480
 SHARPNESS_SIDE_PX = 960
@@ -35,7 +35,7 @@ SHARPNESS_SIDE_PX = 960
 
 JPEG_QUALITY = 95
 USUAL_RATE = 30.0
-"""Assumed frames per second for files without a frame rate or time stamps."""
+"""Assumed frames per second for files without a frame rate or timestamps."""
 
 NUM_CORNERS = 300
 PYRAMID_LEVELS = 4
@@ -76,10 +76,10 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
     The camera path through all videos, measured by the displacement of image corners, is divided into `count`
     sections of equal length, and the sharpest frame of each is selected. A camera at rest gives one frame; a
     short path gives fewer frames. Frames are rotated upright according to the stream's display matrix and
-    stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same videos give the same bytes.
+    stored as 0001.jpg, 0002.jpg, ... at full size and quality 95. The same videos produce the same bytes.
 
-    A video is decoded twice, once to select and once to write frames, so that memory contains only small
-    copies.
+    A video is decoded twice, once to select and once to write frames, so that only small copies are kept
+    in memory.
 
     Raises:
         SceneError: a video cannot be read or has no intact frame.
@@ -268,8 +268,8 @@ def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
 def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
     """Return the section number of each candidate, given the steps between candidates.
 
-    Sections are as short as their maximum number `count` allows, but not shorter than `MIN_STEP`. A longer
-    step cannot be divided, so it counts as one section.
+    Sections are as short as their maximum number `count` allows, but not shorter than `MIN_STEP`. A step
+    longer than a section cannot be divided, so it counts as one section.
     """
 
     def rows(length: float) -> Int64[np.ndarray, " N"]:
@@ -286,7 +286,7 @@ def _stretches(steps: Sequence[float], count: int) -> Int64[np.ndarray, " N"]:
 
 
 def _step(one: Frame, other: Frame) -> float:
-    """Return the displacement between two frames (share of the diagonal), `MIN_STEP` across videos."""
+    """Return the displacement between two frames (share of the diagonal), `MIN_STEP` if the videos differ."""
     if one.video != other.video or one.grey.shape != other.grey.shape:
         return MIN_STEP
     return displacement(one.grey, other.grey)
@@ -295,7 +295,7 @@ def _step(one: Frame, other: Frame) -> float:
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for steep edges.
 
-    It can only compare pictures of the same place, because it depends on the content.
+    It is comparable only between pictures of the same place, because it depends on the content.
     """
     return float(cv2.Laplacian(grey, cv2.CV_32F, ksize=3).var())
 
@@ -303,9 +303,9 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
 def displacement(one: UInt8[np.ndarray, "h w"], other: UInt8[np.ndarray, "h w"]) -> float:
     """Return the upper quartile of corner displacements between two pictures, as a share of the diagonal.
 
-    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that return a pixel or more
-    off are ignored. Unlike the median, the upper quartile captures an object on a turntable in front of a
-    static background. The result is 0 for pictures with too few corners, `LOST` if too few can be tracked.
+    Corners are tracked forwards and backwards with pyramidal Lucas-Kanade; those that end a pixel or more
+    from their start are ignored. Unlike the median, the upper quartile captures an object on a turntable in
+    front of a static background. The result is 0 with too few corners, and `LOST` if too few can be tracked.
     """
     corners = cv2.goodFeaturesToTrack(one, NUM_CORNERS, qualityLevel=0.01, minDistance=7)
     if corners is None or len(corners) < MIN_FOLLOWED:

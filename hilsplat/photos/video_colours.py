@@ -1,4 +1,4 @@
-"""Conversion of video frames to 8-bit sRGB by the stream's matrix and range, with HDR tone mapping."""
+"""Conversion of video frames to 8-bit sRGB with the stream's matrix and range, with HDR tone mapping."""
 
 import functools
 
@@ -56,10 +56,10 @@ def rgb_pixels(frame: VideoFrame) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def srgb_from_hdr(signal: UInt16[np.ndarray, "H W 3"], *, is_hlg: bool) -> UInt8[np.ndarray, "H W 3"]:
-    """Tone-map an HDR picture with BT.2020 primaries, full-range 16-bit RGB, to 8-bit sRGB.
+    """Tone-map an HDR picture (full-range 16-bit RGB, BT.2020 primaries) to 8-bit sRGB.
 
     Light up to 0.6 of white is unchanged; above that, it is compressed: white becomes 0.8, and brighter light
-    stays below 1. All channels are scaled by the factor of the strongest, which preserves the hue.
+    stays below 1. All channels are scaled by the strongest channel's factor, which preserves the hue.
     """
     light = _hlg_light()[signal] if is_hlg else _pq_light()[signal]
     if is_hlg:  # the display's gamma applies to luminance (BT.2100, OOTF)

@@ -22,12 +22,12 @@ MIN_VIEWS_FOR_TEST = 8
 """Number of views below which none is held out, because the fit needs all of them."""
 
 MIN_LEVELNESS_GAP = 3.0
-"""The cameras' x axes determine up if the best direction fits them this many times better than the next."""
+"""How many times better than the second-best direction the best must fit the cameras' x axes to define up."""
 
 
 @dataclass(frozen=True)
 class PosedView:
-    """One view with its lens before undistortion, the PNG that it describes, and the pose in the source."""
+    """One view: a PNG, the camera of that PNG (before or after undistortion), and the pose in the source."""
 
     view: str
     image: Path
@@ -96,8 +96,8 @@ def normalising_similarity(
 
     The origin is the median of the sparse points, or of the camera centres if there are no points. The unit
     is the median distance of the cameras from the origin, so every scene has a size of a few units; metric
-    sources keep the metre. With `turn`, +z is the cameras' up direction: the rotation from structure from
-    motion is arbitrary, whereas imported poses keep their axes.
+    sources keep the metre. With `turn`, +z is the cameras' up direction, because the rotation from structure
+    from motion is arbitrary; imported poses keep their axes.
     """
     rotations = cam_from_source[:, :3, :3]
     centres = -np.einsum("vji,vj->vi", rotations, cam_from_source[:, :3, 3])
@@ -225,7 +225,7 @@ def plot_registration(path: Path, scene: Scene, report: Mapping[str, Any]) -> No
     figure.suptitle(
         f"{scene.name}: {report['registered']} of {report['images']} views, {len(points)} points{quality}"
     )
-    # Without date and library version, the same scene gives the same bytes.
+    # Date and library version are omitted, so that the same scene produces the same bytes.
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
 
 

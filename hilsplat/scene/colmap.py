@@ -15,7 +15,7 @@ __all__ = ["Image", "camera_of", "pose_matrix", "pycolmap", "reprojection_errors
 
 
 def pose_matrix(pose: pycolmap.Rigid3d) -> Float64[np.ndarray, "4 4"]:
-    """Return a COLMAP pose as a matrix."""
+    """Return a COLMAP pose as a 4 x 4 matrix."""
     return np.vstack([pose.matrix(), [0.0, 0.0, 0.0, 1.0]])
 
 

@@ -22,7 +22,7 @@ EXHAUSTIVE_UP_TO = 200
 """Maximum number of views for which the matcher "auto" tries every pair, not only neighbours by name."""
 
 SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
-"""Distances, in name order, between the views that sequential matching pairs."""
+"""Distances, in name order, between the two views of a pair in sequential matching."""
 
 MIN_INLIERS = 12
 """Minimum number of verified matches per pair (reference block, for renders and photographs; COLMAP: 15)."""
@@ -43,7 +43,7 @@ DIAGONAL_35MM = 43.2666
 """Diagonal of a 35 mm frame in mm, the reference of the equivalent focal length in EXIF."""
 
 Lens = tuple[list[str], str, list[float] | None]
-"""Views that share a camera, its COLMAP model, and its initial parameters; None to have COLMAP guess them."""
+"""Views that share a camera, the camera's COLMAP model, and its initial parameters (None: COLMAP guesses)."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def prepare_images(sources: Sequence[Path], folder: Path, max_side_px: int) -> l
 
 
 def lenses_of(images: Sequence[WorkImage], camera_model: str, single_camera: str) -> list[Lens]:
-    """Group views with shared intrinsics: by size and EXIF focal length ("auto"), all ("yes") or none."""
+    """Group views that share intrinsics: same size and EXIF focal length ("auto"), all ("yes") or none."""
     groups: dict[object, list[WorkImage]] = {}
     for image in images:
         key = {"yes": image.size_hw, "no": image.view}.get(single_camera, (image.size_hw, image.focal_px))
@@ -193,7 +193,7 @@ def incremental_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
 
 
 def verified_matches(database: Path) -> dict[str, dict[str, int]]:
-    """Return the number of verified matches of each view with each other view, by their names."""
+    """Return the number of verified matches of each view with each other view, by view names."""
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SceneParts:
-    """Paths of the artifacts that are needed for queries: one variant of one scene.
+    """Paths of the artifacts that queries of one variant of a scene require.
 
     Attributes:
         field: language field; None if it does not exist yet, in which case queries use the tree alone.
@@ -96,7 +96,7 @@ class FinishedScene:
 
     @property
     def naming(self) -> Path:
-        """Folder of the node names, beside the CLIP vectors they were computed from; it may not exist."""
+        """Folder of the node names (may not exist), beside the CLIP vectors that they were computed from."""
         return self.parts.clip.parent / "names"
 
     def evaluate_settings(self) -> EvaluateSettings:
@@ -146,7 +146,7 @@ def refining(folder: Path) -> str:
 
 
 def is_drawn(scene: Path) -> bool:
-    """Return whether a `Scene` artifact was made from renders of the synthetic world, by its provenance."""
+    """Return whether a `Scene` artifact was made from renders of the synthetic world, per its provenance."""
     record = read_provenance(scene)
     images = record.inputs.get("images") if record else None
     return images is not None and Path(images.path).parts[-2:] == ("world", "images")
@@ -178,7 +178,7 @@ def _recorded_input(artifact: Path, name: str, folder: Path) -> Path | None:
 
 
 def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> None:
-    """Refuse a file that an artifact, `what`, was not made for."""
+    """Refuse a file that the artifact `what` was not made for."""
     require_made_for(path, sha256_of_file(path), scene, {what: expected_sha256})
 
 

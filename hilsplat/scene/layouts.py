@@ -1,4 +1,4 @@
-"""Layouts of folders of photographs and known poses; fast to import at the start of the workflow."""
+"""Layouts of folders of photographs and known poses; a module that imports fast at workflow start-up."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,11 +29,11 @@ DATAPARSER = "dataparser_transforms.json"
 """File in which nerfstudio records its training coordinates."""
 
 EXPORTED = ("exports/*/splat.ply", "exports/splat.ply", "splat.ply", "point_cloud.ply")
-"""Paths of a PLY exported by nerfstudio or a viewer; a PLY of 3DGS is preferred."""
+"""Paths of a PLY exported by nerfstudio or a viewer; a PLY written by 3DGS is preferred."""
 
 
 def read_json_object(path: Path, fix: str) -> dict[str, Any]:
-    """Read a JSON object of another program; raise SceneError with the given fix if it cannot be read."""
+    """Read another program's JSON object; raise SceneError with the given fix if it cannot be read."""
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -44,7 +44,7 @@ def read_json_object(path: Path, fix: str) -> dict[str, Any]:
 
 
 def trained_gaussians(folder: Path) -> Path | None:
-    """Return the PLY with the most training steps that 3DGS or nerfstudio wrote to a folder, or None."""
+    """Return the PLY that 3DGS or nerfstudio wrote to a folder after the most training steps, or None."""
     starts = ("output/*/", "output/", "")
     patterns = [f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts]
     found = [path for pattern in patterns for path in Path(folder).glob(pattern)]
@@ -56,18 +56,18 @@ def trained_gaussians(folder: Path) -> Path | None:
 def dataparser_of(ply: Path, source: Path) -> Path | None:
     """Return the file with the training coordinates of nerfstudio's PLY, or None for other PLYs.
 
-    It is in the PLY's folder or, if the PLY has nerfstudio's file name, in the source's folder or that of the
-    latest training run.
+    The file is in the PLY's folder or, if the PLY has nerfstudio's file name, in the source's folder or the
+    folder of the latest training run.
     """
     places = [ply.parent]
     if ply.name == "splat.ply":
-        runs = sorted(Path(source).glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last folder is a time stamp
+        runs = sorted(Path(source).glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last folder is a timestamp
         places += [Path(source), *(run.parent for run in runs[-1:])]
     return next((place / DATAPARSER for place in places if (place / DATAPARSER).is_file()), None)
 
 
 def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
-    """Return the transforms file with a folder's poses (`find_known_poses`); None if they are elsewhere."""
+    """Return the transforms file with a folder's poses (`find_known_poses`); None if it does not exist."""
     known = find_known_poses(folder, named)
     return known.files[0] if known is not None and known.kind == "transforms" else None
 
@@ -109,7 +109,7 @@ def has_known_poses(folder: Path, named: Path | None = None) -> bool:
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Location of the poses of a folder.
+    """Location of the poses for a folder's images.
 
     Attributes:
         root: folder of the images.
@@ -192,7 +192,7 @@ def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def record3d_export(folder: Path) -> tuple[Path, Path] | None:
-    """Return image folder and pose file of a Record3D export (image sequence or unpacked .r3d), or None."""
+    """Return the images and pose file of a Record3D export (image sequence or unpacked .r3d), or None."""
     for metadata in (folder / "metadata.json", folder / "metadata"):
         for images in (folder / "rgb", folder / "rgbd"):
             if metadata.is_file() and images.is_dir():

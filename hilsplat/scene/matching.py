@@ -1,7 +1,7 @@
 """Matching of SIFT features between views, and verification by two-view geometry.
 
-Distance and limits are those of COLMAP. COLMAP's matcher uses approximate neighbours (FAISS); here, all inner
-products of descriptors are computed, in integers, in a third of the time.
+The distance measure and limits are COLMAP's. COLMAP's matcher uses approximate neighbours (FAISS); here, all
+inner products of descriptors are computed, in integers, in a third of the time.
 """
 
 import copy
@@ -68,7 +68,7 @@ def match_pairs(
     options: pycolmap.TwoViewGeometryOptions,
     threads: int,
 ) -> None:
-    """Match pairs of views, verify the matches, and write both to COLMAP's database.
+    """Match pairs of views, verify the matches, and write matches and geometries to COLMAP's database.
 
     `partners` lists, for each view in name order, the rows of the later views to match it with. The result
     does not depend on `threads`.
@@ -87,7 +87,7 @@ def match_pairs(
 def _matched(
     one: ViewFeatures, other: ViewFeatures, options: pycolmap.TwoViewGeometryOptions
 ) -> tuple[UInt32[np.ndarray, "M 2"], pycolmap.TwoViewGeometry]:
-    """Return the matches of a pair of views, and the geometry on which they agree, if any."""
+    """Return the matches of a pair of views, and the two-view geometry that fits them, if any."""
     matches = mutual_matches(one, other)
     if len(matches) < MIN_MATCHES:
         return matches[:0], pycolmap.TwoViewGeometry()

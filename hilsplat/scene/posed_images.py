@@ -48,10 +48,10 @@ class PosedImage:
 
 
 def rigid_pose(world_from_cam: Float[np.ndarray, "..."], where: str) -> Float64[np.ndarray, "4 4"]:
-    """Return a camera-to-world matrix, 3 x 4 or 4 x 4, as 4 x 4; refuse one that is not rigid.
+    """Return a camera-to-world matrix, 3 x 4 or 4 x 4, as 4 x 4; refuse a matrix that is not rigid.
 
     Raises:
-        SceneError: it has another shape, is not finite, scales or mirrors, or its last row is not 0 0 0 1.
+        SceneError: the matrix is not 3 x 4 or 4 x 4, not finite, scales, mirrors, or does not end in 0 0 0 1.
     """
     pose = np.eye(4)
     usable = world_from_cam.shape in ((3, 4), (4, 4)) and np.isfinite(world_from_cam).all()

@@ -316,7 +316,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
 
 
 def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
-    """Add `belongs_near` to a report's unregistered views: the registered views with most shared matches."""
+    """Add `belongs_near` to a report's unregistered views: the registered ones with the most matches."""
     shared = verified_matches(database)
     for view, entry in views.items():
         if entry["registered"]:
@@ -329,7 +329,7 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
-    """Draw a row for each unregistered photograph with its registered neighbours; return False if none."""
+    """Draw each unregistered photograph beside its registered neighbours; return False if there are none."""
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
         return False

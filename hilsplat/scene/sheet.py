@@ -41,13 +41,13 @@ MIN_PHOTOS = 3
 """Minimum number of photographs for structure from motion."""
 
 DATA_PREFIX = "data:"
-"""Prefix of a source in the folder of real data sets (`data_root`)."""
+"""Prefix of a source in the folder of published data sets (`data_root`)."""
 WORLD_SOURCE = re.compile(r"world:([a-z][a-z0-9_-]*):([0-9]{1,9})")
 
 
 @dataclass(frozen=True)
 class SceneRow:
-    """One scene in the sheet. Paths are resolved; those of `data:` are None without a data root.
+    """One scene in the sheet. Paths are resolved; `data:` paths are None without a data root.
 
     Attributes:
         dataset: first part of the scene's path under `results/`; `scene` is the second.
@@ -58,7 +58,7 @@ class SceneRow:
         gaussians: 3DGS PLY in the source's coordinates, used instead of a fit; None to fit.
         features: folder of LangSplat's masks and CLIP vectors; None to run SAM and CLIP.
         poses: COLMAP model or transforms file used instead of the poses in the folder; `NO_POSES` to ignore
-            those; None to use them.
+            the folder's poses; None to use them.
     """
 
     dataset: str
@@ -149,9 +149,9 @@ def row_of_data(name: str, data_root: str) -> SceneRow:
 def choose_scenes(
     rows: Sequence[SceneRow], groups: Collection[str], only: Sequence[str]
 ) -> tuple[SceneRow, ...]:
-    """Return the scenes of a run in the order of the sheet: all scenes of the groups, or only named ones.
+    """Return the scenes of a run in the order of the sheet: all scenes of the groups, or only named scenes.
 
-    A name (`table-1` or `synthetic/table-1`) selects scenes in the groups or, if there is none, in any group.
+    A name (`table-1` or `synthetic/table-1`) selects scenes in the groups or, if none matches, in any group.
     """
     in_groups = [row for row in rows if row.group in groups]
     if not only:
@@ -277,7 +277,7 @@ def _row(
 
 
 def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
-    """Resolve a path from the project root or, for `data:`, from the data root; None if that is not set."""
+    """Resolve a path from the project root or, for `data:`, the data root; return None if that is not set."""
     start = project_root(sheet)
     if place.startswith(DATA_PREFIX):
         if not data_root:

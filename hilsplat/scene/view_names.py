@@ -14,7 +14,7 @@ def view_name(stem: str) -> str:
 
 
 LONGEST_NAME = 200
-"""Maximum bytes in a photograph's name: later file names append to it, and file systems allow 255 bytes."""
+"""Maximum bytes in a photograph's name; later file names extend it, and file systems allow 255 bytes."""
 
 
 def view_names(sources: Sequence[Path]) -> list[str]:

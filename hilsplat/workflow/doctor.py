@@ -24,7 +24,7 @@ from hilsplat.workflow.resources import JobResources, is_installed
 PACKAGE = "hilsplat"
 
 RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
-"""Rules whose memory and disk space are compared with the machine's."""
+"""Rules whose needs of memory and disk space are compared with the machine's capacity."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def verdict(check: str, problem: str | None, sound: str, fix: str) -> Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """Run every check; an unexpected exception is reported as a fault and does not stop the others."""
+    """Run every check; an unexpected exception is reported as a fault and does not stop other checks."""
     for check in CHECKS:
         try:
             yield from check()

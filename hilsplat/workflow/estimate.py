@@ -15,9 +15,9 @@ from hilsplat.workflow.resources import GUIDED, NODES, PICTURE_S, START_S, JobRe
 from hilsplat.workflow.scene_data import of_variant
 
 GPU_GAIN = {"gaussians": 4, "masks": 27, "clip": 60}
-"""Rule -> speed with a GPU relative to one core. Measured for a fit of 100,000 Gaussians
-(docs/benchmarks.md), whose loss and Adam stay on the CPU. The others are from published times on an
-RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."""
+"""Rule -> speed with a GPU relative to one core. The value for `gaussians` was measured on a fit of 100,000
+Gaussians (docs/benchmarks.md), with loss and Adam on the CPU. The others are from published times on an RTX
+3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."""
 
 OTHERS = "tables"  # row for jobs without a scene
 
@@ -107,7 +107,7 @@ def forecasts(plan: Plan, cores: int) -> list[str]:
 
 
 def _forecast(plan: Plan, resources: JobResources, row: SceneRow, cores: int) -> str:
-    from hilsplat.embed.model_check import seconds_of  # onnxruntime takes a while to import
+    from hilsplat.embed.model_check import seconds_of  # onnxruntime is slow to import
 
     files, stages = plan.data.image_files(row), plan.stages(row)
     sam, clip, cache = stages.masks, stages.clip, plan.results / ".cache"

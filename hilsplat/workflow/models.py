@@ -11,7 +11,7 @@ from hilsplat.scene.sheet import PHOTOS
 
 
 def check_models(stages: StageSettings, where: str) -> None:
-    """Refuse a model folder that is missing or contains another kind of model; `stages` has no `auto`."""
+    """Refuse a missing model folder, or one with another kind of model; `stages` must not contain `auto`."""
     models = [("clip", "clip", stages.clip.model, stages.clip.variant)]
     if stages.masks.segmenter == "sam":
         models.append(("masks", "sam", stages.masks.model, stages.masks.variant))
@@ -36,7 +36,7 @@ def check_device(stages: StageSettings, where: str) -> None:
 
 @functools.cache
 def _require_model(folder: Path, kind: str, variant: str) -> None:
-    from hilsplat.models.folder import open_model_folder  # onnxruntime takes a while to import
+    from hilsplat.models.folder import open_model_folder  # onnxruntime is slow to import
 
     released = any(folder.name == release.name for release in RELEASES)
     open_model_folder(
@@ -57,7 +57,7 @@ def describe_models(stages: StageSettings, features: Path | None = None) -> str:
 
 
 def doubt_about_photographs(stages: StageSettings) -> str:
-    """Return why answers about photographs are meaningless with these settings; empty if they are not."""
+    """Return why answers about photographs are meaningless with these settings, or an empty string."""
     clip = read_model(Path(stages.clip.model))
     return meaningless(clip.folder.name) if clip is not None and clip.embedded else ""
 

@@ -29,7 +29,7 @@ from hilsplat.workflow.scene_data import Job, SceneData, VariantJob, of_variant,
 from hilsplat.workflow.stages import stage_code
 
 LEAST_PHOTOGRAPHS = 16
-"""Minimum number of photographs for key views; half of a smaller number would link too few masks."""
+"""Minimum number of photographs for key views; with fewer, the key views (half) would link too few masks."""
 
 
 def any_of(names: Iterable[str]) -> str:
@@ -38,7 +38,7 @@ def any_of(names: Iterable[str]) -> str:
 
 
 def inert(text: str) -> str:
-    """Return the same JSON without `<`; Snakemake copies parameters unescaped into a script in its report."""
+    """Return the same JSON without `<`: Snakemake copies parameters unescaped into a script in its report."""
     return text.replace("<", "\\u003c")
 
 
@@ -51,7 +51,7 @@ class Plan:
     """
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        """Read the sheet; raise HilsplatError if it or the configuration is invalid or no scenes are left."""
+        """Read the sheet; raise HilsplatError if sheet or configuration is invalid, or no scenes are left."""
         self.run = run = parse_run(dict(config))
         self.results = Path(run.results)
         for name in run.every_variant():
@@ -183,7 +183,7 @@ class Plan:
         ]
 
     def shared(self, stage: str, path: str) -> Callable[[VariantJob], str]:
-        """Return the input function for a stage's output, from the first variant with equal settings.
+        """Return the input function for a stage's output, from the first variant with the same settings.
 
         Variants that are in no table are included, so that shared files do not move when tables change.
         """
@@ -215,7 +215,7 @@ class Plan:
         return variant
 
     def scopes(self, row: SceneRow) -> tuple[str, ...]:
-        """Return the keys of `overrides` that apply to a scene and exist, the general one first."""
+        """Return the keys of `overrides` that apply to a scene and exist, the more general first."""
         return tuple(scope for scope in (row.group, row.name) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
@@ -240,7 +240,7 @@ class Plan:
         return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
-        """Return an input of masks that only orders jobs: vectors of key views precede a full-size SAM."""
+        """Return an input of masks that only orders jobs: key views are embedded before a full-size SAM."""
         row, masks = self.row(job), self.stages(job).masks
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
@@ -327,7 +327,7 @@ class Plan:
         return options_of({**rendered, "start": input.start})
 
     def field_seed(self, job: VariantJob) -> int:
-        """Return the seed of a field; 0 if nothing in it is random, so that other seeds do not rerun it."""
+        """Return a field's seed, or 0 if the field is deterministic, so that other seeds do not rerun it."""
         return self.seed(job) if self.stages(job).field.is_random else 0
 
     def clip_stage(self, job: VariantJob) -> str:
@@ -374,6 +374,6 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
 
 
 def some(names: list[str]) -> str:
-    """Return the first three names, and the number of further ones."""
+    """Return the first three names, and the number of remaining names."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more

@@ -40,7 +40,7 @@ LOOPS = {
     "evaluate": "views scored",
     "comparison": "methods compared",
 }
-"""Rule -> the loop (`base.progress.track`) that takes almost all of its time."""
+"""Rule -> the loop (`base.progress.track`) that takes almost all of the rule's time."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class RunningJob:
         return " ".join(filter(None, [scene, variant, self.rule.replace("_", " "), table]))
 
     def progress(self) -> tuple[str, int, int] | None:
-        """Return loop, items done and items in total from the log, or None outside a loop."""
+        """Return the loop, items done and total items from the log, or None outside a loop."""
         found = last_progress(self.log) if self.log is not None else None
         return found if found is not None and found[1] < found[2] else None
 
@@ -97,7 +97,7 @@ class Estimates:
                 try:
                     last = parse_json(file.read_text(encoding="utf-8").splitlines()[-1])
                     self.learn(file.stem, job, max(float(last["cpu_time"]), float(last["s"])))
-                except (OSError, ValueError, KeyError, IndexError, TypeError):  # a job may be writing it
+                except (OSError, ValueError, KeyError, IndexError, TypeError):  # a job may be writing to it
                     continue
 
     def seconds(self, rule: str) -> float:
@@ -179,14 +179,14 @@ class RunProgress:
         return f"{job.name}{loop} {progress[1]} of {progress[2]}"
 
     def seconds_left(self) -> float:
-        """Return the core seconds left divided by the cores, but at least those of the longest job."""
+        """Return the core seconds left divided by the cores, but at least the longest job's time left."""
         waiting = sum(number * estimates.seconds(rule) for rule, number in self.waiting.items() if number)
         running = [(self._left(job), job.threads) for job in self.running.values()]
         spread = (waiting + sum(left * threads for left, threads in running)) / self.cores
         return max([spread, *(left for left, _ in running)])
 
     def _left(self, job: RunningJob) -> float:
-        """Return the seconds left of a running job, from its own progress if it has reported any."""
+        """Return the seconds left of a running job, from the job's progress if it has reported any."""
         elapsed, progress = self.clock() - job.start_s, job.progress()
         if progress is not None and progress[1] and progress[0] == LOOPS.get(job.rule):
             return elapsed * (progress[2] / progress[1] - 1)
@@ -195,7 +195,7 @@ class RunProgress:
     def _hint(self, job: RunningJob) -> list[str]:
         """Return a line when a scene is ready to query, with the query commands once per run.
 
-        If key views made it ready first, the line for all photographs is shorter.
+        If key views already made the scene ready, the line for all photographs is shorter.
         """
         variant = job.wildcards.get("variant")
         needed = {"clip": "semantic_tree", "semantic_tree": "clip"}.get(job.rule)

@@ -37,9 +37,9 @@ class Expected:
     """How a plan makes an artifact.
 
     Attributes:
-        output: one of the outputs that its rule declares, if it is not the artifact itself.
-        seed: seed expected in its provenance; None if nothing is random.
-        plugins: readers or baselines that are part of its code digest.
+        output: an output declared by the rule, if the rule does not declare the artifact itself.
+        seed: seed expected in the provenance; None if the artifact is deterministic.
+        plugins: readers or baselines that are part of the code digest.
     """
 
     stage: str
@@ -50,7 +50,7 @@ class Expected:
 
 
 def expected_artifacts(plan: Plan) -> dict[str, Expected]:
-    """Return how the plan makes each artifact that the run can write, by path."""
+    """Map the path of each artifact that the run can write to how the plan makes it."""
     found: dict[str, Expected] = {}
     for row in plan.scenes:
         readers = plan.data.label_readers(row)
@@ -161,7 +161,7 @@ class Records:
         self._digests: dict[Path, str | None] = {}
 
     def state(self, artifact: Path, expected: Expected | None = None) -> tuple[str, str]:
-        """Return an artifact's state, and why it is not whole.
+        """Return an artifact's state and, if it is not whole, the reason.
 
         Without `expected`, only code and inputs are compared."""
         try:
@@ -194,7 +194,7 @@ class Records:
         return None
 
     def _differences(self, record: Provenance, expected: Expected | None) -> Iterator[str]:
-        """Yield differences between how an artifact was made and the plan, and its changed inputs."""
+        """Yield differences between an artifact's provenance and the plan, and changes of its inputs."""
         stage, plugins = record.stage, record.plugins
         if expected is not None and stage != IMPORTED:
             if stage != expected.stage:
@@ -233,7 +233,7 @@ class Records:
         return self._digests[path]
 
     def _known_digest(self, name: str, path: Path) -> str | None:
-        """Return the recorded digest of an artifact, or a model's; None if only Snakemake tracks it."""
+        """Return the known digest of an artifact or model; None if only Snakemake tracks it."""
         if name == "model" and path.is_dir():
             return model_digest(path, self.results / ".cache")
         return self._digests.get(path)

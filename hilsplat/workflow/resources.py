@@ -1,11 +1,11 @@
 """Threads, memory, time and GPUs of a job, from the size of its scene and its settings.
 
-`resources.tsv` lists for each rule the core seconds per megapixel of all views and the terms of its memory in
+`resources.tsv` lists each rule's core seconds per megapixel of all views, and the terms of its memory in
 megabytes: a base, per megapixel of all views (`mp`, and `capped_mp` up to `cap`), per megapixel of one view
-(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on disk with
-caches, per megapixel of all views and per thousand Gaussians (for fields: times latent channels). The memory
-exceeds the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source` and
-`train_models` were not measured). Times were measured on the benchmark scenes and can be wrong by a factor of
+(`view_mp`, and `thread_mp` per thread), and per thousand Gaussians. It also lists megabytes on disk (with
+caches) per megapixel of all views and per thousand Gaussians (for fields: times latent channels). These
+estimates exceed the peaks in Snakemake's `benchmark:` records (tests/unit/workflow/peak_memory.tsv; `source`
+and `train_models` were not measured). Times were measured on benchmark scenes and can be off by a factor of
 three elsewhere. A killed job is retried with twice the memory and time limit.
 """
 
@@ -44,8 +44,8 @@ TIME_FACTOR, LEAST_MINUTES = 6, 10  # time limit of a job divided by its estimat
 START_S = 2.0  # seconds to start Python, load libraries and read the inputs of a job
 
 FIT_S_PER_MP, FIT_S_PER_GAUSSIAN, GRAPH_S_PER_MP = 0.14, 0.9e-6, 4.0
-"""Core seconds per fit step, for each megapixel of the view and for each Gaussian of the limit; core seconds
-per megapixel in the graph segmenter."""
+"""Core seconds per fit step, for each megapixel of the view and for each of the maximum number of Gaussians;
+core seconds per megapixel of the graph segmenter."""
 
 TRAINED_S_PER_MP, LITERAL_S_PER_MP = 0.08, 0.15
 """Core seconds per step, level and megapixel of a trained baseline, and of the literal trainer."""
@@ -58,7 +58,7 @@ SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
 """Part of a SAM model's name -> core seconds per picture; others: SAM 2.1 small (docs/benchmarks.md)."""
 
 PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
-"""Core seconds per SAM prompt, per picture between logits and masks, and per crop in CLIP B/16."""
+"""Core seconds per SAM prompt, per picture from logits to masks, and per crop in CLIP B/16."""
 
 PREVIEWED, GUIDED = 0.65, 0.25
 """Relative cost of a prompt with preview, and share of the grid's prompts that guided views use."""
@@ -95,7 +95,7 @@ class JobResources:
         self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
-        """Return a number of threads proportional to the scene's pixels, within its share of the cores."""
+        """Return a number of threads proportional to the scene's pixels, within that scene's core limit."""
         views, view_mp = self.size(self.plan.row(wildcards))
         return int(min(max(1, math.ceil(views * view_mp / MP_PER_THREAD)), self._per_scene))
 
@@ -192,7 +192,7 @@ class JobResources:
             with np.load(Path(self.plan.path(row, "scene")) / "cameras.npz") as cameras:
                 sizes = cameras["size_hw"].astype(np.float64)
             return Size(len(sizes), float(sizes.prod(axis=1).mean()) / 1e6)
-        except (OSError, ValueError, KeyError):  # the poses stage has not written it yet
+        except (OSError, ValueError, KeyError):  # the poses stage has not written the file yet
             stages = self.plan.stages(row)
         if row.world:
             return Size(stages.world.views, stages.world.image_px**2 / 1e6)
@@ -206,7 +206,7 @@ class JobResources:
         return known or self.plan.stages(row).gaussians.max_gaussians
 
     def _model_mb(self, rule: str, wildcards: Job, threads: int) -> int:
-        """Return the memory of a model with one view per thread, MB; the stage uses at most what is free."""
+        """Return a model's memory with one view per thread, MB; the stage uses at most the free memory."""
         settings = getattr(self.plan.stages(wildcards), rule) if rule in EMBEDDED_S else None
         if settings is None or getattr(settings, "segmenter", "sam") != "sam":
             return 0
@@ -239,7 +239,7 @@ def _first_mp(images: Iterable[str], max_side_px: int) -> float:
 def _model_memory_mb(folder: Path, variant: str, batch: int | str, threads: int) -> int:
     """Return the memory of a stage with a model, MB; 0 if the folder is unreadable (the stage reports it)."""
     from hilsplat.models.folder import open_model_folder
-    from hilsplat.models.memory import MIB, needs_of  # onnxruntime takes a while to import
+    from hilsplat.models.memory import MIB, needs_of  # onnxruntime is slow to import
     from hilsplat.segment.sam import own_thresholds
 
     try:

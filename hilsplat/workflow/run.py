@@ -1,7 +1,7 @@
 """`hilsplat run`: Snakemake with checks, and with options that users would otherwise type.
 
 It recovers from a killed run, rebuilds artifacts that don't match their provenance, and starts Snakemake in
-this process. Plain `snakemake --cores 2` gives the same bytes.
+this process. Plain `snakemake --cores 2` produces the same bytes.
 """
 
 import argparse
@@ -44,7 +44,7 @@ TARGET_RULES = ("all", "tables", "efficiency", "train_models")
 """Rules that can be targets; all others have wildcards."""
 
 ELSEWHERE = ("--executor", "-e", "--profile", "--workflow-profile")
-"""Snakemake options that set cores and threads, so that they are not set here."""
+"""Snakemake options that may set cores and threads; if one is given, they are not set here."""
 
 
 _marks: list[TextIOWrapper] = []  # the marker of this process's run, if one is in progress
@@ -55,7 +55,7 @@ def prepare_process() -> TextIOWrapper | None:
 
     Jobs use the interpreter that runs Snakemake, whether or not its environment is activated, and end with
     Snakemake. The lock is shared and is taken before Snakemake's own locks, which record no owner. If no
-    process holds ours, Snakemake's locks are left over from a dead run.
+    process holds our lock, Snakemake's locks are left over from a dead run.
     """
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     os.environ[PARENT] = str(os.getpid())
@@ -78,7 +78,7 @@ def mark_run() -> None:
 def unmark_run() -> None:
     """Remove the marker of this process's run, and cancel the timers that Snakemake leaves running.
 
-    Snakemake's job rate limit starts a timer after each scheduling step; the process would wait for them all.
+    Snakemake's job rate limit starts a timer after each scheduling step; the process would wait for all.
     """
     timers = (thread for thread in threading.enumerate() if isinstance(thread, threading.Timer))
     for timer in timers:
@@ -175,7 +175,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         mark_run()
         status = _start(command, plan, targets, scenes)
         if status != 0:
-            remove_leftovers(plan.results)  # of killed jobs
+            remove_leftovers(plan.results)  # left by killed jobs
         unmark_run()
         return status
 

@@ -1,7 +1,7 @@
 """External files that the jobs of a scene read: photographs, Gaussians and labels.
 
 A *job* is any object with the attributes `dataset` and `scene` and, in a variant's stages, `variant`: the
-wildcards of a rule, or a row of the sheet. Only evaluation and figures get labels.
+wildcards of a rule, or a row of the sheet. Only evaluation and figures read labels.
 """
 
 import functools
@@ -44,7 +44,7 @@ def of_variant(job: Job, variant: str) -> VariantJob:
 def options_of(named: Mapping[str, Any]) -> str:
     """Return quoted command-line options, without those whose value is empty.
 
-    A path in a job's input is the job's own, which a module may have prefixed.
+    Paths are taken from a job's input, because a Snakemake module may have prefixed them.
     """
     return " ".join(f"--{name} {shlex.quote(str(value))}" for name, value in named.items() if value)
 
@@ -97,7 +97,7 @@ class SceneData:
         return f"--no-render {options_of({'poses': row.poses})}".rstrip()
 
     def require_no_braces(self, row: SceneRow) -> None:
-        """Raise an error for file names with braces, which Snakemake reads as wildcards and cannot quote."""
+        """Raise SettingsError for file names with braces, which Snakemake interprets as wildcards."""
         files = self.image_files(row) if row.folder is not None else []
         files = [files] if isinstance(files, str) else files
         for path in [*files, *self.existing_gaussians(row), *self.features(row)]:
@@ -108,7 +108,7 @@ class SceneData:
                 )
 
     def source_files(self, job: Job) -> list[str]:
-        """Return the input of source: files of a data set with the images and poses."""
+        """Return the input of source: a data set's files that contain the images and poses."""
         return [str(path) for path in image_files(self.row(job).source, self.data_root)]
 
     def source_name(self, job: Job) -> str:
@@ -159,7 +159,7 @@ class SceneData:
         ]
 
     def truth(self, job: Job) -> list[str]:
-        """Return the input with the annotations of a synthetic scene; empty for others."""
+        """Return the input with the annotations of a synthetic scene; empty for other scenes."""
         return [self.path(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:

@@ -12,7 +12,7 @@ from hilsplat.workflow.plan import Plan, some
 
 
 def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
-    """Return the score files of a table, or files next to them; sweeps use the scenes configured for them."""
+    """Return a table's score files, or files next to them; sweeps use the scenes configured for sweeps."""
     kind = TABLES[table]
     rows = [row for row in labelled(plan) if data_of(row) in kind.data]
     if kind.is_sweep and plan.run.sweep_scenes:
@@ -26,7 +26,7 @@ def scores(plan: Plan, table: str, name: str = "scores.csv") -> list[str]:
 
 
 def absent_options(plan: Plan, table: str) -> str:
-    """Return the options that list the scenes of a table's data sets that were not measured."""
+    """Return the options that list the unmeasured scenes of a table's data sets."""
     by_dataset: dict[str, list[tuple[str, str]]] = {}
     for row in plan.rows:
         reason = plan.data.absence(row)
@@ -57,7 +57,7 @@ def annotated(plan: Plan) -> list[SceneRow]:
 
 
 def data_of(row: SceneRow) -> str:
-    """Return a scene's data as named in tables: its kind of synthetic scene, or its published data set."""
+    """Return the name of a scene's data in tables: its kind of synthetic scene, or its published data set."""
     if row.world:
         return row.world[0]
     place = published(row.source)
@@ -65,7 +65,7 @@ def data_of(row: SceneRow) -> str:
 
 
 def tables(plan: Plan) -> list[str]:
-    """Return every table with variants to compare; each has the paper's rows besides measured rows."""
+    """Return every table with variants to compare; each contains the paper's rows and measured rows."""
     return [
         f"{plan.run.results}/tables/{name}.csv"
         for name, kind in TABLES.items()

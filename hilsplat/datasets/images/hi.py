@@ -35,7 +35,7 @@ OUTSIDE_SHARE = 0.01
 
 
 def open_hi(dataset: str, root: Path, scene: str) -> LabelledScene:
-    """Read the labels of a scene of `dataset`: one region per object; several objects may have the same text."""
+    """Read the labels of a scene of `dataset`: one region per object; objects may have the same text."""
     HI_DATASETS[dataset].require(root, scene)
     source = root.parent / IMAGES_OF[dataset] / scene
     images = images_by_view(source / "images")

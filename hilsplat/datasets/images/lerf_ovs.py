@@ -2,7 +2,7 @@
 
 Labels are polygons. Objects of one category in one image form one region with several boxes, and a view is
 queried only for the categories labelled in it. Labels are in `label/<scene>`, beside the scenes. Images are
-matched by name, never by position: LangSplat's own evaluation uses the index of the rendered view, which shifts
+matched by name, never by position: LangSplat's own evaluation uses the index of the rendering, which shifts
 if an earlier image was not registered. A missing part, a labelled frame without an image, or an unusable
 label file raises SceneError.
 """

@@ -1,4 +1,4 @@
-"""Replica: rendered sequences in three layouts, the labelled quad mesh, and labels per vertex as text.
+"""Replica: rendered sequences in three layouts, the labelled quad mesh, and text files of vertex labels.
 
 All readers raise SceneError if a file is missing, damaged, or doesn't match the others.
 
@@ -58,7 +58,7 @@ def layout_of(folder: Path) -> tuple[str, str, str]:
 
 
 def read_lens(path: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
-    """Return K and its image size from `cam_params.json`, which is beside a NICE-SLAM sequence."""
+    """Return K and the image size from `cam_params.json`, which is beside a NICE-SLAM sequence."""
     camera = read_json_object(path, ("camera",))["camera"]
     try:
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
@@ -100,7 +100,7 @@ def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     own = pose_file == LAYOUTS[0][0] and lens.is_file()
     if own:
         K, size_hw = read_lens(lens)
-    else:  # the centre stated by the renderings, 599.5 of 1200 px, is relative to the first pixel's centre
+    else:  # the renderings' stated centre, 599.5 of 1200 px, is relative to the first pixel's centre
         size_hw = height, width = image_size_hw(frames[0][1])
         K = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
     images = []
@@ -155,7 +155,7 @@ def class_of_objects(path: Path) -> Int32[np.ndarray, " O"]:
 def object_of_vertices(
     faces: Int[np.ndarray, "F c"], object_of_face: Int[np.ndarray, " F"], num_vertices: int
 ) -> Int32[np.ndarray, " P"]:
-    """Return the most frequent object of each vertex's faces, -1 without faces; the lowest id wins ties."""
+    """Return the most frequent object of each vertex's faces, -1 if it has none; the lowest id wins ties."""
     corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
     pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
     # The last entry of each vertex has the most votes and, among ties, the smallest id.
@@ -168,7 +168,7 @@ def object_of_vertices(
 
 
 def triangles_of(quads: Int32[np.ndarray, "F 4"]) -> Int32[np.ndarray, "T 3"]:
-    """Split each quad into triangles, corners 0 1 2 and 0 2 3; degenerate ones are dropped."""
+    """Split each quad into triangles (corners 0 1 2 and 0 2 3), and drop degenerate triangles."""
     triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     return triangles[(triangles != triangles[:, [1, 2, 0]]).all(axis=1)]
 
@@ -196,7 +196,7 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
 
 
 def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]:
-    """Read `semantic_labels_<scene>.txt`: a known class id for each vertex; negative ones become 0."""
+    """Read `semantic_labels_<scene>.txt`: one known class id per vertex; negative ids become 0."""
     require_file(path)
     try:
         labels = np.array(path.read_text(encoding="utf-8").split(), dtype=np.int32)
@@ -249,7 +249,7 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
 
 
 def open_scene(root: Path, scene: str) -> PointScene:
-    """Read a scene, such as "room_0": its frames, and the release's labels or else OpenNeRF's."""
+    """Read a scene, such as "room_0": its frames, and the release's labels or, if missing, OpenNeRF's."""
     habitat, short = root / scene / "habitat", scene.replace("_", "")
     text = root / f"semantic_labels_{short}.txt"
     if habitat.is_dir():

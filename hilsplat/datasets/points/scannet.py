@@ -1,6 +1,6 @@
 """ScanNet v2 and ScanNet200: exported frames, the evaluated mesh, NYU40 and ScanNet200 labels, instances.
 
-The layout is that of the ScanNet release, with the frames exported from `.sens` by its own reader:
+The layout is that of the ScanNet release, with the frames exported from `.sens` by ScanNet's reader:
 `color/<n>.jpg`, `pose/<n>.txt` (camera-to-world, OpenCV axes), `intrinsic/intrinsic_color.txt`. All readers
 raise SceneError if a file is missing, damaged, or doesn't match the others.
 """
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 SAME_PLACE_M = 1e-4
-"""Tolerance between vertices of the labelled and the unlabelled mesh, because some copies are rounded."""
+"""Tolerance between corresponding vertices of the labelled and unlabelled mesh; some copies are rounded."""
 
 
 def scan_folder(root: Path, scan: str) -> Path:
@@ -86,7 +86,7 @@ def read_scan_info(path: Path) -> dict[str, str]:
 
 
 def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix that aligns a scan's walls with the axes; test scans have none."""
+    """Return the matrix that aligns a scan's walls with the axes; test scans have no such matrix."""
     words = read_scan_info(folder / f"{scan}.txt").get("axisAlignment", "").split()
     try:
         return np.array([float(word) for word in words]).reshape(4, 4)
@@ -179,7 +179,7 @@ def read_truth(
 def _from_aggregation(
     folder: Path, scan: str, table: dict[str, int], num_points: int
 ) -> tuple[Int32[np.ndarray, " P"], Int32[np.ndarray, " P"], Counter]:
-    """Return ScanNet200 id and instance of each vertex, and raw categories missing from the table."""
+    """Return each vertex's ScanNet200 id and instance, and the raw categories missing from the table."""
     segments_path = folder / f"{scan}_vh_clean_2.0.010000.segs.json"
     segments = np.asarray(read_json_object(segments_path, ("segIndices",))["segIndices"])
     if segments.shape != (num_points,) or segments.dtype.kind != "i":
@@ -281,5 +281,5 @@ DATASET = Dataset(
 )
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
-"""The same scans and files with other labels. The paper does not state which scans it scored with 200
-classes: the ten, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""
+"""The same scans and files with other labels. Which scans the paper scored with 200 classes is not stated:
+these ten or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

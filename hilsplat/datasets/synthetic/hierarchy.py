@@ -32,7 +32,7 @@ class AnnotatedNode:
         id: row in the list of nodes.
         level: 1 whole, 2 part, 3 subpart.
         parent: id of the node one level up, -1 for a whole.
-        text: its query. The masks of nodes with the same text are merged.
+        text: query for the node. The masks of nodes with the same text are merged.
         synonyms: alternative texts.
     """
 
@@ -50,7 +50,7 @@ class HierarchyAnnotations:
     Attributes:
         folder: folder with the label images.
         nodes: all nodes, by id.
-        views: ids of the annotated nodes per view name (large enough to be scored there).
+        views: view name -> ids of the nodes annotated there (those large enough to be scored).
     """
 
     folder: Path

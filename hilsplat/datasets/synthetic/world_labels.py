@@ -25,7 +25,7 @@ REPLICA_WORDS = {
     "tv stand": "tv-stand",
     "mug": "cup",
 }
-"""World class -> its name in the data set, if different. Classes that the data set lacks are undefined."""
+"""World class -> its name in the data set, if different. Classes missing from the data set are undefined."""
 
 WAYMO_CLASSES: dict[str, str] = {
     "car": "car",
@@ -48,7 +48,7 @@ WAYMO_CLASSES: dict[str, str] = {
     "traffic sign pole": "pole",
     "traffic light pole": "pole",
 }
-"""Text of a whole or part of a street -> Waymo class name; a part's class overrides that of its whole. Fences
+"""Text of a whole or part in a street -> Waymo class name; a part's class overrides that of its whole. Fences
 are undefined: Waymo has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
@@ -64,7 +64,7 @@ def scannet_ids(text: str) -> tuple[int, int]:
 
 
 def replica_id(text: str) -> int:
-    """Return Replica's class id of a world class, 0 for none."""
+    """Return Replica's class id for a world class, or 0 if there is none."""
     name = REPLICA_WORDS.get(text, text)
     return {query: number for number, query in REPLICA_NAMES.items()}.get(name, 0)
 

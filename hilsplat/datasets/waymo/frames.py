@@ -25,7 +25,7 @@ INSTANCE, CLASS = 0, 1
 CV_FROM_WAYMO = np.array(
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-"""Camera axes: OpenCV's x is Waymo's -y, y is -z, z is x."""
+"""Change of camera axes: OpenCV's x, y and z are Waymo's -y, -z and x."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class LidarReturn:
     Attributes:
         image: range (metres; zero or negative without a return), intensity, elongation, no-label zone.
         labels: instance and class; None if the frame is not labelled.
-        projection: first camera, x, y, second camera, x, y; camera 0 means none. None if not stored.
+        projection: first camera, x, y, second camera, x, y; camera 0 means no camera. None if not stored.
     """
 
     image: Float32[np.ndarray, "H W 4"]
@@ -68,7 +68,7 @@ class WaymoCamera:
     Attributes:
         intrinsic: f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3; px with the first pixel's left edge at 0, as in
             this project.
-        vehicle_from_cam: pose on the vehicle, Waymo's camera axes.
+        vehicle_from_cam: pose on the vehicle, in Waymo's camera axes.
     """
 
     name: str
@@ -95,7 +95,7 @@ class WaymoCamera:
 
 @dataclass(frozen=True, eq=False)
 class CameraShot:
-    """One image (JPEG bytes), with its frame's time stamp and the vehicle's pose when the image was taken."""
+    """One image (JPEG bytes), with its frame's timestamp and the vehicle's pose when the image was taken."""
 
     timestamp_micros: int
     camera: WaymoCamera
@@ -129,7 +129,7 @@ def column_azimuths(width: int, vehicle_from_lidar: Float[np.ndarray, "4 4"]) ->
 
 
 def rotation_of(angles: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Return Rz(yaw) Ry(pitch) Rx(roll) of (roll, pitch, yaw), radians."""
+    """Return Rz(yaw) Ry(pitch) Rx(roll) for angles (roll, pitch, yaw), radians."""
     roll, pitch, yaw = (angles[..., column] for column in range(3))
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
     rows = [
@@ -202,7 +202,7 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
 
 
 def joined_points(parts: Sequence[LabelledPoints]) -> LabelledPoints:
-    """Concatenate the points of frames or returns, at least one; visibility is kept if every part has it."""
+    """Concatenate the points of one or more frames or returns; keep visibility if every part has it."""
     seen = [part.visible for part in parts if part.visible is not None]
     return LabelledPoints(
         np.concatenate([part.xyz for part in parts]),

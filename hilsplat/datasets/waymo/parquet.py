@@ -131,7 +131,7 @@ def lidar_frames(split: Path, segment: str) -> Iterator[LidarFrame]:
 def _range_images(
     split: Path, segment: str, time: int, tag: str, component: str, depth: int, returns: int = 2
 ) -> list[np.ndarray | None]:
-    """Return the images (H x W x depth) of the top lidar's returns at a time stamp; None for null values."""
+    """Return the images (H x W x depth) of the top lidar's returns at a timestamp; None for null values."""
     names = [f"[{component}].range_image_return{number}" for number in range(1, returns + 1)]
     columns = [f"{name}.{part}" for name in names for part in ("values", "shape")]
     rows = read_component(split, tag, segment, columns, {FRAME: time, LASER: TOP})
@@ -178,7 +178,7 @@ def _cameras(split: Path, segment: str) -> dict[int, WaymoCamera]:
 
 
 def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraShot]:
-    """Yield the images of every n-th frame, by time, then camera."""
+    """Yield the images of every n-th frame, sorted by time, then camera."""
     known = _cameras(split, segment)
     pose = "[CameraImageComponent].pose.transform"
     rows = read_component(split, "camera_image", segment, [FRAME, CAMERA])

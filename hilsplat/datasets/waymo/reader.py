@@ -1,8 +1,8 @@
 """Waymo perception: labelled points of the top lidar and the images of the five cameras of a segment.
 
 Reads release 2.0.1 (parquet) or 1.4.3 (TFRecord), which contain the same data. Coordinates are relative to
-the vehicle at the segment's first frame, because positions in the files are too large for float32
-(kilometres).
+the vehicle at the segment's first frame, because positions in the files (kilometres) are too large
+for float32.
 """
 
 import logging

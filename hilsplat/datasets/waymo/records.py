@@ -177,7 +177,7 @@ def _named(messages: Iterable[Any], name: int) -> Any:
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:
-    """Yield the images of every n-th frame, by frame, then camera."""
+    """Yield the images of every n-th frame, sorted by frame, then camera."""
     for number, (where, frame) in enumerate(frames(path)):
         if number % every:
             continue

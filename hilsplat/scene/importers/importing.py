@@ -53,7 +53,7 @@ def import_poses(
 
     Raises:
         SceneError: the model or transforms file cannot be used.
-        RegistrationError: too few of its views have an image.
+        RegistrationError: too few of the source's views have an image.
     """
     described, points, errors = read_source(known)
     present = [view for view in described if view.image is not None]
@@ -136,7 +136,7 @@ def import_poses(
 
 
 def _with_pixels(view: KnownView, file: Path, view_name: str, folder: Path, max_side_px: int) -> PosedView:
-    """Read an image in the orientation of its camera, write the work image, and adapt the lens to it."""
+    """Read an image in the orientation of its camera, write the work image, and adapt the camera to it."""
     folder.mkdir(parents=True, exist_ok=True)
     pixels = _read_as_described(file, view.camera)
     camera = pycolmap.Camera(view.camera.todict())
@@ -208,15 +208,15 @@ def triangulate(
 def random_points(
     views: Sequence[PosedView], seed: int
 ) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
-    """Sample random grey points in front of the cameras, to start a fit if triangulation yields too few.
+    """Sample random grey points in front of the cameras, to start a fit if too few can be triangulated.
 
-    Each is on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the distance
-    from the camera to the point nearest to all optical axes.
+    Each point is on the ray of a random pixel of a random view, at a depth between 0.3 and 2 times the
+    distance from the camera to the point nearest to all optical axes.
     """
     generator = np.random.default_rng(seed)
     centres = np.stack([view.centre for view in views])
     looks = np.stack([view.cam_from_source[2, :3] for view in views])
-    # Least squares for the point nearest to all axes, with a weak prior at one camera spread ahead.
+    # Least-squares point nearest to all axes, with a weak prior one camera spread ahead of the cameras.
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()) or 1.0
     across = np.eye(3)[None] - looks[:, :, None] * looks[:, None, :]
     prior = 1e-3

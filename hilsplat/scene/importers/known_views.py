@@ -41,7 +41,7 @@ MAX_VIEWS = 300
 scene needs (nerfstudio: 300 for Record3D, 600 for Polycam)."""
 
 POLYCAM_BORDER_PX = 15
-"""Width of the black borders of corrected images, from undistortion (nerfstudio: `crop_border_pixels`)."""
+"""Width of black borders left by undistortion in corrected images (nerfstudio: `crop_border_pixels`)."""
 
 Z_UP_FROM_Y_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """ARKit's world has y up; scenes here have z up. This is a cyclic permutation, so nothing is mirrored."""
@@ -52,8 +52,8 @@ class KnownView:
     """A posed view as described by its source, before its image is read.
 
     Attributes:
-        image: its file, or None if missing.
-        camera: its lens, for the image size stated by the source.
+        image: image file, or None if missing.
+        camera: lens for the image size stated by the source.
         cam_from_source: world-to-camera transform, OpenCV axes.
         border_px: width of a blank border to crop, px of the camera.
     """
@@ -77,7 +77,7 @@ def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Erro
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Return the views; refuse an invalid lens or pose, and three or more views with the same pose."""
+    """Return the views; refuse invalid lenses and poses, and three or more views that all have one pose."""
     for view in views:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
         focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
@@ -124,7 +124,7 @@ def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points, Errors]:
             for name, of_view in reprojection_errors(model).items()
         }
         points = sparse_points(model)
-    except (ValueError, RuntimeError, IndexError) as error:  # also for references to missing entries
+    except (ValueError, RuntimeError, IndexError) as error:  # also raised for references to missing entries
         raise SceneError(f"the COLMAP model in {folder} cannot be read: {error}", fix=AGAIN) from error
     return checked(views, known), points, errors
 
@@ -153,7 +153,7 @@ def _check_inside(root: Path, name: str) -> None:
 
 
 def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
-    """Read transforms files: camera-to-world in OpenGL axes, with common intrinsics or intrinsics per frame.
+    """Read transforms files: camera-to-world matrices in OpenGL axes, and intrinsics per file or frame.
 
     Returns the views and, if a file contains `ply_file_path`, its points.
     """
@@ -173,7 +173,7 @@ def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
 
 
 def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, Any]) -> KnownView:
-    """Read one frame of a transforms file; its own keys override those of the file."""
+    """Read one frame of a transforms file; the frame's keys override those of the file."""
     where = f"{file}, frame {number}"
     try:
         name = str(frame["file_path"]).removeprefix("./")
@@ -195,7 +195,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
     try:
         width, height = frame.get("w"), frame.get("h")
         if width is None or height is None:
-            width = height = 2  # not used: a view without an image is skipped
+            width = height = 2  # not used, because a view without an image is skipped
             if image is not None:
                 with open_image(image) as opened:
                     width, height = opened.size
