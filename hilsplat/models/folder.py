@@ -161,7 +161,7 @@ def variants_of(folder: Path, layout: str) -> list[str]:
 def _preprocessing_of(path: Path) -> dict[str, Any]:
     """Read the image preprocessing; keys of open_clip are converted.
 
-    A ModelError is raised if the file cannot be read, disables a step, or has an invalid mean or std.
+    A ModelError is raised if the file is unreadable, disables a step, or has an invalid mean or deviation.
     """
     try:
         found = {key: value for key, value in read_json(path).items() if value is not None}

@@ -22,7 +22,7 @@ def coverage_parents(
     """Return the parent of every mask of one view (paper, Sec. III-B).
 
     Mask `a` is a child of mask `b` if more than `theta` of `a` is inside `b` and less than `theta` of `b` is
-    inside `a`. The parent is the smallest such `b`, and on a tie the lower row.
+    inside `a`. The parent is the smallest such `b`, or on a tie the one with the lower row.
 
     Departs: the paper doesn't specify which levels a parent may come from. Here a parent's level is
     coarser than its child's; the parent of a subpart may be a whole.

@@ -36,7 +36,7 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 @compiled
 @no_type_check
 def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
-    """Compute y[r, c] = sum over k of a[r, k] x[k, c]; add it to y unless `begin`.
+    """Compute sum over k of a[r, k] x[k, c]; set y[r, c] to it if `begin`, otherwise add it to y[r, c].
 
     Each flat array comes with the index of its first element and a row stride. `columns`: multiple of 16.
     """
@@ -228,7 +228,7 @@ def pixels_first(e, e_t, rows, padded, pixels):
 @compiled
 @no_type_check
 def read_image(sizes, rows, keys, values, top, sums):
-    """Compute the first attention of tokens to pixels, whose keys and values depend on the image only.
+    """Compute the first token-to-pixel attention, whose keys and values depend on the image only.
 
     Args:
         sizes: prompts, blocks, H, T, D, P, depth.
@@ -259,7 +259,7 @@ def read_image(sizes, rows, keys, values, top, sums):
 @compiled
 @no_type_check
 def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
-    """Compute the shares of the tokens in each pixel at the first layer (H, T - 1, P)."""
+    """Compute each token's share in each pixel at the first layer (H, T - 1, P)."""
     _, _, heads, tokens, dim, pixels, _ = sizes
     base = b * heads * dim * pixels
     by_head(s, 0, rows, i * heads * tokens * dim, queries, base, heads, tokens, dim, pixels)
@@ -269,7 +269,7 @@ def first_factors(sizes, b, i, rows, queries, s, e, none, ones):
 @compiled
 @no_type_check
 def second_factors(sizes, b, i, rows, low, offset, scaled_q, fixed_q, s1, q, s, e):
-    """Compute the shares at the second layer into the rows of `e` after those of the first layer."""
+    """Write the shares at the second layer to the rows of `e` after those of the first layer."""
     _, _, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
     base = b * heads * dim * pixels
@@ -312,7 +312,7 @@ def read_by_factors(sizes, b, i, image, prompt, u, v, factors, padded, e, e_t, k
 @compiled
 @no_type_check
 def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out, e_out):
-    """Compute the first attention of pixels to tokens, its layer norm, and the second attention of tokens.
+    """Compute the first pixel-to-token attention, its layer norm, and the second token-to-pixel attention.
 
     Args:
         sizes: as in `read_image`.
@@ -320,7 +320,7 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
         image, prompt: `FirstLayer`, `FirstPrompts`.
         top, sums: as in `pixel_weights`; sums (prompts, H * T, depth + padded + 16); overwritten.
         s1_out: layer norm scale of each pixel (prompts, blocks, P).
-        e_out: factors times that scale (prompts, blocks, padded, P).
+        e_out: factors times the scale in `s1_out` (prompts, blocks, padded, P).
     """
     number, blocks, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)
@@ -363,13 +363,13 @@ def update_and_read_first(sizes, channels, eps, image, prompt, top, sums, s1_out
 @compiled
 @no_type_check
 def update_and_read_second(sizes, channels, eps, image, prompt, s1_in, e_in, top, sums, s2_out, e_out):
-    """Compute the second attention of pixels to tokens, its layer norm, and the final attention of tokens.
+    """Compute the second pixel-to-token attention, its layer norm, and the final token-to-pixel attention.
 
     Args:
         image, prompt: `SecondLayer`, `SecondPrompts`.
         s1_in, e_in: outputs of `update_and_read_first`.
-        s2_out: scale of each pixel by this layer norm (prompts, blocks, P).
-        e_out: factors of both layers times this scale (prompts, blocks, padded, P).
+        s2_out: layer norm scale of each pixel (prompts, blocks, P).
+        e_out: factors of both layers times the scale in `s2_out` (prompts, blocks, padded, P).
     """
     number, blocks, heads, tokens, dim, pixels, _ = sizes
     all_rows, factors = heads * tokens, heads * (tokens - 1)

@@ -69,7 +69,7 @@ def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> Hierarchi
 def require_same_masks(folder: Path, other: Path) -> list[str]:
     """Return the views of `other` in order if both artifacts were computed from the same masks.
 
-    One of them may be the masks artifact.
+    Either artifact may be the masks artifact itself.
 
     Raises:
         MisalignedArtifactError: if the digests of a view differ, or only one artifact contains the view.

@@ -7,12 +7,12 @@ in a few tokens. Before its layer norm, the image side after layer 1 is
                          F: softmax weights of H heads x T tokens in each pixel, H (T - 1) rows
                          B: values of the tokens after the output projection, H (T - 1) x channels
 
-The weights of a head sum to 1, so its last token contributes the constant b and the others contribute their
-difference from it. The layer norm is then one scale per pixel, computed from |X|^2, from products of X that
-all prompts share, and from B's Gram matrix. Every later projection of the image side is the sum of a
-projection of X, computed once per image, and one of few factors: 2 H (T - 1) after layer 2. Masks are the
-first per-prompt arrays as large as the image side. Results differ from the network's only by rounding;
-`SamModel` checks this on a few prompts before it uses this class.
+The weights of a head sum to 1, so the last token contributes the constant b, and each other token its
+difference from the last. The layer norm is then one scale per pixel, computed from |X|^2, from products of X
+that all prompts share, and from B's Gram matrix. Every later projection of the image side is the sum of a
+projection of X, computed once per image, and a projection of few factors: 2 H (T - 1) after layer 2. Masks
+are the first per-prompt arrays as large as the image side. Results differ from the network's only by
+rounding; `SamModel` checks this on a few prompts before it uses this class.
 
 The two attentions of a layer, its layer norm and the next attention process one block of pixels at a time
 for several prompts (`decoder_kernels`). Operations on tokens alone are plain numpy here.
@@ -35,34 +35,34 @@ from hilsplat.segment.decoder_weights import DecoderGraph, Linear
 
 LOG2_E = np.float32(1 / np.log(2))  # converts scores to base 2
 BLOCK = 64
-"""Maximum pixels per block. Its arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
+"""Maximum pixels per block. A block's arrays fit into a core's L2 cache; 128 and 256 are 2 % slower."""
 PROMPTS = 16
-"""Prompts per call, applied to each block one after the other while it is in the cache."""
+"""Prompts per call, applied to each block one after the other while the block is in the cache."""
 HEADS_PER_ATTENTION = 8  # if the model's configuration doesn't specify them
 
 
 class FirstLayer(NamedTuple):
     """Image arrays that the kernels read at the first layer, block by block."""
 
-    queries: np.ndarray  # of the attention of pixels to tokens
+    queries: np.ndarray  # queries of the pixel-to-token attention
     before: np.ndarray  # products of the pixels' features with the output projection of the values
     square: np.ndarray  # squared length of each pixel's features
     cross: np.ndarray  # products of the pixels' features with the bias that is added to them
-    scaled_keys: np.ndarray  # keys of the attention of tokens to pixels; the layer norm scales this part
+    scaled_keys: np.ndarray  # keys of the token-to-pixel attention: the part scaled by the layer norm
     fixed_keys: np.ndarray
-    values: np.ndarray  # of that attention, before the layer norm's scale
+    values: np.ndarray  # values of the token-to-pixel attention, before the layer norm's scale
 
 
 class FirstPrompts(NamedTuple):
     """Prompt arrays that the kernels read at the first layer."""
 
-    update_keys: np.ndarray  # keys of the attention of pixels to tokens
-    twice_changes: np.ndarray  # twice the difference between the values of its tokens and the last token's
+    update_keys: np.ndarray  # keys of the pixel-to-token attention
+    twice_changes: np.ndarray  # twice the difference between each token's values and the last token's
     gram: np.ndarray  # products of these differences after the output projection (`doubled_below`)
     last: np.ndarray  # values of the last token
     square: np.ndarray  # squared length of the constant that the last token and the bias add to every pixel
     linear: np.ndarray  # twice the products of that constant with the differences
-    queries: np.ndarray  # of the attention of tokens to pixels
+    queries: np.ndarray  # queries of the token-to-pixel attention
     low: np.ndarray  # products of `queries` with the keys of the factors
     offset: np.ndarray  # products of `queries` with the keys of that constant
 
@@ -114,7 +114,7 @@ class ImageTerms:
     """Arrays that the decoder computes once per image."""
 
     grid_hw: tuple[int, int]  # size of the image side
-    keys: np.ndarray  # keys and values of the first attention of tokens to pixels (`kernels.read_image`)
+    keys: np.ndarray  # keys and values of the first token-to-pixel attention (`kernels.read_image`)
     values: np.ndarray
     first: FirstLayer
     second: SecondLayer
@@ -278,7 +278,7 @@ class FactoredDecoder:
         """Return predicted IoUs, logits and the arrays that `logits` needs, for one point per prompt.
 
         Points are inside the object, in px of the network's input. With `fine`, all 4 x 4 logits of each
-        pixel of the image side are computed, otherwise only the first.
+        pixel of the image side are computed, otherwise only the first logit.
         """
         pe = _run(self._tokens, self._blank, points_xy)[0]
         pe = pe.reshape(len(points_xy), *pe.shape[-2:])
@@ -415,7 +415,7 @@ class FactoredDecoder:
         return norm(q + found if layer else found)
 
     def _think(self, layer: int, q: np.ndarray) -> np.ndarray:
-        """Apply a layer's norms after its attention to the image, and the perceptron between them."""
+        """Apply a layer's two norms after the attention to the image, and the perceptron between them."""
         _, norm, last_norm = self._norms[layer]
         q = norm(q)
         return last_norm(q + _layers(self._mlps[layer], q))
@@ -437,7 +437,7 @@ class FactoredDecoder:
 
 
 class PixelSums:
-    """Running sums of an attention of tokens to pixels with factors (`decoder_kernels.pixel_weights`)."""
+    """Running sums of a token-to-pixel attention with factors (`decoder_kernels.pixel_weights`)."""
 
     def __init__(self, sizes: tuple[int, ...], factors: int) -> None:
         rows = sizes[0] * sizes[2] * sizes[3]

@@ -1,9 +1,9 @@
 """Automatic mask generation: from a grid of prompts to masks at three levels.
 
 `decode_candidates` runs the networks and depends on few settings; its result is cached.
-`masks_from_candidates` filters, upscales and suppresses; changing its settings costs no network call. The
-steps are SAM's automatic generator, run separately for the three heads as in LangSplat, then LangSplat's mask
-suppression. With `generator: official`, each step is as published (docs/segment.md lists the differences).
+`masks_from_candidates` filters, upscales and suppresses them; changing its settings needs no network call.
+The steps are those of SAM's automatic generator, run separately for the three heads as in LangSplat, and of
+LangSplat's suppression. With `generator: official`, each is as published (differences: docs/segment.md).
 """
 
 import math
@@ -57,10 +57,10 @@ CROP_EDGE_PX = 20
 class Candidates:
     """K decoded masks, before any user-defined threshold is applied.
 
-    A mask's logits are kept in a window around it, in steps of `sam.LOGIT_STEP` (unrounded for the official
+    A mask's logits are stored in a window around it, in steps of `sam.LOGIT_STEP` (unrounded for the official
     generator). Logits with no edge within `BAND_PX` are set to +-127, so that windows compress well. This
     changes no pixel of a mask: the two bilinear resizings up to the view read logits at most three pixels
-    apart. Outside the window logits are -127.
+    apart. Outside the window, logits are -127.
     """
 
     logits: Int8[np.ndarray, " R"] | Float32[np.ndarray, " R"]  # concatenated windows, each row by row
@@ -85,7 +85,7 @@ class Candidates:
 def crop_boxes(
     size_hw: tuple[int, int], layers: int
 ) -> tuple[Int32[np.ndarray, "C 4"], UInt8[np.ndarray, " C"]]:
-    """Return the boxes (xyxy, px) of the whole image and of each layer's overlapping crops, and their layers.
+    """Return the boxes (xyxy, px) of the image and of each layer's overlapping crops, and each box's layer.
 
     Layer i has 2**i crops per side; crops of one layer overlap by 512/1500 of the shorter side,
     divided by 2**(i - 1).
@@ -152,7 +152,7 @@ def decode_candidates(
 ) -> Candidates:
     """Decode masks at grid points of the image and its crops, skipping repeats (`distinct_prompts`).
 
-    `points` (x, y, px; at least one) replace the grid of the whole image; crops keep the grid.
+    `points` (x, y, px; at least one) replace the grid of the whole image; crops keep their grids.
     """
     boxes, _ = crop_boxes((image.shape[0], image.shape[1]), settings.crop_layers)
     grid = point_grid(settings.points_per_side)
@@ -274,7 +274,7 @@ def masks_from_candidates(
     thresholds = model.thresholds(settings)
     official = settings.generator == "official"
     boxes, layer_of = crop_boxes(size_hw, settings.crop_layers)
-    # smaller crops show more detail (SAM): `official` prefers smaller crops, ours those of deeper layers
+    # smaller crops show more detail (SAM): `official` prefers smaller crops, ours crops of deeper layers
     preferred = 1 / np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) if official else layer_of
     enough = (candidates.predicted_iou > thresholds.predicted_iou_min) | (thresholds.predicted_iou_min == 0)
     enough &= candidates.stability >= thresholds.stability_min
@@ -305,7 +305,7 @@ def masks_from_candidates(
 def _suppressed(
     masks: HierarchicalMasks, first: Float64[np.ndarray, " M"] | None, settings: MasksSettings
 ) -> HierarchicalMasks:
-    """Drop masks whose box repeats that of a better mask, by `first`, then by predicted IoU."""
+    """Drop masks whose box repeats that of a better mask, ranked by `first`, then by predicted IoU."""
     suppress = suppress_boxes_officially if settings.generator == "official" else suppress_boxes
     return masks.take(suppress(masks.box_xyxy, masks.predicted_iou, settings.box_nms_iou, first))
 
@@ -321,7 +321,7 @@ def _upscale(
 ) -> HierarchicalMasks:
     """Upscale candidates to masks of the view.
 
-    Empty masks are dropped, and so are truncated ones, which touch an edge of their crop that is not an edge
+    Empty masks are dropped, and so are truncated masks, which touch an edge of their crop that is not an edge
     of the image.
     """
     low_h, low_w = candidates.low_hw.tolist()
@@ -351,7 +351,7 @@ def _upscale(
 def clean_masks(
     masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Fill holes and drop islands below `min_area_px` (8-connected), and drop smaller masks.
+    """Fill holes, and drop islands (8-connected) and masks, that are smaller than `min_area_px`.
 
     The largest island of a mask is always kept. With `keep_small`, masks below `min_area_px` are kept and
     count as changed (SAM). Returns the remaining masks, and which of them were changed.

@@ -1,8 +1,8 @@
-"""Masks without a model: OpenCV's graph segmentation, merged into three scales, nested by construction.
+"""Masks without a model: regions of OpenCV's graph segmentation, merged at three nested scales.
 
-It needs no SAM weights and has no notion of objects: its levels are coarse, medium and fine regions of
-uniform colour, and its scores measure the contrast with the surroundings. A region that is the same at two
-scales appears at both levels.
+This segmenter needs no SAM weights and has no notion of objects: its levels are coarse, medium and fine
+regions of uniform colour, and its scores measure the contrast with the surroundings. A region that is the
+same at two scales appears at both levels.
 """
 
 import heapq
@@ -25,7 +25,7 @@ stays separate; for larger regions, the difference is inversely proportional to 
 THIN_PX = 4.0
 """A region narrower than this (at working size) is treated as a seam caused by blur along a strong edge."""
 THIN_HURRY = 0.01
-"""Factor on the cost of merging a seam: seams merge first, into the more similar side."""
+"""Factor applied to the cost of merging a seam: seams merge first, into the more similar side."""
 LIGHTNESS = 0.6
 """Weight of lightness relative to a* and b*: shading changes lightness within an object."""
 CLEAR_EDGE = 40.0
@@ -139,7 +139,7 @@ def merge_regions(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 
 
     The colour difference of a pair is the mean of two differences: between the regions' mean colours, and
     across their border (minus their mean texture, at least 0). The cost is halved if the larger region
-    encloses the smaller one, and nearly zero if it is a seam (`THIN_PX`).
+    encloses the smaller one, and nearly zero if the smaller one is a seam (`THIN_PX`).
     """
     flat = labels.reshape(-1)
     area = np.bincount(flat).astype(np.float64).tolist()

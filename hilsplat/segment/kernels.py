@@ -10,7 +10,7 @@ import numpy as np
 from hilsplat.base.compiled import compiled
 
 BAND_WORDS = 2**17
-"""64-bit words per band of packed masks in `shared_pixels`: 1 MiB stays in a core's cache."""
+"""64-bit words per band of packed masks in `shared_pixels`: 1 MiB, which fits into a core's cache."""
 
 
 @compiled
@@ -24,7 +24,7 @@ def quantise_logits(logits, per_unit, upper, lower, valid_h, valid_w):
         valid_h, valid_w: rows and columns of the image.
 
     Returns:
-        steps int8 (K, h, w) in -127..127; pixels of the image above `upper` and above `lower`;
+        steps int8 (K, h, w) in -127..127; numbers of image pixels above `upper` and above `lower`;
         box (xyxy, end exclusive) of all pixels above 0, empty if there are none.
     """
     number, height, width = logits.shape
@@ -89,7 +89,7 @@ def edge_windows(steps, rows, boxes, reach):
         mask = steps[rows[place]]
         x0, y0, x1, y1 = windows[place]
         high, wide = y1 - y0, x1 - x0
-        # positive pixels among the (2 reach + 1)^2 around each pixel: sums along x, then along y
+        # number of positive pixels in the (2 reach + 1)^2 around each pixel: sums along x, then along y
         along = np.zeros((high, wide), np.int32)
         for y in range(high):
             total = 0
@@ -391,14 +391,14 @@ def _set_bits(words, start, stop):
 def shared_pixels(runs, offsets, boxes, height, width):
     """Count the pixels that each pair of masks shares, int64 (M, M), as set bits of packed masks.
 
-    Masks are packed in bands of a few image rows; for a pair, only words and rows in both boxes are read.
+    Masks are packed in bands of a few image rows; for a pair, only words and rows inside both boxes are read.
     """
     number = len(offsets) - 1
     shared = np.zeros((number, number), np.int64)
     words = (width + 63) // 64
     band = max(1, min(height, BAND_WORDS // max(1, number * words)))
     bits = np.zeros((number, band, words), np.uint64)
-    place, at = offsets[:-1].copy(), np.zeros(number, np.int64)  # current run of each mask, its start
+    place, at = offsets[:-1].copy(), np.zeros(number, np.int64)  # current run of each mask, the run's start
     active = np.empty(number, np.int64)
     for top in range(0, height, band):
         bottom = min(height, top + band)

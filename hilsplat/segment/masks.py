@@ -48,9 +48,9 @@ def take_runs(
 def runs_of_labels(
     labels: Int[np.ndarray, "H W"], chosen: Int[np.ndarray, " M"]
 ) -> tuple[UInt32[np.ndarray, " R"], Int64[np.ndarray, " M_and_1"]]:
-    """Encode the regions of a label map, one mask per chosen label; each must occur in the map.
+    """Encode the regions of a label map, one mask per chosen label; each label must occur in the map.
 
-    The result equals `encode_runs` of `labels == label` for each label, but needs only one pass.
+    The result equals `encode_runs` of `labels == label` for each label, but is computed in one pass.
     """
     flat = labels.reshape(-1)
     borders = np.concatenate(([0], np.flatnonzero(flat[1:] != flat[:-1]) + 1, [flat.size]))
@@ -162,8 +162,8 @@ class HierarchicalMasks:
     def content_order(self) -> Int64[np.ndarray, " M"]:
         """Return the rows sorted by content: level, decreasing area, box, predicted IoU, stability, runs.
 
-        The order does not depend on row numbers, so a segmenter that sorts by it writes the same file for any
-        order of prompts.
+        The order does not depend on row numbers, so a segmenter that sorts its masks this way writes the same
+        file for any order of prompts.
         """
 
         def key(row: int) -> tuple:
@@ -180,7 +180,7 @@ class HierarchicalMasks:
     def label_map(self, level: Level | None) -> Int32[np.ndarray, "H W"]:
         """Return the row of the mask visible at each pixel (-1: none), for one level or all levels (None).
 
-        Large masks are painted first, so small ones stay visible. At equal area, the lower row wins.
+        Large masks are painted first, so small masks stay visible. For the same area, the lower row wins.
         """
         labels = np.full(self.size_hw, NONE, dtype=np.int32)
         rows = np.arange(len(self)) if level is None else self.rows_of(level)
@@ -244,7 +244,7 @@ def region_ious(
 ) -> tuple[Int64[np.ndarray, " R"], Int64[np.ndarray, " R"], Float32[np.ndarray, "R M"]]:
     """Return the ids of a label image's regions, their areas (px) and their IoUs with every mask.
 
-    Ids ascend. Labels are negative where there is no region; masks may overlap.
+    Ids are in ascending order. Labels are negative where there is no region; masks may overlap.
     """
     flat = labels.reshape(-1)
     ids, index = np.unique(flat, return_inverse=True)

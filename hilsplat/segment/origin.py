@@ -6,7 +6,7 @@ from hilsplat.base.artifacts import read_index
 
 
 def masks_label(masks_folder: Path) -> str:
-    """Return the label in the masks' index, or else the name of the model or, without one, the segmenter.
+    """Return the label in the masks' index, else the model's name, else the segmenter's name.
 
     The label of masks made from ground-truth labels lists their simulated faults.
     """

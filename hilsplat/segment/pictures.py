@@ -49,7 +49,7 @@ def paint_level(
 def masks_picture(
     image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, min_side_px: int = 384
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw a view and its three levels side by side, with the number of masks of each."""
+    """Draw a view and its three levels side by side, with the number of masks of each level."""
     factor = max(1, -(-min_side_px // max(image.shape[:2])))
     panels = {"photo": image}
     for level in LEVELS:
@@ -132,7 +132,7 @@ def masks_overview(
 
     Args:
         out_png: file to write; the trees are written beside it as `<name>_tree.png`.
-        view: view name; None selects the middle one of the views that have masks.
+        view: name of the view; None selects the middle view of those that have masks.
         tree_folder: output of the coverage_tree stage; None draws no trees.
 
     Raises:

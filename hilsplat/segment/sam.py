@@ -1,7 +1,7 @@
 """Segment Anything in onnxruntime: three masks per point prompt on an image.
 
-The models are ONNX exports of the transformers library, and images and masks are resized as by its
-SamProcessor. The rounding of logits (`read_logits`) is ours.
+The models are ONNX exports from the transformers library, and images and masks are resized as by the
+library's SamProcessor. The rounding of logits (`read_logits`) is ours.
 """
 
 import logging
@@ -79,12 +79,12 @@ REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, 
 """LangSplat's thresholds for the released SAM models. A ViT-B call takes 60 MB per prompt, and calls of
 more than 8 prompts are no faster per prompt."""
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
-"""Prompts on which the factored decoder is compared with the network, and the largest difference allowed."""
+"""Prompts per comparison of the factored decoder with the network, and the largest difference allowed."""
 OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
 
 
 def resized_size(original_hw: tuple[int, int], longest_edge: int) -> tuple[int, int]:
-    """Return the height and width whose longer side is `longest_edge`, halves rounded up as in SamProcessor.
+    """Return the size with the longer side `longest_edge`, with halves rounded up as in SamProcessor.
 
     Departs: neither side becomes 0 for very thin images.
     """
@@ -135,7 +135,7 @@ class SamModel:
     def choose_precision(
         self, precision: str, images: Sequence[UInt8[np.ndarray, "H W 3"]], cache: Path, threads: int = 1
     ) -> None:
-        """Use int8 if `masks.precision` requires it, or if its masks of these images agree with float32's."""
+        """Use int8 if `masks.precision` requires it, or if int8 and float32 masks of these images agree."""
         if not considers_int8(precision, self.model):
             return
         quantised = self.int8_encoder(cache)
@@ -166,7 +166,7 @@ class SamModel:
         return int8_network(self.model, "vision_encoder", cache, self._graph, exact)
 
     def _rowwise_encoder(self) -> bytes | None:
-        """Rewrite a ViT's global attentions for the CPU; None for other encoders or on a GPU."""
+        """Return a ViT's graph with row-wise global attention; None for other encoders or on a GPU."""
         vision = self.model.config.get("vision_config")
         on_cpu = execution_providers()[0] == "CPUExecutionProvider"
         if self.stretches or not isinstance(vision, dict) or not on_cpu:
@@ -182,7 +182,7 @@ class SamModel:
         return graph
 
     def _factor(self) -> FactoredDecoder | None:
-        """Factor the decoder and check it against the network; None if that fails."""
+        """Return the factored decoder, checked against the network; None if factoring or the check fails."""
         described = self.model.config.get("mask_decoder_config", {})
         heads = described.get("num_attention_heads", HEADS_PER_ATTENTION)
         on_runtime = f"the decoder of {self.model.folder} runs in onnxruntime"
@@ -233,7 +233,7 @@ class SamModel:
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
     def prompts_per_call(self, limit: int, prompts: int) -> int:
-        """Return the prompts per decoder call: fixed by the decoder, or `limit` and at most `prompts`."""
+        """Return the number of prompts per decoder call: the decoder's fixed one, or min(limit, prompts)."""
         if self.factored:
             return PROMPTS
         return self.decoder.fixed_axis("input_points", 1) or min(limit, prompts)
@@ -241,7 +241,7 @@ class SamModel:
     def decode(
         self, encoded: Encoded, points_xy: Float[np.ndarray, "P 2"]
     ) -> tuple[Float32[np.ndarray, "P 3"], Float32[np.ndarray, "P 3 h w"]]:
-        """Return predicted IoUs and low-resolution logits (as `HEADS`) for each point of the image, px."""
+        """Return predicted IoUs and low-resolution logits (ordered as `HEADS`) for each image point, px."""
         points = in_input(points_xy, encoded.frame)
         if self.factored and encoded.terms:
             iou, logits, _ = self.factored.decode(encoded.terms, points, fine=True)
@@ -258,7 +258,7 @@ class SamModel:
 
     @property
     def previews(self) -> bool:
-        """Whether the model can decode at a lower resolution in less time."""
+        """Whether the model can also decode prompts at a lower resolution, in less time."""
         return self.previewer is not None or self.factored is not None
 
     def preview(
@@ -322,8 +322,8 @@ def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndar
 def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
     """Return the largest difference between the factored decoder and the network on random inputs.
 
-    It covers predicted IoUs, and logits divided by the largest one (at least 1). A ModelError is raised if
-    the network doesn't declare the shapes of its inputs.
+    Compared are predicted IoUs, and logits divided by the largest logit (at least 1). A ModelError is raised
+    if the network doesn't declare the shapes of its inputs.
     """
     rng = np.random.default_rng(0)
     features = {}
@@ -419,7 +419,7 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return, for one axis, the first low-resolution pixel read by each pixel, and the weights from there on.
+    """Return, for one axis, the first low-resolution pixel that each pixel reads, and weights from it on.
 
     The weights combine SamProcessor's steps: bilinear from `low` to the padded input, cropping to the resized
     image, bilinear to the original size.

@@ -58,7 +58,7 @@ def run_masks(
         memory_mib: memory that the stage may use; None for all free memory.
         key_views: views to segment; None for every training view.
         prompts: function that returns a view's prompt points for SAM (x, y, px); None for the settings' grid.
-        finished: output of this stage whose views are reused as they are.
+        finished: earlier output of this stage whose views are reused unchanged.
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene) if key_views is None else list(key_views)

@@ -1,4 +1,4 @@
-"""Suppression of masks that repeat a better one: by boxes, then by pixels."""
+"""Suppression of masks that repeat a better mask: by boxes, then by pixels."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -27,7 +27,7 @@ def box_iou(boxes_a: Int[np.ndarray, "A 4"], boxes_b: Int[np.ndarray, "B 4"]) ->
 
 
 def last_inside(boxes_xyxy: Int[np.ndarray, "M 4"]) -> Int[np.ndarray, "M 4"]:
-    """Convert end-exclusive boxes to boxes that end at the last row and column inside, as in SAM."""
+    """Convert boxes with exclusive maxima to boxes with inclusive maxima, as in SAM."""
     return boxes_xyxy - np.array([0, 0, 1, 1], boxes_xyxy.dtype)
 
 
@@ -57,7 +57,7 @@ def suppress_boxes_officially(
 ) -> Int64[np.ndarray, " k"]:
     """Return the rows kept by SAM's suppression as published, the best first.
 
-    Boxes end at the last pixel inside. They are ranked by `first`, or by score if it is None; ties by row.
+    Box maxima are inclusive. Boxes are ranked by `first`, or by score if `first` is None; ties by row.
     """
     order = np.argsort(-(score if first is None else first), kind="stable")
     return order[_greedy(last_inside(boxes_xyxy)[order], iou_max)]
@@ -73,9 +73,9 @@ def distinct_boxes(
     """Return the rows kept by a suppression that is valid for any thresholds, the best first.
 
     The box with the highest score (on a tie, the lower row) is kept and drops every other box whose IoU with
-    it exceeds `iou_max` and whose stability is at most `slack` above its own; this is repeated for the
-    remaining boxes. Except for the slack, a box that passes a threshold is dropped only by a box that also
-    passes it.
+    it exceeds `iou_max` and whose stability is at most `slack` above the kept box's; this is repeated for
+    the remaining boxes. Except for the slack, a box that passes a threshold is dropped only by a box that
+    also passes it.
     """
     order = np.argsort(-score, kind="stable")
     return order[_greedy(boxes_xyxy[order], iou_max, stability[order], slack)]
@@ -89,7 +89,7 @@ def _greedy(
 ) -> Bool[np.ndarray, " M"]:
     """Return which boxes are kept if each kept box drops later ones whose IoU with it exceeds `iou_max`.
 
-    If stabilities are given, it drops only boxes whose stability is at most `slack` above its own.
+    If stabilities are given, only boxes with a stability at most `slack` above the kept box's are dropped.
     """
     alive = np.ones(len(boxes), dtype=bool)
     for start in range(0, len(boxes), BOXES_AT_ONCE):
@@ -120,7 +120,7 @@ def keep_best_masks(
       `1 - (I / a_i) (I / a_j) > 1 - inner`. The left side exceeds 0.5, so `inner = 0.5` drops every
       contained mask regardless of its score (masks then nest between levels only), and
       `inner = 0` drops none (masks also nest within levels).
-    As in LangSplat, dropped rows still drop others, so the result doesn't depend on the order of visits.
+    As in LangSplat, dropped rows still drop others, so the result doesn't depend on the processing order.
     """
     area_px = np.diagonal(overlap_px)
     union_px = area_px[:, None] + area_px[None, :] - overlap_px
