@@ -79,7 +79,7 @@ REAL_SAM = Thresholds(predicted_iou_min=0.7, stability_min=0.85, nms_score=0.7, 
 """LangSplat's thresholds for the released SAM models. A ViT-B call takes 60 MB per prompt, and calls of
 more than 8 prompts are no faster per prompt."""
 CHECKED_PROMPTS, AGREEMENT = 2, 1e-4
-"""Prompts per comparison of the factored decoder with the network, and the largest difference allowed."""
+"""Number of prompts for checking the factored decoder against the network, and the maximum difference."""
 OWN = "mask_generation"  # key of `config.json` under which a model specifies its own `Thresholds`
 
 

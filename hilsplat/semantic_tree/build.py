@@ -1,9 +1,9 @@
-"""The semantic tree stage: links the masks of all views by the Gaussians they share.
+"""The semantic tree stage: links masks of different views by the Gaussians that they share.
 
 Masks of one level in different views are linked by how well they agree on the Gaussians that both views see.
 Clusters of masks become nodes, each Gaussian is assigned to its best node, and small stray pieces are
 removed. A coarser node that contains most of a finer one becomes its parent. None of this needs CLIP: the
-tree only scores each node's crops. The clip stage embeds the best; their average is the node's vector.
+tree only scores each node's crops. The clip stage embeds the best crops, whose average is the node's vector.
 """
 
 import logging
@@ -33,7 +33,7 @@ from hilsplat.semantic_tree.wholes import joined_regions
 from hilsplat.settings import SemanticTreeSettings
 
 APART_DEG = 30.0
-"""Directions at least this far apart do not lower each other's score."""
+"""Crops with directions at least this far apart do not lower each other's score."""
 
 MIN_NEW = 0.1
 """Share of a crop's score that remains if a higher-ranked crop has the same direction."""
@@ -50,9 +50,9 @@ logger = logging.getLogger(__name__)
 def crop_ranks(
     node: Int32[np.ndarray, " M"], score: Float32[np.ndarray, " M"], directions: Float[np.ndarray, "M 3"]
 ) -> Int32[np.ndarray, " M"]:
-    """Rank the masks of each node by score, reduced for directions close to those already ranked.
+    """Rank the masks of each node by score, reduced for directions close to those of higher-ranked masks.
 
-    At equal scores, crops from different sides describe an object better (docs/experiments.md).
+    For the same scores, crops from different sides describe an object better (docs/experiments.md).
 
     Args:
         node: node that each mask shows, -1 for none.
@@ -60,7 +60,7 @@ def crop_ranks(
         directions: unit vectors from nodes to cameras.
 
     Returns:
-        rank of each mask within its node, 0 for the best; -1 without a node or beyond `RANKED`.
+        rank of each mask within its node, 0 for the best; -1 for masks without a node or beyond `RANKED`.
     """
     rank = np.full(len(node), NONE, np.int32)
     order = np.argsort(node, kind="stable")
@@ -85,12 +85,12 @@ def build_tree(
     join_wholes: bool,
     nodes_of: NodesOf | None,
 ) -> SemanticTree:
-    """Link masks into nodes, compute their Gaussians, parents and boxes, and score the crops that show them.
+    """Link masks into nodes, compute the nodes' Gaussians, parents and boxes, and score their crops.
 
     Args:
-        threads: the result does not depend on it.
-        join_wholes: join wholes from nodes that touch in 3D, for segmenters that detect only colour regions.
-        nodes_of: function that finds the nodes of a level; None: nodes are linked masks.
+        threads: number of threads; it does not affect the result.
+        join_wholes: join regions touching in 3D into wholes, for segmenters that detect only colour regions.
+        nodes_of: function that finds the nodes of a level; None to link masks.
     """
     S, mass, means = contributions.matrix("S"), contributions.mass(), contributions.means()
     view = contributions.view
@@ -137,7 +137,7 @@ def build_tree(
     # Nesting may remove the Gaussians that a node's masks show; the node still needs a crop.
     fit = np.where(cluster_of_mask == NONE, 0.0, np.maximum(iou, MIN_IOU))
     score = (np.sqrt(contributions.area_px) * fit).astype(np.float32)
-    if join_wholes:  # a piece's mask has a low IoU with the joined whole, but still shows it
+    if join_wholes:  # a piece's mask has a low IoU with the joined whole, but still shows the whole
         pieces = contributions.rows_of(Level.WHOLE)
         fits[pieces] = cluster_of_mask[pieces]
     linked = cluster_of_mask.astype(np.int32)
@@ -179,7 +179,7 @@ def run_semantic_tree(
     `nodes_of` is as in `build_tree`.
 
     Raises:
-        MisalignedArtifactError: the contributions belong to other masks.
+        MisalignedArtifactError: the contributions were computed from other masks.
         ArtifactError: the masks do not record their segmenter.
     """
     contributions = Contributions.load(contributions_folder)

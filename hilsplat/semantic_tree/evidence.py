@@ -52,9 +52,9 @@ def mask_evidence(
 
     Two masks of one view show different objects, so they are evidence against a link (intersection 0, union:
     both full sizes). Masks that share Gaussians are no evidence if each view sees less than `min_covisible`
-    of the other mask. If they share none, each mask counts if the other view sees at least that share of it.
+    of the other mask. If they share none, a mask counts if the other view sees at least that share of it.
 
-    Shares have one row per mask of a level, and are zero if the Gaussian is not visible in the mask's view.
+    `shares` has one row per mask of a level, and zeros for Gaussians not visible in the mask's view.
     The result does not depend on the number of threads.
     """
     num, share = len(view), shares.data.astype(np.float64)
@@ -78,7 +78,7 @@ def mask_evidence(
 
 @compiled
 def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
-    """Add up the size of each mask on the Gaussians that each view sees, into `out`."""
+    """Write to `out` the size of each mask on the Gaussians that each view sees."""
     for a in range(begin, end):
         for k in range(indptr[a], indptr[a + 1]):
             g = indices[k]

@@ -36,7 +36,7 @@ def readable_nodes(tree: SemanticTree) -> list[dict]:
 def write_tree_ply(gaussians_ply: Path, tree: SemanticTree, out: Path) -> None:
     """Copy a 3DGS PLY and add three properties per Gaussian: `node_whole`, `node_part`, `node_subpart`.
 
-    Gaussian viewers ignore them; tools that display scalar fields can use them as colours. -1 means no node.
+    Gaussian viewers ignore these; tools that display scalar fields can use them as colours. -1 means no node.
 
     Raises:
         MisalignedArtifactError: the tree was computed from another PLY.
@@ -57,7 +57,7 @@ def write_selection_ply(
 
     Args:
         labels: label of each Gaussian, from 1; written as the property `label`.
-        names: name of each label; the header gets a comment for each, such as `label 1: mug`.
+        names: name of each label; the header gets one comment per label, such as `label 1: mug`.
     """
     # PLY headers are ASCII, and a comment is one line.
     plain = [" ".join(name.split()).encode("ascii", "backslashreplace").decode() for name in names]

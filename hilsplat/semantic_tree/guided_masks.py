@@ -1,4 +1,4 @@
-"""Masks of the views after the key views, with one prompt per node and grid prompts only elsewhere."""
+"""Masks of the views other than the key views: one prompt per node, and grid prompts only elsewhere."""
 
 from pathlib import Path
 
@@ -30,9 +30,9 @@ def run_guided_masks(
     threads: int,
     memory_mib: float | None = None,
 ) -> None:
-    """Segment the training views after the key views, with guided prompts (`segment.stage.run_masks`).
+    """Segment the remaining training views with guided prompts (see `segment.stage.run_masks`).
 
-    The masks of the key views are kept unchanged; `semantic_tree_folder` is their tree.
+    The masks of the key views are kept unchanged; `semantic_tree_folder` contains their semantic tree.
 
     Departs: SAM and LangSplat prompt a grid in every view (measured in docs/experiments.md).
 
@@ -63,8 +63,8 @@ def guided_points(
 ) -> Float[np.ndarray, "P 2"]:
     """Return a prompt in the middle of each node, and the grid points not covered by any subpart; (x, y), px.
 
-    The middle is the pixel farthest from the region's border. `labels` contains the node that each pixel
-    shows at each level, -1 for none; `grid` contains points in the unit square.
+    The middle is the pixel farthest from the border of the node's region. `labels` contains the node of each
+    pixel at each level, -1 for none; `grid` contains points in the unit square.
     """
     found = []
     for node_of_pixel in labels.values():

@@ -11,7 +11,7 @@ from hilsplat.base.compiled import compiled
 from hilsplat.semantic_tree.evidence import Evidence
 
 ROWS_OF_A_BLOCK = 256
-"""Rows per block; the best score of each block is stored, so that finding the best row takes few reads."""
+"""Rows per block; the best score of each block is stored, so finding the best row requires few reads."""
 
 
 def pooled_linkage(
@@ -42,7 +42,7 @@ def pooled_linkage(
 
 @compiled
 def _neighbours(indptr, indices, intersection, union, seen, view):
-    """Return the initial pool of neighbours for `_link`, with 25 % spare room, and each mask's run in it."""
+    """Return the initial pool of neighbours for `_link`, with 25 % spare room, and each mask's run bounds."""
     num = len(view)
     start = np.zeros(num + 1, np.int64)
     for a in range(num):
@@ -67,9 +67,9 @@ def _neighbours(indptr, indices, intersection, union, seen, view):
 
 @compiled
 def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self_a, self_b):
-    """Copy a run of neighbours to `first` onwards, and sum neighbours joined since the run was written.
+    """Copy a run of neighbours to position `first`, and sum neighbours joined since the run was written.
 
-    Entries already there, from an earlier run of the cluster, are summed too. Entries that refer to the
+    Entries copied there from an earlier run of the cluster are summed too. Entries that refer to the
     cluster itself are omitted. Returns the end of the run and the two sums of the omitted entries.
     """
     own_inter, own_extra = 0.0, 0.0
@@ -92,7 +92,7 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 @compiled
 def _plus_sizes(total, i, j, seen, members, shown, shows):
-    """Add to `total`, for each view, each cluster's size as seen there times the other's members there."""
+    """Add each cluster's size in each view times the number of the other's members there to `total`."""
     num_views = seen.shape[1]
     at_i = at_j = 0
     while at_i < shows[i] or at_j < shows[j]:
@@ -125,7 +125,7 @@ def _best_neighbour(i, begin, end, neighbour, inter, extra, seen, members, shown
 
 @compiled
 def _compacted(needed, alive, start, stop, neighbour, inter, extra):
-    """Move the runs of existing clusters to the front of the pool or to a larger pool; update their ends.
+    """Move the runs of existing clusters to the front of the pool or to a larger pool; update their bounds.
 
     The new pool has room for `needed` more entries.
     """
@@ -183,7 +183,7 @@ def _link(start, stop, neighbour, inter, extra, seen, view, threshold, root, wit
     num, num_views = seen.shape
     used = stop[-1] if num else 0
     members = np.zeros((num, num_views))
-    # Views of each cluster's members, in order, and their number.
+    # Views of each cluster's members, in order, and the number of these views.
     shown, shows = np.empty((num, num_views), np.int32), np.ones(num, np.int32)
     for i in range(num):
         members[i, view[i]] = 1.0

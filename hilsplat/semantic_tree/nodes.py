@@ -25,10 +25,10 @@ MIN_FIT = 0.25
 """A mask shows its best-fitting node if their IoU in the mask's view exceeds this."""
 
 PRIOR_VIEWS = 3
-"""Number of views without the node added to those that show it, to limit a single view's influence."""
+"""Number of views without the node added to the views that show it, to limit a single view's influence."""
 
 NEIGHBOURS = 11
-"""Number of nearest Gaussians, itself included, that connect a node."""
+"""Number of nearest Gaussians (including itself) to which each Gaussian of a node is connected."""
 
 STRAY_SHARE = 0.02
 """A piece is removed from its node if its mass is less than this share of the largest piece's mass."""
@@ -41,7 +41,7 @@ class LevelNodes:
     Attributes:
         of_mask: node that each mask of the level belongs to, -1 for none.
         of_gaussian: node of each Gaussian, -1 for none.
-        membership: share of the Gaussian's visible weight inside its node's masks.
+        membership: share of each Gaussian's visible weight that is inside its node's masks.
         quality: pooled IoU of each node.
     """
 
@@ -51,7 +51,7 @@ class LevelNodes:
     quality: Float64[np.ndarray, " t"]
 
     def joined(self, into: Int64[np.ndarray, " t"]) -> "LevelNodes":
-        """Merge nodes with equal numbers in `into`; the new quality is the mean over their masks."""
+        """Merge nodes with the same number in `into`; the new quality is the mean over their masks."""
         into_or_none = np.append(into, NONE)
         masks = np.bincount(self.of_mask[self.of_mask != NONE], minlength=len(into))
         total = np.bincount(into, masks * self.quality)
@@ -133,12 +133,12 @@ def gaussian_nodes(
 
     The first is the share inside the node's masks in all views; it must exceed `MIN_MEMBER_SHARE`. The second
     is the same share in the views with a mask of the node, with `PRIOR_VIEWS` average views added to its
-    denominator. It lets a small object, segmented in few views, keep its Gaussians next to a large one whose
-    masks sometimes cover it. Masks of one view may overlap, and a node may have several masks there, so a
-    Gaussian's weight in a view is capped at its visible mass there.
+    denominator. The second share lets a small object that is segmented in few views keep its Gaussians next
+    to a large object whose masks sometimes cover them. Masks of one view may overlap, and a node may have
+    several masks in one view, so a Gaussian's weight in a view is capped at its visible mass there.
 
-    `cluster` is the node of each mask, -1 for none; the other arguments are those of its masks, as in
-    `linked_nodes`; `total_mass` is the sum of `mass` over views.
+    `cluster` is the node of each mask, -1 for none; `weights`, `view` and `mass` belong to the same masks, as
+    in `linked_nodes`; `total_mass` is the sum of `mass` over views.
 
     Returns:
         node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.
@@ -186,9 +186,9 @@ def without_strays(
     nearest: Int64[np.ndarray, "N K"],
     total_mass: Float64[np.ndarray, " N"],  # visible weight over all views, px
 ) -> Int32[np.ndarray, " N"]:
-    """Return the nodes without stray pieces: Gaussians covered by an object's masks but behind or beside it.
+    """Remove stray pieces from nodes: Gaussians inside an object's masks, but behind or beside the object.
 
-    Gaussians of one node are connected if one is among the nearest of the other (`nearest_gaussians`).
+    Two Gaussians of a node are connected if one is among the other's nearest (`nearest_gaussians`).
     """
     num = len(node_of_gaussian)
     row, other = np.repeat(np.arange(num), nearest.shape[1]), nearest.ravel()
@@ -248,7 +248,7 @@ def mask_fits(
 
     Returns:
         best node at the mask's level, -1 if the mask shares no Gaussians with any node; and the IoU with the
-        linked node, 0 for none.
+        linked node, 0 if there is none.
     """
     fits, of_linked = np.full(len(view), NONE, np.int32), np.zeros(len(view))
     for each in LEVELS:
@@ -266,7 +266,7 @@ def level_ious(
     mass: Float32[np.ndarray, "V N"],
     view: Int32[np.ndarray, " m"],
 ) -> sp.csr_matrix:
-    """Return the soft IoU, in its view, of each mask of a level with each node that it shares Gaussians with.
+    """Return each mask's soft IoU, in the mask's view, with each node that shares Gaussians with the mask.
 
     `weights` is S of the level's masks; `mass` is the visible mass of each Gaussian in each view, px.
     """
@@ -283,7 +283,7 @@ def level_ious(
 
 
 def best_fits(iou: sp.csr_matrix) -> tuple[Int32[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
-    """Return the column of each row's largest value (lowest on a tie) and the value; -1 and 0 if empty."""
+    """Return the column (lowest on a tie) and value of each row's maximum; -1 and 0 for empty rows."""
     best, value = np.full(iou.shape[0], NONE, np.int32), np.zeros(iou.shape[0])
     row = _row_of(iou)
     order = np.lexsort((iou.indices, -iou.data, row))
@@ -299,8 +299,8 @@ def nest_nodes(
 ) -> Int32[np.ndarray, "N 3"]:
     """Make every child a subset of its parent, so that the tree is nested by construction.
 
-    A Gaussian of a child is added to the parent and the parent's parent if no other node contains it at their
-    levels; otherwise it is removed from the child. Coarse levels are processed first.
+    A Gaussian of a child is added to the parent and the parent's parent if no other node of their levels
+    contains it; otherwise, it is removed from the child. Coarse levels are processed first.
     """
     nested = node_of_gaussian.copy()
     index_of = level.astype(np.int64) - 1
@@ -325,7 +325,7 @@ def nest_nodes(
 def renumbered_without_empty(
     node_of_gaussian: Int32[np.ndarray, "..."], num_nodes: int
 ) -> Int32[np.ndarray, " T1"]:
-    """Return each node's new id, in the old order; NONE for a node without Gaussians (it selects nothing).
+    """Return each node's new id, in the old order; NONE for nodes without Gaussians, which select nothing.
 
     Nesting may remove a node's last Gaussian; its children are then empty too, so no parent is lost. The
     result has an additional last entry, NONE, so that indexing with NONE returns NONE.

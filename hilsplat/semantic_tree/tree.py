@@ -1,4 +1,4 @@
-"""The 3D semantic tree of a scene: nodes, their Gaussians, parents, boxes and vectors, and their pixels."""
+"""The 3D semantic tree of a scene: nodes, their Gaussians, parents, boxes, vectors, and pixels in views."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ LIMITS = {"level": (1, 3), "quality": (0, 1), "membership": (0, 1 + 1e-5), "view
 """Valid range of the values of a stored tree."""
 
 BOX_PERCENTILES = (2.0, 98.0)
-"""Percentiles of the members' centres that bound a box, so that a few stray Gaussians do not inflate it."""
+"""Percentiles of a node's Gaussian centres that bound its box, so that stray Gaussians do not inflate it."""
 
 Triple = tuple[float, float, float]
 
@@ -29,7 +29,7 @@ class OrientedBox:
 
     Attributes:
         centre: scene units.
-        axes: three orthogonal unit vectors, right-handed, the longest side's first.
+        axes: three orthogonal unit vectors, right-handed; the first is along the longest side.
         size: full length along each axis, scene units.
     """
 
@@ -59,19 +59,19 @@ class SemanticTree:
         centroid: mean of the Gaussians' centres, weighted by visible mass, scene units.
         box: axis-aligned box, lower and upper corner, scene units.
         oriented_box: centre, three axes and sizes (see `OrientedBox`), scene units.
-        quality: pooled IoU of its masks across views, in [0, 1].
+        quality: pooled IoU of each node's masks across views, in [0, 1].
         views: number of views with masks of each node.
         node_of_gaussian: node of each Gaussian at each level, -1 for none.
-        membership: share of the Gaussian's visible weight inside its node's masks, in [0, 1]; 0 without
-            a node, and for a Gaussian that was added only because a child of the node contains it.
+        membership: share of each Gaussian's visible weight that is inside its node's masks, in [0, 1]; 0
+            without a node, and for a Gaussian added only because a child of the node contains it.
         node_of_mask: node that each mask (row of the contributions) fits best at its level; -1 if it shares
             no Gaussians with any node.
         linked_node: node that each mask was linked into, -1 for none.
-        crop_score: how well each mask's crop shows the node that the mask was linked into: the square root of
-            its area times its IoU with the node in its view, px; 0 without a node.
+        crop_score: how well each mask's crop shows the node that the mask was linked into: the mask's IoU
+            with the node in the mask's view, times the square root of the mask's area, px; 0 without a node.
         crop_rank: order in which the crops of a node are embedded (`build.crop_ranks`), -1 for none.
         view_area_px: area of each node's masks in each view.
-        gaussians_sha256: digest of the PLY that the tree belongs to.
+        gaussians_sha256: digest of the PLY from which the tree was computed.
         cameras_sha256: digest of the scene's cameras.
         min_weight: weights below this are dropped in the contributions and when views are rendered.
     """
@@ -151,7 +151,7 @@ class SemanticTree:
 
         Raises:
             ArtifactError: the tree is missing, damaged or from another version.
-            MisalignedArtifactError: the vectors belong to other masks, or to another tree of these masks.
+            MisalignedArtifactError: the vectors are of other masks, or of another tree of these masks.
         """
         folder, names = Path(folder), ("gaussians_sha256", "cameras_sha256", "min_weight")
         index = read_index(folder, *names)
@@ -226,13 +226,13 @@ def node_boxes(
 class ViewNodes:
     """Share of each node of one level in each pixel of a view (CSR over P pixels).
 
-    A pixel blends about ten Gaussians, but rarely more than two nodes of a level. Summing its weights by node
-    once per view makes each later query in that view several times cheaper than a product with all weights,
+    A pixel blends about ten Gaussians, but rarely more than two nodes of a level. Summing the weights by node
+    once per view makes each later query in that view several times faster than a product with all weights,
     and needs only a fraction of the memory.
 
     Attributes:
         nodes: rows of the semantic tree.
-        shares: each node's share of the pixel; the rest has no node.
+        shares: each node's share of the pixel; the remainder belongs to no node.
         covered: whether the Gaussians cover each pixel.
     """
 
@@ -258,7 +258,7 @@ class ViewNodes:
     ) -> Float32[np.ndarray, " P"]:
         """Blend one value per node; Gaussians without a node have the value `without`.
 
-        Uncovered pixels get the lowest value of the covered ones. The result is written to `out` if given.
+        Uncovered pixels get the lowest value of the covered pixels. The result is written to `out` if given.
         """
         out = np.empty(len(self.covered), np.float32) if out is None else out
         _blend(self.indptr, self.nodes, self.shares, self.covered, values, np.float32(without), out)

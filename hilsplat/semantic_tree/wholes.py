@@ -1,8 +1,8 @@
 """Wholes for a segmenter that detects only colour regions: regions that touch in 3D are joined.
 
-In a photograph, a coloured part of an object borders both the wall behind it and the part beside it. In 3D it
-touches only that other part. Small regions join first, so objects are complete before any part is joined to
-the table, the walls or the floor, which are large.
+In a photograph, a coloured part of an object borders both the wall behind it and the next part of the object.
+In 3D, it touches only that next part. Small regions join first, so objects are complete before any part is
+joined to the table, the walls or the floor, which are large.
 """
 
 import heapq
@@ -18,7 +18,7 @@ NEIGHBOURS = 10
 """Number of nearest Gaussians (including itself) that are searched for neighbours in another region."""
 
 MIN_MASS_PX = 2.0
-"""Minimum mass of a neighbouring Gaussian, summed over views; lighter ones may float anywhere."""
+"""Minimum mass of a neighbouring Gaussian, summed over views; Gaussians with less mass may float anywhere."""
 
 MIN_SHARE = 1e-4
 """A view shows a region if the region covers more than this share of the view."""
@@ -109,6 +109,6 @@ def joined(touch: sp.csr_matrix, shares: Float64[np.ndarray, "T V"], most: float
 
 
 def _side(share: Float64[np.ndarray, " V"]) -> float:
-    """Return the square root of a region's mean area share in the views that show it; 0 if none does."""
+    """Return the square root of a region's mean area share in the views that show it; 0 if unseen."""
     shown = share > MIN_SHARE
     return float(np.sqrt(share.sum() / max(shown.sum(), 1)))
