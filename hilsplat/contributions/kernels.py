@@ -122,7 +122,7 @@ def enlarged(indices, values, kept, room):
 
 @compiled
 def _load(first, last, indices, values, sums):
-    """Load pairs of a row into the sums, and mark them as known."""
+    """Load pairs of a row into the sums, and mark the pairs as known."""
     levels = values.shape[1]
     for k in range(first, last):
         at = np.int64(indices[k]) * SUMS

@@ -21,7 +21,7 @@ MIN_WEIGHT = 1 / 255
 """Smaller weights of a Gaussian at a pixel are ignored."""
 
 MIN_VISIBLE_PX = 0.02
-"""A Gaussian is visible in a view if its mass there exceeds this: 0.3 px if the view were 800 px wide."""
+"""A Gaussian is visible in a view if its mass there exceeds this, which is 0.3 px at 800 px resolution."""
 
 
 def run_key_masks(
@@ -39,7 +39,7 @@ def run_key_masks(
 
 
 def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1) -> list[str]:
-    """Return a share of the training views (rounded up), chosen by the Gaussians each adds, in camera order.
+    """Return the share of the training views (rounded up) that adds the most Gaussians, in camera order.
 
     A Gaussian is weighted by its mean visible mass, halved by each chosen view that shows it, so that views
     of uncovered regions are preferred. The result does not depend on `threads`.

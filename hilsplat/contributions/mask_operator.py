@@ -19,7 +19,7 @@ MEDIAN_SOFTENING = 1e-4
 """Minimum distance between a latent and the median, to avoid division by zero."""
 
 BLOCK = 2**15
-"""Gaussians per pass of a wide product with A, so that their features stay in the processor's cache."""
+"""Number of Gaussians per pass of a wide product with A: their features fit into the processor's cache."""
 
 SPREAD_PARTS = 4
 """Number of Gaussian ranges per thread; several balance the load (some Gaussians are in more masks)."""

@@ -38,7 +38,7 @@ CHUNK_WEIGHTS = 2**25
 """Number of non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""
 
 LARGE_PART = 2**23
-"""Parts with at least this many non-zeros are added to G directly, as copying them first gains little."""
+"""Parts with this many or more non-zeros are added to G directly, because copying them would gain little."""
 
 MAX_WEIGHTS = 2**28
 """Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
@@ -53,7 +53,7 @@ ROWS = ("indptr", "indices", "values")
 
 
 class _Rows:
-    """Some rows of G, in reused memory: the first writes to new pages take time and memory."""
+    """Some rows of G, in reused memory because first writes to new pages take time and memory."""
 
     def __init__(self, rows: int) -> None:
         self.indptr = np.zeros(rows + 1, np.int64)
@@ -86,12 +86,12 @@ class _Rows:
 
 
 class GramBuilder:
-    """Sum of G over parts of W, such as one view after another; its memory grows only with G.
+    """Sum of G over parts of W, such as one view after another; memory grows only with the size of G.
 
     Entries are summed in float64 in the order of the pixels, so results depend neither on the division of
     pixels into parts nor on the number of threads. A part shows about 10 % of the Gaussians of a large scene,
-    so sums of known pairs are updated in place, and only late pairs are rewritten for each part, until enough
-    of them have accumulated to be merged.
+    so sums of known pairs are updated in place. Only late pairs, which were added since the last merge, are
+    rewritten for each part.
     """
 
     def __init__(self, num_gaussians: int, threads: int) -> None:

@@ -94,7 +94,7 @@ class ArrayStream:
 
 
 def views_together(scene: Scene, threads: int) -> int:
-    """Return how many views to prepare at once: two if W fits, as half of the work is single-threaded."""
+    """Return how many views to prepare at once: two if W fits, because half the work is single-threaded."""
     most_px = max((int(np.prod(scene.cameras[name].size_hw)) for name in scene.views("train")), default=0)
     return min(2, max(1, threads)) if most_px * WEIGHTS_PER_PIXEL <= MAX_WEIGHTS_TOGETHER else 1
 

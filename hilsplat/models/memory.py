@@ -74,7 +74,7 @@ def needs_of(model: ModelFolder, batch: int, *, as_exported: bool = False) -> Ne
 def _attention_mib(vision: dict[str, Any], side_px: int) -> float:
     """Return the memory of one layer's attention weights between all patches of an image, MiB.
 
-    Keys missing from the configuration default to those of transformers: patches of 16 px and 12 heads. In
+    Keys missing from the configuration get the defaults of transformers: patches of 16 px and 12 heads. In
     SAM 2, the stage with global attention has a stride of 16 px and 4 heads.
     """
     stages = (vision.get("backbone_config") or {}).get("num_attention_heads_per_stage")

@@ -189,7 +189,7 @@ def split_clip(folder: Path) -> list[Path]:
     A network above 2 GiB has its weights in a separate file (`model.onnx_data`), to which both halves refer.
 
     Raises:
-        ModelError: there is no `model.onnx`, it cannot be read, or it lacks an input or output.
+        ModelError: `model.onnx` is missing, cannot be read, or lacks an input or output.
     """
     import onnx
     from onnx.utils import Extractor

@@ -142,7 +142,7 @@ def _folders() -> list[Path]:
 def model_digest(folder: Path, cache: Path) -> str:
     """Return the digest of a model folder, or "... is missing"; the stage reports how to fix it.
 
-    Digests are cached in `cache`, keyed by file sizes and modification times, as reading ViT-H takes seconds.
+    Digests are kept in `cache`, keyed by file sizes and modification times; reading ViT-H takes seconds.
     """
     if not folder.is_dir():
         return f"{folder} is missing"

@@ -479,7 +479,7 @@ def mask_logits(sizes, fine, eps, weights, image, prompt, s1_in, s2_in, e_in, pa
     """Compute mask logits from the factors of both layers.
 
     Args:
-        fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first of them.
+        fine: compute all 4 x 4 logits of each pixel of the image side; otherwise only the first logit.
         eps: epsilon of the layer norm between the two upscalings.
         weights, image, prompt: `Upscaling`, `MaskImage`, `MaskPrompts`.
         e_in, padded: factors times their scales (prompts, blocks, padded, P).

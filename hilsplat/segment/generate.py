@@ -50,7 +50,7 @@ REPEAT_SLACK = 0.05
 CROP_OVERLAP = 512 / 1500
 """Overlap of the first layer's crops, as a share of the image's shorter side (SAM)."""
 CROP_EDGE_PX = 20
-"""A mask counts as truncated if its box is this close to a crop edge that isn't an image edge (SAM)."""
+"""A mask is truncated if its box is at most this far from a crop edge that isn't an image edge (SAM)."""
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def steps_along(axis: int, labels: Int32[np.ndarray, "H W"], lab: np.ndarray) ->
 def neighbours(
     labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]
 ) -> dict[tuple[int, int], tuple[float, int]]:
-    """Return the summed colour difference across each border between two regions, and its length, px."""
+    """Return the summed colour difference across each border of two regions, and the border's length, px."""
     pairs, contrasts = [], []
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)
@@ -124,7 +124,7 @@ def neighbours(
 
 
 def roughness(labels: Int32[np.ndarray, "H W"], lab: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, " n"]:
-    """Return the texture of each region: the mean colour difference between its adjacent pixels."""
+    """Return the texture of each region: the mean colour difference between the region's adjacent pixels."""
     total, count = np.zeros(labels.max() + 1), np.zeros(labels.max() + 1)
     for axis in (0, 1):
         first, second, contrast = steps_along(axis, labels, lab)

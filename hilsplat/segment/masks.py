@@ -205,7 +205,7 @@ class HierarchicalMasks:
 
     @staticmethod
     def load(path: Path) -> "HierarchicalMasks":
-        """Read `<view>.npz`; raise an ArtifactError if it is missing or damaged, or its arrays disagree."""
+        """Read `<view>.npz`; raise an ArtifactError if it is missing, damaged or inconsistent."""
         arrays = read_npz(path, "size_hw")
         size = arrays.pop("size_hw")
         is_size = size.shape == (2,) and size.dtype.kind in "iu"
@@ -216,7 +216,7 @@ class HierarchicalMasks:
         return masks
 
     def _require_whole(self, path: Path) -> None:
-        """Check that offsets, runs, areas and boxes agree."""
+        """Check that offsets, runs, areas and boxes are consistent."""
         lengths, ends = np.diff(self.offsets), self.offsets[[0, -1]].tolist() if len(self.offsets) else []
         if len(self.offsets) != len(self) + 1 or ends != [0, len(self.runs)] or (lengths <= 0).any():
             found = f"{len(self.offsets)} from {ends}, the smallest step {lengths.min(initial=0)}"

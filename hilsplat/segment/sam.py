@@ -34,7 +34,7 @@ from hilsplat.settings import MasksSettings
 logger = logging.getLogger(__name__)
 
 HEADS: tuple[Level, Level, Level] = (Level.SUBPART, Level.PART, Level.WHOLE)
-"""Levels of the decoder's three outputs, in their order: fine to coarse."""
+"""Levels of the decoder's three outputs, in the order of the outputs: fine to coarse."""
 LOGIT_STEP = 1 / 8
 """Logits are rounded to this step and clipped to +-127 steps, so that a view's candidates take a few MB in
 the cache. Borders move by less than 0.01 low-resolution pixels where the logit changes by 5 per pixel, as is
@@ -419,7 +419,7 @@ def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
 def taps(
     low: int, padded: int, resized: int, original: int
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N T"]]:
-    """Return, for one axis, the first low-resolution pixel that each pixel reads, and weights from it on.
+    """Return, for one axis, the first low-resolution pixel each pixel reads, and the weights from it onwards.
 
     The weights combine SamProcessor's steps: bilinear from `low` to the padded input, cropping to the resized
     image, bilinear to the original size.

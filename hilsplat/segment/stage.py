@@ -114,7 +114,7 @@ def sam_masks(
     settings: MasksSettings,
     points: Float[np.ndarray, "P 2"] | None = None,
 ) -> HierarchicalMasks:
-    """Segment one view with SAM; the networks run only if its candidates are not in the cache."""
+    """Segment one view with SAM; the networks run only if the view's candidates are not in the cache."""
     key = candidates_key(sha256_of_file(scene.image_path(view)), model, settings, points)
     size_hw = scene.cameras[view].size_hw
 

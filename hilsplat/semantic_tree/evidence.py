@@ -23,8 +23,8 @@ class Evidence:
     Attributes:
         intersection: soft intersection of pairs a < b from different views that share Gaussians.
         union: soft union of the same pairs, in the same order.
-        seen: visible size of each mask in each of the V views: its full size in its own view, 0 in views
-            that see too little of it. A pair that is not stored has intersection 0 and union
+        seen: visible size of each mask in each of the V views: the full size in the mask's own view, 0 in
+            views that see too little of the mask. A pair that is not stored has intersection 0 and union
             `seen[a, view[b]] + seen[b, view[a]]`.
     """
 

@@ -1,7 +1,7 @@
 """Pooled average linkage of the masks of one level across views.
 
 Everything is sparse: only masks that share Gaussians can be joined, and the mutual visibility of two clusters
-is a sum over their members' views. The cost grows with the number of pairs that share Gaussians.
+is a sum over the views of their members. The run time grows with the number of pairs that share Gaussians.
 """
 
 import numpy as np
@@ -19,9 +19,9 @@ def pooled_linkage(
 ) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, " K"]]:
     """Join clusters while the best pair's pooled IoU is at least the threshold.
 
-    The IoU of two clusters is the sum of intersections divided by the sum of unions of all their pairs of
-    masks. Pooling is reducible (joining never creates a better pair), so one nearest neighbour per cluster
-    suffices. On a tie, the pair with the lowest rows is joined.
+    The IoU of two clusters is the sum of intersections divided by the sum of unions, over all pairs of a mask
+    of one and a mask of the other. Pooling is reducible (joining never creates a better pair), so one nearest
+    neighbour per cluster suffices. On a tie, the pair with the lowest rows is joined.
 
     Returns:
         cluster of each mask, numbered by first appearance, and each cluster's pooled IoU over its
@@ -92,7 +92,7 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 @compiled
 def _plus_sizes(total, i, j, seen, members, shown, shows):
-    """Add each cluster's size in each view times the number of the other's members there to `total`."""
+    """Add to `total`, for each view, each cluster's size in the view times the other's number of members."""
     num_views = seen.shape[1]
     at_i = at_j = 0
     while at_i < shows[i] or at_j < shows[j]:

@@ -47,8 +47,8 @@ def decompose(similarity: Float[np.ndarray, "4 4"]) -> tuple[float, Float64[np.n
 def move_gaussians(gaussians: Gaussians, similarity: Float[np.ndarray, "4 4"]) -> Gaussians:
     """Transform Gaussians from coordinates a to b, given b_from_a.
 
-    A camera transformed with them sees the same image: spherical harmonics are rotated too, because they are
-    functions of the direction in the world. The errors are those of `decompose`.
+    A camera transformed in the same way sees the same image. Spherical harmonics are rotated too, because
+    they are functions of the direction in the world. Errors are as in `decompose`.
     """
     scale, rotation, translation = decompose(similarity)
     g = gaussians

@@ -4,7 +4,7 @@ Conventions are gsplat's (docs/rasteriser.md): the 3D covariance is mapped by th
 centre (EWA), with the ray clamped to 30 % beyond the image border; 0.3 px^2 are added to the diagonal; colour
 is max(0, 0.5 + spherical harmonics) in the direction from the camera to the mean.
 
-Projected Gaussians are stored for the blending loops, whose exponent is base 2:
+Projected Gaussians are stored for the blending loops, which use exponents of base 2:
 log2 alpha = peak - (a dx^2 + b dx dy + c dy^2), where (dx, dy) = mean - pixel centre.
 """
 
