@@ -158,7 +158,7 @@ class RunSettings(StageSettings):
     only: tuple[str, ...] = knob(
         (), "the only scenes to run, from any group: table-1, or synthetic/table-1; empty: all in the groups"
     )
-    # The report shows the data root without escaping special characters.
+    # The report shows the data root without escaping < and >, so these are not allowed.
     data_root: str = knob(
         "", "folder of the published data sets; empty: their scenes are skipped", pattern="^[^<>]*$"
     )

@@ -378,7 +378,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
 
 
 def sealed(folder: Path, name: str) -> Path:
-    """Return the path of an artifact's file; raise ArtifactError if its checksum is not in the index."""
+    """Return the path of an artifact's file; raise ArtifactError if its checksum differs from the index."""
     path = Path(folder) / name
     sums = _index(Path(folder))["crc32"]
     if not path.is_file():

@@ -35,7 +35,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 class _Stamp:
     """Digest of the imported code that a loop is compiled from, computed when numba first opens its cache.
 
-    It is falsy if the package was edited after its import; numba then neither reads nor writes the cache.
+    It is falsy if the package was edited after being imported; numba then neither reads nor writes the cache.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:

@@ -183,7 +183,7 @@ def _strip(top: ast.AST) -> None:
             called = (_chain(node.func) or ("",))[-1]
             node.keywords = [each for each in node.keywords if each.arg not in PROSE.get(called, ())]
             if called == "knob":
-                node.args = node.args[:1]  # the second is the description
+                node.args = node.args[:1]  # the second argument is the description
             elif called == "Plugins":
                 node.args = []
         waiting += [(child, is_local) for child in _children(node)]

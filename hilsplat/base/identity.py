@@ -74,7 +74,7 @@ def _digest(roots: tuple[str, ...], root: Path) -> str:
 
 
 def _read_state(root: Path) -> str:
-    """Return a digest of all modules' paths, times and sizes; Python also detects changes by these."""
+    """Return a digest of all modules' paths, times and sizes; Python detects changes from the same data."""
     found, folders = [], [str(root)]
     for folder in folders:
         with os.scandir(folder) as entries:

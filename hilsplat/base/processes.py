@@ -35,7 +35,7 @@ PR_SET_PDEATHSIG = 1  # from Linux's <sys/prctl.h>
 def end_with_parent(parent: int) -> None:
     """Kill this process as soon as the process that started it ends for any reason.
 
-    Otherwise jobs of a killed Snakemake process would continue, and write outputs with old settings during
+    Otherwise, jobs of a killed Snakemake process would continue, and write outputs with old settings during
     the next run. Linux does this unless a shell is in between; otherwise, a thread checks every second.
     """
     if sys.platform == "linux":
@@ -113,7 +113,7 @@ def _discard(folder: Path, lock: IO[bytes]) -> None:
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Delete unfinished files that dead processes of this host left under a folder; return what was deleted.
+    """Delete unfinished files that dead processes of this host left in a folder; return the deleted folders.
 
     Files of live processes, including those in other containers, are kept. So are files of other hosts that
     share the folder, because their locks may be invisible here.

@@ -103,7 +103,7 @@ def write_provenance(
     """Write an artifact's provenance record: command, settings, inputs, software, and digests of outputs.
 
     Args:
-        beside: further outputs.
+        beside: other outputs.
         plugins: import paths of the readers or baselines that the stage used.
         device: device that the setting `device` resolves to, if the stage has this setting.
     """

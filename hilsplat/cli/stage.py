@@ -95,7 +95,7 @@ def stage(
         settings: the section that the stage uses, or several sections by name. If it has the setting
             `device`, provenance records the device that `auto` resolves to.
         seed: None if the stage is deterministic.
-        inputs: files and folders that the stage reads, or lists of files, by name; None for those not given.
+        inputs: name -> file, folder or list of files that the stage reads; None for an input not given.
         plugins: import paths of the readers or baselines that the stage uses (`base.plugins`).
 
     Raises:

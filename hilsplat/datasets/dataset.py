@@ -14,7 +14,7 @@ class SceneReport:
     """Result of checking one scene.
 
     Attributes:
-        facts: what was read, such as {"labelled views": 4, "texts": 21}.
+        facts: counts of what was read, such as {"labelled views": 4, "texts": 21}.
         warnings: one sentence for each item that was reinterpreted or could not be used.
     """
 
@@ -37,7 +37,7 @@ class Dataset:
         required: paths that a scene needs.
         open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
         open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
-        protocols: its own protocols (`evaluate.protocols.cards`), besides those for all image labels.
+        protocols: protocols of the data set (`evaluate.protocols.cards`), besides those for all image labels.
         label_places: glob patterns of a scene's files that only evaluation reads.
     """
 

@@ -6,7 +6,7 @@ Sources. `FRAMES`: LERF-OVS from the released labels (minghanqin/LangSplat); 3D-
 bed, bench and lawn also from a second repository; Hi-LERF and Hi-3DOVS from the table of the Hi-LSplat paper
 (its `frame_01` of a 3D-OVS scene is image 01). `PROMPTS`: LERF-OVS from yanmin-wu/OpenGaussian, LERF-Mask
 from lkeab/gaussian-grouping, 3D-OVS bed to sofa from published evaluation code; blue_sofa, snacks and
-office_desk from figure captions of the LangSplat supplement, perhaps incomplete; covered_desk, table: none.
+office_desk from figure captions in LangSplat's supplement, perhaps incomplete; covered_desk and table: none.
 """
 
 import json

@@ -81,7 +81,7 @@ def _folder(dataset: Dataset, data_root: str) -> Path:
 
 
 def label_files(labels: str, data_root: str) -> tuple[Path, ...]:
-    """Return the files of `data set/scene`, sorted, that only evaluation reads and depends on."""
+    """Return the files of `data set/scene` that only evaluation reads, sorted; edits rerun nothing else."""
     name, _, scene = labels.partition("/")
     dataset = dataset_of(name)
     root = _folder(dataset, data_root)
@@ -112,8 +112,8 @@ def is_exported(source: str) -> bool:
 def export_images(name: str, data_root: Path, out: Path) -> int:
     """Write images and poses of `data set/scene` to a folder for the `poses` stage; return the image count.
 
-    The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (optionally
-    frozen) positions of Gaussians. Lidar points are not: the sky and distant objects have no lidar points.
+    The vertices of a labelled mesh are also written (`points.ply`), without labels, as initial (or frozen)
+    Gaussian positions. Lidar points are not written, because the sky and distant objects have none.
 
     Raises:
         SceneError: the scene's labels are on images, which need no export, or the scene cannot be read.

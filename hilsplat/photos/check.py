@@ -60,7 +60,7 @@ NAMED = 5
 class CheckedPhoto:
     """A photograph's data for the checks.
 
-    `focal_px` is the focal length from EXIF, px of the full picture, or None; `grey` an upright grey copy
+    `focal_px` is the focal length from EXIF, px of the full picture, or None; `grey` is an upright grey copy
     with a longer side of at most `CHECK_SIDE_PX`.
     """
 

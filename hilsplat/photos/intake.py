@@ -73,7 +73,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
             notes = make(folder)
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} already exists, from the same files"]  # an earlier run was killed later
+        notes = [f"{target} already exists, from the same files"]  # an earlier run made it and was killed
     else:
         fix = "choose another name for the scene, or move that folder away"
         raise SceneError(f"{target} already exists", fix=fix)
@@ -98,10 +98,8 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
 
     Every entry is checked before anything is written, and at most the declared sizes are written.
 
-    Raises:
-        SceneError: it is not a zip archive, is damaged, encrypted or too large, or contains links or names
-            that lead out of the folder.
-        DiskSpaceError: there is too little free space.
+    Raises: SceneError: it is not a zip archive, is damaged, encrypted or too large, or contains links or
+    names that lead out of the folder. DiskSpaceError: there is too little free space.
     """
     try:
         with zipfile.ZipFile(archive) as opened:

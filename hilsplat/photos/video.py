@@ -295,7 +295,7 @@ def _step(one: Frame, other: Frame) -> float:
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Compute the variance of the Laplacian (Pech-Pacheco et al. 2000), which is large for steep edges.
 
-    It is comparable only between pictures of the same place, because it depends on the content.
+    Values are comparable only between pictures of the same place, because they depend on the content.
     """
     return float(cv2.Laplacian(grey, cv2.CV_32F, ksize=3).var())
 

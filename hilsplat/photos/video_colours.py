@@ -1,4 +1,4 @@
-"""Conversion of video frames to 8-bit sRGB with the stream's matrix and range, with HDR tone mapping."""
+"""Conversion of video frames to 8-bit sRGB, using the stream's matrix and range, with HDR tone mapping."""
 
 import functools
 

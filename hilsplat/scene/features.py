@@ -34,7 +34,7 @@ MAX_TRIALS = 1000
 """Maximum RANSAC trials per pair (COLMAP: 10000); pairs without common content use all of them."""
 
 WORK_COMPRESSION = 1
-"""zlib level of work images: it is a third faster than level 6, and COLMAP reads the images only once."""
+"""zlib level of work images, a third faster than level 6; COLMAP reads the images only once."""
 
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF unit of the focal plane resolution -> mm (default: inch)."""
@@ -205,7 +205,7 @@ def verified_matches(database: Path) -> dict[str, dict[str, int]]:
 
 
 def count_matches(database: Path) -> dict[str, dict[str, int]]:
-    """Return entries of the registration report for every view: features, and verified matches with others.
+    """Return the registration report's entries per view: features, and verified matches with other views.
 
     Two views count as matched if they have at least `MIN_INLIERS` verified matches.
     """

@@ -183,7 +183,7 @@ def require_same(what: str, scene: str, path: Path, expected_sha256: str) -> Non
 
 
 def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[str, str]) -> None:
-    """Refuse a file that artifacts were not made for; `made_for` maps each to the digest it expects."""
+    """Refuse a file that artifacts were not made for; `made_for` maps artifacts to expected digests."""
     for what, expected in made_for.items():
         if found_sha256 != expected:
             raise MisalignedArtifactError(

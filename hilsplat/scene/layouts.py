@@ -1,4 +1,4 @@
-"""Layouts of folders of photographs and known poses; a module that imports fast at workflow start-up."""
+"""Layouts of folders of photographs and known poses; this module imports fast, for workflow start-up."""
 
 from dataclasses import dataclass
 from pathlib import Path

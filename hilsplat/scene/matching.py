@@ -131,7 +131,7 @@ def _multiplier(columns: Int8[np.ndarray, "128 N"]) -> Callable[[UInt8[np.ndarra
     if session is not None:
         return lambda rows: session.run(None, {"rows": rows, "columns": columns})[0]
     whole = columns.astype(np.float32) + 128
-    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # allocation takes longer than the products
+    space = np.empty((_BLOCK, whole.shape[1]), np.float32)  # allocating it takes longer than the products
     # Sums are below 2**24, so float32 is exact.
     return lambda rows: np.matmul(rows.astype(np.float32), whole, out=space[: len(rows)])
 

@@ -51,7 +51,7 @@ def rigid_pose(world_from_cam: Float[np.ndarray, "..."], where: str) -> Float64[
     """Return a camera-to-world matrix, 3 x 4 or 4 x 4, as 4 x 4; refuse a matrix that is not rigid.
 
     Raises:
-        SceneError: the matrix is not 3 x 4 or 4 x 4, not finite, scales, mirrors, or does not end in 0 0 0 1.
+        SceneError: it is not 3 x 4 or 4 x 4, is not finite, scales or mirrors, or does not end in 0 0 0 1.
     """
     pose = np.eye(4)
     usable = world_from_cam.shape in ((3, 4), (4, 4)) and np.isfinite(world_from_cam).all()
@@ -76,9 +76,9 @@ def write_posed_images(
 ) -> None:
     """Write `images/` and `transforms.json` (OpenGL axes, intrinsics per frame) as a source for `poses`.
 
-    Images are copied byte for byte; distortion is kept, because `poses` undistorts. Points, if any, are in
-    the unit of the poses, and become the scene's sparse points in the same order (`points.ply`). An existing
-    folder is replaced.
+    Images are copied byte for byte; distortion is kept, because `poses` undistorts them. Points, if any, are
+    in the unit of the poses, and become the scene's sparse points in the same order (`points.ply`). An
+    existing folder is replaced.
     """
     names = [image.name for image in images]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)

@@ -74,8 +74,8 @@ def run_poses(
     """Pose the images of scene `<dataset>/<scene>`, and write its Scene artifact with a registration report.
 
     A folder with known poses, such as a COLMAP model (`sparse/`) or a `transforms*.json`, is imported; any
-    other is posed by structure from motion. The result depends on images, settings and seed, but not on
-    `threads`: features and matches are computed pair by pair, and the mapping runs on one thread.
+    other folder is posed by structure from motion. The result depends on images, settings and seed, but not
+    on `threads`: features and matches are computed pair by pair, and the mapping runs on one thread.
 
     Args:
         unit: "metre" or "arbitrary": the unit of imported poses. Structure from motion cannot recover metric
@@ -329,7 +329,7 @@ def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None
 
 
 def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
-    """Draw each unregistered photograph beside its registered neighbours; return False if there are none."""
+    """Draw unregistered photographs with their registered neighbours; return False if all are registered."""
     lost = [(view, entry) for view, entry in report["views"].items() if not entry["registered"]]
     if not lost:
         return False

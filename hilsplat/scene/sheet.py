@@ -287,7 +287,7 @@ def _resolved(sheet: Path, place: str, data_root: str) -> Path | None:
 
 
 def _ply_problem(ply: Path) -> str:
-    """Return why a file cannot be a PLY; empty if it can."""
+    """Return why a file cannot be a PLY, or an empty string."""
     if not ply.is_file():
         return "is a folder" if ply.exists() else "is missing"
     with ply.open("rb") as stream:

@@ -24,7 +24,7 @@ from hilsplat.workflow.resources import JobResources, is_installed
 PACKAGE = "hilsplat"
 
 RULES = ("poses", "gaussians", "masks", "contributions", "semantic_tree", "clip", "field", "figures")
-"""Rules whose needs of memory and disk space are compared with the machine's capacity."""
+"""Rules whose memory and disk requirements are compared with the machine's capacity."""
 
 
 @dataclass(frozen=True)

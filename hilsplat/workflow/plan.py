@@ -152,7 +152,7 @@ class Plan:
         return lambda job: stage_code(stage(job) if callable(stage) else stage, plugins(job))
 
     def vocabulary(self, job: Job) -> list[str]:
-        """Return the input of names: the user's own vocabulary, if any."""
+        """Return the input of `names`: the user's own vocabulary, if any."""
         named = self.stages(job).query.vocabulary
         return [] if named == AUTO else [named]
 
@@ -194,7 +194,7 @@ class Plan:
         return lambda job: list(dict.fromkeys(map(self.shared(stage, path), self._main_jobs(job))))
 
     def compared_scores(self, job: Job) -> list[str]:
-        """Return the input of comparison: the scores of each variant in the main tables."""
+        """Return the input of `comparison`: the scores of each variant in the main tables."""
         return [self.path(each, each.variant, "scores.csv") for each in self._main_jobs(job)]
 
     def _main_jobs(self, job: Job) -> list[VariantJob]:
@@ -219,7 +219,7 @@ class Plan:
         return tuple(scope for scope in (row.group, row.name) if scope in self.run.overrides)
 
     def masks_stage(self, job: VariantJob) -> str:
-        """Return the stage of the masks; imported masks, key views and the diagnostic have their own."""
+        """Return the masks stage; imported masks, key views and the diagnostic have their own stages."""
         masks = self.stages(job).masks
         if masks.segmenter == "truth-perturbed":
             return "truth_masks"
@@ -230,17 +230,17 @@ class Plan:
         return "guided_masks" if masks.prompts == "guided" and self.first_answer(job) else "masks"
 
     def key_gaussians(self, job: VariantJob) -> list[str]:
-        """Return the input of masks: the Gaussians that key views or projected prompts need, if any."""
+        """Return the input of `masks`: the Gaussians that key views or projected prompts need, if any."""
         needed = self.masks_stage(job) in ("key_masks", "guided_masks")
         return [self.path(job, "gaussians.ply")] if needed else []
 
     def key_parts(self, job: VariantJob, stage: str) -> list[str]:
-        """Return the input of masks: masks or semantic tree of the key views, if they guide the prompts."""
+        """Return the input of `masks`: masks or semantic tree of the key views, if they guide the prompts."""
         is_guided = self.masks_stage(job) == "guided_masks"
         return [self.shared(stage, stage)(of_variant(job, KEY_VIEWS))] if is_guided else []
 
     def first_answer(self, job: VariantJob) -> list[str]:
-        """Return an input of masks that only orders jobs: key views are embedded before a full-size SAM."""
+        """Return an input of `masks` that only orders jobs: key views are embedded before full-size SAM."""
         row, masks = self.row(job), self.stages(job).masks
         of_photographs = job.variant == "default" and row.group == PHOTOS and not row.features
         if not of_photographs or KEY_VIEWS not in self.run.variants:
@@ -251,7 +251,7 @@ class Plan:
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
     def masks_truth(self, job: VariantJob) -> list[str]:
-        """Return the input of masks: the diagnostic's ground-truth labels; SettingsError if none exist."""
+        """Return the input of `masks`: the diagnostic's ground-truth labels; SettingsError if none exist."""
         if self.masks_stage(job) != "truth_masks":
             return []
         row = self.row(job)
@@ -264,7 +264,7 @@ class Plan:
         return self.data.truth(job)
 
     def masks_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of masks for imported masks, key views or the diagnostic segmenter."""
+        """Return the options of `masks` for imported masks, key views or the diagnostic segmenter."""
         if self.masks_stage(job) == "langsplat":
             return options_of({"features": self.row(job).features})
         faults = self.stages(job).perturb.model_dump_json() if input.truth else ""
@@ -272,12 +272,12 @@ class Plan:
         return options_of({**key, "truth": input.truth, "perturb": faults})
 
     def crops_tree(self, job: VariantJob) -> list[str]:
-        """Return the input of clip: the semantic tree that selects crops; empty if all masks are embedded."""
+        """Return the input of `clip`: the semantic tree that selects crops; empty to embed all masks."""
         by_node = self.stages(job).clip.crops == "nodes" and not self.row(job).features
         return [self.shared("semantic_tree", "semantic_tree")(job)] if by_node else []
 
     def crops_tree_option(self, job: VariantJob, input: Any) -> str:
-        """Return the option of clip for `crops_tree`, or for imported vectors."""
+        """Return the option of `clip` for `crops_tree`, or for imported vectors."""
         return options_of({"semantic-tree": input.semantic_tree, "features": self.row(job).features})
 
     def tree_stage(self, job: VariantJob) -> str:
@@ -285,12 +285,12 @@ class Plan:
         return "feature_tree" if self.stages(job).semantic_tree.evidence == "features" else "semantic_tree"
 
     def tree_parents(self, job: VariantJob) -> list[str]:
-        """Return the input of semantic_tree: the coverage trees, if it clusters features."""
+        """Return the input of `semantic_tree`: the coverage trees, if features are clustered."""
         by_features = self.tree_stage(job) == "feature_tree"
         return [self.shared("coverage_tree", "coverage_tree")(job)] if by_features else []
 
     def tree_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of semantic-tree for `tree_parents`."""
+        """Return the options of `semantic-tree` for `tree_parents`."""
         if not input.coverage_tree:
             return ""
         field = self.settings("field")(job)
@@ -298,13 +298,13 @@ class Plan:
         return options_of({"coverage-tree": input.coverage_tree, "field-settings": field, "seed": seed})
 
     def rendered(self, job: VariantJob) -> list[str]:
-        """Return the input of field: scene, Gaussians and masks, if the literal trainer renders them."""
+        """Return the input of `field`: scene, Gaussians and masks, if the literal trainer renders them."""
         if self.stages(job).field.trainer != "literal":
             return []
         return [self.path(job, "scene"), self.path(job, "gaussians.ply"), self.shared("masks", "masks")(job)]
 
     def first_field(self, job: VariantJob) -> list[str]:
-        """Return the input of field: LangSplat's initial field; SettingsError if no variant computes it."""
+        """Return the input of `field`: LangSplat's initial field; SettingsError if no variant computes it."""
         stages, scopes = self.stages(job), self.scopes(self.row(job))
         if stages.field.start != "langsplat":
             return []
@@ -322,7 +322,7 @@ class Plan:
         )
 
     def field_option(self, job: VariantJob, input: Any) -> str:
-        """Return the options of field for `rendered` and `first_field`."""
+        """Return the options of `field` for `rendered` and `first_field`."""
         rendered = dict(zip(("scene", "gaussians", "masks"), input.rendered, strict=False))
         return options_of({**rendered, "start": input.start})
 

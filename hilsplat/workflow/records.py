@@ -24,7 +24,7 @@ from hilsplat.workflow.stages import stage_code
 from hilsplat.workflow.targets import tables
 
 IMPORTED = "langsplat"
-"""Stage of artifacts imported in place of a stage's output, to which no settings of the plan apply."""
+"""Stage of imported artifacts, which replace a stage's output; no settings of the plan apply to them."""
 
 SHARED = ("masks", "coverage_tree", "clip", "contributions", "semantic_tree", "autoencoder", "field")
 """Stages whose outputs variants share."""

@@ -95,12 +95,12 @@ class JobResources:
         self._seconds = functools.cache(self._estimate)
 
     def threads(self, wildcards: Job) -> int:
-        """Return a number of threads proportional to the scene's pixels, within that scene's core limit."""
+        """Return a number of threads proportional to the scene's pixels, up to the core limit per scene."""
         views, view_mp = self.size(self.plan.row(wildcards))
         return int(min(max(1, math.ceil(views * view_mp / MP_PER_THREAD)), self._per_scene))
 
     def variant_threads(self, wildcards: Job) -> int:
-        """Return the threads of a rule with many short jobs per scene, which run in parallel."""
+        """Return the number of threads for a rule with many short jobs per scene, which run in parallel."""
         return int(min(self.threads(wildcards), self._per_variant))
 
     def memory_mb(self, rule: str) -> Callable[..., int]:

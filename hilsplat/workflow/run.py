@@ -78,7 +78,7 @@ def mark_run() -> None:
 def unmark_run() -> None:
     """Remove the marker of this process's run, and cancel the timers that Snakemake leaves running.
 
-    Snakemake's job rate limit starts a timer after each scheduling step; the process would wait for all.
+    Snakemake's rate limit starts a timer after each scheduling step; the process would wait for every timer.
     """
     timers = (thread for thread in threading.enumerate() if isinstance(thread, threading.Timer))
     for timer in timers:
@@ -228,7 +228,7 @@ def _snakefile(configs: Sequence[Path]) -> Path:
 
 
 def _has(words: Sequence[str], *options: str) -> bool:
-    """Return whether words contain an option, also as `--option=value` or `-o8`."""
+    """Return whether words contain an option, also in the form `--option=value` or `-o8`."""
     return any(
         word.split("=")[0] == option or (len(option) == 2 and word.startswith(option))
         for word in words

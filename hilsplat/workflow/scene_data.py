@@ -37,12 +37,12 @@ class VariantJob(Job, Protocol):
 
 
 def of_variant(job: Job, variant: str) -> VariantJob:
-    """Return the job of a variant of a job's scene."""
+    """Return the job for a variant of a job's scene."""
     return SimpleNamespace(dataset=job.dataset, scene=job.scene, variant=variant)
 
 
 def options_of(named: Mapping[str, Any]) -> str:
-    """Return quoted command-line options, without those whose value is empty.
+    """Return quoted command-line options; omit options with an empty value.
 
     Paths are taken from a job's input, because a Snakemake module may have prefixed them.
     """
@@ -64,12 +64,12 @@ class SceneData:
         return self._row_of[job.dataset, job.scene]
 
     def images(self, job: Job, input: Sequence[str]) -> str:
-        """Return the parameter of poses: the folder of the images."""
+        """Return the parameter of `poses`: the folder of the images."""
         row = self.row(job)
         return input[0] if row.world or is_exported(row.source) else str(row.folder)
 
     def image_files(self, job: Job) -> str | list[str]:
-        """Return the input of poses: a folder that a rule writes, or all files in a folder of photographs."""
+        """Return the input of `poses`: a folder that a rule writes, or all files in a photograph folder."""
         row = self.row(job)
         if row.world:
             return self.path(job, "world/images")
@@ -108,7 +108,7 @@ class SceneData:
                 )
 
     def source_files(self, job: Job) -> list[str]:
-        """Return the input of source: a data set's files that contain the images and poses."""
+        """Return the input of `source`: a data set's files that contain the images and poses."""
         return [str(path) for path in image_files(self.row(job).source, self.data_root)]
 
     def source_name(self, job: Job) -> str:
@@ -119,7 +119,7 @@ class SceneData:
         return readers_of([self.source_name(job)])
 
     def existing_gaussians(self, job: Job) -> list[str]:
-        """Return the input of gaussians: a PLY that replaces the fit, and its coordinate files, if any."""
+        """Return the input of `gaussians`: a PLY that replaces the fit, and its coordinate files, if any."""
         ply = self.row(job).gaussians
         if ply is None:
             return []
@@ -141,7 +141,7 @@ class SceneData:
         return {"dataparser": dataparser, **({"transforms": transforms} if transforms else {})}
 
     def features(self, job: Job) -> list[str]:
-        """Return the input of masks and clip: LangSplat's files that replace SAM and CLIP; usually empty."""
+        """Return the input of `masks` and `clip`: LangSplat's files, which replace SAM and CLIP, if any."""
         folder = self.row(job).features
         return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
@@ -163,11 +163,11 @@ class SceneData:
         return [self.path(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:
-        """Return the input of evaluate: the annotations of a synthetic scene, or label files of others."""
+        """Return the input of `evaluate`: the annotations of a synthetic scene, or label files of others."""
         return self.truth(job) or self._label_files(self.row(job))
 
     def truth_option(self, job: Job, input: Any) -> str:
-        """Return the options of evaluate: the ground truth or labels that a scene is scored against."""
+        """Return the options of `evaluate`: the ground truth or labels that a scene is scored against."""
         row = self.row(job)
         if row.world:
             return options_of({"truth": input.truth, "kind": row.world[0]})
@@ -175,7 +175,7 @@ class SceneData:
         return " ".join([*options, options_of({"data-root": Path(self.data_root)})])
 
     def figure_truth_option(self, job: Job, input: Any) -> str:
-        """Return the options of figures: the ground truth or labels for queries and outlines, if any."""
+        """Return the options of `figures`: the ground truth or labels for queries and outlines, if any."""
         row = self.row(job)
         if row.world:
             return options_of({"truth": input.truth})

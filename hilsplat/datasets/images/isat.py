@@ -1,4 +1,4 @@
-"""Label files of the ISAT annotation tool, the format of LERF-OVS's labels; masks to polygons and back.
+"""Label files of the ISAT annotation tool, the format of LERF-OVS's labels; rasterising and tracing polygons.
 
 `objects` is a list. In each object, `category` is the text, `segmentation` is one polygon as a list of [x, y]
 (a list of polygons is also accepted), and `bbox` is [x1, y1, x2, y2]. `group` does not identify an object,
@@ -33,7 +33,7 @@ def fill_polygons(polygons: Sequence[Polygon], size_hw: tuple[int, int]) -> Bool
     """Return the union of polygons (vertices x, y, truncated to integers): even-odd fill, borders included.
 
     This is OpenCV's `fillPoly` on int32 vertices, used by LangSplat's evaluation. Vertex (x, y) is the
-    pixel (x, y) itself, so the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. Parts outside the image are cut.
+    pixel (x, y) itself, so the triangle (0, 0), (2, 0), (0, 2) has 6 pixels. The result is clipped.
     """
     canvas = np.zeros(size_hw, dtype=np.uint8)
     for polygon in polygons:  # a single call would omit pixels that two polygons share

@@ -193,7 +193,7 @@ class PlyMesh:
 
     @cached_property
     def faces(self) -> Int32[np.ndarray, "F corners"]:
-        """Vertex indices of the corners of all faces."""
+        """Vertex indices of all faces' corners, checked against the number of vertices."""
         faces = self.column("face", "vertex_indices").astype(np.int32)
         count = len(self._content["vertex"].data)
         if faces.size and (faces.min() < 0 or faces.max() >= count):

@@ -56,7 +56,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 
 
 def read_label_table(path: Path) -> dict[str, int]:
-    """Return the id of each raw category in `scannetv2-labels.combined.tsv`; 0 if it isn't one of the 200."""
+    """Return each raw category's id in `scannetv2-labels.combined.tsv`; 0 if not one of the 200 classes."""
     require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
     found = {}
     with path.open(encoding="utf-8", newline="") as stream:
@@ -100,7 +100,7 @@ def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
 
 
 def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
-    """Return posed colour images by frame number, skipping frames that tracking lost.
+    """Return posed colour images by frame number, skipping frames for which tracking failed.
 
     ScanNet's coordinates are relative to the first pixel's centre (the depth camera's centre is 319.5 of
     640), so half a pixel is added to the principal point in K.
@@ -281,5 +281,5 @@ DATASET = Dataset(
 )
 
 SCANNET200_DATASET = replace(DATASET, name="scannet200", title="ScanNet200")
-"""The same scans and files with other labels. Which scans the paper scored with 200 classes is not stated:
-these ten or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""
+"""The same scans and files with other labels. The paper does not state whether it scored these ten scans with
+200 classes, or the benchmark's 312 validation scans (ScanNet's `Tasks/Benchmark/scannetv2_val.txt`)."""

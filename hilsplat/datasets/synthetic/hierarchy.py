@@ -5,7 +5,7 @@ This is our own format for benchmarks like Hi-LERF, whose format is unpublished.
     annotations.json          nodes (the tree) and the ids of the nodes annotated in each view
     labels/<view>.<level>.png 16-bit label images: node id + 1, 0 where there is no node
 
-Only `evaluate` and the diagnostic segmenter (`truth_masks`) may read it.
+Only `evaluate` and the diagnostic segmenter (`truth_masks`) may read the folder.
 """
 
 from collections.abc import Iterable, Mapping
@@ -74,13 +74,13 @@ class HierarchyAnnotations:
         return {text: tuple(ids) for text, ids in texts.items()}
 
     def mask(self, view: str, ids: Iterable[int]) -> Bool[np.ndarray, "H W"]:
-        """Return the union of the regions of nodes of one level in a view."""
+        """Return the union of nodes' regions in a view; all nodes must have the same level."""
         ids = tuple(ids)
         level = Level(self.nodes[ids[0]].level)
         return np.isin(self.label_image(view, level), ids)
 
     def path_of(self, node_id: int) -> tuple[str, ...]:
-        """Return the texts from the whole down to the node: ("bear", "head", "nose")."""
+        """Return the texts from the whole down to the node, such as ("bear", "head", "nose")."""
         texts: list[str] = []
         while node_id != NONE:
             texts.insert(0, self.nodes[node_id].text)

@@ -49,7 +49,7 @@ WAYMO_CLASSES: dict[str, str] = {
     "traffic light pole": "pole",
 }
 """Text of a whole or part in a street -> Waymo class name; a part's class overrides that of its whole. Fences
-are undefined: Waymo has no class for them."""
+are undefined, because Waymo has no class for them."""
 
 COUNTABLE = frozenset({"car", "truck", "bus", "bicyclist", "pedestrian"})
 """Classes with separate instances."""

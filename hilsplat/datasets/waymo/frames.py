@@ -108,7 +108,7 @@ def beam_inclinations(
 ) -> Float[np.ndarray, " H"]:
     """Return the inclination of each row of a range image, radians; row 0 is the highest beam.
 
-    `values` are calibrated inclinations, ascending; None if the beams are evenly spaced between the borders
+    `values` are calibrated inclinations, ascending; None if the beams are evenly spaced between the limits
     `lowest` and `highest`.
     """
     if values is None:

@@ -36,7 +36,7 @@ def find_parquet(root: Path, segment: str) -> Path | None:
 
 
 def find_record(root: Path, segment: str) -> Path | None:
-    """Return the file of a segment in release 1, in the folder or a split's folder, or None."""
+    """Return the file of a segment in release 1, in `root` or a split's folder, or None."""
     for split in SPLITS:
         whole = RECORD.format(split=split, segment=segment)
         for name in (whole, whole.removeprefix(f"individual_files_{split}_")):

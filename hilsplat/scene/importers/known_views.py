@@ -305,8 +305,8 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
 def read_polycam(known: KnownPoses) -> list[KnownView]:
     """Read the posed views of a raw Polycam export.
 
-    `keyframes/cameras/<stem>.json` or its corrected version contains fx, fy, cx, cy, width, height in px, and
-    t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
+    `keyframes/cameras/<stem>.json`, or its corrected version, contains fx, fy, cx, cy, width, height in px,
+    and t_00 ... t_23, the camera-to-world matrix by rows, metres, OpenGL axes.
     """
     images, cameras = known.files
     border_px = POLYCAM_BORDER_PX if images.name.startswith("corrected") else 0
