@@ -1,6 +1,6 @@
 """HTTP server of the annotation page: `hilsplat annotate`.
 
-All geometry is computed here, with evaluation's polygon filling; the page only displays it.
+All geometry is computed here, with the polygon filling used in evaluation; the page only displays it.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,7 +42,7 @@ MAX_BODY_BYTES = 16 << 20
 
 
 class Stroke(Message):
-    """A brush stroke: discs of one radius along points, px."""
+    """A brush stroke: discs of the same radius along points, px."""
 
     points: Annotated[list[tuple[Place, Place]], Field(min_length=1, max_length=20_000)]
     radius: Annotated[float, Field(ge=0.5, le=500)]
@@ -67,7 +67,7 @@ class At(Message):
 
 
 class Segment(Message):
-    """Clicks on one thing in a photograph (x, y, inside), or a box around it (left, top, right, bottom)."""
+    """Clicks on one object in a photograph (x, y, inside), or a box around it (left, top, right, bottom)."""
 
     view: int
     clicks: Annotated[tuple[tuple[int, int, bool], ...], Field(max_length=64)] = ()
@@ -75,7 +75,7 @@ class Segment(Message):
 
 
 class Carry(Message):
-    """Ids of things, and the view to transfer them to."""
+    """Ids of objects, and the view to transfer these objects to."""
 
     ids: Annotated[list[int], Field(min_length=1, max_length=2000)]
     view: int
@@ -88,14 +88,14 @@ class Labels(Message):
 
 
 class File(Message):
-    """A file of annotations."""
+    """An annotation file."""
 
     name: Annotated[str, Field(max_length=300)]
     text: str
 
 
 class Given(Message):
-    """Files of annotations."""
+    """Annotation files."""
 
     files: Annotated[list[File], Field(min_length=1, max_length=5000)]
 
@@ -105,7 +105,7 @@ class OpenedScene(ShownScene):
 
     Args:
         folder: the scene's folder, such as results/photos/desk.
-        labels: folder of its label files; created with the first one.
+        labels: folder of the scene's label files; created when the first label file is saved.
         variant: variant whose masks and nodes are proposed.
 
     Raises:
@@ -132,7 +132,7 @@ class OpenedScene(ShownScene):
         return OpenedScene(self.folder, self.labels, self.variant, self.threads)
 
     def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard reads of photographs, and drawing on them; other parts may change."""
+        """Guard reading and annotating of photographs; other parts may change."""
         return self.unchanged(self.photographs)
 
     def described(self) -> dict[str, Any]:
@@ -152,7 +152,7 @@ class OpenedScene(ShownScene):
         }
 
     def known(self) -> dict[str, list[Label]]:
-        """Return the annotations of all views that have any."""
+        """Return the annotations of all annotated views."""
         return known_labels(self.labels, self.scene.cameras, self.scene.cameras.names)
 
 
@@ -198,7 +198,7 @@ class Annotator:
 
 
 def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the annotations of every view with their versions, in view order."""
+    """Return the annotations and file version of every view, in view order."""
     known = opened.known()
     return [
         {
@@ -210,14 +210,14 @@ def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, An
 
 
 def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
-    """Return polygons and area of a region: polygons, plus or minus a stroke, inside another region."""
+    """Return a region's polygons and area: given polygons, plus or minus a stroke, cut to `inside`."""
     size_hw = opened.scene.cameras[view_name(opened.scene, asked.view)].size_hw
     mask = drawn = fill_polygons(asked.add, size_hw)
     if asked.stroke is not None:
         painted = np.zeros(size_hw, np.uint8)
         points, radius = np.array(asked.stroke.points, np.int32), asked.stroke.radius
         cv2.polylines(painted, [points], False, 1, max(1, round(2 * radius)))
-        for x, y in points:  # round ends, and dots
+        for x, y in points:  # rounds the ends of lines, and draws single points
             cv2.circle(painted, (int(x), int(y)), round(radius), 1, cv2.FILLED)
         mask = mask & (painted == 0) if asked.stroke.erase else mask | (painted > 0)
     if asked.inside is not None:
@@ -239,7 +239,7 @@ def _segment(opened: OpenedScene, asked: Segment) -> list[dict[str, Any]]:
 
 
 def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
-    """Return things of other views, transferred to a view, as proposals; nothing is written."""
+    """Return objects of other views, transferred to a view, as proposals; nothing is written."""
     with opened.unchanged():
         view = view_name(opened.scene, asked.view)
         found = opened.proposals.carried(opened.known(), asked.ids, view)
@@ -247,7 +247,7 @@ def _carry(opened: OpenedScene, asked: Carry) -> list[dict[str, Any]]:
 
 
 def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
-    """Return the annotations merged with those of files, by view number; nothing is written."""
+    """Return the annotations merged with those in files, by view number; nothing is written."""
     cameras = opened.scene.cameras
     files = [imported(file.name, file.text, cameras) for file in asked.files]
     sizes_hw = {view: cameras[view].size_hw for view in cameras.names}
@@ -288,6 +288,6 @@ def run_annotate(
     opened = OpenedScene(folder, labels, variant, threads)
     annotator, annotated = Annotator(opened), len(opened.known())
     first = opened.scene.cameras.names[0]
-    annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles its loops before the first click
+    annotator.drawing.submit(opened.proposals.at, first, 0, 0)  # compiles the loops before the first click
     about = f"{opened.scene.name}: {annotated} photographs annotated in {labels}; page"
     serve(annotator.app, about, port=port, browser=browser, on_ready=on_ready)

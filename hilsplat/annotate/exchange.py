@@ -26,11 +26,11 @@ from hilsplat.web.coco import coco_content, coco_region
 
 Kind = Literal["hilsplat", "isat", "labelme", "coco"]
 OURS = {"level", "parent", "origin"}
-"""Keys of ours in the other formats."""
+"""Our extra keys in the other formats."""
 
 
 def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras) -> bytes:
-    """Return all annotations as a ZIP with one file per view, or, for COCO, as one JSON file."""
+    """Return all annotations as a ZIP with one file per view or, for COCO, as one JSON file."""
     if kind == "coco":
         return _json(_coco(known, cameras)).encode()
     write = {"hilsplat": as_file, "isat": _isat, "labelme": _labelme}[kind]
@@ -44,10 +44,10 @@ def exported(kind: Kind, known: Mapping[str, Sequence[Label]], cameras: Cameras)
 def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int:
     """Write a scene's annotations, or a synthetic scene's ground truth, in the layout of LERF-OVS's labels.
 
-    `out`, such as `label/teatime`, is replaced; it gets `<view>.json` and the image of each labelled view.
-    Each polygon is an object, as LangSplat's evaluation requires; the keys for levels and parents are ignored
-    there. Annotations are read from `annotated/<dataset>/<scene>` below `data_root`. Return the number of
-    labelled views.
+    `out`, such as `label/teatime`, is replaced and gets `<view>.json` and the image of each labelled view.
+    Each polygon is an object, as LangSplat's evaluation requires; that evaluation ignores the keys for levels
+    and parents. Annotations are read from `annotated/<dataset>/<scene>` below `data_root`. Return the number
+    of labelled views.
 
     Raises:
         SceneError: the scene has no labels.
@@ -71,7 +71,7 @@ def export_labels(scene: Scene, folder: Path, data_root: Path, out: Path) -> int
 
 
 def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[str, list[Label]]:
-    """Return the ground-truth labels of a synthetic scene as annotations, in views that have any."""
+    """Return a synthetic scene's ground-truth labels as annotations, for views that have labels."""
     known: dict[str, list[Label]] = {}
     for view in views:
         nodes = [truth.nodes[number] for number in truth.views.get(view, ())]
@@ -92,7 +92,7 @@ def labels_of_truth(truth: HierarchyAnnotations, views: Sequence[str]) -> dict[s
 
 
 def _isat(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> str:
-    """Format labels as ISAT, with one polygon per object; pieces of a thing have the same group."""
+    """Format labels as ISAT, one polygon per entry; all pieces of a labelled object have the same group."""
     size = {"width": size_hw[1], "height": size_hw[0]}
     info = {"description": "ISAT", "folder": "", "name": view, **size, "depth": 3, "note": ""}
     objects = []
@@ -124,7 +124,7 @@ def _labelme(view: str, size_hw: tuple[int, int], labels: Sequence[Label]) -> st
 
 
 def _coco(known: Mapping[str, Sequence[Label]], cameras: Cameras) -> dict[str, Any]:
-    """Format labels as COCO, with run lengths because COCO fills polygons in another way."""
+    """Format labels as COCO, with run lengths because COCO fills polygons differently."""
     texts = sorted({label.text for labels in known.values() for label in labels})
     content = coco_content("annotations by hilsplat", known, cameras, texts)
     for number, (view, labels) in enumerate(known.items()):
@@ -150,7 +150,7 @@ def _json(value: object) -> str:
 def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
     """Read the annotations in a file of any of the four formats, by view.
 
-    Ids are counted from 1 unless the file has its own. The file's name identifies the photograph if the
+    Ids are counted from 1 unless the file contains ids. The file's name identifies the photograph if the
     content does not.
 
     Raises:
@@ -163,7 +163,7 @@ def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
             if isinstance(content, dict) and isinstance(content.get(key), list):
                 return read(name, content, cameras)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
-        # Any value may have an unexpected type or be invalid: a list for an id, an infinite number.
+        # Any value may be invalid or have an unexpected type: a list as an id, an infinite number.
         raise SceneError(f"{name} cannot be read: {error}", expected="a whole JSON file") from error
     raise SceneError(
         f"{name} has an unknown format",
@@ -173,11 +173,11 @@ def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
 
 
 Piece = tuple[str, Any, np.ndarray, Mapping[str, Any]]
-"""Text, identifier of the thing (or None), vertices, and the keys in the file."""
+"""Text, identifier of the object (or None), vertices, and the keys in the file."""
 
 
 def _joined(name: str, pieces: Sequence[Piece]) -> list[Label]:
-    """Join pieces into one label per thing; pieces without an identifier are separate things."""
+    """Join pieces into one label per object; pieces without an identifier are separate objects."""
     things: dict[Any, list[Piece]] = {}
     for row, piece in enumerate(pieces):
         things.setdefault((piece[0], piece[1]) if piece[1] is not None else row, []).append(piece)
@@ -207,7 +207,7 @@ def _from_isat(name: str, content: Mapping[str, Any], cameras: Cameras) -> dict[
         return {view: labels_of(labels)}
     pieces: list[Piece] = []
     for thing in labels.objects:
-        # Without our keys, groups are ignored: in LERF-OVS's files, they repeat and identify nothing.
+        # Without our keys, groups are ignored: in LERF-OVS's files, the numbers repeat and identify nothing.
         group = thing.keys.get("group") if "level" in thing.keys else None
         pieces += [(thing.category, group, polygon, thing.keys) for polygon in thing.polygons]
     return {view: _joined(name, pieces)}
@@ -278,7 +278,7 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
 def unpacked_counts(text: str) -> list[int]:
     """Decode COCO's compressed run lengths.
 
-    Each character has five bits, low bits first; from the fourth on, a run is relative to the last but one.
+    Each character has five bits, low bits first; from the fourth run, values are relative to two runs before.
     """
     runs: list[int] = []
     value = shift = 0
@@ -296,7 +296,7 @@ def unpacked_counts(text: str) -> list[int]:
 
 
 def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> str:
-    """Return the view whose photograph has the name and size in a file; folder and suffix are ignored."""
+    """Return the view whose photograph has the given name and size; folder and suffix are ignored."""
     stem = Path(image.replace("\\", "/")).stem
     view = next((each for each in cameras.names if Path(each).stem == stem), None)
     if view is None:
@@ -316,7 +316,7 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
 
 
 SAME_THING = 0.5
-"""Minimum IoU of labels of one photograph, with the same text and level, that are the same thing."""
+"""Minimum IoU at which two labels of a photograph, with the same text and level, are one object."""
 
 
 def merged(
@@ -326,14 +326,14 @@ def merged(
 ) -> tuple[dict[str, list[Label]], int, int]:
     """Add the labels of files to those of a scene.
 
-    Ids are compared only among things with the same text and level, because shapes without ids are numbered
-    from 1 in every photograph. Among the scene's things with its text and level, a label is matched to the
-    one that it overlaps, else to the one with its id, else to one without a label in the photograph. If there
-    is none, it is a new thing.
+    Ids are compared only among objects with the same text and level, because shapes without ids are numbered
+    from 1 in every photograph. Among the scene's objects with the same text and level, a label is matched to
+    an object that it overlaps, else to one with the same id, else to one without a label in the photograph.
+    A label without a match is a new object.
 
     Returns:
-        all labels of each changed photograph; the number of labels that are new or have another region; and
-        the number of labels that already existed.
+        all labels of each changed photograph; the number of new labels or labels with another region; and the
+        number of labels that already existed.
     """
     views = {view: list(labels) for view, labels in known.items()}
     things = {label.id: _kind(label) for labels in views.values() for label in labels}
@@ -369,7 +369,7 @@ def _kind(label: Label) -> tuple[str, int]:
 def _row_of(
     label: Label, mask: Bool[np.ndarray, "H W"], here: Sequence[Label], size_hw: tuple[int, int]
 ) -> int | None:
-    """Return the row of a photograph's label that is the same thing; None if there is none."""
+    """Return the row of the photograph's label of the same object; None if there is no such label."""
     for row, other in enumerate(here):
         if _kind(other) == _kind(label):
             region = other.mask(size_hw)

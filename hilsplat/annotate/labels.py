@@ -1,6 +1,6 @@
-"""Annotations of one view: text, level, parent and pixels of each thing.
+"""Annotations of one view: text, level, parent and pixels of each object.
 
-Each view has a file in the format of `datasets.images.hi`; a thing has the same id in all views. Polygon
+Each view has a file in the format of `datasets.images.hi`; an object has the same id in all views. Polygon
 vertices are whole pixels, so that evaluation fills exactly the drawn region.
 """
 
@@ -37,15 +37,15 @@ def _plain_text(text: str) -> str:
 
 
 class Label(Message):
-    """One thing in one view.
+    """One object in one view.
 
     Attributes:
-        id: identifies the thing in all views.
+        id: identifies the object in all views.
         level: 1 whole, 2 part, 3 subpart.
-        parent: id of a thing one level up in the same view; None if it has none.
+        parent: id of an object one level up in the same view; None if there is no parent.
         polygons: vertices in whole pixels; the region is the union of the filled polygons.
         origin: drawn by hand; proposed by a node, a mask or another view; accepted as proposed; or a proposal
-            that was edited by hand. Labels that are only proposed are not scored.
+            edited by hand. Labels that are only proposed are not scored.
     """
 
     id: Annotated[int, Field(ge=1, le=1_000_000)]
@@ -68,7 +68,7 @@ class Label(Message):
             ) from error
 
     def mask(self, size_hw: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """Return the region."""
+        """Return the label's region."""
         return fill_polygons(self.polygons, size_hw)
 
 
@@ -81,7 +81,7 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     """Cut every child to its parent, wholes first, so that a subpart also stays inside the whole.
 
     Raises:
-        SettingsError: an id is used twice, a parent is missing or not one level up, or no pixel of a thing is
+        SettingsError: an id is used twice, a parent is missing or not one level up, or an object has no pixel
             inside the image and its parent.
     """
     twice = [number for number, count in Counter(label.id for label in labels).items() if count > 1]
@@ -142,13 +142,13 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
 
 
 def known_labels(folder: Path, cameras: Cameras, views: Sequence[str]) -> dict[str, list[Label]]:
-    """Return the annotations of the views that have any; errors as in `read_labels`."""
+    """Return the annotations of all annotated views; errors are those of `read_labels`."""
     found = {view: read_labels(label_path(folder, view), cameras[view].size_hw) for view in views}
     return {view: labels for view, labels in found.items() if labels}
 
 
 def labels_of(found: IsatFile) -> list[Label]:
-    """Return the objects of a file in our format as labels; raise SceneError if an id or level is invalid."""
+    """Return the objects in a file of our format as labels; raise SceneError if an id or level is invalid."""
     objects = by_id(found)
     parents = parents_of(found, objects, [])
     return [
@@ -173,7 +173,7 @@ def whole_pixels(points: np.ndarray) -> list[tuple[int, int]]:
 def write_labels(
     path: Path, view: str, size_hw: tuple[int, int], labels: Sequence[Label], version: str
 ) -> str:
-    """Replace the annotations of a view, and return the new version; without annotations there is no file.
+    """Replace the annotations of a view and return the new version; without annotations, delete the file.
 
     Raises:
         StaleFileError: the file changed since `version` was read.

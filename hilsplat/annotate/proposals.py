@@ -1,4 +1,4 @@
-"""Outlines that the user can accept or correct: of nodes, masks, things of other views, or SAM at clicks.
+"""Outlines that the user can accept or correct: from nodes, masks, labels in other views, or SAM clicks.
 
 A proposal becomes an annotation only when the user accepts it, because ground truth copied from a prediction
 measures nothing.
@@ -31,14 +31,14 @@ from hilsplat.splat.ply import load_ply
 from hilsplat.splat.rasterise.api import pixel_weights
 
 LEAST_PX = 20
-"""Minimum area of a proposal; smaller ones are noise."""
+"""Minimum area of a proposal; smaller proposals are noise."""
 LEAST_SHARE = 0.05
-"""Minimum area of a proposal's pieces and holes, as a share of the proposal; smaller ones are noise."""
+"""Minimum area of a proposal's pieces and holes, relative to the proposal; smaller ones are noise."""
 SMOOTH_PX = 1.0
-"""Maximum deviation of a proposal's outline from its pixels, so that there are fewer vertices to correct."""
+"""Maximum deviation of a proposal's outline from its pixels, px; reduces the vertices to correct."""
 MOST_MASKS = 6
 LEAST_SEEN = 0.25
-"""Minimum share of a transferred thing's pixel that belongs to Gaussians seen in its annotated views."""
+"""Minimum share of a transferred object's pixel from Gaussians visible in the object's annotated views."""
 VIEWS_MIB = 512.0
 KEPT_VIEWS = 3
 """Number of photographs whose SAM features are cached: 4 MB each for ViT-B, up to 40 MB for SAM 2."""
@@ -46,12 +46,12 @@ BOX_GRID = 4
 """Prompt points along each side of a box, because not all SAM exports accept boxes."""
 OFFERED = 3
 SAME_IOU = 0.9
-"""Minimum IoU of masks that count as the same."""
+"""Minimum IoU of two masks that count as the same mask."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """An outline and its source, such as "node 12" or "mask 3"; `text` is the user's name for the node."""
+    """An outline and its source, such as "node 12" or "mask 3"; `text` is the node's user-given name."""
 
     what: str
     text: str
@@ -60,7 +60,7 @@ class Proposal:
 
 
 class Proposals:
-    """Proposals in the views of a scene, from the existing parts of its folder. Not thread-safe."""
+    """Proposals in a scene's views, from the existing parts of the scene's folder. Not thread-safe."""
 
     def __init__(self, scene: Scene, folder: Path, variant: str, threads: int) -> None:
         self.scene, self.threads = scene, threads
@@ -108,7 +108,7 @@ class Proposals:
         return _proposals(found)
 
     def _masks_at(self, view: str, x: int, y: int) -> list[Proposal]:
-        path = self.masks / f"{view}.npz"  # test views have none
+        path = self.masks / f"{view}.npz"  # test views have no masks
         if not path.is_file():
             return []
         masks = HierarchicalMasks.load(path)
@@ -122,18 +122,18 @@ class Proposals:
     def carried(
         self, known: Mapping[str, Sequence[Label]], ids: Sequence[int], view: str
     ) -> list[tuple[Label, list[list[tuple[int, int]]]]]:
-        """Transfer objects annotated in other views to a view by their Gaussians, parents before children.
+        """Transfer objects annotated in other views to this view via Gaussians, parents before children.
 
-        A Gaussian belongs to a thing if more than half of its weight in the thing's annotated views is inside
-        the thing's regions. Gaussians that none of those views sees are ignored. Children are cut to their
-        parents in this view.
+        A Gaussian belongs to an object if more than half of its weight in the object's annotated views is
+        inside the object's regions. Gaussians not visible in these views are ignored. Children are cut to
+        their parents in this view.
 
         Args:
             known: annotations by view; unaccepted proposals are ignored.
-            ids: things to transfer; those with a label in this view are skipped.
+            ids: ids of objects to transfer; objects with a label in this view are skipped.
 
         Returns:
-            each thing's label in another view, and its polygons in this view.
+            each object's label in another view, and its polygons in this view.
 
         Raises:
             SettingsError: the scene has no Gaussians yet.
@@ -168,7 +168,7 @@ class Proposals:
         return found
 
     def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether each Gaussian belongs to a thing, and whether any of its views sees it (0 or 1)."""
+        """Return whether each Gaussian belongs to an object and is visible in the object's views (0 or 1)."""
         assert self.gaussians is not None
         inside = np.zeros(len(self.gaussians), np.float64)
         total = np.zeros(len(self.gaussians), np.float64)
@@ -198,7 +198,7 @@ class Proposals:
 
 
 def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:
-    """Return distinct proposals that are not empty after cleaning."""
+    """Return the distinct proposals that are not empty after cleaning."""
     kept: list[Proposal] = []
     for what, text, level, mask in found:
         if (mask := cleaned(mask)).any():
@@ -216,7 +216,7 @@ def cleaned(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     if not contours:
         return canvas.astype(bool)
     by_area = sorted(zip(contours, ranks[0], strict=True), key=lambda pair: -cv2.contourArea(pair[0]))
-    for contour, rank in by_area:  # from outside to inside, so that a hole keeps smaller pieces inside it
+    for contour, rank in by_area:  # from outside to inside, so that smaller pieces inside a hole are kept
         if cv2.contourArea(contour) >= least:
             cv2.fillPoly(canvas, [cv2.approxPolyDP(contour, SMOOTH_PX, True)], int(rank[3] < 0))
     return canvas.astype(bool)
@@ -226,7 +226,7 @@ def cleaned(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 
 
 class Clicks:
-    """The SAM model that made a scene's masks, opened at the first click. Not thread-safe."""
+    """The SAM model that computed a scene's masks, opened at the first click. Not thread-safe."""
 
     def __init__(self, scene: Scene, masks: Path) -> None:
         self.scene = scene
@@ -236,12 +236,12 @@ class Clicks:
 
     @property
     def name(self) -> str:
-        """Name of the model; empty if the scene's masks were made without SAM."""
+        """Name of the model; empty if the scene's masks were computed without SAM."""
         return Path(self.folder).name
 
     @cached_property
     def model(self) -> SamModel:
-        """The opened model; raises SettingsError if the scene's masks were made without SAM."""
+        """The opened model; raises SettingsError if the scene's masks were computed without SAM."""
         if not self.folder:
             raise SettingsError(
                 "the masks of this scene were made without SAM", fix="draw, or compute masks with SAM"
@@ -251,17 +251,17 @@ class Clicks:
     def outlines(
         self, view: str, clicks: Sequence[tuple[int, int, bool]], box: tuple[int, int, int, int] | None
     ) -> list[Proposal]:
-        """Return the outlines of the object at clicks or in a box, best first.
+        """Return outlines of the object at clicks or in a box, best first.
 
         Masks are ranked by the number of clicks that they satisfy, then by SAM's predicted IoU (with a box,
-        times the IoU of the mask's box and the given one).
+        times the IoU of the mask's box and the given box).
 
         Args:
-            clicks: x, y, and whether the pixel is inside the thing.
+            clicks: x, y, and whether the pixel is inside the object.
             box: left, top, right, bottom, inclusive; only without clicks.
 
         Raises:
-            SettingsError: no click is inside the thing and the photograph, or the scene has no SAM.
+            SettingsError: no click inside the object is in the photograph, or the scene has no SAM.
         """
         height, width = self.scene.cameras[view].size_hw
         points = np.array([[x + 0.5, y + 0.5] for x, y, _ in clicks]).reshape(-1, 2)
@@ -273,7 +273,7 @@ class Clicks:
         asked = points[inside] if clicks else _grid(corners)
         iou, logits = self.model.decode(encoded, asked)
         iou, logits = iou.reshape(-1), logits.reshape(-1, *logits.shape[2:])
-        if len(clicks) > 1:  # all clicks as one prompt
+        if len(clicks) > 1:  # decode all clicks as one prompt, too
             more_iou, more = self.model.decode_clicks(encoded, points, inside)
             iou, logits = np.concatenate([more_iou, iou]), np.concatenate([more, logits])
         masks = enlarged(logits, encoded.frame)

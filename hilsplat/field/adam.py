@@ -27,7 +27,7 @@ class Adam:
 
     values: np.ndarray  # parameters, float32, contiguous
     rate: float  # step size; it may change between steps
-    # added to the square root of the second moment: 1e-8 in torch, 1e-15 in the optimiser of 3DGS and in
+    # added to the square root of the second moment: 1e-8 in torch, 1e-15 in 3DGS's optimiser and in the
     # published code of language fields
     eps: float = 1e-15
 

@@ -34,7 +34,7 @@ from hilsplat.settings import AutoencoderSettings
 Arrays = dict[str, np.ndarray]
 
 # Values for the backward pass through a layer: inputs (B, I) of the linear layer, after BatchNorm and ReLU;
-# normalised inputs (B, I) of the BatchNorm and reciprocal standard deviations (I), both empty without it.
+# normalised inputs (B, I) of the BatchNorm and reciprocal standard deviations (I), empty without BatchNorm.
 Passed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -45,9 +45,9 @@ def mask_targets(
 
     Args:
         clip: each mask's own vector, zero if it has none.
-        targets: "node": the vector of the node that the mask fits best, or the mean of all nodes for a mask
-            that shares no Gaussian with any; "mask": the mask's own vector, as in the paper; also used if
-            the tree has no nodes.
+        targets: "node": the vector of the node that the mask fits best, or the mean over all nodes for a mask
+            that shares no Gaussian with any node; "mask": the mask's own vector, as in the paper; also used
+            if the tree has no nodes.
     """
     if targets == "node" and len(tree):
         or_mean = np.append(tree.clip, tree.clip.mean(axis=0, keepdims=True), axis=0)
@@ -111,8 +111,8 @@ def train_autoencoder(
 ) -> Autoencoder:
     """Train on one scene's unit vectors: Adam with cosine decay, full batches drawn without replacement.
 
-    Equal inputs and seeds give equal bytes for any number of stage threads (the command line limits BLAS to
-    one thread). The seed determines the initial weights and the order of vectors.
+    Identical inputs and seeds produce identical bytes for any number of stage threads (the command line
+    limits BLAS to one thread). The seed determines the initial weights and the order of vectors.
     """
     twister = torch_generator(seed)
     channels, latent = vectors.shape[1], settings.latent
@@ -148,7 +148,7 @@ def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray,
 
 @compiled
 def _swap(order, drawn):
-    """Swap each element with itself or a later one, as drawn."""
+    """Swap each element with itself or a later element, as drawn."""
     for place in range(len(drawn)):
         other = place + np.int64(drawn[place]) % (len(order) - place)
         order[place], order[other] = order[other], order[place]
@@ -229,7 +229,7 @@ def _backward(
 
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the gradient before `unit` from the gradient after it; the part along the vectors vanishes."""
+    """Return the gradient before `unit` from that after `unit`; the component along the vectors vanishes."""
     length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
     return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
@@ -237,7 +237,7 @@ def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 @compiled(error_model="numpy")
 def _normalised(values, weight, bias):
-    """Apply BatchNorm with the batch's statistics and ReLU; return scaled inputs, 1 / deviation, outputs."""
+    """Apply BatchNorm (batch statistics) and ReLU; return normalised inputs, 1 / deviation and outputs."""
     rows, columns = values.shape
     mean, var = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
     scaled, out = np.empty_like(values), np.empty_like(values)
@@ -258,7 +258,7 @@ def _normalised(values, weight, bias):
 
 @compiled(error_model="numpy")
 def _normalised_backward(slope, scaled, spread, weight, of_weight, of_bias):
-    """Convert `slope` from a BatchNorm's outputs to its inputs; write the gradients of weight and bias."""
+    """Convert gradients `slope` from a BatchNorm's outputs to its inputs; write those of weight and bias."""
     rows, columns = slope.shape
     of_weight[:] = 0
     of_bias[:] = 0

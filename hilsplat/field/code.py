@@ -1,4 +1,4 @@
-"""The scene's code from CLIP vectors to a few numbers and back, and the language field of such codes."""
+"""The scene's code, which maps CLIP vectors to a few numbers and back, and the language field of codes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from hilsplat.base.lane_products import MOST_ROWS, WIDE_COLUMNS, rows_of_product
 from hilsplat.contributions.rows import Contributions
 from hilsplat.segment.digests import require_same_masks
 
-CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers, 2 MiB, fit into the processor's cache
+CHUNK_ROWS = 4096  # rows decoded at once: 4096 vectors of 128 numbers (2 MiB) fit in the processor's cache
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 NORM_EPS = 1e-5  # epsilon added to the variances of BatchNorm, as in torch
 
-ROWS = 2 * WIDE_COLUMNS  # rows that pass through the layers together; weights are read from L2 only once
-UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple
+ROWS = 2 * WIDE_COLUMNS  # rows processed together; for each such block, weights are read from L2 once
+UNITS = MOST_ROWS  # outputs of a layer that are summed together; layers are padded to a multiple of this
 
 _add_products = rows_of_products(UNITS)
 
@@ -33,9 +33,8 @@ class LinearCode:
     """Code e = unit(m + U z) with d principal directions about the mean.
 
     m is the mean, and U the basis with orthonormal rows. The code needs no training and no randomness. Unlike
-    with a network, the code of an average is the average of the codes, and a cosine with any vector takes d
-    products, so relevancy needs no decoding. A network, however, can adapt its d numbers nonlinearly to the
-    scene's vectors.
+    for a network, the code of an average is the average of the codes, and a cosine with any vector takes d
+    products, so relevancy needs no decoding. But a network can adapt nonlinearly to the scene's vectors.
     """
 
     def __init__(self, mean: Float32[np.ndarray, " C"], basis: Float32[np.ndarray, "D C"]) -> None:
@@ -77,16 +76,16 @@ class LinearCode:
         )
 
     def save(self, path: Path) -> None:
-        """Write a .safetensors file; equal codes give equal bytes."""
+        """Write a .safetensors file; identical codes produce identical bytes."""
         arrays = {"mean": self.mean, "basis": self.basis}
         write_tensors(path, arrays, code="pca", channels=self.channels, latent=self.latent)
 
 
 class PackedLayers(NamedTuple):
-    """Dense layers with ReLUs between them, in the layout of one compiled loop.
+    """Dense layers with ReLUs between them, in the memory layout of a compiled loop.
 
-    The values fit into the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit into
-    the registers. The order of summation in a row does not depend on other rows.
+    The values fit in the L1 cache. Rows are SIMD lanes, and as many outputs are summed together as fit in
+    the registers. The summation order in a row does not depend on other rows.
     """
 
     widths: Int64[np.ndarray, " L_plus_1"]  # number of inputs, then number of each layer's outputs
@@ -156,17 +155,17 @@ def _through(rows, widths, weights, biases, out):
 class Layer(NamedTuple):
     """A linear layer, with the normalisation and activation before it."""
 
-    name: str  # name of its weights in the file
-    norm: str  # name of the BatchNorm before it; empty if there is none
-    relu: bool  # whether a ReLU is applied to its inputs, after the BatchNorm
+    name: str  # name of the layer's weights in the file
+    norm: str  # name of the BatchNorm before the layer; empty if there is none
+    relu: bool  # whether a ReLU is applied to the layer's inputs, after the BatchNorm
     inputs: int
     outputs: int
 
 
 def layers_of(channels: int, latent: int) -> tuple[list[Layer], list[Layer]]:
-    """Return the layers of encoder and decoder; no layer is wider than the vectors."""
+    """Return the layers of the encoder and the decoder; no layer is wider than the vectors."""
     inner, outer = ([min(width, channels) for width in sizes] for sizes in (ENCODER_WIDTHS, DECODER_WIDTHS))
-    # names use the numbering of torch's nn.Sequential, which counts norms and ReLUs
+    # names follow the numbering of torch's nn.Sequential, which also counts norms and ReLUs
     encoder = [
         Layer(f"encoder.{3 * k}", f"encoder.{3 * k - 2}" if k else "", k > 0, *sizes)
         for k, sizes in enumerate(pairwise([channels, *inner, latent]))
@@ -191,9 +190,9 @@ def unit(vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B C"]:
 class Autoencoder:
     """LangSplat's scene autoencoder, C -> 256 -> 128 -> 64 -> 32 -> d and back, unit length at both ends.
 
-    Departs: layer widths never exceed C. The encoder's BatchNorm (measured better than LayerNorm or none)
-    is trained on full batches only, and then uses the statistics of all vectors: see
-    `autoencoder.train_autoencoder`. Arrays are named and laid out as in torch's modules.
+    Departs: layer widths never exceed C. The encoder's BatchNorm (better in tests than LayerNorm or no norm)
+    is trained only on full batches and then uses the statistics of all vectors: see
+    `autoencoder.train_autoencoder`. Arrays have the names and layout of torch's modules.
     """
 
     def __init__(self, channels: int, latent: int, arrays: Mapping[str, np.ndarray]) -> None:
@@ -227,7 +226,7 @@ class Autoencoder:
 
     @staticmethod
     def drawn(channels: int, latent: int, twister: np.random.RandomState) -> "Autoencoder":
-        """Draw the same weights as torch from this generator state; BatchNorm is the identity."""
+        """Draw the weights that torch draws from this generator state; BatchNorm is the identity."""
         arrays: dict[str, np.ndarray] = {}
         for layer in (layer for side in layers_of(channels, latent) for layer in side):
             if layer.norm:
@@ -241,7 +240,7 @@ class Autoencoder:
         return Autoencoder(channels, latent, arrays)
 
     def save(self, path: Path) -> None:
-        """Write a .safetensors file; equal weights give equal bytes."""
+        """Write a .safetensors file; identical weights produce identical bytes."""
         write_tensors(path, self.arrays, channels=self.channels, latent=self.latent)
 
 
@@ -290,7 +289,7 @@ class LanguageField:
     autoencoder_sha256: str  # digest of the code that decodes the latents
 
     def save(self, path: Path) -> None:
-        """Write `field.safetensors` atomically; equal fields give equal bytes."""
+        """Write `field.safetensors` atomically; identical fields produce identical bytes."""
         about = {"gaussians_sha256": self.gaussians_sha256, "autoencoder_sha256": self.autoencoder_sha256}
         write_tensors(path, {"features": self.features}, **about)
 

@@ -20,7 +20,7 @@ from hilsplat.field.losses import (
 )
 from hilsplat.settings import FieldSettings
 
-MAX_MASKS_PER_LEVEL = 96  # maximum number of masks per view and level in the losses, which compare all pairs
+MAX_MASKS_PER_LEVEL = 96  # maximum masks per view and level in the losses, because all pairs are compared
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class ViewRelations:
 
     rows: Int64[np.ndarray, " m"]  # selected masks of all levels
     depth: Int64[np.ndarray, "m m"]  # depth of the deepest common ancestor of each pair of masks
-    level: Int64[np.ndarray, " m"]  # their levels
-    # selected masks of PART and of SUBPART, and the rows of their parents, -1 for none
+    level: Int64[np.ndarray, " m"]  # level of each selected mask
+    # for PART and SUBPART: the selected masks and the rows of their parents, -1 for none
     parts: tuple[tuple[Int64[np.ndarray, " _"], Int64[np.ndarray, " _"]], ...]
 
 
@@ -70,11 +70,11 @@ def view_relations(
 def distinct(
     means: Float32[np.ndarray, "m D"], depth: Int64[np.ndarray, "m m"], most_alike: float
 ) -> Int64[np.ndarray, " k"]:
-    """Prune contrastive samples: return rows not similar to any unrelated row that was kept before.
+    """Prune contrastive samples: return rows that are not similar to any unrelated row kept before.
 
     The paper keeps the most distinct samples and specifies no numbers. A pair of masks that are similar but
-    unrelated in the tree adds a gradient that is almost redundant with those of the kept pairs. Rows are in
-    order of preference, `depth` is their `common_ancestor_depth`, and `most_alike` is a cosine.
+    unrelated in the tree adds almost no information to the gradients of the kept pairs. Rows are in order of
+    preference, `depth` is their `common_ancestor_depth`, and `most_alike` is a cosine.
     """
     unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     alike = (unit @ unit.T > most_alike) & (depth == 0)
@@ -85,7 +85,7 @@ def distinct(
 
 
 def compared(relations: list[ViewRelations]) -> tuple[int, int]:
-    """Return the number of views averaged in L_ins, and of (view, level) pairs averaged in L_part."""
+    """Return the numbers of views averaged in L_ins and (view, level) pairs averaged in L_part."""
     instance = sum(len(view.rows) > 1 for view in relations)
     part = sum(
         len(rows) > 1 and bool((parent != NONE).any()) for view in relations for rows, parent in view.parts
@@ -96,7 +96,7 @@ def compared(relations: list[ViewRelations]) -> tuple[int, int]:
 def instance_term(
     means: Float64[np.ndarray, "M D"], relations: list[ViewRelations], settings: FieldSettings
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Compute L_ins of masks' mean features, averaged over views with two or more masks, and its gradient."""
+    """Compute L_ins of the mask means, averaged over views with at least two masks, and its gradient."""
     losses, gradient = [], np.zeros(means.shape)
     for view in relations:
         if len(view.rows) < 2:
@@ -180,7 +180,7 @@ class Contrast:
         return total, gradient
 
     def _means(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the mean feature of each mask, of its random half and of its other half, in float64."""
+        """Return the mean features of each mask, its random half and its other half, in float64."""
         means = self.masks.means(features).astype(np.float64)
         halves = self.half_masks.means(features).astype(np.float64)
         n, half, rest = self._counts()

@@ -1,7 +1,7 @@
 """Stage `field`: solve the language field.
 
 Geometry is frozen, so the contributions contain all inputs of the losses. The quadratic part is in `problem`,
-the contrastive losses are in `contrast`, and their minimisation is in `solver`.
+the contrastive losses are in `contrast`, and the minimisation is in `solver`.
 """
 
 from pathlib import Path
@@ -33,9 +33,9 @@ def run_field(
     rendered: tuple[Path, Path, Path] | None = None,  # scene, Gaussians and masks for `trainer: literal`
     start: Path | None = None,  # field from which `start: langsplat` begins
 ) -> None:
-    """Solve the language field of a scene: `field.safetensors` and `field.report.json` beside it.
+    """Solve the language field of a scene; write `field.safetensors` and, beside it, `field.report.json`.
 
-    With `trainer: fast`, only a random start depends on the seed (halves of masks are seeded by the view's
+    With `trainer: fast`, only a random start depends on the seed (mask halves are seeded by the view's
     name). The result does not depend on `threads`.
 
     Raises:
@@ -116,7 +116,7 @@ def field_losses(
 
 
 def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
-    """Return the parent of each mask in the coverage tree of each view.
+    """Return the parent of each mask in the coverage trees, by view.
 
     Raises:
         MisalignedArtifactError: the trees were computed from other masks.

@@ -1,8 +1,8 @@
 """Train the field as in the paper: render a view, compute its losses, take an Adam step on the features.
 
-It is the slow reference for the sparse solver (`solver.solve_field`). Both minimise the same objective, term
-by term. Here each step computes every term on the rendered maps of one random view; the mean over all views
-is the solver's objective.
+This is the slow reference for the sparse solver (`solver.solve_field`). Both minimise the same objective,
+term by term. Here each step computes every term on the rendered maps of one random view; the mean over all
+views is the solver's objective.
 
 Departs from `train.py` of minghanqin/LangSplat, whose loop it follows: one run trains all three levels on the
 same views; rendered features are divided by alpha, so that losses and queries use the same features; thinly
@@ -35,14 +35,14 @@ from hilsplat.splat.rasterise.device import choose_device
 
 logger = logging.getLogger(__name__)
 
-CURVE_POINTS = 30  # points of the loss curve in the report
+CURVE_POINTS = 30  # number of points of the loss curve in the report
 
 
 @dataclass(frozen=True)
 class ViewTargets:
-    """Masks of one view in its covered pixels."""
+    """Masks of one view in the view's covered pixels."""
 
-    rows: Int64[np.ndarray, " m"]  # rows of its masks in the contributions
+    rows: Int64[np.ndarray, " m"]  # rows of the view's masks in the contributions
     level: Int64[np.ndarray, " m"]  # level of each mask, 0 to 2
     painted: sp.csr_matrix  # indicator (masks x pixels) of the pixels that show each mask
     half: sp.csr_matrix  # indicator of the shown pixels that are in the random half
@@ -124,7 +124,7 @@ def train_literally(
     """Run Adam from the field's start, one random view per step; views repeat only after all were used.
 
     Returns:
-        the features, and a report: every term of the objective before and after, and the loss curve.
+        the features, and a report with every term of the objective before and after, and the loss curve.
 
     Raises:
         MisalignedArtifactError: the contributions belong to other Gaussians or other masks.

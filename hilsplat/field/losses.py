@@ -1,7 +1,7 @@
 """The losses L_ins and L_part (paper, Eq. 3 to 5) of one view, each in two variants, with gradients.
 
-The losses compare a few dozen masks at a time, so their gradients are written in NumPy: importing torch takes
-longer than computing them for a whole solve. The tests compare them with autograd.
+The losses compare a few dozen masks at a time, so the gradients are written in NumPy: importing torch takes
+longer than computing all gradients of a solve. The tests compare the gradients with autograd.
 """
 
 import math
@@ -22,9 +22,9 @@ def log_distance_loss(
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """Return the mean over ordered pairs i != j of the squared difference of log distances, and its gradient.
 
-    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from dot products: M x M
-    numbers instead of M x M x D. In float64 the cancellation error is far below the softening. At least two
-    means are required; `log_wanted` is the natural logarithm of the target distance of each pair.
+    The distance is sqrt(|m_i - m_j|^2 + SOFTENING^2). Squares are computed from dot products, which needs
+    M x M numbers instead of M x M x D. In float64 the cancellation error is far below the softening. At least
+    two means are required; `log_wanted` is the natural logarithm of each pair's target distance.
     """
     rows = len(means)
     centred = means - means.mean(axis=0)
@@ -45,9 +45,9 @@ def instance_loss_literal(
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """Compute L_ins as printed (Eq. 3): the target distance of two masks is Omega^-|l_i - l_j|.
 
-    This pushes all masks of the same level to distance 1, related or not, which is impossible for more than D
-    + 1 masks. Departs only in the softened distance. `means` contains the mean rendered feature of each mask
-    of one view, all levels; Omega exceeds 1.
+    This pushes all masks of the same level, related or not, to distance 1, which is impossible for more than
+    D + 1 masks. Departs only in the softened distance. `means` contains the mean rendered feature of each
+    mask of one view, at all levels; Omega exceeds 1.
     """
     return log_distance_loss(means, -np.abs(level[:, None] - level[None]) * math.log(omega))
 
@@ -55,7 +55,7 @@ def instance_loss_literal(
 def instance_loss_tree(
     means: Float[np.ndarray, "M D"], depth: Int[np.ndarray, "M M"], omega: float
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
-    """Compute L_ins by relation instead of level: the target distance is Omega^-depth.
+    """Compute L_ins by tree relation instead of level: the target distance is Omega^-depth.
 
     Departs: the depth of the deepest common ancestor in the coverage tree replaces |l_i - l_j| of Eq. 3.
     Unrelated masks thus have a target distance of 1, parts of one object 1 / Omega, and subparts of one part
@@ -67,8 +67,8 @@ def instance_loss_tree(
 def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, "M M"]:
     """Return the depth of each mask pair's deepest common ancestor in one view's coverage tree.
 
-    A mask counts as its own ancestor and roots have depth 1; 0 means that two masks are unrelated. The value
-    for a mask and its child is the depth of the mask; for two children of a root it is 1.
+    A mask counts as its own ancestor, and roots have depth 1; 0 means that two masks are unrelated. The value
+    for a mask and its child is the mask's depth; for two children of a root, it is 1.
 
     Example:
         >>> common_ancestor_depth(np.array([-1, 0, 0, 1], dtype=np.int32))[3]
@@ -84,7 +84,7 @@ def common_ancestor_depth(parent: Int32[np.ndarray, " M"]) -> Int64[np.ndarray, 
             break
         is_ancestor[has, current[has]] = 1
     # Common ancestors of two masks form a chain from the root down, so the number of ancestors is the
-    # depth. float32 counts are exact, and its products are fast.
+    # depth. Counts in float32 are exact, and float32 products are fast.
     chains = is_ancestor.astype(np.float32)
     return (chains @ chains.T).astype(np.int64)
 
@@ -98,14 +98,14 @@ def similarity_without_parent(
 ) -> tuple[Float64[np.ndarray, "A B"], Pullback]:
     """Compute s_p of Eq. 4: cosine of two mask means after subtracting the anchor's parent mean from both.
 
-    Departs: Eq. 4 prints index j twice in the denominator; we use i and j, so that s_p is a cosine. We
-    interpret the parent mean in Eq. 4, which has no index, as the anchor's for positives and negatives. The
-    parent gets no gradient: parts move relative to their whole, not the whole relative to its parts.
+    Departs: Eq. 4 prints index j twice in the denominator; we use i and j, so that s_p is a cosine. The
+    parent mean in Eq. 4 has no index; we use the anchor's parent for both positives and negatives. The parent
+    gets no gradient: parts move relative to their whole, not the whole relative to its parts.
     """
     own = anchors - parent
     square = np.square(own).sum(axis=1, keepdims=True) + SHORTEST**2
     along = own @ others.T - (own * parent).sum(axis=1, keepdims=True)
-    # |other - parent|^2 from dot products: A x B numbers instead of A x B x D
+    # |other - parent|^2 from dot products, which needs A x B numbers instead of A x B x D
     far = np.square(others).sum(axis=1) - 2 * parent @ others.T + np.square(parent).sum(axis=1, keepdims=True)
     softened = np.maximum(far, 0) + SHORTEST**2
     scale = 1 / np.sqrt(square * softened)
@@ -130,12 +130,12 @@ def part_loss_literal(
 ) -> tuple[float, Float64[np.ndarray, "M D"]]:
     """Compute L_part of one view and level as printed (Eq. 5): siblings attract, other masks repel.
 
-    The denominator contains only the negatives, as printed. This pulls siblings together ("bear nose" and
-    "bear mouth"), whereas the paper's text says to separate them.
+    The denominator contains only the negatives, as printed. This pulls siblings ("bear nose" and "bear
+    mouth") together, whereas the paper's text states that siblings are separated.
 
     Departs: we interpret 1 / (L N_p) as the mean, over anchors with at least one positive and one negative,
-    of the mean over their positives. The caller omits level l = 1, which has no parents; this function omits
-    orphans. An anchor is not its own positive. Without anchors, the loss is 0.
+    of the mean over each anchor's positives. The caller omits level l = 1, which has no parents; orphans are
+    omitted here. An anchor is not its own positive. Without anchors, the loss is 0.
     """
     similarity, pull_back = similarity_without_parent(means, means, parent_means)
     has_parent = parent != NONE
@@ -182,7 +182,7 @@ def part_loss_disentangle(
 def log_sum_exp(
     values: Float64[np.ndarray, "A B"],
 ) -> tuple[Float64[np.ndarray, " A"], Float64[np.ndarray, "A B"]]:
-    """Return the log-sum-exp of each row and its gradient, the softmax."""
+    """Return the log-sum-exp of each row, and the gradient, which is the softmax."""
     most = values.max(axis=1, keepdims=True)
     powers = np.exp(values - most)
     total = powers.sum(axis=1, keepdims=True)

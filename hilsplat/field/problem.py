@@ -3,8 +3,8 @@
 With the rendered map M = W F, the mask means A F, the areas n and the mask latents h (see
 `contributions`), and all sums divided by the number of labelled pixels:
 
-- language loss (squared regression): tr F'GF - 2 sum n h.(AF) + sum n |h|^2
-- clustering loss L_h (Eq. 2):        tr F'GF - sum n |AF|^2
+- language loss (least-squares regression): tr F'GF - 2 sum n h.(AF) + sum n |h|^2
+- clustering loss L_h (Eq. 2):              tr F'GF - sum n |AF|^2
 - ridge: sum of visible mass x |F - F_lifted|^2
 
 Their sum is a single quadratic form, minimised by a few conjugate-gradient steps from the lifted average.
@@ -29,7 +29,7 @@ class QuadraticProblem:
 
     masks: MaskOperator  # A
     quadratic: Quadratic
-    mass: Float32[np.ndarray, "N 3"]  # G 1, the visible mass of each Gaussian at each level, px
+    mass: Float32[np.ndarray, "N 3"]  # G times ones: visible mass of each Gaussian at each level, px
     pixels: Float32[np.ndarray, " M"]  # n
     latents: Float32[np.ndarray, "M D"]  # h
     lifted: Float32[np.ndarray, "N 3 D"]  # start of the field, towards which the ridge pulls
@@ -108,7 +108,7 @@ def conjugate_gradient(
 ) -> np.ndarray:
     """Minimise the quadratic part in a few steps from the lifted start, preconditioned by the visible mass.
 
-    Levels and channels do not interact, so each has its own step size. `curved` is G F_lifted, if available.
+    Levels and channels do not interact, so each pair has its own step size. `curved` is G F_lifted, if known.
     """
     scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
@@ -135,9 +135,9 @@ def _ratio(
     return np.where(below > 0, above / np.where(below > 0, below, 1), 0).astype(np.float32)
 
 
-# Updates and sums over a whole field in one pass, without temporaries of its size. They are memory-bound:
-# three levels of sixteen numbers for a million Gaussians are 192 MB, and a NumPy expression reads and writes
-# that much for each operator. Sums are computed in float64 in a fixed order.
+# One-pass updates and sums over a whole field, without temporaries of that size. They are memory-bound: three
+# levels of sixteen numbers for a million Gaussians take 192 MB, and NumPy reads and writes that much for each
+# operator of an expression. Sums are computed in float64 in a fixed order.
 
 
 @compiled
@@ -153,7 +153,7 @@ def channel_dots(a, b):
 
 @compiled
 def scaled_squares(scale, a):
-    """Return `channel_dots` of a field and the same field times scale (N, 3)."""
+    """Return `channel_dots` of a field with itself times scale (N, 3)."""
     out = np.zeros(a.shape[1:])
     for n in range(len(a)):
         for level in range(a.shape[1]):
@@ -184,7 +184,7 @@ def add_by_channel(factors, a, out):
 
 @compiled
 def redirect(scale, residual, ratio, direction):
-    """Compute the next conjugate direction: scale (N, 3) times residual plus ratio (3, D) times the last."""
+    """Update the conjugate direction: scale (N, 3) times residual plus ratio (3, D) times the last one."""
     for n in range(len(residual)):
         for level in range(residual.shape[1]):
             for c in range(residual.shape[2]):

@@ -24,8 +24,8 @@ def solve_field(
 ) -> tuple[Float32[np.ndarray, "N 3 D"], dict[str, object]]:
     """Return the features, and a report with every loss before and after each phase."""
     settings, total = contrast.settings, problem.total_pixels
-    # L-BFGS needs much memory, so its variables are only the features visible in masks. They are scaled by
-    # the square root of the mass, which makes the quadratic part nearly isotropic.
+    # L-BFGS needs much memory, so its variables are only the features visible in masks, scaled by the square
+    # root of the mass, which makes the quadratic part nearly isotropic.
     shown = np.flatnonzero(problem.mass)
     root = np.sqrt(problem.mass.reshape(-1)[shown])[:, None]
     inverse_root = np.zeros(problem.mass.shape, np.float32)
@@ -61,7 +61,7 @@ def solve_field(
 
 
 def _rows(features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "R D"]:
-    """Return one row per Gaussian and level, in the same memory."""
+    """Return a view of the same memory with one row per Gaussian and level."""
     return features.reshape(-1, features.shape[2])
 
 
@@ -71,10 +71,10 @@ def keep_labelled(
     total_mass: Float[np.ndarray, " N"],  # visible weight in all pixels
     min_share: float,
 ) -> Float32[np.ndarray, "N 3 D"]:
-    """Remove the latents of Gaussians with little of their visible weight in a level's labelled pixels.
+    """Remove latents of Gaussians that have little of their visible weight in a level's labelled pixels.
 
-    Tables and walls have no part masks. But if a mask extends onto them by a pixel, their Gaussians get the
-    mask's full latent and match its queries everywhere, because the regression uses only labelled pixels.
+    Tables and walls have no part masks. But if a mask extends onto a wall by a pixel, the wall's Gaussians
+    get the mask's latent and match its queries everywhere, because the regression uses only labelled pixels.
     """
     share = mass / np.maximum(total_mass, 1e-12)[:, None]
     return np.where((share >= min_share)[:, :, None], features, np.float32(0)).astype(np.float32)
@@ -83,8 +83,8 @@ def keep_labelled(
 def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float) -> np.ndarray:
     """Minimise by limited-memory BFGS with step halving; every sum is computed in a fixed order.
 
-    The start `point` is overwritten. A step needs one evaluation of value and gradient, plus one per halving.
-    `first_step` is the inverse curvature that the first step assumes.
+    The start `point` is overwritten. Each step evaluates value and gradient once, plus once per halving.
+    `first_step` is the inverse curvature assumed for the first step.
     """
     value, gradient = objective(point)
     memory: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -105,7 +105,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
         else:
             break
         del direction
-        # reuse the memory of vectors no longer needed: each takes over 100 MiB in a large scene
+        # reuse the memory of vectors that are no longer needed: each takes over 100 MiB in a large scene
         moved = np.subtract(candidate, point, out=point)
         turned = np.subtract(new_gradient, gradient, out=gradient)
         curvature = dot(moved, turned)
@@ -116,7 +116,7 @@ def lbfgs(objective: Objective, point: np.ndarray, steps: int, first_step: float
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the dot product in float64, without BLAS, whose order of summation depends on the threads."""
+    """Return the dot product in float64, without BLAS, whose summation order depends on the threads."""
     return float(_dot(np.ascontiguousarray(a).reshape(-1), np.ascontiguousarray(b).reshape(-1)))
 
 
@@ -144,7 +144,7 @@ def _add(factor, vector, out):
 def _two_loops(
     gradient: np.ndarray, memory: list[tuple[np.ndarray, np.ndarray, float]], first_step: float
 ) -> np.ndarray:
-    """Return the approximate inverse Hessian times the gradient, from the steps in memory."""
+    """Return the approximate inverse Hessian times the gradient, computed from the steps in `memory`."""
     result = gradient.copy()
     flat, factors = result.reshape(-1), []
     for moved, turned, curvature in reversed(memory):

@@ -6,7 +6,7 @@ length and stores its product-quantised bytes (kaist-ami/Dr-Splat `train.py`). N
 
 Departs from the published code:
     - the product quantiser is trained on the scene's own mask vectors, not on general images;
-    - one byte per four vector elements (128 bytes for 512); the published index file has its own number;
+    - one byte per four vector elements (128 bytes for 512); the published index file determines its number;
     - weights of a pixel are divided by its alpha, those below `contributions.min_weight` are dropped, and
       pixels with alpha below `MIN_ALPHA` are ignored;
     - all three levels are used instead of one (`--feature_level`);
@@ -26,7 +26,7 @@ from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
-TOP_GAUSSIANS = 45  # Gaussians with the largest weights at a pixel, which get its vector, as published
+TOP_GAUSSIANS = 45  # number of Gaussians, by weight, that get a pixel's vector, as published
 PART = 4  # elements of a CLIP vector that share a byte
 UNSEEN = 1e-9  # averages shorter than this have no direction
 
@@ -42,7 +42,7 @@ def heaviest(weights: sp.csr_matrix, count: int) -> sp.csr_matrix:
 def register(
     inputs: MethodInputs, vectors: Float32[np.ndarray, "M C"], count: int
 ) -> Float32[np.ndarray, "N 3 C"]:
-    """Return unit averages of unit mask vectors over the pixels each Gaussian dominates; zero without any.
+    """Return unit averages of unit mask vectors over the pixels each Gaussian dominates; zero if none.
 
     The `count` Gaussians with the largest weights dominate a pixel.
     """
@@ -61,7 +61,7 @@ def register(
 
 
 def codebooks(vectors: Float32[np.ndarray, "B C"], seed: int) -> list[Float32[np.ndarray, "256 S"]]:
-    """Return a codebook for each part of a vector (product quantisation; Jegou et al., PAMI 2011)."""
+    """Return one codebook per vector part (product quantisation; Jegou et al., PAMI 2011)."""
     return [kmeans(part, 256, seed + at)[0] for at, part in enumerate(_parts(vectors))]
 
 
@@ -76,7 +76,7 @@ def quantised(
 
 
 def _parts(vectors: Float32[np.ndarray, "n C"]) -> list[Float32[np.ndarray, "n S"]]:
-    """Return parts of `PART` elements; the last is padded with zeros."""
+    """Return parts of `PART` elements; the last part is padded with zeros."""
     filled = np.pad(vectors, ((0, 0), (0, -vectors.shape[1] % PART)))
     return [np.ascontiguousarray(filled[:, at : at + PART]) for at in range(0, filled.shape[1], PART)]
 

@@ -2,11 +2,11 @@
 
 1. Every Gaussian learns an identity feature for each level by L = L_h + lambda_1 L_ins + lambda_2 L_part
    alone (paper, Sec. III-C), without language.
-2. Gaussians are clustered coarse to fine: wholes by their whole-level features, then parts inside wholes,
+2. Gaussians are clustered coarse to fine: wholes by whole-level features, then parts inside wholes, then
    subparts inside parts. Clusters closer than half the median distance of two masks that share a view and a
    parent are merged.
-3. A cluster's vector is computed from the CLIP vectors of the masks of its level that fit it best, as in
-   OpenGaussian. Parents follow from containment, as for linked masks.
+3. A cluster's vector is computed from the CLIP vectors of the best-fitting masks of its level, as in
+   OpenGaussian. Parents are determined by containment, as for linked masks.
 
 The paper only states "train and cluster point-level features"; the distance threshold is ours.
 """
@@ -25,7 +25,7 @@ from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.semantic_tree.nodes import MIN_FIT, LevelNodes, best_fits, level_ious
 from hilsplat.settings import FieldSettings, SemanticTreeSettings
 
-CENTRE_OF = 4  # minimum number of Gaussians per centre
+CENTRE_OF = 4  # minimum number of Gaussians per k-means centre
 STEPS = 60  # number of L-BFGS steps
 
 RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in unobserved directions
@@ -34,7 +34,7 @@ RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in u
 def farthest_alike(
     means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
 ) -> tuple[float, ...]:
-    """Return, per level, half the median distance of two masks that share a view, a level and a parent."""
+    """Return half the median distance of two masks that share a view, a level and a parent, per level."""
     found: list[list[float]] = [[] for _ in LEVELS]
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
         level, parent = contributions.level[rows], parents[view]
@@ -48,7 +48,7 @@ def farthest_alike(
 def nested_clusters(
     features: Float32[np.ndarray, "N 3 D"], farthest: tuple[float, ...], seed: int
 ) -> Int64[np.ndarray, "N 3"]:
-    """Return each Gaussian's cluster per level, -1 where its feature is NaN; clusters are nested.
+    """Return each Gaussian's cluster per level, -1 if its feature is NaN; clusters are nested.
 
     Clusters are divided by k-means; centres with an average distance of at most `farthest` are merged.
     """
@@ -79,7 +79,7 @@ def run_feature_tree(
     seed: int,
     threads: int,
 ) -> None:
-    """Write a semantic tree whose nodes are clusters of features trained with L alone.
+    """Write a semantic tree whose nodes are clusters of features trained with the loss L alone.
 
     Results do not depend on `threads`.
 

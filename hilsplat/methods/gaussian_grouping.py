@@ -1,12 +1,12 @@
 """Gaussian Grouping: identity codes with a linear classifier, smooth in 3D; each identity has a CLIP vector.
 
-1. Masks of all views that show the same object get one identity.
+1. Masks of the same object in all views get one identity.
 2. Every Gaussian learns a code of 16 numbers. A linear classifier predicts the identity of each rendered
-   pixel (cross-entropy), and class probabilities of a Gaussian and its 5 nearest neighbours agree (KL).
+   pixel (cross-entropy); a Gaussian and its 5 nearest neighbours get similar class probabilities (KL).
 3. A Gaussian gets its most probable identity, and the mean CLIP vector of that identity's masks.
 
 Source: Ye et al., Gaussian Grouping, ECCV 2024; lkeab/gaussian-grouping `train.py`, `utils/loss_utils.py`.
-The authors' values are in the constants, and `steps` 30,000, `rate` 0.0025 (0.0005 for the classifier).
+The authors' values are the constants below, `steps` 30,000, and `rate` 0.0025 (0.0005 for the classifier).
 
 Departs:
     - identities come from masks linked by shared Gaussians, as in our tree, not from a video tracker (DEVA),
@@ -16,7 +16,7 @@ Departs:
     - geometry is frozen instead of trained together with the codes;
     - fewer steps, on 4096 pixels of a view; classifier and codes share a learning rate;
     - the KL is computed at every step instead of every fifth, with 1000 samples as in the original;
-    - text queries use the identities' CLIP vectors, not Grounding-DINO and SAM in a first view.
+    - text queries use the identities' CLIP vectors, not Grounding-DINO and SAM in the first view.
 """
 
 import numpy as np
@@ -40,9 +40,9 @@ SAMPLES = 1000
 
 
 def mask_identities(contributions: Contributions, level: Level, threads: int) -> Int64[np.ndarray, " M"]:
-    """Return each mask's identity at a level by our default linking via shared Gaussians; -1 for none.
+    """Return each mask's identity at a level, by our default linking via shared Gaussians; -1 for none.
 
-    Masks of other levels have none.
+    Masks of other levels have no identity.
     """
     S, mass, rows = contributions.matrix("S"), contributions.mass(), contributions.rows_of(level)
     settings = SemanticTreeSettings()
@@ -56,7 +56,7 @@ def mask_identities(contributions: Contributions, level: Level, threads: int) ->
 def neighbour_loss(
     logits: Float[Tensor, "s K"], others: Float[Tensor, "s n K"], num_classes: int
 ) -> Float[Tensor, ""]:
-    """Return the mean KL divergence of class probabilities from the neighbours' probabilities, per class."""
+    """Return the mean KL divergence of class probabilities from those of the neighbours, per class."""
     log_p, log_q = log_softmax(logits, -1)[:, None], log_softmax(others, -1)
     return (log_p.exp() * (log_p - log_q)).sum(-1).mean() / num_classes
 
@@ -69,7 +69,7 @@ def identity_of_gaussians(
     settings: MethodSettings,
     seed: int,
 ) -> Int64[np.ndarray, " N"]:
-    """Train the codes and classifier of a level, and classify the Gaussians."""
+    """Train the codes and the classifier of a level, and classify the Gaussians."""
     num_classes = int(identity.max()) + 1
     draw = torch.Generator().manual_seed(seed)
     codes = (0.1 * torch.randn(contributions.num_gaussians, CHANNELS, generator=draw)).requires_grad_()

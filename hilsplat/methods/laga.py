@@ -2,23 +2,23 @@
 
 1. Every Gaussian learns 32 numbers: wholes use the first 16, parts 24, subparts all. Pixels are attracted to
    the prototype of their mask and repelled from other prototypes. Pixels that share a finer mask must agree
-   in the coarser prefix; pixels that a coarser mask separates must differ in the finer one.
-2. Prototypes of masks over all views are clustered by density: each cluster is an object, and a Gaussian
-   belongs to the nearest object.
-3. The CLIP vectors of an object's masks are clustered; the silhouette chooses the number of descriptors, up
-   to 20. A descriptor's weight is its agreement with the object's average.
+   in the coarser prefix; pixels that a coarser mask separates must differ in the finer prefix.
+2. Mask prototypes from all views are clustered by density: each cluster is an object, and a Gaussian belongs
+   to the nearest object.
+3. The CLIP vectors of an object's masks are clustered; the silhouette determines the number of descriptors,
+   up to 20. A descriptor's weight is its cosine with the object's average.
 
 Source: Cen et al., LaGa, ICML 2025; SJTU-DeepVisionLab/LaGa `train_affinity_features.py`, `inference.ipynb`.
-The authors' values are in the constants, and `steps` 30,000, `rate` 0.0025.
+The authors' values are the constants below, `steps` 30,000, and `rate` 0.0025.
 
 Departs:
-    - an object's descriptors are summed by weight; for each text the authors take the maximum of relevancy
-      times weight, but a field here holds one code per Gaussian and level;
+    - an object's descriptors are summed by weight, because a field here has one code per Gaussian and level;
+      the authors take, for each text, the maximum of relevancy times weight;
     - levels are queried separately; the authors average the three scores and smooth them over neighbours;
-    - DBSCAN* clusters at the authors' radius instead of HDBSCAN clusters with it as the minimum radius;
+    - DBSCAN* clusters at the authors' radius; they use it as the minimum radius of HDBSCAN clusters;
     - one k-means start per number of descriptors instead of ten;
-    - painted masks, fewer steps on 2048 pixels of a view; almost equal initial features; prototypes of
-      objects from exact mask means; masks below the same share of the image are ignored.
+    - painted masks; fewer steps, on 2048 pixels of a view; almost identical initial features; object
+      prototypes from exact mask means; masks below the authors' share of the image are ignored.
 """
 
 import numpy as np
@@ -78,10 +78,10 @@ def masks_of_pixels(labels: Int32[np.ndarray, "p 3"]) -> list[Bool[np.ndarray, "
 def nested_loss(
     rendered: Float[Tensor, "p 32"], masks: list[Bool[np.ndarray, "p _"]], random: np.random.Generator
 ) -> Float[Tensor, ""]:
-    """Return the contrast of pixels with mask prototypes per prefix, plus a penalty for slice lengths not 1.
+    """Return the pixel-to-prototype contrast per prefix, plus a penalty on slice lengths other than 1.
 
     `masks` contains the pixels of each mask at whole, part and subpart. Outside a mask, all hard pixels are
-    used, and as many random ones as there are pixels inside.
+    used, plus as many random pixels as there are pixels inside.
     """
     inside = [torch.from_numpy(each) for each in masks]
     last = len(LEVELS) - 1
@@ -112,7 +112,7 @@ def nested_loss(
 def objects(
     features: Float32[np.ndarray, "N C"], prototypes: Float32[np.ndarray, "m C"], radius: float, least: int
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " m"]]:
-    """Return the object of each Gaussian and of each mask, -1 for none: a density cluster of prototypes.
+    """Return the object (a density cluster of prototypes) of each Gaussian and each mask, -1 for none.
 
     Features and prototypes have unit length; `radius` and `least` are as in `density_clusters`.
     """
@@ -126,7 +126,7 @@ def objects(
 
 
 def silhouette(distance: Float[np.ndarray, "n n"], group: Int64[np.ndarray, " n"]) -> float:
-    """Return the mean silhouette (Rousseeuw 1987); a row alone in its group counts as 0."""
+    """Return the mean silhouette (Rousseeuw 1987); the only row of a group counts as 0."""
     counts = np.bincount(group)
     to_group = distance @ np.eye(len(counts))[group]
     rows = np.arange(len(group))
@@ -139,10 +139,10 @@ def silhouette(distance: Float[np.ndarray, "n n"], group: Int64[np.ndarray, " n"
 
 
 def descriptor_weights(vectors: Float32[np.ndarray, "n C"], seed: int) -> Float[np.ndarray, " n"]:
-    """Return the weight of each mask's vector in the sum of its object's weighted descriptors.
+    """Return the weight of each mask's vector in the weighted sum of its object's descriptors.
 
     A descriptor is the unit centroid c of a cluster of vectors. Its weight is c.a, where a is the unit
-    average of all vectors, so that scattered clusters have less weight. `vectors`: unit vectors, one object.
+    average of all vectors, so that scattered clusters have less weight. Vectors have unit length.
     """
     group, best = np.zeros(len(vectors), np.int64), -1.0
     distance = cdist(vectors, vectors)
@@ -175,7 +175,7 @@ def object_latents(
 
 
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
-    """Train features, find objects at each level, and assign each the code of its descriptors."""
+    """Train features, find objects at each level, and assign each object the code of its descriptors."""
     contributions, code = inputs.contributions, inputs.linear_code("laga")
     views, found = labelled_views(inputs, settings.pixel_step), inputs.no_features()
     trained = alike(contributions.num_gaussians, sum(SLICES), seed)

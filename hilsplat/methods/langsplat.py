@@ -1,20 +1,20 @@
 """LangSplat: an independent field per level, an L1 loss between rendered and painted codes, no tree.
 
-The published code renders one random view per step (each once before any is repeated) and compares every
-labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so rendering is a product with fixed
-compositing weights, which we compute once per view.
+The published code renders one random view per step (using each view once before repeating any) and compares
+every labelled pixel (minghanqin/LangSplat `train.py`). Geometry is frozen, so rendering is a product with
+fixed compositing weights, which we compute once per view.
 
 Departs from the published code:
     - fewer steps, and a pixel grid instead of all pixels (`MethodSettings`);
     - L1 is averaged over the labelled pixels of the grid; LangSplat averages over all pixels, counting
-      unlabelled ones as 0, so a view's step has more weight the larger the area of its masks;
+      unlabelled pixels as 0, so views with larger masks have more weight;
     - rendered codes are divided by alpha, as in queries, and pixels with alpha below `MIN_ALPHA` are ignored;
       LangSplat compares premultiplied codes wherever a mask is painted;
-    - Gaussians' codes are blended unscaled; LangSplat first scales each to unit length;
+    - Gaussians' codes are blended unscaled; LangSplat first scales each code to unit length;
     - weights below `contributions.min_weight` are dropped.
 
 `hilsplat.field.literal_trainer` (loss `l1`) renders at every step, and averages over all pixels like
-LangSplat. It also trains all levels in one run. It treats alpha and unit length as in this module.
+LangSplat. It also trains all levels in one run. It treats alpha and unit length like this module.
 """
 
 from typing import Any
@@ -33,8 +33,8 @@ from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 # Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
-# `hilsplat.base.lanes` has sixteen lanes; codes of three channels would waste thirteen. Operations are
-# neither fused nor reordered, so results are bit-identical to plain loops over the channels.
+# `hilsplat.base.lanes` has sixteen lanes, of which codes with three channels would waste thirteen. Operations
+# are neither fused nor reordered, so results are bit-identical to plain loops over the channels.
 WIDTH = 4
 _FLOAT = ir.FloatType()
 _VECTOR = ir.VectorType(_FLOAT, WIDTH)
@@ -108,7 +108,7 @@ def zeros(typingctx):
 
 @intrinsic
 def signs_of_difference(typingctx, a, b, scale):
-    """Return scale where a > b, -scale where a < b, 0 where they are equal; NaN is preserved."""
+    """Return scale where a > b, -scale where a < b, and 0 where a == b; NaN is preserved."""
 
     def codegen(context, builder, sig, args):
         apart, up = builder.fsub(args[0], args[1]), _all(builder, args[2])
@@ -127,7 +127,7 @@ def train_level(
     settings: MethodSettings,
     seed: int,
 ) -> Float32[np.ndarray, "N D"]:
-    """Train with Adam from zero, one random view per step, each once before any is repeated."""
+    """Train with Adam from zero, one random view per step; each view is used once before any is repeated."""
     channels = latents.shape[1]
     wide = channels + -channels % WIDTH
     features, gradient = np.zeros((2, num_gaussians * wide), np.float32)
@@ -145,14 +145,14 @@ def train_level(
 def l1_gradient(indptr, indices, data, labels, codes, channels, wide, features, gradient):
     """Write the features' gradient of the mean absolute difference between rendered and painted codes.
 
-    A row of weights is read once for its sum and, while it is in the fastest cache, once for its gradient.
+    A row of weights is read once for its sum and, while still in the fastest cache, once for its gradient.
     Sums have the same order as products with the matrix and its transpose; one thread is used.
 
     Args:
         indptr, indices, data: weights (pixels x Gaussians), CSR.
         labels: row of the code painted at each pixel, -1 for none.
         codes, features, gradient: float32, flat, `wide` numbers per row or Gaussian; `gradient` is written.
-        channels: size of a code; the padding after it is 0.
+        channels: size of a code; the padding after each code is 0.
         wide: multiple of `WIDTH`.
     """
     gradient[:] = 0

@@ -1,8 +1,8 @@
 """LangSplatV2: each Gaussian mixes a few entries of a global codebook, and the mixture is splatted directly.
 
-The published code gives each Gaussian 64 logits per level, keeps the largest 4 of their softmax, and renders
-those coefficients; a 64 x 512 codebook, initialised by k-means on the masks' CLIP vectors and then trained,
-maps them to CLIP vectors without an autoencoder. Loss 1 - cosine, Adam, logits from zero
+The published code gives each Gaussian 64 logits per level, keeps the 4 largest softmax values, and renders
+these coefficients; a 64 x 512 codebook, initialised by k-means on the masks' CLIP vectors and then trained,
+maps them to CLIP vectors without an autoencoder. The loss is 1 - cosine; Adam starts from zero logits
 (ZhaoYujie2002/LangSplatV2 `train.py`, `scene/gaussian_model.py`, `utils/vq_utils.py`).
 
 Departs from the published code:
@@ -10,8 +10,8 @@ Departs from the published code:
     - codebook entries, and therefore their mixtures, are vectors m + U z of the scene's linear code; d = 64
       reproduces the masks' vectors with a mean cosine of 0.9998 on the development scenes;
     - the loss is averaged over the labelled pixels of the grid, rendered mixtures are divided by alpha,
-      thinly covered pixels are ignored and small weights dropped, as in `langsplat`;
-    - k-means uses all mask vectors of the level at once instead of mini-batches.
+      thinly covered pixels are ignored and small weights are dropped, as in `langsplat`;
+    - k-means uses all mask vectors of a level at once instead of mini-batches.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ KEPT = 4  # non-zero coefficients per Gaussian and level (LangSplatV2)
 def largest_shares(
     logits: Float32[np.ndarray, "N E"], kept: int = KEPT
 ) -> tuple[Int64[np.ndarray, "N K"], Float32[np.ndarray, "N K"]]:
-    """Return the largest entries of each softmax and their shares, which sum to 1; lower entries win ties."""
+    """Return each softmax's largest entries and their shares, which sum to 1; lower entries win ties."""
     chosen = np.zeros((len(logits), kept), np.int64)
     shares = np.zeros(chosen.shape, np.float32)
     _largest(logits, chosen, shares)
@@ -42,7 +42,7 @@ def largest_shares(
 
 
 def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32[np.ndarray, "B D+1"]:
-    """Return m + U z in D + 1 coordinates that keep lengths and angles: along U, and along the rest of m."""
+    """Return m + U z in D + 1 coordinates that preserve lengths and angles: along U, and the rest of m."""
     along = code.basis @ code.mean
     rest = np.linalg.norm(code.mean - along @ code.basis)
     return np.column_stack([latents + along, np.full(len(latents), rest)]).astype(np.float32)
@@ -51,7 +51,7 @@ def as_vectors(latents: Float32[np.ndarray, "B D"], code: LinearCode) -> Float32
 def cosine_loss(
     rendered: Float32[np.ndarray, "P C"], targets: Float32[np.ndarray, "P C"]
 ) -> tuple[float, Float32[np.ndarray, "P C"]]:
-    """Return the mean of 1 - cosine with unit targets, and its gradient for the rendered vectors."""
+    """Return the mean of 1 - cosine with unit targets, and its gradient for `rendered`."""
     length = np.maximum(np.linalg.norm(rendered, axis=1), 1e-6)[:, None]
     unit = rendered / length
     cosine = (unit * targets).sum(axis=1, keepdims=True)
@@ -65,7 +65,7 @@ def step(
     targets: Float32[np.ndarray, "p D"],  # code of the mask painted at each pixel
     code: LinearCode,
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
-    """Return the loss of a view's labelled pixels, and its gradients for logits and codebook."""
+    """Return the loss over a view's labelled pixels, and its gradients for logits and codebook."""
     chosen, shares = largest_shares(logits)
     rows = weights.indptr, weights.indices, weights.data
     mixed = np.zeros((weights.shape[0], len(codebook)), np.float32)

@@ -3,22 +3,22 @@
 1. The CLIP vectors of the masks are quantised to 128 entries, so every pixel has an index.
 2. Every Gaussian learns 8 numbers and an uncertainty; a small network predicts the entry of each rendered
    pixel (cross-entropy, weighted by 1 - uncertainty, plus -log(1 - uncertainty)).
-3. A network predicts the 8 numbers from the position; they are pulled towards its output, more strongly if
-   they are uncertain.
+3. Another network predicts the 8 numbers from the position; the numbers are pulled towards the prediction,
+   more strongly if they are uncertain.
 
 Source: Shi et al., Language Embedded 3D Gaussians, CVPR 2024; buaavrcg/LEGaussians `train.py`,
-`scene/index_decoder.py`, `arguments/__init__.py`. The authors' values are in the constants, and `steps`
-30,000, `rate` 0.001 for codes and networks.
+`scene/index_decoder.py`, `arguments/__init__.py`. The authors' values are the constants below, `steps`
+30,000, and `rate` 0.001 for codes and networks.
 
 Departs:
-    - mask CLIP vectors are indexed with a k-means codebook per level; the authors quantise a pyramid
-      of CLIP crops together with DINO, which masks do not have, and train the codebook with balanced loads;
+    - mask CLIP vectors are indexed with a k-means codebook per level; the authors quantise a pyramid of
+      CLIP crops with DINO features, which masks do not have, and train the codebook with balanced loads;
     - geometry is frozen instead of trained together with the codes;
-    - fewer steps, on 1024 pixels of a view; almost equal initial codes; networks learn at a fifth of the
-      rate; no weight decay (1e-5);
-    - smoothing at every step on 1000 Gaussians with 10 % of its weight, instead of every tenth step on
-      all; positions are scaled to a standard deviation of 1;
-    - each Gaussian gets the entry with its largest logit, which is then rendered; the authors decode rendered
+    - fewer steps, on 1024 pixels of a view; almost identical initial codes; networks learn at a fifth of the
+      rate; no weight decay (the authors use 1e-5);
+    - smoothing at every step on 1000 Gaussians with 10 % of its weight, instead of every tenth step on all
+      Gaussians; positions are scaled to a standard deviation of 1;
+    - each Gaussian gets the entry with the largest logit, which is then rendered; the authors decode rendered
       codes at each pixel to the most probable entry or a softmax mixture.
 """
 
@@ -41,16 +41,16 @@ CHANNELS = 8
 DECODER_WIDTHS = (128, 256)
 POSITION_WIDTHS = (128,) * 4
 FIRST_UNCERTAINTY = 0.01
-UNCERTAINTY_RATE = 0.05  # Adam's rate for uncertainties, regardless of the rate of the codes
+UNCERTAINTY_RATE = 0.05  # Adam's rate for uncertainties, independent of the codes' rate
 NETWORK_RATE = 0.2  # factor of the codes' rate for the networks; the authors use 1
-MIN_SMOOTHING = 0.1  # smoothing weight of a fully certain Gaussian; it is 1 for a fully uncertain one
+MIN_SMOOTHING = 0.1  # smoothing weight of a fully certain Gaussian; fully uncertain ones have weight 1
 SMOOTHING = 0.1
 SAMPLES = 1000
 PIXELS = 1024
 
 
 def network(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Return linear layers with ReLU between them."""
+    """Return linear layers with ReLUs between them."""
     layers: list[nn.Module] = []
     for inward, outward in itertools.pairwise(sizes):
         layers += [nn.Linear(inward, outward), nn.ReLU()]
@@ -68,7 +68,7 @@ def index_loss(
 def smoothing_loss(
     codes: Float[Tensor, "s 8"], predicted: Float[Tensor, "s 8"], uncertainty: Float[Tensor, " s"]
 ) -> Float[Tensor, ""]:
-    """Return squared distances that pull predictions to codes, and uncertain codes to predictions."""
+    """Return squared distances that pull predictions towards codes, and uncertain codes to predictions."""
     weight = MIN_SMOOTHING + (1 - MIN_SMOOTHING) * uncertainty.detach()
     follow = (predicted - codes.detach()).square().mean(1).mean()
     return follow + ((predicted.detach() - codes).square().mean(1) * weight).mean()

@@ -1,6 +1,6 @@
 """Training-free lifting: the weighted average of mask codes at each Gaussian (the idea of Occam's LGS).
 
-Departs: exact weights of all pixels of a mask instead of weights at projected centres, and the scene's
+Departs: uses exact weights of all pixels of a mask instead of weights at projected centres, and the scene's
 linear code (pca, 64) instead of 512 numbers.
 """
 

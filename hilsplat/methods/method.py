@@ -1,6 +1,6 @@
 """Stage `method`: compute a language field with a baseline, from the same artifacts as our method.
 
-All other stages (Gaussians, masks, CLIP vectors, the scene's code, queries, protocols, tables) are shared, so
+Everything else (Gaussians, masks, CLIP vectors, the scene's code, queries, protocols, tables) is shared, so
 that table rows differ only in the method.
 """
 
@@ -42,11 +42,11 @@ class MethodInputs:
     masks_folder: Path
     contributions_folder: Path
     autoencoder_folder: Path
-    threads: int = 1  # rasteriser threads; results must not depend on it
+    threads: int = 1  # rasteriser threads; results must not depend on this number
 
     @cached_property
     def contributions(self) -> Contributions:
-        """One row per mask of all training views."""
+        """Contributions, with one row per mask of all training views."""
         return Contributions.load(self.contributions_folder)
 
     @cached_property
@@ -55,7 +55,7 @@ class MethodInputs:
         return load_latents(self.autoencoder_folder, self.contributions)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
-        """Return a view's compositing weights (pixels x Gaussians), rows summing to 1, empty if uncovered."""
+        """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or are empty if uncovered."""
         gaussians, scene = self._loaded
         least = self.contributions.min_weight
         weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=self.threads)
@@ -78,7 +78,7 @@ class MethodInputs:
         return np.zeros((self.contributions.num_gaussians, len(LEVELS), self.latents.shape[1]), np.float32)
 
     def seen(self) -> Bool[np.ndarray, "N 3"]:
-        """Return whether a mask of the level contains the Gaussian."""
+        """Return whether each Gaussian is visible in a mask, per level."""
         masks = MaskOperator.of(self.contributions.matrix("A"), self.contributions.level)
         return masks.spread(np.ones((len(self.latents), 1), np.float32))[:, :, 0] > 0
 
@@ -86,7 +86,7 @@ class MethodInputs:
         """Return the scene's code, for methods whose training or averages need the CLIP vectors themselves.
 
         Raises:
-            SettingsError: the code is a network, whose numbers cannot be averaged like vectors.
+            SettingsError: the code is a network, whose latents cannot be averaged like vectors.
         """
         code = load_code(self.autoencoder_folder)
         if not isinstance(code, LinearCode):
@@ -153,7 +153,7 @@ class LabelledView:
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Return the labelled pixels of each training view that has any, on every `pixel_step`-th row and column.
+    """Return the labelled pixels of each training view that has any, in every `pixel_step`-th row and column.
 
     Raises:
         ArtifactError: no view has a labelled pixel.

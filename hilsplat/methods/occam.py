@@ -5,7 +5,7 @@ A view's weight is the Gaussian's visibility at that pixel, and hidden Gaussians
 large Gaussian across a border gets one mask per view here, but a share of both masks in `lifted`.
 
 Departs from the published code:
-    - the scene's linear code instead of 512 numbers, averaged in the same way;
+    - the scene's linear code replaces the 512 numbers and is averaged in the same way;
     - the weight of a Gaussian at its centre's pixel is divided by the pixel's alpha, and weights below
       `contributions.min_weight` count as invisible; the published kernel returns a different weight.
 """
@@ -21,7 +21,7 @@ from hilsplat.settings import MethodSettings
 
 
 def centre_pixels(means: Float[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " N"]:
-    """Return the row-major pixel index of each centre, -1 behind the camera or outside the image."""
+    """Return each centre's row-major pixel index; -1 if behind the camera or outside the image."""
     height, width = camera.size_hw
     seen = means @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     in_front = seen[:, 2] > 0

@@ -1,19 +1,19 @@
 """OmniSeg3D: features contrasted by the number of masks two patches share; thresholds set the granularity.
 
 1. Masks of all levels divide a view into patches. Two patches share the masks that contain both: for nested
-   masks, their number is the depth of the deepest common ancestor in the coverage tree.
+   masks, the number of shared masks is the depth of the deepest common ancestor in the coverage tree.
 2. Every Gaussian learns one vector of 16 numbers: a rendered pixel is close to its own patch's prototype,
-   less close to those of patches that share masks with it, and far from the others.
+   less close to prototypes of patches that share masks with its patch, and far from the others.
 3. Gaussians are clustered by cosine at three thresholds, one per level; a cluster is assigned the CLIP
    vectors of the masks that fit it best in each view.
 
-Source: Ying et al., OmniSeg3D, CVPR 2024; OceanYing/OmniSeg3D-GS `train.py`. The authors' values are in the
-constants, and `steps` 10,000, `rate` 0.01.
+Source: Ying et al., OmniSeg3D, CVPR 2024; OceanYing/OmniSeg3D-GS `train.py`. The authors' values are the
+constants below, `steps` 10,000, and `rate` 0.01.
 
 Departs:
     - larger masks do not first absorb smaller ones; patches come from our painted masks;
     - fewer steps, on 4096 (not 32,768) pixels of a view, and prototypes of at least 3 (not 20) pixels;
-    - initial vectors are almost equal instead of independent (see `training.alike`);
+    - initial vectors are almost identical instead of independent (see `training.alike`);
     - pixel vectors are divided by their length instead of constrained by a penalty of weight 100;
     - the authors threshold the cosine with a clicked pixel and don't support text: here 256 k-means centres
       are merged by average cosine down to the threshold.
@@ -33,13 +33,13 @@ from hilsplat.settings import MethodSettings
 
 CHANNELS = 16
 MIN_PATCH_PX = 3
-LEVEL_WEIGHT = 0.2  # weight of each additional step of sharing, relative to the previous one
+LEVEL_WEIGHT = 0.2  # factor on a patch's weight for each shared mask fewer
 SPREAD, MIN_TEMPERATURE, MAX_TEMPERATURE = 10.0, 0.5, 1.0
 THRESHOLDS = (0.5, 0.8, 0.95)
 
 
 def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, "k k"]]:
-    """Return each pixel's patch (-1 in small patches), and the number of masks shared by every two patches.
+    """Return each pixel's patch (-1 in small patches), and the number of masks shared by each patch pair.
 
     Example:
         >>> patches(np.array([[0, 1, -1]] * 3 + [[0, 2, -1]] * 3, dtype=np.int32))[1]
@@ -58,12 +58,12 @@ def patches(labels: Int32[np.ndarray, "p 3"]) -> tuple[Int64[np.ndarray, " p"], 
 def hierarchical_loss(
     rendered: Float[Tensor, "p D"], patch: Int64[Tensor, " p"], shared: Int64[Tensor, "k k"]
 ) -> Float[Tensor, ""]:
-    """Return the contrast of pixels with patch prototypes, summed over the steps of sharing.
+    """Return the pixel-to-prototype contrast, summed over numbers of shared masks.
 
-    A pixel's loss is -log of the softmax over prototypes. Its weight is 1 at the pixel's own patch and 1/5
-    (1/25) at patches that share one mask fewer (two fewer). The loss of a step is at least that of the
-    previous step, so that patches with more shared masks are closer. Patches without a shared mask are only
-    negatives. Rendered features have unit length; `shared` counts the masks shared by two patches.
+    A pixel's loss is -log of the softmax over prototypes, weighted by 1 at the pixel's own patch and by 1/5
+    (1/25) at patches that share one mask fewer (two fewer). The loss at each number of shared masks is at
+    least the loss at the next larger number, so that patches that share more masks are closer. Patches
+    without a shared mask are only negatives. Rendered features have unit length; `shared` counts shared masks.
     """
     num = len(shared)
     prototypes, _ = segment_means(rendered, patch, num)

@@ -1,23 +1,23 @@
 """OpenGaussian: instance features without language, an instance codebook, CLIP vectors from associated masks.
 
-1. Every Gaussian learns a unit vector of 6 numbers: rendered features are smooth inside a mask, and means of
-   a view's masks are kept apart.
-2. A coarse codebook groups Gaussians by feature and position; a fine one divides each group by feature.
+1. Every Gaussian learns a unit vector of 6 numbers: rendered features are made similar inside each mask, and
+   the means of a view's masks are pushed apart.
+2. A coarse codebook groups Gaussians by feature and position; a fine codebook divides each group by feature.
 3. A group (an instance) is assigned the CLIP vectors of the masks that fit it best in each view, by IoU times
-   feature closeness. No language features are trained.
+   feature similarity. No language features are trained.
 
-Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. The authors' values are in
-the constants, `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
+Source: Wu et al., OpenGaussian, NeurIPS 2024; yanmin-wu/OpenGaussian `train.py`. The authors' values are the
+constants below, `codebook` (64, 10), `steps` 10,000 and `rate` 0.001.
 
 Departs:
     - each of our levels is processed separately; the authors use one level (wholes on LERF);
-    - fewer steps and a larger rate; a step uses 4096 pixels of a view, and exact means of all its masks;
+    - fewer steps and a larger rate; a step uses 4096 pixels of a view, and exact means of the view's masks;
     - features are not trained further towards the codebooks (published: 10,000 and 20,000 steps);
     - positions are scaled to a standard deviation of 1 in the scene before the weight of 0.5;
     - Gaussians in no mask of the level keep their random features and belong to no instance;
     - Gaussians are never shrunk at random, and pixels with alpha below 0.5, not 0.7, are ignored;
     - the IoU of an instance and a mask uses visible weights instead of the instance rendered alone;
-    - text queries use relevancy, as for all methods, not the best instance and up to ten similar ones.
+    - text queries use relevancy, as for all methods, not the best instance and up to ten similar instances.
 """
 
 import numpy as np
@@ -42,17 +42,17 @@ HARD_FROM = 0.5  # share of steps after which only the closest pairs keep their 
 def smoothing_loss(
     rendered: Float[Tensor, "p D"], means: Float[Tensor, "m D"], label: Int64[Tensor, " p"]
 ) -> Float[Tensor, ""]:
-    """Return the mean distance between pixels and their mask's mean, averaged over masks with pixels."""
+    """Return the mean distance of pixels from their mask's mean, averaged over masks that have pixels."""
     apart = (rendered - means[label]).square().sum(1, keepdim=True)
     distance, counts = segment_means((apart + 1e-12).sqrt(), label, len(means))
     return distance.sum() / (counts > 0).sum().clamp(min=1)
 
 
 def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]:
-    """Return the mean of w / (squared distance + 1) over pairs of masks, w = 0.1 + 0.9 rank / (masks - 1).
+    """Return the mean of w / (squared distance + 1) over mask pairs, with w = 0.1 + 0.9 rank / (masks - 1).
 
-    The other masks are ranked by distance from each mask, from 1 for the farthest to masks - 1 (w = 1) for
-    the closest mask. After half of the steps, weights below 0.9 become 0.1.
+    For each mask, the other masks are ranked by distance, from 1 for the farthest mask to masks - 1 (w = 1)
+    for the closest. After half of the steps, weights below 0.9 become 0.1.
     """
     num = len(means)
     if num < 2:
@@ -104,9 +104,9 @@ def instances(
     codebook: tuple[int, int],
     seed: int,
 ) -> Int64[np.ndarray, " N"]:
-    """Return each Gaussian's group in the two codebooks: coarse group x number of fine groups + fine group.
+    """Return each Gaussian's group: coarse group times the number of fine groups, plus fine group.
 
-    `codebook` is the number of coarse groups, and of fine groups in each.
+    `codebook` contains the number of coarse groups and the number of fine groups in each coarse group.
     """
     num_coarse, num_fine = codebook
     placed = np.concatenate([features, np.float32(POSITION) * standardised(means)], axis=1)
@@ -121,7 +121,7 @@ def instances(
 def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np.ndarray, "N 3 D"]:
     """Train instance features, and assign each level's instances the codes of the masks that fit them.
 
-    Gaussians get 0 where no mask fits their instance.
+    Gaussians get 0 if no mask fits their instance.
     """
     features, found = instance_features(inputs, settings, seed), inputs.no_features()
     contributions, seen, means = inputs.contributions, inputs.seen(), inputs.contributions.means()

@@ -20,7 +20,7 @@ OURS: str = MethodSettings().name
 
 
 def require_method(name: str) -> None:
-    """Raise a `SettingsError` unless the name is that of our method or a baseline."""
+    """Raise a `SettingsError` unless `name` is our method or a baseline."""
     if name != OURS and name not in METHODS:
         raise SettingsError(
             f"method.name: there is no method {name!r}",
@@ -30,7 +30,7 @@ def require_method(name: str) -> None:
 
 
 def method_of(name: str) -> "Fit":
-    """Import a baseline, or raise a `SettingsError` if there is none with this name."""
+    """Import a baseline; raise a `SettingsError` if there is no baseline with this name."""
     require_method(name)
     if name == OURS:
         raise SettingsError(

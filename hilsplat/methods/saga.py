@@ -1,20 +1,20 @@
 """SAGA: affinity features of Gaussians that a gate adapts to a scale (GARField's idea for Gaussians).
 
 1. Every mask has a 3D scale. Every Gaussian learns 32 numbers, averaged over its neighbours and multiplied by
-   a gate that depends on the scale: two pixels can form one group at a large scale and two at a small one.
+   a gate that depends on the scale: two pixels can be grouped at a large scale and separate at a small scale.
 2. At a scale, two pixels belong together if they share a mask up to that scale, or if the smallest larger
-   mask that contains them is the same.
-3. The gated features at the median scale of each level's masks are clustered; a cluster is assigned the CLIP
+   mask that contains each is the same.
+3. Features gated at the median scale of each level's masks are clustered; a cluster is assigned the CLIP
    vectors of the masks that fit it.
 
 Source: Cen et al., Segment Any 3D Gaussians, AAAI 2025; Jumpat/SegAnyGAussians `get_scale.py`,
 `train_contrastive_feature.py`; scales and their quantiles from GARField (Kim et al., CVPR 2024,
-chungmin99/garfield). The authors' values are in the constants, and `steps` 10,000, `rate` 0.0025.
+chungmin99/garfield). The authors' values are the constants below, `steps` 10,000, and `rate` 0.0025.
 
 Departs:
-    - a mask's scale is the spread of its Gaussians, not that of unprojected depths;
+    - a mask's scale is the spread of its Gaussians, not of unprojected depths;
     - painted masks, at most three per pixel; fewer steps, on 256 pixels of a view instead of 1000;
-    - almost equal initial features; all 16 neighbours are used at every step;
+    - almost identical initial features; all 16 neighbours are used at every step;
     - the authors click at a chosen scale or cluster by HDBSCAN, and don't support text: here the scales are
       the levels' medians, 256 k-means centres are merged by average cosine as for OmniSeg3D, and clusters
       get CLIP vectors by association.
@@ -39,11 +39,11 @@ SCALES = 8  # random scales per step, plus one below and one above all masks of 
 PIXELS = 256
 MAX_WEIGHT = 10.0
 EASY_POSITIVE, HARD_NEGATIVE = 0.75, 0.5
-COSINE = 0.95  # minimum average in a cluster; 0.5 doesn't separate parts and subparts on development scenes
+COSINE = 0.95  # minimum average in a cluster; 0.5 doesn't separate parts and subparts in development scenes
 
 
 def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
-    """Return twice the standard deviation of each mask's Gaussians, scene units; 0 if it has none."""
+    """Return twice the standard deviation of each mask's Gaussians, scene units; 0 if a mask has none."""
     A = contributions.matrix("A").astype(np.float64)
     means = contributions.means().astype(np.float64)
     means -= means.mean(axis=0)
@@ -62,10 +62,10 @@ def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator)
 def together(
     labels: Int32[np.ndarray, "p 3"], scales: Float64[np.ndarray, "p 3"], scale: float
 ) -> Bool[np.ndarray, "p p"]:
-    """Return whether two pixels share a mask at or below the scale, or the smallest mask above it.
+    """Return whether two pixels share a mask at or below the scale, or the smallest mask above the scale.
 
-    `labels` is the mask of each pixel at each level (-1: none), and `scales` contains the masks' scales; each
-    mask has only one level.
+    `labels` contains each pixel's mask at each level (-1: none), and `scales` the masks' scales; each mask
+    has only one level.
     """
     above = (labels >= 0) & (scales > scale)
     smallest = np.where(above, scales, np.inf).argmin(axis=1)
@@ -88,9 +88,9 @@ def affinity_loss(
     weight: Float32[np.ndarray, "p p"],  # of each pair
     random: np.random.Generator,
 ) -> Float[Tensor, ""]:
-    """Return a loss that raises gated cosines in groups, lowers positive ones between groups; lengths stay 1.
+    """Return a loss that raises cosines in groups, lowers positive cosines between groups, keeps lengths 1.
 
-    Pairs used: those whose grouping depends on the scale, those hard at any scale, and as many easy ones.
+    It uses pairs whose grouping depends on the scale, pairs hard at any scale, and as many easy pairs.
     """
     gated = unit(rendered[None] * gates[:, None])
     cosine = gated @ gated.transpose(1, 2)

@@ -1,20 +1,20 @@
 """View-consistent hierarchy: features whose ultrametric reproduces the coverage trees of the views.
 
-1. Every Gaussian learns a vector. Pixels are joined to their 10 nearest in the image by edges as long as the
+1. Every Gaussian learns a vector. Pixels are joined to their 10 nearest pixels by edges as long as the
    distance of their vectors; the ultrametric is the longest edge on a pair's minimum spanning tree path.
-2. For every mask, a pixel must be closer to pixels inside than to pixels outside but in the mask's parent, by
-   dot product and by ultrametric.
-3. Gaussians are connected to those of their 16 nearest neighbours within a distance; nested components at
-   three distances form the levels. A component is assigned its best masks' CLIP vectors in each view.
+2. For every mask, a pixel inside must be closer to other pixels inside than to pixels outside that are in the
+   mask's parent, by dot product and by ultrametric.
+3. Gaussians are connected to those of their 16 nearest neighbours within a given feature distance; nested
+   components at three distances form the levels. A component gets its best mask's CLIP vector in each view.
 
 Source: He et al., View-Consistent Hierarchical 3D Segmentation Using Ultrametric Feature Fields, CVPR 2024;
-hardyho/ultrametric_feature_fields. The authors' values are in the constants, `steps` 20 epochs, `rate` 0.01.
+hardyho/ultrametric_feature_fields. The authors' values are the constants below, 20 epochs, and `rate` 0.01.
 
 Departs:
     - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
     - unit length by division, without a penalty on the norm; depth is not smoothed;
-    - parents are those of our coverage tree (0.9 inside), not 0.95 inside and IoU below 0.9;
-    - components of Gaussians, not of voxels of 0.002; Gaussians outside the 200 largest join the nearest;
+    - parents are those in our coverage tree (0.9 inside), not 0.95 inside and IoU below 0.9;
+    - components of Gaussians, not of 0.002 voxels; Gaussians outside the 200 largest join the nearest one;
     - the authors don't support text.
 """
 
@@ -47,7 +47,7 @@ THRESHOLDS = (0.6, 0.5, 0.45)
 
 @compiled
 def joining_edges(num, edge_a, edge_b, first, second):
-    """Return the edge, in the given order, that joins the two pixels of each pair, or -1."""
+    """Return the edge, when adding edges in the given order, that connects each pair of pixels, or -1."""
     top = np.arange(num)  # union-find over pixels
     node = np.arange(num)  # dendrogram node of the root's component
     up = np.full(num + len(edge_a), -1, np.int64)
@@ -85,9 +85,9 @@ def ultrametric(
     penalty: Float[np.ndarray, " e"],
     pairs: Int64[np.ndarray, "2 k"],
 ) -> Float[Tensor, " k"]:
-    """Return the longest edge between each pair of pixels in the minimum spanning tree; differentiable.
+    """Return the longest edge on each pixel pair's path in the minimum spanning tree; differentiable.
 
-    The penalty is added to an edge's length when the tree is chosen, not in the result. The result is 2 for a
+    The penalty is added to edge lengths when the tree is chosen, not in the result. The result is 2 for a
     pair without a path, and 0 for a pixel and itself.
     """
     num = len(vectors)
@@ -121,9 +121,9 @@ def triplets(
     parent: Int32[np.ndarray, " m"],
     random: np.random.Generator,
 ) -> Int64[np.ndarray, "3 k"]:
-    """Draw, per mask, `PAIRS` pixels a and b inside, and c outside but in its parent (anywhere, for a root).
+    """Draw, per mask, `PAIRS` pixels a and b inside, and c outside but in the parent (a root: anywhere).
 
-    `labels` contains the mask row at each pixel and level, `parent` the row of each mask's parent (-1: none).
+    `labels` contains the mask row at each pixel and level; `parent`, each mask's parent row or -1.
     """
     found = []
     for mask in np.unique(labels[labels >= 0]):
@@ -141,9 +141,9 @@ def components(
     means: Float32[np.ndarray, "N 3"],
     thresholds: tuple[float, float, float],
 ) -> Int64[np.ndarray, "N 3"]:
-    """Return the component of each Gaussian at every distance, largest first.
+    """Return each Gaussian's component at every distance, numbered from the largest component.
 
-    Gaussians outside the 200 largest components join the component of the nearest Gaussian inside one.
+    Gaussians outside the 200 largest components join the component of the nearest Gaussian in one of these.
     """
     num = len(means)
     near = nearest(means, NEIGHBOURS + 1)
@@ -183,7 +183,7 @@ def fit(inputs: MethodInputs, settings: MethodSettings, seed: int) -> Float32[np
         pairs = np.concatenate([chosen[[0, 1]], chosen[[0, 2]]], axis=1)
         near, far = ultrametric(vectors, edges, BORDER * borders, pairs).chunk(2)
         dots = (vectors[a] * (vectors[c] - vectors[b])).sum(1)
-        # -log of the softmax of the pair inside versus the pair across
+        # -log of the softmax of the pair inside the mask versus the pair across its border
         return softplus(dots / TEMPERATURE).mean() + softplus((near - far) / TEMPERATURE).mean()
 
     train(views, [features], loss, settings, seed)

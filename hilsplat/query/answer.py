@@ -37,12 +37,12 @@ def answer(
 ) -> Iterator[str]:
     """Query a scene: yield the report, then write `panel.png` and `selection.ply` and yield their names.
 
-    The answer takes milliseconds, the picture one to two seconds, including imports and rendering. Other
-    arguments and errors are those of `LanguageScene.open` and `LanguageScene.query`.
+    The answer takes milliseconds; the picture takes one to two seconds, including imports and rendering.
+    Other arguments and errors are those of `LanguageScene.open` and `LanguageScene.query`.
 
     Args:
         views: number of views in the panel; `view`, if given, is the first.
-        out: folder of both files; by default `queries/<text>` in the scene's folder.
+        out: output folder for both files; by default `queries/<text>` in the scene's folder.
     """
     found = FinishedScene.locate(Path(folder), variant)
     scene = LanguageScene.of(found, threads=threads)
@@ -67,7 +67,7 @@ def answer(
 
 
 def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]:
-    """Return the views in which the best answers are largest, then others, evenly spaced over the scene."""
+    """Return the views that show the best answers largest, then other views, evenly spaced over the scene."""
     best = [view for hit in hits for view in hit.best_views[:1]] + [v for hit in hits for v in hit.best_views]
     every = scene.scene.views()
     spread = [every[number * len(every) // count] for number in range(count)]
@@ -75,7 +75,7 @@ def views_of(scene: LanguageScene, hits: Sequence[Hit], count: int) -> list[str]
 
 
 def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = None) -> str:
-    """Return the answers as text, with doubts; `view` is the view that the query was restricted to."""
+    """Return answers and doubts as text; `view` is the view that the query was restricted to."""
     place = scene.scene.name if view is None else f"view {view} of {scene.scene.name}"
     hits, doubts = scene.hits_of(found, LISTED), doubts_of(found)
     if not hits:
@@ -107,9 +107,9 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
 
 
 def file_name(text: str) -> str:
-    """Return a folder name for a query that is valid on every system, such as `bear--nose`.
+    """Return a folder name for a query, such as `bear--nose`, that is valid on every system.
 
-    The name of a text that is long or contains other characters ends in part of its digest, to be unique.
+    For a long text or one with other characters, the name ends in part of the text's digest, to be unique.
     """
     parts = [part.split() for part in text.split(PATH_SEPARATOR)]
     if all(parts) and all(re.fullmatch(r"[\w.]*\w", word) for part in parts for word in part):

@@ -41,7 +41,7 @@ class FieldScene(SceneViews):
         """Return the language field and the code that decodes it.
 
         Raises:
-            ArtifactError: the run has not computed them yet.
+            ArtifactError: the run has not computed the field yet.
         """
         if self.language is None or self.autoencoder is None:
             raise ArtifactError(
@@ -62,11 +62,11 @@ class FieldScene(SceneViews):
     ) -> Float32[np.ndarray, "T 3 H W"]:
         """Compute relevancy from decoded rendered latents at every pixel and level, as in the paper.
 
-        Pixels that show mostly Gaussians without a latent at the level get the lowest value of the others.
+        Pixels that show mostly Gaussians without a latent at the level get the other pixels' lowest value.
 
         Args:
             exact: if true, a network decodes every pixel at every call; otherwise it decodes a view once, and
-                results differ by at most 2e-3 (see `LatentRelevancy`). It has no effect for a linear code.
+                results differ by at most 2e-3 (see `LatentRelevancy`). Has no effect for a linear code.
         """
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)
@@ -83,7 +83,7 @@ class FieldScene(SceneViews):
     def field_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Return the cosines of texts with the rendered, decoded latents of pixels, at each level.
+        """Return the cosines of texts with pixels' rendered and decoded latents, at each level.
 
         Pixels (row * width + column) that show mostly Gaussians without a latent have -inf.
         """
@@ -103,7 +103,7 @@ class FieldScene(SceneViews):
         return found
 
     def gaussian_relevancy(self, text: str, level: str = "auto") -> Float32[np.ndarray, " N"]:
-        """Return each Gaussian's field relevancy at a level, or its maximum over levels; 0 if no latent."""
+        """Return each Gaussian's field relevancy at a level, or the maximum over levels; 0 if no latent."""
         features = self.trained()[0].features
         out = np.zeros(len(features), np.float32)
         vector = self.text_vectors([text])
@@ -123,19 +123,19 @@ class FieldScene(SceneViews):
 
     @cached_property
     def _decoded_nodes(self) -> Float32[np.ndarray, "n C"]:
-        """Decoded mean latent of each node's Gaussians at its level."""
+        """Mean latent of each node's Gaussians at the node's level, decoded."""
         language, code = self.trained()
         return code.decode_array(node_means(self.tree.node_of_gaussian, self.tree.level, language.features))
 
     def latents(self, view: str) -> list[tuple[np.ndarray, Float32[np.ndarray, "P D"]]]:
-        """Return, per level, the pixels that show mostly Gaussians with a latent, and their latents."""
+        """Return the pixels that show mostly Gaussians with a latent, and their latents, per level."""
         return self._views.get(
             ("latents", view),
             lambda: rendered_latents(self.view_weights(view), self.trained()[0].features),
         )
 
     def _placed_latents(self, view: str) -> list:
-        """Return the look-up data of a view for each level, created at the first look-up."""
+        """Return a view's look-up data for each level, computed at the first look-up."""
         return self._views.get(
             ("placed", view),
             lambda: [self._latent_relevancy.prepare(latents) for _, latents in self.latents(view)],
@@ -150,9 +150,9 @@ class FieldScene(SceneViews):
 def field_colours(features: Float32[np.ndarray, "N D"]) -> Float32[np.ndarray, "N 3"]:
     """Map a level's features to colours along their three principal directions, stretched to [0, 1].
 
-    The largest component of each direction is positive, and its 2nd to 98th percentile over all Gaussians is
-    stretched to the colour range, so that all views use the same colours. Gaussians without a feature are
-    black; with fewer than three directions, the remaining channels are 0.
+    The largest component of each direction is positive, and the 2nd to 98th percentiles over all Gaussians
+    span the colour range, so that all views use the same colours. Gaussians without a feature are black; with
+    fewer than three directions, the remaining channels are 0.
     """
     values = features.astype(np.float64)
     seen = np.square(values).sum(axis=1) > 0

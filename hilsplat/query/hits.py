@@ -11,7 +11,7 @@ from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.tree import OrientedBox
 
 LIKELY_CHANCE = 0.05
-"""An answer is doubtful if more than this share of the words for absent things score as high."""
+"""An answer is doubtful if more than this share of the words for absent objects score at least as high."""
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class Doubt:
 
     Attributes:
         level: the level that was searched, if a node of any level matches the text; otherwise None.
-        chance: share of words for absent things whose best score is as high; None if the reason for the doubt
-            is another.
+        chance: share of words for absent objects whose best score is at least as high; None if the doubt has
+            another reason.
         unknown: words of the text that are not in the model's vocabulary.
     """
 
@@ -49,15 +49,15 @@ class Hit:
     Attributes:
         node: row of the semantic tree.
         score: relevancy in (0, 1) of the node and, with a lower weight, of its ancestors; answers are sorted
-            by it, and 0.5 is no better than a generic word. For route "like", the cosine with a node or
+            by score, and 0.5 is no better than a generic word. For route "like", the cosine with a node or
             picture.
-        box: axis-aligned, lower and upper corner.
+        box: lower and upper corner of the axis-aligned box.
         oriented_box: the box along the node's own axes.
-        best_views: up to three training views in which it is largest.
+        best_views: up to three training views in which the node is largest.
         route: as in `NodeHits`, or "like".
-        doubts: texts of the query that may match nothing; if the first text of a path is doubtful, so are
-            all answers.
-        name: the user's name for the node, otherwise its vocabulary name; empty if nothing fits.
+        doubts: texts of the query that may match nothing; if the first text of a path is doubtful, all
+            answers are.
+        name: the user's name for the node, otherwise its vocabulary name; empty if no name fits.
     """
 
     node: int
@@ -74,11 +74,11 @@ class Hit:
 
     @property
     def gaussians(self) -> Int64[np.ndarray, " g"]:
-        """Rows of `gaussians.ply` that belong to the node."""
+        """Rows of the node's Gaussians in `gaussians.ply`."""
         return self._scene.gaussians_of([self.node])
 
     def mask(self, view: str) -> Bool[np.ndarray, "H W"]:
-        """Return the pixels of a view in which the node's Gaussians have a share above 0.5.
+        """Return the pixels of a view in which the node's Gaussians have more than half of the weight.
 
         Raises:
             SettingsError: the scene has no such view.
@@ -87,7 +87,7 @@ class Hit:
 
 
 def doubts_of(found: NodeHits) -> tuple[Doubt, ...]:
-    """Return the texts of a query that may match nothing in the scene."""
+    """Return a doubt for each text of a query that may match nothing in the scene."""
     doubts = []
     for each in found.texts:
         likely = each.chance is not None and each.chance > LIKELY_CHANCE

@@ -1,7 +1,7 @@
-"""A finished scene that accepts text queries of its semantic tree or of its decoded language field.
+"""A finished scene that accepts text queries of its semantic tree or its decoded language field.
 
-docs/python.md describes its use. From text to Gaussians: `query` parses the text, `select` searches the tree
-by cosine margins (`node_search.search`), and each `Hit` has its Gaussians.
+docs/python.md describes the usage. `query` parses the text, `select` searches the tree by cosine margins
+(`node_search.search`), and each `Hit` has its Gaussians.
 """
 
 import logging
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 NAMED = 2.0
-"""Cosine margin of a node for the name that the user gave it: the maximum, so that it is ranked first."""
+"""Cosine margin of a node for its user-given name: the maximum, so that the node is ranked first."""
 
 BEST_VIEWS = 3
-"""Maximum number of views of an answer."""
+"""Maximum number of best views of an answer."""
 
 ANSWERERS = ("tree", "field")
 
@@ -51,7 +51,7 @@ class LanguageScene(FieldScene):
     Attributes:
         caution: sentence that explains why CLIP's answers are meaningless for this scene, or empty.
         names: the user's names for nodes, which are matched first.
-        naming: vocabulary names of the nodes, and words for absent things; None if the stage has not run.
+        naming: vocabulary names of the nodes, and words for absent objects; None if the stage has not run.
         unknown_words: returns the words of a text that are not in the text model's vocabulary.
         encode_picture: returns the unit CLIP vector of an RGB image; None if images cannot be embedded.
         finished: location and variant of the scene; None if it was assembled from parts.
@@ -64,19 +64,19 @@ class LanguageScene(FieldScene):
     encode_picture: Callable[[np.ndarray], np.ndarray] | None = field(default=None, repr=False)
     finished: FinishedScene | None = field(default=None, repr=False)
     _by_chance: dict[str, np.ndarray] = field(default_factory=dict, repr=False, kw_only=True)
-    """Margins of all nodes for `naming.rivals`, by answerer, (W, n)."""
+    """Margins (W, n) of all nodes for `naming.rivals`, by answerer."""
 
     @staticmethod
     def open(folder: Path | str, variant: str = "default", *, threads: int = 1) -> "LanguageScene":
-        """Open `results/<dataset>/<scene>`, or a copy of it anywhere, with the settings that made it.
+        """Open `results/<dataset>/<scene>`, or a copy of that folder, with the settings that created it.
 
         Canonical phrases, template, scale and node selection are read from the provenance of the variant's
         evaluation, or of its panel if the scene has no labels.
 
         Raises:
             ArtifactError: the scene is not finished.
-            MisalignedArtifactError: its parts do not belong together.
-            ModelError: the CLIP that embedded its masks is not found.
+            MisalignedArtifactError: the scene's parts do not belong together.
+            ModelError: the CLIP that embedded the scene's masks is not found.
         """
         scene = LanguageScene.of(FinishedScene.locate(Path(folder), variant), threads=threads)
         if scene.caution:
@@ -106,7 +106,7 @@ class LanguageScene(FieldScene):
         names: NodeNames | None = None,
         naming: NodeNaming | None = None,
     ) -> "LanguageScene":
-        """Read a scene's artifacts, each once, and check that they belong together.
+        """Read each of a scene's artifacts once, and check that they belong together.
 
         Args:
             opened: artifacts that other variants of the scene have already opened.
@@ -165,7 +165,7 @@ class LanguageScene(FieldScene):
 
         Args:
             text: query to run when the page opens.
-            height: px.
+            height: height of the frame, px.
             proxy: address, containing `{port}`, at which a browser on another machine reaches a port of this
                 machine: "/user/me/proxy/{port}/" on a JupyterHub.
 
@@ -196,11 +196,11 @@ class LanguageScene(FieldScene):
             text: words, or words separated by ">".
             level: "whole", "part", "subpart" or "auto"; for a path, the level of its last text.
             answerer: "tree" compares the nodes' averaged CLIP vectors with the text; "field" compares the
-                decoded mean of the paper's field over their Gaussians.
-            view: name of a view, to find only nodes that it shows; None: the whole scene.
-            threshold: minimum score of an answer, in (0, 1); None: the best answer, and those whose margin is
-                lower by at most (1 - `node_select`) times the range of the level's margins, or three times
-                that if they look like the best.
+                paper's field, averaged over each node's Gaussians and decoded.
+            view: name of a view, to find only nodes visible in that view; None searches the whole scene.
+            threshold: minimum score of an answer, in (0, 1); None returns the best answer, and answers whose
+                margin is lower by at most (1 - `node_select`) times the range of the level's margins, or
+                three times that if they look like the best.
             limit: maximum number of answers.
 
         Raises:
@@ -211,7 +211,7 @@ class LanguageScene(FieldScene):
         return self.hits_of(found, limit)
 
     def like_node(self, node: int, *, limit: int = 10) -> list[Hit]:
-        """Return the nodes of a node's level that look most like it, best first; scores are cosines.
+        """Return the nodes at the same level that look most like a node, best first; scores are cosines.
 
         Raises:
             SettingsError: there is no such node.
@@ -239,7 +239,7 @@ class LanguageScene(FieldScene):
         return [self._hit(int(nodes[row]), float(cosine[row]), "like", ()) for row in order]
 
     def hits_of(self, found: NodeHits, limit: int) -> list[Hit]:
-        """Return the best nodes, at most `limit`, as answers."""
+        """Return at most `limit` best nodes as answers."""
         doubts, hits = doubts_of(found), []
         for node, value in zip(found.ids[:limit].tolist(), found.values[:limit], strict=True):
             score = relevancy_of_margins(np.array([value]), self.settings.relevancy_scale)[0]
@@ -275,7 +275,7 @@ class LanguageScene(FieldScene):
     ) -> NodeHits:
         """Return the answers of `query` as rows of the tree; the path may also be a sequence of texts.
 
-        Arguments and errors are those of `query`; a level of None is "auto".
+        Arguments and errors are those of `query`; level None means "auto".
         """
         path = path_of(path) if isinstance(path, str) else tuple(path)
         if answerer not in ANSWERERS:
@@ -306,7 +306,7 @@ class LanguageScene(FieldScene):
         return replace(found, texts=tuple(self._doubted(each, answerer, shown) for each in found.texts))
 
     def _doubted(self, answer: TextAnswer, answerer: str, shown: Bool[np.ndarray, " n"] | None) -> TextAnswer:
-        """Return a text's answer, completed by the share of words for absent things that score as high."""
+        """Add to a text's answer the share of words for absent objects that score at least as high."""
         if self.names.nodes_of(answer.text):
             return answer
         chance = None
@@ -322,9 +322,9 @@ class LanguageScene(FieldScene):
         return replace(answer, chance=chance, unknown=tuple(self.unknown_words(answer.text)))
 
     def name_of(self, node: int) -> str:
-        """Return the user's name for a node, otherwise its vocabulary name; empty if nothing fits.
+        """Return the user's name for a node, otherwise its vocabulary name; empty if no name fits.
 
-        The vocabulary name of a part includes its whole, as in "wheel of car", unless it already does.
+        The vocabulary name of a part gets its whole appended, as in "wheel of car", unless already included.
         """
         own, parent = self.own_name_of(node), int(self.tree.parent[node])
         if not own or parent == NONE or node in self.names.of_node:
@@ -335,7 +335,7 @@ class LanguageScene(FieldScene):
         return own if not whole or whole in own else f"{own} of {whole}"
 
     def own_name_of(self, node: int) -> str:
-        """Return `name_of` without the whole that a part belongs to."""
+        """Return `name_of` without the name of the whole that a part belongs to."""
         called = self.naming.of_node[node] if self.naming is not None else ""
         return self.names.of_node.get(node, "") or called
 
@@ -344,7 +344,7 @@ class LanguageScene(FieldScene):
     def node_margins(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
         """Return each node's cosine margin for each text, relative to this scene's canonical phrases.
 
-        A node has the margin `NAMED` for the name that the user gave it.
+        A node has the margin `NAMED` for its user-given name.
         """
         if not len(texts):
             return np.zeros((0, len(self.tree)), np.float32)
@@ -363,7 +363,7 @@ class LanguageScene(FieldScene):
         return relevancy_of_margins(self.node_margins(texts, answerer), self.settings.relevancy_scale)
 
     def node_vectors(self, answerer: str = "tree") -> Float32[np.ndarray, "n C"]:
-        """Return the nodes' unit vectors: their own, or decoded from the field of their Gaussians."""
+        """Return the nodes' unit vectors: those of the tree, or decoded from the field of their Gaussians."""
         return self.tree.clip if answerer == "tree" else self._decoded_nodes
 
     def node_relevancy_map(self, texts: Sequence[str], view: str) -> Float32[np.ndarray, "T 3 H W"]:
@@ -373,10 +373,10 @@ class LanguageScene(FieldScene):
     def node_cosine(
         self, texts: Sequence[str], view: str, pixels: Int64[np.ndarray, " P"]
     ) -> Float32[np.ndarray, "T 3 P"]:
-        """Average the cosines of texts and nodes over the Gaussians of pixels, weighted by W, at each level.
+        """Average the text-node cosines over each pixel's Gaussians, weighted by W, at each level.
 
         Gaussians without a node have the lowest cosine of the level; uncovered pixels have -inf. User-given
-        names are ignored. A pixel's number is row * width + column.
+        names are ignored. A pixel's index is row * width + column.
         """
         cosines = self.text_vectors(texts) @ self.tree.clip.astype(np.float32).T
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
@@ -392,7 +392,7 @@ class LanguageScene(FieldScene):
 
 
 def path_of(text: str) -> tuple[str, ...]:
-    """Return the texts of a query, coarse to fine: one, or those of a path such as "bear > head > nose".
+    """Return the texts of a query, coarse to fine: one text, or a path such as "bear > head > nose".
 
     Raises:
         SettingsError: a text is empty or not UTF-8.

@@ -1,7 +1,7 @@
-"""Names that the user gave to nodes; they are matched first, without a model.
+"""User-given names of nodes, which are matched first, without a model.
 
-`names.json` in a scene's folder stores them under the digest of `tree.npz`, because rows of one tree mean
-nothing in another. If a tree is rebuilt, the names of the previous tree are kept but not used.
+`names.json` in a scene's folder stores the names under the digest of `tree.npz`, because row numbers of one
+tree are meaningless in another. If a tree is rebuilt, the previous tree's names are kept but not used.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ LONGEST = 80
 
 @dataclass(frozen=True)
 class NodeNames:
-    """Names of nodes of one semantic tree, by row, and the version of the file they were read from."""
+    """Names of one semantic tree's nodes, by row, and the version of the file they were read from."""
 
     of_node: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}))
     version: str = NO_FILE
@@ -44,7 +44,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
     """Return the names of a tree's nodes from the scene's folder; empty if unnamed.
 
     Raises:
-        ArtifactError: the file is damaged or of another version, or names nodes that do not exist.
+        ArtifactError: the file is damaged, has another version, or names nodes that do not exist.
     """
     path = Path(folder) / FILE
     kept = _kept(path).trees.get(tree_digest(semantic_tree), {})
@@ -62,7 +62,7 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
 def write_names(
     folder: Path, semantic_tree: Path, names: Mapping[int, str], num_nodes: int, version: str
 ) -> NodeNames:
-    """Replace the names of a tree in its scene's folder; empty names are removed.
+    """Replace the names of a tree in the scene's folder; empty names are removed.
 
     Raises:
         StaleFileError: the file changed since `version` was read.

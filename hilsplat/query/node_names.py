@@ -1,4 +1,4 @@
-"""Stage `names`: the best vocabulary word for each node, and vectors of words for absent things."""
+"""Stage `names`: the best vocabulary word for each node, and vectors of words for absent objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,17 +38,17 @@ CANDIDATES = 5
 """Number of texts stored for each node, best first."""
 
 STANDS_OUT = 0.5
-"""Minimum distance of a name's margin above the fifth nearest text's (the nearest include synonyms), in
+"""Minimum lead of a name's margin over that of the fifth-nearest text (nearer texts include synonyms), in
 standard deviations of the vocabulary's margins. Chosen on development scenes (docs/experiments.md)."""
 
 FEWEST_ABSENT = 100
-"""Minimum number of known words for absent things. If there are fewer, vocabulary words that are not the
-nearest word of any node replace them; if those are too few as well, chance is not estimated."""
+"""Minimum number of known words for absent objects. If there are fewer, vocabulary words that are not the
+nearest word of any node replace them; if these are too few as well, chance is not estimated."""
 
 THINGS, PARTS, SURFACES = range(3)
 
 VOCABULARY = "vocabulary.txt"
-"""File of a model's own vocabulary in its folder; the file in this package is for all other models."""
+"""Vocabulary file in a model's folder; models without this file use the one in this package."""
 
 COMMON = Path(str(files("hilsplat.query") / VOCABULARY))
 AUTO = "auto"
@@ -57,7 +57,7 @@ SECTIONS = ("things", "parts", "surfaces", "absent")
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Distinct texts by kind; `absent` has words for things that few scenes contain, and may be empty."""
+    """Distinct texts by kind; `absent` has words for objects that few scenes contain, and may be empty."""
 
     things: tuple[str, ...]
     parts: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class Vocabulary:
         """Read a text file: texts on lines or between commas, in sections [things] (default), [parts], ...
 
         Raises:
-            SettingsError: it cannot be read, has an unknown section or contains no text.
+            SettingsError: the file cannot be read, has an unknown section or contains no text.
         """
         try:
             lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -99,7 +99,7 @@ class Vocabulary:
 
 
 def vocabulary_file(setting: str, model: Path) -> Path:
-    """Return a setting's vocabulary file; `auto` is the model's if it has one, otherwise the package's."""
+    """Return a setting's vocabulary file; `auto` means the model's file if any, otherwise the package's."""
     if setting != AUTO:
         return Path(setting)
     own = Path(model) / VOCABULARY
@@ -111,9 +111,9 @@ class NodeNaming:
     """Vocabulary names of the nodes of a tree.
 
     Attributes:
-        of_node: name of each node; "" if nothing fits.
-        surfaces: whether each node's name is a surface.
-        rivals: unit vectors of words for absent things, to estimate chance; may be empty.
+        of_node: name of each node; "" if no name fits.
+        surfaces: whether each node's name is that of a surface.
+        rivals: unit vectors of words for absent objects, to estimate chance; may be empty.
     """
 
     of_node: tuple[str, ...]
@@ -122,7 +122,7 @@ class NodeNaming:
 
     @staticmethod
     def load(folder: Path, semantic_tree: Path, clip_folder: Path) -> "NodeNaming | None":
-        """Read the artifact; return None if it is missing or was made for another tree or other vectors.
+        """Read the artifact; return None if it is missing or was computed for another tree or vectors.
 
         Raises:
             ArtifactError: the artifact is damaged.
@@ -163,7 +163,7 @@ def run_names(
 
     Args:
         clip_folder: CLIP vectors of the masks.
-        cache: folder of text vectors, shared by all scenes of a model.
+        cache: folder of text vectors, shared by all scenes with the same model.
 
     Raises:
         SettingsError: the vocabulary cannot be read.
@@ -223,14 +223,14 @@ def named(
 ) -> list[dict[str, Any]]:
     """Name each node by the text nearest to its vector, if that text stands out from the others.
 
-    A whole is a thing or a surface. A part or subpart is a part, or a thing: a plate is part of a laid table.
+    A whole gets a thing or surface name. A part or subpart gets a part or thing name: a laid table's plate.
 
     Args:
         margin: the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order.
 
     Returns:
-        for each node, its `name`, whether this is a `surface`, and the nearest texts with their margins, best
-        first, as `candidates`.
+        for each node, its `name`, whether that name is a `surface`, and, as `candidates`, the nearest texts
+        with their margins, best first.
     """
     groups = (vocabulary.things, vocabulary.parts, vocabulary.surfaces)
     words = [word for group in groups for word in group]

@@ -13,20 +13,20 @@ from hilsplat.semantic_tree.tree import SemanticTree
 # Chosen on development scenes; docs/experiments.md ("Query") compares them with other values.
 
 ALIKE = 0.9
-"""Nodes whose vectors have at least this cosine count as alike, such as things of one kind."""
+"""Nodes whose vectors have at least this cosine count as alike, such as objects of one kind."""
 
 ALIKE_REACH = 3.0
-"""Factor by which a node that looks like the best answer may be further below it than other nodes."""
+"""Factor on the allowed distance below the best answer, for nodes that look like the best answer."""
 
 ANCESTORS_SHARE = 0.5
-"""Share of an ancestor's distance below the best of its level that is subtracted from a node on a path."""
+"""Fraction of an ancestor's shortfall, relative to its level's best, subtracted from a node on a path."""
 
 PLAUSIBLE = 0.25
-"""A node competes on a path only if its ancestor is at most this share of the range below the best answer to
-the first text: only the nose of a plausible bear is an answer to "bear > nose"."""
+"""A node competes on a path only if its ancestor is at most this fraction of the margin range below the best
+answer to the first text: only the nose of a plausible bear is an answer to "bear > nose"."""
 
 WITHOUT_ANCESTOR = 0.1
-"""Share of the range by which a missing ancestor counts as below the best."""
+"""Assumed shortfall of a missing ancestor, relative to the best, as a fraction of the margin range."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class TextAnswer:
     """The best match of one text of a query.
 
     Attributes:
-        margin: cosine margin of the best node that competed at `level`; -inf if none did.
+        margin: cosine margin of the best node that competed at `level`; -inf if no node competed.
         anywhere: cosine margin of the best node of any level.
-        chance: share of words for absent things whose best margin is as high; None if unknown.
+        chance: share of words for absent objects whose best margin is at least as high; None if unknown.
         unknown: words of the text that are not in the model's vocabulary.
     """
 
@@ -59,11 +59,11 @@ class NodeHits:
 
     Attributes:
         ids: rows of the semantic tree, best first.
-        values: sort key: the cosine margin for the last text, plus a bonus (one text) or minus a penalty (a
-            path) from their ancestors.
-        route: how the best node was reached: "flat"; or on a path "child" (it has an ancestor at the level of
-            every earlier text, and the last one is its parent), "descendant" (at some, or the last one is not
-            its parent) or "fallback" (at none, or no node is part of a plausible answer to the first text).
+        values: sort key of each node: its cosine margin for the last text, plus a bonus (one text) or minus a
+            penalty (a path) that depends on its ancestors.
+        route: how the best node was found: "flat" for one text. On a path, "child": it has an ancestor at the
+            level of every earlier text, the last being its parent; "descendant": only some, or the last isn't
+            its parent; "fallback": none, or no node is part of a plausible answer to the first text.
         texts: the best match of each text of the query, coarse to fine.
     """
 
@@ -95,13 +95,13 @@ def search(
         margin: cosine margin of every node for each text.
         vectors: unit vectors of every node, which determine which nodes look alike.
         threshold: see `best_nodes`.
-        ancestors: share of the mean margin of a node's ancestors that is added to its own; ignored for a path
-            of several texts, which names the ancestors itself.
-        level: level of the last text; None: chosen by `automatic_level` or `_search_path`.
-        shown: which nodes are allowed as answers; None: all.
+        ancestors: fraction of the ancestors' mean margin that is added to a node's own margin; ignored for a
+            path of several texts, which names the ancestors itself.
+        level: level of the last text; None lets `automatic_level` or `_search_path` choose it.
+        shown: which nodes are allowed as answers; None allows all.
 
     Raises:
-        SettingsError: the path is empty, or has more texts than there are levels down to the last text's.
+        SettingsError: the path is empty, or has more texts than there are levels down to its last text.
     """
     margin = margin.astype(np.float64)
     anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
@@ -123,15 +123,15 @@ def best_nodes(
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None = None,
 ) -> Int64[np.ndarray, " h"]:
-    """Return the candidates near the best one, and those slightly further away that look like it.
+    """Return the candidates near the best one, and slightly worse candidates that look like the best.
 
-    They are sorted best first, on a tie by row. Vectors and `shown` are as in `search`.
+    Candidates are sorted best first, ties by row. Vectors and `shown` are as in `search`.
 
     Args:
-        value: sort key of every node: its cosine margin plus the ancestors' share.
+        value: sort key of every node: its cosine margin plus its ancestors' bonus.
         candidates: the nodes of a level, which define the range of values.
-        threshold: answers are at most (1 - threshold) times the range below the best one shown, or
-            `ALIKE_REACH` times that if they look like it.
+        threshold: answers are at most (1 - threshold) times the range below the best candidate shown, or
+            `ALIKE_REACH` times that distance if they look like the best.
     """
     may = candidates if shown is None else candidates[shown[candidates]]
     spread = np.ptp(value[candidates]) if len(candidates) else 0.0
@@ -144,7 +144,7 @@ def _near_best(
     vectors: Float32[np.ndarray, "n C"],
     reach: float,
 ) -> Int64[np.ndarray, " h"]:
-    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look like it."""
+    """Return candidates at most `reach` below the best, or `ALIKE_REACH` times that if they look alike."""
     if not len(candidates):
         return np.zeros(0, np.int64)
     own = value[candidates]
@@ -156,10 +156,10 @@ def _near_best(
 
 
 def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """Return the mean margin of each node's ancestors: "kettle knob" more likely means a knob of a kettle.
+    """Return the mean margin of each node's ancestors: "kettle knob" probably means a knob of a kettle.
 
-    A node without an ancestor gets the lowest margin of all. A whole gets 0: wholes have no ancestors and
-    compete only with each other. `search` adds a share that was chosen on development scenes.
+    A node without ancestors gets the lowest margin of all nodes. A whole gets 0, because wholes have no
+    ancestors and compete only with each other. `search` adds a fraction chosen on development scenes.
     """
     ancestors = tree.ancestors()
     above = (ancestors != NONE) & (ancestors != np.arange(len(tree))[:, None])
@@ -172,11 +172,11 @@ def ancestor_margins(tree: SemanticTree, margin: Float64[np.ndarray, " n"]) -> F
 def automatic_level(
     tree: SemanticTree, margin: Float64[np.ndarray, " n"], shown: Bool[np.ndarray, " n"] | None = None
 ) -> Level:
-    """Return the level of the node that best matches a text; on a tie, the coarsest.
+    """Return the level of the node that best matches a text; the coarsest level wins ties.
 
     This is LangSplat's rule, applied to nodes instead of pixels. A node's vector is an average over views,
-    and a level has tens of nodes, so noise does not favour the finest level, as it does with the maximum over
-    100,000 pixels. Rules that choose the best node's parent, standardise each level's margins or consult
+    and a level has tens of nodes, so noise does not favour the finest level, as it does for a maximum over
+    100,000 pixels. Rules that choose the best node's parent, standardise each level's margins or compare
     siblings were all worse on development scenes (docs/experiments.md, "Query").
     """
     levels = tree.level if shown is None else tree.level[shown]
@@ -187,11 +187,11 @@ def automatic_level(
 
 
 def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
-    """Return the range of nodes' margins for a text, extended to include 0, the canonical phrases' margin.
+    """Return the range of the nodes' margins for a text, extended to include 0, the margin of a tie.
 
-    This is the scale of a path's penalties. Among many things, some are further from a text than a generic
-    phrase is, so 0 is inside the range of the nodes. With a single thing, or things that all match the text,
-    the range of the nodes alone would be close to 0 and penalties would vanish.
+    A path's penalties are scaled by this range. Among many objects, some are further from a text than a
+    canonical phrase is, so the nodes' range includes 0. With a single object, or objects that all match the
+    text, the range of the nodes alone would be close to 0 and penalties would vanish.
     """
     return float(margin.max(initial=0.0) - margin.min(initial=0.0))
 
@@ -208,15 +208,15 @@ def _search_path(
 ) -> NodeHits:
     """Find nodes that match the last text and are part of nodes that match the earlier texts.
 
-    Every text has its own level. All nodes of the last text's level compete, each together with its
+    Every text has its own level. All nodes at the last text's level compete, each together with its
     ancestors: a bear that matches "bear" slightly worse than a cushion does still has the better head and
     nose. A node that is not part of a plausible answer to the first text (`PLAUSIBLE`) does not compete,
-    unless no node is.
+    unless no node is part of one.
 
     If a path has fewer texts than there are levels, its levels are ambiguous: the handle of a mug may be a
     part or a subpart, and the head of ("head", "nose") is not a whole. All combinations of levels are
-    therefore searched. Those whose best answer has an ancestor for every text are preferred, and among these
-    the one with the largest sum of margins. Ancestors need not be shown; they compete with nodes that are
+    therefore searched. Combinations whose best answer has an ancestor for every text are preferred; among
+    these, the largest sum of margins wins. Ancestors need not be shown; they compete with nodes that are
     shown or have a shown descendant.
     """
     ways = [way for way in combinations(LEVELS, len(path)) if way and level in (None, way[-1])]
@@ -246,12 +246,12 @@ def _search_way(
     threshold: float,
     shown: Bool[np.ndarray, " n"] | None,
 ) -> tuple[bool, float, list[float], NodeHits]:
-    """Search the last text at the last level, and each earlier text among the ancestors at its level.
+    """Search for the last text at the last level, and for each earlier text among ancestors at its level.
 
     Returns:
         whether the best answer is part of a plausible answer to the first text and has an ancestor for every
         text; the sum of the margins of the best answer and its ancestors; the margin of the best node that
-        competed for each text; and the answers, without their texts.
+        competed for each text; and the answers, with `texts` unset.
     """
     nodes, last = tree.nodes_of(levels[-1]), margin[-1]
     may = nodes if shown is None else nodes[shown[nodes]]

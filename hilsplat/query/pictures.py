@@ -1,4 +1,4 @@
-"""Parts of figures: overlays of answers, relevancy colours, a map of the scene from above."""
+"""Parts of figures: answer overlays, relevancy colours, and a map of the scene from above."""
 
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ def grey(image: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
 
 
 def outline(mask: Bool[np.ndarray, "H W"], width_px: int) -> Bool[np.ndarray, "H W"]:
-    """Return a line along the inner border of a mask."""
+    """Return the pixels of a line along the inner border of a mask."""
     import cv2
 
     kernel = np.ones((2 * width_px + 1, 2 * width_px + 1), np.uint8)
@@ -70,7 +70,7 @@ def paint_answer(
 def paint_relevancy(
     image: UInt8[np.ndarray, "H W 3"], relevancy: Float[np.ndarray, "H W"], low: float, high: float
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Paint relevancy in colours, stretched from `low` to `high`, over the grey photograph."""
+    """Paint relevancy over the grey photograph; the colours span `low` to `high`."""
     stretched = np.clip((relevancy - low) / max(high - low, 1e-6), 0, 1)
     colours = colormaps[RELEVANCY_COLOURS](stretched)[..., :3] * 255
     return (0.78 * colours + 0.22 * grey(image)).clip(0, 255).astype(np.uint8)
@@ -84,19 +84,19 @@ def show(axes: Axes, picture: UInt8[np.ndarray, "H W 3"], title: str = "", bold:
     for spine in axes.spines.values():
         spine.set_linewidth(2.0 if bold else 0.5)
         spine.set_color("#ff7a00" if bold else "#888888")
-    # Titles contain queries and user-given names; a dollar sign in these must not start a formula.
+    # Titles contain queries and user-given names, in which a dollar sign must not start a formula.
     axes.set_title(title, fontsize=8, pad=3, fontweight="bold" if bold else "normal", parse_math=False)
 
 
 def label_left(axes: Axes, text: str, level: Level | None = None) -> None:
-    """Write the name of a row of pictures along the left side of its first one."""
+    """Write the name of a row of pictures along the left side of its first picture."""
     axes.set_ylabel(f"{text}\n{level.label}" if level else text, fontsize=8, parse_math=False)
 
 
 def show_from_above(
     axes: Axes, gaussians: Gaussians, cameras: Cameras, selected: Bool[np.ndarray, " N"], title: str
 ) -> None:
-    """Draw Gaussians along the cameras' mean up direction, selected ones in orange; cameras as triangles."""
+    """Draw Gaussians along the mean up direction, selected ones in orange, and cameras as triangles."""
     means = gaussians.means.astype(np.float64)
     centres = np.stack([cameras[name].centre for name in cameras.names])
     rotation = _from_above(cameras)
@@ -131,7 +131,7 @@ def _from_above(cameras: Cameras) -> Float[np.ndarray, "3 3"]:
 
 
 def save_figure(figure: Figure, out: Path, dpi: int = DPI) -> None:
-    """Write a PNG atomically; its metadata names this package instead of Matplotlib's version."""
+    """Write a PNG atomically; the metadata names this package instead of Matplotlib's version."""
     packed = {"compress_level": 4}  # half the time of the default 6, for 4 % more bytes
     own: dict[str, Any] = {"format": "png", "metadata": SOFTWARE, "pil_kwargs": packed}
     with atomic_path(out) as temporary:
@@ -139,7 +139,7 @@ def save_figure(figure: Figure, out: Path, dpi: int = DPI) -> None:
 
 
 def save_png_and_pdf(figure: Figure, out: Path) -> None:
-    """Write a PNG and, beside it, a PDF; the same figure gives the same bytes."""
+    """Write a PNG and, beside it, a PDF; identical figures produce identical bytes."""
     save_figure(figure, out)
     with atomic_path(Path(out).with_suffix(".pdf")) as temporary:
         about = {"Creator": None, "Producer": None, "CreationDate": None}

@@ -1,4 +1,4 @@
-"""Picture of a query: answer and relevancy in a few views, and the answer from above."""
+"""Picture of a query: the answer and its relevancy in a few views, and the answer from above."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,8 +40,8 @@ def query_panel(
 ) -> None:
     """Draw a query: photograph, answer and relevancy at three levels per view, and the scene from above.
 
-    `note` is appended to the title; doubts are written below it. The answerer "field" draws the field's
-    relevancy.
+    `note` is appended to the title; doubts are written below the title. With answerer "field", the field's
+    relevancy is drawn.
     """
     last = path_of(text)[-1]
     found = f"{counted(len(hits.ids), 'node')} at level {hits.level.label}"
@@ -83,10 +83,10 @@ def query_panel(
 
 
 class _Page:
-    """A figure with pixel coordinates from its upper left corner.
+    """A figure with pixel coordinates, measured from its upper left corner.
 
     Pictures are scaled and placed directly. One `Axes` per picture, with a layout computed by drawing
-    everything twice, would take most of the time of a query.
+    everything twice, would take most of a query's time.
     """
 
     def __init__(self, width_px: int, height_px: int) -> None:

@@ -1,18 +1,18 @@
-"""Match between embeddings and texts: cosine margins, and LERF's relevancy, computed from them.
+"""Match between embeddings and texts: cosine margins, and LERF's relevancy computed from these margins.
 
 `LatentRelevancy` computes relevancy for every pixel of a view from its rendered latents:
 
 - Linear code (PCA): the length of a decoded latent and its nearest canonical phrase do not depend on the
-  text, so they are found once per view. A text then costs d products per pixel, without decoding.
+  text, so they are computed once per view. A text then costs d products per pixel, without decoding.
 - Network: every pixel of a view is decoded once. The decoded vectors are close to a subspace of few
   directions (about 65 of 128, 105 of 512). Each vector is stored as its coordinates in the subspace, in 16
   bits, with the cosine of its nearest canonical phrase, computed from the full vector. A text then costs one
   product per pixel and direction. The directions are computed from a sample of the pixels. Every pixel is
-  then checked: pixels whose loss exceeds the error bound (`lost_for_error`), such as those of a small
-  unsampled object, get additional directions.
+  then checked: pixels whose loss exceeds the bound (`lost_for_error`), such as pixels of a small unsampled
+  object, get additional directions.
 
 Both forms are stored channel by channel, so that the compiler can process eight or sixteen pixels at once.
-Memory bandwidth is the limit: three levels of a 986 x 728 view at d = 16 are 138 MB.
+Memory bandwidth is the bottleneck: three levels of a 986 x 728 view at d = 16 take 138 MB.
 """
 
 from collections.abc import Callable
@@ -37,16 +37,16 @@ EMBEDDINGS_AT_A_TIME = 65_536
 PIXELS_AT_A_TIME = 1 << 16
 
 ERROR = 2e-3
-"""Maximum error of the relevancy of any pixel of a network's latents."""
+"""Maximum relevancy error at any pixel if the code is a network."""
 
 RESIDUAL = 5e-5
-"""Root mean square of the decoded vectors' component outside the stored directions."""
+"""Maximum root mean square of the decoded vectors' component outside the stored directions."""
 
 SAMPLE = 8192
 """Number of latents in the sample from which the directions are computed."""
 
 STEPS = 32767
-"""Steps of a coordinate from 0 to 1; the rounding error is at most 1.5e-5."""
+"""Quantisation steps of a coordinate from 0 to 1; the rounding error is at most 1.5e-5."""
 
 
 def margins(
@@ -140,7 +140,7 @@ class LatentRelevancy:
     ) -> None:
         self._code, self._canonical, self._scale, self._threads = code, canonical, scale, threads
         self.is_linear = isinstance(code, LinearCode)
-        """Whether `fast` equals `exact` up to rounding; otherwise it is within `ERROR`."""
+        """Whether `fast` equals `exact` up to rounding; otherwise they differ by at most `ERROR`."""
 
     def exact(
         self, latents: Float32[np.ndarray, "P D"], texts: Float32[np.ndarray, "T C"]
@@ -166,7 +166,7 @@ class LatentRelevancy:
     ) -> Float32[np.ndarray, "T P"]:
         """Compute the relevancy of a prepared view from a few products per pixel.
 
-        Each text's weights are computed alone, so that its result does not depend on the other texts.
+        Each text's weights are computed separately, so that results do not depend on the other texts.
         """
         out = np.empty((len(texts), len(view.generic)), np.float32)
         if not len(texts):
@@ -202,8 +202,8 @@ class LatentRelevancy:
 
         The directions computed from a sample lose `RESIDUAL` on that sample. Pixels whose loss exceeds the
         limit get additional directions in the same way, orthogonal to all previous ones. The other pixels
-        have coordinate 0 along these, so their loss does not change. Each round uses at least one of the C
-        directions, so the loop ends.
+        have coordinate 0 along the new directions, so their loss does not change. Each round uses at least
+        one of the C directions, so the loop ends.
         """
         may_lose = lost_for_error(self._scale, self._code.channels)
         directions, others = self._directions(latents, np.eye(self._code.channels))
@@ -212,7 +212,7 @@ class LatentRelevancy:
         while len(missed) and len(others):
             more, others = self._directions(latents[missed], others)
             directions = np.concatenate([directions, more])
-            # Rows of 0 are added in place; a copy would store a large view twice.
+            # Rows of zeros are added in place; a copy would store a large view twice.
             coordinates.resize((len(directions), len(latents)), refcheck=False)
             coordinates[:, missed], generic[missed], lost = self._decode(latents[missed], directions)
             missed = missed[lost > may_lose]
@@ -229,7 +229,7 @@ class LatentRelevancy:
     def _decode(
         self, latents: Float32[np.ndarray, "P D"], directions: Float32[np.ndarray, "R C"]
     ) -> tuple[Int16[np.ndarray, "R P"], Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
-        """Return coordinates, cosine with the nearest phrase, and loss outside the directions per pixel."""
+        """Return, per pixel, coordinates, cosine with the nearest phrase, and loss outside the directions."""
         coordinates = np.empty((len(directions), len(latents)), np.int16)
         generic, lost = np.empty(len(latents), np.float32), np.empty(len(latents), np.float32)
 
@@ -238,7 +238,7 @@ class LatentRelevancy:
             generic[span] = (vectors @ self._canonical.T).max(axis=1)
             along = directions @ vectors.T
             coordinates[:, span] = np.rint(along * STEPS)
-            # 1 minus the sum of squared coordinates is too inexact: its error of 1e-7 is the square of 3e-4.
+            # 1 minus the sum of squared coordinates is too imprecise: its error, 1e-7, is the square of 3e-4.
             rest = vectors - along.T @ directions
             lost[span] = np.sqrt(np.einsum("pc,pc->p", rest, rest))
 
@@ -256,20 +256,20 @@ class LatentRelevancy:
 
 
 def lost_for_error(scale: float, channels: int) -> float:
-    """Return the loss outside the directions at which a relevancy error cannot exceed `ERROR`.
+    """Return the largest loss outside the directions with which no relevancy error can exceed `ERROR`.
 
     Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. The nearest phrase's g is computed from the
     full vector, so only e.q has an error: at most |q| = 1 times the distance of e from its stored form. This
     distance is the loss outside the directions plus the rounding of at most C coordinates,
-    sqrt(C) / (2 `STEPS`). The slope is at most s / 4, where text and phrase tie. So the directions may lose
+    sqrt(C) / (2 `STEPS`). The slope is at most s / 4, where text and phrase tie. The directions may thus lose
 
         4 `ERROR` / s - sqrt(C) / (2 `STEPS`),
 
     which is 4.5e-4 with s = 10 and C = 512. (Loss and rounding are orthogonal, so their combined length is
     less than their sum, which leaves a margin for 32-bit sums.)
 
-    Departs: never less than `RESIDUAL`. At s >= 20 (C = 512), 16 bits are too few for `ERROR`, and relevancy
-    has an error of up to s / 4 times the sum of `RESIDUAL` and rounding.
+    Departs: the result is at least `RESIDUAL`. At s >= 20 (C = 512), 16 bits are too few for `ERROR`, and the
+    relevancy error can reach s / 4 times the sum of `RESIDUAL` and rounding.
     """
     return max(4 * ERROR / scale - channels**0.5 / (2 * STEPS), RESIDUAL)
 
@@ -277,7 +277,7 @@ def lost_for_error(scale: float, channels: int) -> float:
 def main_directions(
     vectors: Float32[np.ndarray, "P C"], among: Float64[np.ndarray, "A C"]
 ) -> tuple[Float64[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-    """Return the minimum number of directions that lose at most `RESIDUAL`, and the others (A = R + B).
+    """Return the fewest directions that lose at most `RESIDUAL`, and the other directions (A = R + B).
 
     Args:
         vectors: only their components in the span of `among` are used.

@@ -1,15 +1,15 @@
-"""Compiled loops of relevancy look-ups."""
+"""Compiled loops for relevancy look-ups."""
 
 import numpy as np
 
 from hilsplat.base.compiled import compiled
 
 BLOCK = 2048
-"""Pixels to process at once: their sums fit in the L1 cache, and each channel's part is long enough to be
-prefetched."""
+"""Pixels to process at once: the pixels' sums fit in the L1 cache, and the block of each channel is long
+enough to be prefetched."""
 
 TRANSPOSED = 16
-"""Rows to transpose at once: their part of a channel fills a cache line."""
+"""Rows to transpose at once: one channel of these rows fills a cache line."""
 
 
 @compiled
@@ -29,7 +29,7 @@ def by_channel(rows):
 def _dots_of_block(channels, begin, end, offset, slope, out):
     """Write the offset plus the weighted channel sum of pixels begin..end to the start of `out`.
 
-    Eight channels are summed at a time, so that sums are read and written an eighth as often.
+    Eight channels are summed at a time, so that sums are read and written one eighth as often.
     """
     for p in range(end - begin):
         out[p] = offset
@@ -55,7 +55,7 @@ def _dots_of_block(channels, begin, end, offset, slope, out):
 
 @compiled
 def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, generic):
-    """Write |m + U z|, and the largest cosine with the phrases; `slopes` (K, D)."""
+    """Write |m + U z| and the largest cosine with a canonical phrase; `slopes` has shape (K, D)."""
     dots = np.empty(BLOCK, np.float32)
     for begin in range(0, len(length), BLOCK):
         end = min(begin + BLOCK, len(length))
@@ -76,7 +76,7 @@ def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, g
 
 @compiled
 def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
-    """Write the relevancy of texts (T, p) at pixels starting with `first`; channels (D, P).
+    """Write the relevancy (T, p) of texts at pixels from `first` on; `channels` has shape (D, P).
 
     The cosine of a text is (offset + slope . channels) / length. All texts are processed while a block of
     pixels is in the cache.
@@ -94,7 +94,7 @@ def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, o
 
 @compiled
 def projected_relevancy(coordinates, generic, first, weights, scale, out):
-    """Write the relevancy of texts (T, p) at pixels starting with `first`; coordinates (R, P) of 16 bits.
+    """Write the relevancy (T, p) of texts at pixels from `first` on; `coordinates` (R, P) have 16 bits.
 
     The cosine of a text is weights . coordinates. All texts are processed while a block of pixels is cached.
     """
@@ -132,8 +132,8 @@ def fill_maps(found, least, pixels, level, maps):
 def _write_relevancy(cosines, generic, scale, out):
     """Write 1 / (1 + exp(-scale (cosine - generic))) for at most `BLOCK` pixels.
 
-    exp(-x) = 2^n 2^f with integer n and f in [-1/2, 1/2]. 2^n is set as the bits of a float, and 2^f is seven
-    terms of its series (relative error 1e-8), so that the compiler can process many pixels at once.
+    exp(-x) = 2^n 2^f with integer n and f in [-1/2, 1/2]. 2^n is set as the bits of a float, and 2^f is
+    approximated by seven terms of its series (relative error 1e-8), so that the compiler can vectorise.
     """
     fraction, bits = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     power = bits.view(np.float32)

@@ -1,4 +1,4 @@
-"""Nodes and pixels that a scene's views show; artifacts are opened once, and results cached per view."""
+"""Nodes and pixels shown by a scene's views; artifacts are opened once, and results are cached per view."""
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.gaussians import Gaussians
 
 MIN_SHOWN_SHARE = 1e-4
-"""Minimum share of a view's pixels that a shown node covers; 14 px of 384 x 384 are too few."""
+"""Minimum share of a view's pixels that a visible node covers; 14 px of 384 x 384 are too few."""
 
 VIEW_CACHE_MIB = 1024.0
 
@@ -26,7 +26,7 @@ Nodes = Sequence[int] | Int64[np.ndarray, " n"]
 
 
 class Opened:
-    """Artifacts by path, each opened and hashed once because the variants of a scene share most of them."""
+    """Artifacts by path, each opened and hashed once, because a scene's variants share most artifacts."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[Hashable, ...], Any] = {}
@@ -40,7 +40,7 @@ class Opened:
 
 
 class ViewStore:
-    """Cache of results per view; above `max_mib`, the least recently used are dropped."""
+    """Cache of results per view; above `max_mib`, the least recently used results are dropped."""
 
     def __init__(self, max_mib: float = VIEW_CACHE_MIB) -> None:
         self._max_bytes = max_mib * 2**20
@@ -64,7 +64,7 @@ class ViewStore:
 
 
 def _nbytes(value: Any) -> int:
-    """Return the memory of an array, or of the arrays in a list, a tuple or an object's attributes, bytes."""
+    """Return the bytes of an array, or of the arrays in a list, a tuple or an object's attributes."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, list | tuple):
@@ -101,7 +101,7 @@ class SceneViews:
         return self.scene.cameras[view]
 
     def image(self, view: str) -> UInt8[np.ndarray, "H W 3"]:
-        """Return a view's undistorted photograph; the cached array is read-only: copy it to change pixels."""
+        """Return a view's undistorted photograph, a cached read-only array: copy it to change pixels."""
         self.camera(view)
 
         def read() -> np.ndarray:
@@ -142,7 +142,7 @@ class SceneViews:
         return np.flatnonzero(np.isin(self.tree.node_of_gaussian, np.asarray(ids)).any(axis=1))
 
     def node_masks(self, view: str, ids: Nodes) -> Bool[np.ndarray, "H W"]:
-        """Return the pixels in which the nodes' Gaussians have a total share above 0.5."""
+        """Return the pixels in which the nodes' Gaussians have more than half of the total weight."""
         ids = np.asarray(ids, np.int64)
         size_hw = self.camera(view).size_hw
         if not len(ids):
@@ -159,8 +159,8 @@ class SceneViews:
     def blended(self, view: str, scores: Float32[np.ndarray, "T n"]) -> Float32[np.ndarray, "T 3 H W"]:
         """Average node scores over each pixel's Gaussians, weighted by W, at each level.
 
-        Gaussians without a node have the lowest node score of the level. Uncovered pixels get the lowest
-        value of the covered ones, so that they are never selected and do not extend the range.
+        Gaussians without a node have the lowest node score of the level. Uncovered pixels get the covered
+        pixels' lowest value, so that they are never selected and do not extend the range.
         """
         height, width = self.camera(view).size_hw
         maps = np.zeros((len(scores), len(LEVELS), height * width), np.float32)

@@ -16,7 +16,7 @@ from hilsplat.semantic_tree.export import readable_nodes, write_tree_ply
 CELL_PX = 84
 GAP_PX = 6
 LABEL_PX = 32
-"""Height of two lines: the name of a node and its number."""
+"""Height of two lines of text: a node's name and number."""
 
 BLOCK_GAP_PX = 18
 MARGIN_PX = 84
@@ -24,7 +24,7 @@ MARGIN_PX = 84
 
 ROW_PX = CELL_PX + LABEL_PX + 2 * GAP_PX
 COLUMNS = 18
-"""Leaves in a row of the picture; wholes are placed side by side until the row is full."""
+"""Maximum leaves in a row of the picture; wholes are placed side by side until the row is full."""
 
 BACKGROUND = 250
 LINE = (150, 150, 150)
@@ -33,7 +33,7 @@ TEXT_PX = 12
 
 
 def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
-    """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` of a finished scene.
+    """Write `tree.json`, `tree.ply` (a node per Gaussian and level) and `tree.png` for a finished scene.
 
     Return a human-readable summary.
     """
@@ -49,10 +49,10 @@ def export_tree(folder: Path, variant: str, out: Path, threads: int) -> str:
 
 
 def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw the tree: one row of crops per level, and side by side one block per whole with its descendants.
+    """Draw the tree: a row of crops per level, and, side by side, a block per whole with its descendants.
 
     Nodes of finer levels without a parent have their own blocks. A crop shows the node in the view in which
-    it is largest, with the rest of that view dimmed, above the node's name and number.
+    it is largest, with the rest of that view dimmed; the node's name and number are below.
     """
     tree = scene.tree
     roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
@@ -69,7 +69,7 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     placed: list[tuple[int, int, int]] = []
 
     def place(node: int, left: int, top: int) -> tuple[int, int]:
-        """Place a node and its descendants, draw their lines, and return the node's middle and the width."""
+        """Place a node and its descendants, draw their lines, and return the node's centre and the width."""
         index = Level(int(tree.level[node])).index
         y = top + index * ROW_PX
         kids, used, middles = tree.children_of(np.array([node])), 0, []
@@ -127,7 +127,7 @@ def _leaves(tree, node: int) -> int:
 
 
 def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:
-    """Return a square crop of the node in the view in which it is largest, the rest dimmed."""
+    """Return a square crop of the view in which a node is largest, with everything else dimmed."""
     import cv2
 
     view = scene.tree.view_names[int(scene.tree.view_area_px[node].argmax())]

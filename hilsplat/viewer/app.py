@@ -47,7 +47,7 @@ class Viewer:
         self.pages = Pages("index.html", "hilsplat.viewer")
 
     def app(self, token: str, *, embedded: bool = False) -> Guard:
-        """Return the guarded application, for a separate page or a frame in another page."""
+        """Return the guarded application, for a standalone page or a frame in another page."""
         get, post = self.thread.get, self.thread.post
         routes = [
             *self.pages.routes(),
@@ -117,7 +117,7 @@ def _like(shown: ViewerScene, asked: wire.Like) -> payload.Answer:
 
 
 def _field(shown: ViewerScene, asked: wire.FieldRelevancy) -> bytes:
-    """Return the field's relevancy of each Gaussian, one byte each."""
+    """Return the field relevancy of each Gaussian, as one byte each."""
     found = shown.field_relevancy(asked.variant, asked.text, asked.level)
     return (found[shown.order] if asked.order == "page" else found).tobytes()
 
@@ -167,7 +167,7 @@ def run_view(
 
 
 class EmbeddedViewer:
-    """A notebook frame with the page of a scene; `close` stops its server.
+    """A notebook frame with the page of a scene; `close` stops the page's server.
 
     Arguments are those of `LanguageScene.show`.
     """
@@ -186,7 +186,7 @@ class EmbeddedViewer:
 
     @property
     def address(self) -> str:
-        """Address of the page; anyone who has it can see the scene until the server is closed."""
+        """Address of the page; anyone who has the address can see the scene until the server stops."""
         base = self.proxy.format(port=self.port) if self.proxy else f"http://127.0.0.1:{self.port}/"
         asked = f"#{urlencode({'q': self.text})}" if self.text else ""
         return f"{base}?{urlencode({'token': self.token, 'embedded': 1})}{asked}"

@@ -1,4 +1,4 @@
-"""Content of exported files: Gaussians, masks of all views, films; crops of nodes."""
+"""Content of exported files (Gaussians, masks of all views, films), and crops of nodes."""
 
 import io
 import json
@@ -25,24 +25,24 @@ from hilsplat.web.coco import coco_content, coco_region
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
-"""Frame step of each format: a GIF has every second frame; with all, it would be far larger than the MP4."""
+"""Frame step of each format. A GIF uses every second frame; with all, it would be far larger than an MP4."""
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
-"""Lower bound of alpha when a crop's pixels are assigned to the node: enlarged Gaussians leave gaps."""
+"""Minimum alpha for assigning a crop's pixels to the node, which is low: enlarged Gaussians leave gaps."""
 DIMMED, GROUND = 0.2, 110.0
-"""Weight of the photograph outside the node of a crop, and the grey value that it is blended with."""
+"""Weight of a crop's photograph outside the node, and the grey value that it is blended with."""
 
 Steps = Generator[tuple[int, int], None, bytes]
-"""A file made in steps: yields (steps done, total), starting with 0, and finally returns the file."""
+"""A file created in steps: yields (steps done, total), starting with 0, and finally returns the file."""
 
 
 def labelled(
     scene: LanguageScene, groups: Sequence[Group]
 ) -> tuple[Int64[np.ndarray, " g"], Int32[np.ndarray, " g"]]:
-    """Return the rows of all groups' Gaussians, ascending, and the group of each, numbered from 1.
+    """Return the rows of all groups' Gaussians, ascending, and each one's group, numbered from 1.
 
-    A Gaussian of several groups belongs to the one with the fewest Gaussians.
+    A Gaussian in several groups gets the group with the fewest Gaussians.
     """
     members = [scene.gaussians_of(group.nodes) for group in groups]
     label = np.zeros(len(scene.gaussians), np.int32)
@@ -53,7 +53,7 @@ def labelled(
 
 
 def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Group]) -> bytes:
-    """Return the Gaussians of groups as a 3DGS PLY, with their labels."""
+    """Return the groups' Gaussians as a 3DGS PLY, with group labels."""
     rows, labels = labelled(scene, groups)
     with TemporaryDirectory() as folder:
         out = Path(folder) / "selection.ply"
@@ -62,9 +62,9 @@ def selection_ply(gaussians_ply: Path, scene: LanguageScene, groups: Sequence[Gr
 
 
 def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
-    """Make a ZIP with masks of nodes in all views: a PNG per node and view that shows it, and one COCO file.
+    """Make a ZIP of node masks in all views: one PNG per node and view that shows it, and one COCO file.
 
-    Groups are the COCO categories; a node of several groups has an annotation for each.
+    Groups are the COCO categories; a node in several groups has one annotation per group.
     """
     nodes = sorted({node for group in groups for node in group.nodes})
     yield 0, len(scene.views)
@@ -94,7 +94,7 @@ def masks_zip(scene: LanguageScene, groups: Sequence[Group]) -> Steps:
 def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray, "S S 3"]:
     """Return a square crop of the photograph in which a node is largest, with the rest dimmed towards grey.
 
-    To find the node's pixels, only the square is rendered, with a camera whose image is the square.
+    To find the node's pixels, only the square is rendered, by a camera whose image is that square.
     """
     tree = scene.tree
     view = tree.view_names[int(tree.view_area_px[node].argmax())]
@@ -115,12 +115,12 @@ def crop(scene: LanguageScene, node: int, threads: int = 1) -> UInt8[np.ndarray,
 
 
 def resampled(image: UInt8[np.ndarray, "H W 3"], x: float, y: float, side: float) -> np.ndarray:
-    """Return the square (x, y, side) of an image at `CROP_PX` px; black beyond its borders."""
+    """Return the square (x, y, side) of an image at `CROP_PX` px; black beyond the image's borders."""
     shrink = max(1.0, side / CROP_PX)  # warping does not average areas, so shrink first
     if shrink > 1:
         image = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
     scale = CROP_PX * shrink / side
-    # Pixel centres are at 0.5 here, and at 0 in OpenCV.
+    # Pixel centres are at 0.5 here, but at 0 in OpenCV.
     move = np.array([[scale, 0, -scale * x / shrink], [0, scale, -scale * y / shrink]])
     move[:, 2] += 0.5 * scale - 0.5
     return cv2.warpAffine(image, move, (CROP_PX, CROP_PX), flags=cv2.INTER_LINEAR)
@@ -158,9 +158,9 @@ def flight(asked: Film, scene: Scene) -> list[Camera]:
 def film(
     gaussians: Gaussians, cameras: Sequence[Camera], paint: Paint | None, *, kind: str, threads: int
 ) -> Steps:
-    """Make a film in the colours of a style (None: the scene's own colours), with one step per frame.
+    """Make a film in the colours of a style (None for the scene's own colours), with one step per frame.
 
-    There is one camera per frame, of even size; a GIF has every second one.
+    Each frame has one camera, with an even image size; a GIF uses every second camera.
     """
     used = cameras[:: STEP[kind]]
     yield 0, len(used)
@@ -174,7 +174,7 @@ def film(
 
 
 def encoded_gif(path: Path, frames: Iterable[np.ndarray]) -> Iterator[None]:
-    """Write a looping GIF with 256 colours chosen from the whole film; yields after each frame.
+    """Write a looping GIF with 256 colours chosen from the whole film, yielding after each frame.
 
     Dithering is off: on a synthetic table (128 colours) it lowered the quality from 41 dB to 35 dB, increased
     the size from 2.5 MB to 3.6 MB, and scattered dots over the answer.

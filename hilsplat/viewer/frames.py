@@ -16,9 +16,9 @@ from hilsplat.viewer.wire import Style
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 TINT = np.float32(0.35)
-"""Factor of unselected Gaussians' luminance in `tint`. The page's shader has the same numbers."""
+"""Factor on unselected Gaussians' luminance in mode `tint`. The page's shader has the same numbers."""
 GHOST = np.float32(0.08)
-"""Factor of unselected Gaussians' opacity in `ghost`."""
+"""Factor on unselected Gaussians' opacity in mode `ghost`."""
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -28,7 +28,7 @@ SEEN = 0.05
 
 @dataclass(frozen=True)
 class Paint:
-    """A style, resolved for each Gaussian: the share of `rgb` in its colour; 0 means unselected."""
+    """A style, resolved for each Gaussian: `share` is the weight of `rgb` in its colour; 0 if unselected."""
 
     rgb: Float32[np.ndarray, "N 3"]
     share: Float32[np.ndarray, " N"]
@@ -46,7 +46,7 @@ class Paint:
         Relevancy is in steps of 1/255, and required if the style has a ramp.
 
         Raises:
-            SettingsError: the table has another number of rows, or isn't base64.
+            SettingsError: the table has the wrong number of rows, or isn't base64.
         """
         if style.ramp:
             assert relevancy is not None
@@ -64,7 +64,7 @@ class Paint:
 def painted(
     gaussians: Gaussians, camera: Camera, paint: Paint | None = None, threads: int = 1
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Render a view over black, as `render` does, in the colours of a style.
+    """Render a view over black, like `render`, in the colours of a style.
 
     A selected Gaussian's colour c becomes c (1 - share) + rgb share. Unselected Gaussians are unchanged in
     mode `plain`, dark grey in `tint`, nearly transparent in `ghost`, and invisible in `isolate`.
@@ -92,7 +92,7 @@ def painted(
 def weights_at(
     gaussians: Gaussians, camera: Camera, x: int, y: int, threads: int = 1
 ) -> tuple[Int64[np.ndarray, " g"], Float64[np.ndarray, " g"]]:
-    """Return the Gaussians of one pixel, nearest first, and their blending weights: a row of `pixel_weights`.
+    """Return one pixel's Gaussians, nearest first, and their blending weights, like a row of `pixel_weights`.
 
     The whole view is projected, because the Jacobian depends on the picture's borders, but only this pixel
     is blended.
@@ -122,8 +122,8 @@ def pick(
 ) -> dict[str, Any] | None:
     """Return the content of the pixel at (x, y); None outside the picture or if alpha is below `SEEN`.
 
-    `nodes` has, per level, the node with the largest share of the pixel (-1 for none) and its share of alpha;
-    `point` is the mean position of the Gaussians, weighted by their blending weights, in scene units.
+    `nodes` has, per level, the node with the largest weight in the pixel (-1 for none) and its share of the
+    alpha; `point` is the Gaussians' mean position, weighted by their blending weights, in scene units.
     """
     height, width = camera.size_hw
     if not (0 <= x < width and 0 <= y < height):

@@ -1,4 +1,4 @@
-"""A scene with answers to some queries as one HTML file that needs no server, for papers and talks.
+"""A scene with answers to some queries, as one HTML file that needs no server, for papers and talks.
 
 The file is the viewer page: its scripts are data URLs in an import map, with `offline.js` instead of
 `api.js`. Gaussians, nodes, crops and small photographs are embedded as base64. It sends no network requests.
@@ -16,7 +16,7 @@ from hilsplat.web.server import as_json, encoded
 
 PHOTO_PX = 320
 MAX_CROPS = 400
-"""Maximum number of nodes with a crop each; in a larger tree, only wholes and answers have crops."""
+"""Maximum number of nodes if all have crops; in a larger tree, only wholes and answers have crops."""
 
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data: blob:; style-src 'unsafe-inline'; "
@@ -25,7 +25,7 @@ POLICY = (
 
 
 def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> exports.Steps:
-    """Make the page of a scene, with one step per crop; 8 MB for 60,000 Gaussians.
+    """Make the page of a scene, with one step per crop; 60,000 Gaussians take 8 MB.
 
     Raises:
         SettingsError: a text is empty, or the variant cannot be queried.
@@ -88,7 +88,7 @@ def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> expo
 
 
 def _inert(text: str) -> str:
-    """Escape a text so that it cannot end the element that contains it; its JSON value does not change."""
+    """Escape a text so that it cannot end its enclosing element; the JSON value does not change."""
     return text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
 
 

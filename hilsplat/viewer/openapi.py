@@ -33,7 +33,7 @@ ANSWERS = ("/api/query", "/api/like")
 
 @cache
 def description() -> dict[str, Any]:
-    """Return the description, as OpenAPI 3.1."""
+    """Return the OpenAPI 3.1 description."""
     schemas: dict[str, Any] = {}
 
     def schema_of(kind: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Data of the page: scene, nodes, answers and boxes as JSON, and the order and nodes of the Gaussians."""
+"""Data for the page: scene, nodes, answers and boxes as JSON, and the Gaussians' order and nodes."""
 
 import gzip
 import time
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
+from typing_extensions import TypedDict  # pydantic needs this class before Python 3.12
 
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.query.hits import Hit, doubts_of
@@ -23,14 +23,14 @@ CHUNK = 65_536
 """Gaussians per chunk: 32 rows of the page's textures."""
 
 MAX_NODES = 65_534
-"""Maximum number of nodes: they are numbered from 1 in 16 bits, and 0 is none."""
+"""Maximum number of nodes: they are numbered from 1 in 16 bits, and 0 means no node."""
 
 LISTED = 24
 """Maximum number of answers in the list."""
 
 
 def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
-    """Return the order in which the page loads Gaussians: most visible first, each chunk in Morton order.
+    """Return the order in which the page loads Gaussians: most visible first, and Morton order in a chunk.
 
     The first chunk alone gives an impression of the scene.
     """
@@ -41,7 +41,7 @@ def arrival_order(gaussians: Gaussians) -> Int64[np.ndarray, " N"]:
 
 
 def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
-    """Pack each Gaussian's nodes (from 1; 0 is none) as a gzipped RGBA16UI texel, one level per channel."""
+    """Pack each Gaussian's nodes as an RGBA16UI texel, one level per channel (from 1; 0: none), gzipped."""
     assert len(tree) <= MAX_NODES, f"{len(tree)} nodes"
     texels = np.zeros((len(order), 4), np.uint16)
     texels[:, :3] = tree.node_of_gaussian[order] + 1
@@ -49,7 +49,7 @@ def packed_nodes(tree: SemanticTree, order: Int64[np.ndarray, " N"]) -> bytes:
 
 
 def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
-    """Describe the scene: views with their cameras, initial focus point, up direction."""
+    """Describe the scene: views with their cameras, initial focus point, and up direction."""
     cameras = scene.cameras
     up, focus = upright(cameras), crossing(cameras)
     centres = np.stack([cameras[name].centre for name in cameras.names])
@@ -85,7 +85,7 @@ def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
 def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
     """Return the point nearest to all optical axes (least squares), in front of the first camera.
 
-    A small pull towards a point in front of the mean camera makes it unique for parallel axes.
+    A small pull towards a point in front of the mean camera makes the result unique for parallel axes.
     """
     rotation, translation = cameras.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, 3]
     centres = -np.einsum("vji,vj->vi", rotation, translation)
@@ -145,8 +145,8 @@ class FoundNode(TypedDict):
 class Answer(TypedDict):
     """Answers to a text, or nodes that look like a node or a picture.
 
-    `relevancy` has one value per node, `total` counts all answers, `hits` lists the best, and `route` is that
-    of `hilsplat.Hit`.
+    `relevancy` has one value per node, `total` counts all answers, `hits` lists the best answers, and `route`
+    is as in `hilsplat.Hit`.
     """
 
     text: str
@@ -161,7 +161,7 @@ class Answer(TypedDict):
 
 
 def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Answer:
-    """Query a scene, and return hits, each node's relevancy to the last text, and doubts.
+    """Query a scene; return hits, each node's relevancy to the last text, and doubts.
 
     Raises:
         SettingsError: the text is empty, or the view does not exist.
@@ -186,7 +186,7 @@ def answer(scene: LanguageScene, asked: Question, answerer: str = "tree") -> Ans
 
 
 def alike(scene: LanguageScene, hits: Sequence[Hit], what: str, also: Sequence[int] = ()) -> Answer:
-    """Return nodes that look like a node or a picture as an answer; nodes in `also` have relevancy 1."""
+    """Return nodes that look like a node or picture, as an answer; nodes in `also` get relevancy 1."""
     relevancy = np.zeros(len(scene.tree))
     relevancy[[hit.node for hit in hits]] = [max(hit.score, 0.0) for hit in hits]
     relevancy[list(also)] = 1
@@ -218,7 +218,7 @@ def _answer(scene: LanguageScene, text: str, hits: Sequence[Hit], relevancy: np.
 
 
 def boxes(scene: LanguageScene, groups: Sequence[Group]) -> dict[str, Any]:
-    """Return the boxes of nodes for other programs; a node of several groups has a box for each."""
+    """Return node boxes for other programs; a node in several groups has one box per group."""
     tree = scene.tree
     return {
         "format": "hilsplat-boxes-1",

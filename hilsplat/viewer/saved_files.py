@@ -1,6 +1,6 @@
 """Files that users can save from the page.
 
-Slow files are made in steps on the scene thread, which runs other requests between the steps. Films read only
+Slow files are created in steps on the scene thread, which runs other requests between steps. Films read only
 arrays, so they have their own thread. The response contains lines of JSON, then the file:
 `{"made": 3, "of": 120}` after each step, `{"bytes": 12345}` before the file, or `{"error": "..."}`.
 """
@@ -25,7 +25,7 @@ from hilsplat.web.server import as_json, read
 
 
 class SavedFiles:
-    """Handlers of requests for files; `static` holds the page's own files by name."""
+    """Handlers of file requests; `static` contains the page's own files by name."""
 
     def __init__(self, thread: SceneThread, static: dict[str, bytes]) -> None:
         self.thread, self.static = thread, static
@@ -66,7 +66,7 @@ class SavedFiles:
         begin: Callable[[ViewerScene], exports.Steps],
         worker: ThreadPoolExecutor | None = None,
     ) -> Response:
-        """Return the response for a file; `begin` runs on the scene thread, further steps on a worker."""
+        """Return the response for a file; `begin` runs on the scene thread, later steps on a worker."""
 
         def first(shown: ViewerScene) -> tuple[exports.Steps, tuple[int, int]]:
             steps = begin(shown)
@@ -128,7 +128,7 @@ def _line(**values: int | str) -> bytes:
 
 
 def node_of(scene: LanguageScene, node: int) -> int:
-    """Return a requested node; raise SettingsError if it does not exist."""
+    """Return the requested node; raise SettingsError if it does not exist."""
     if node >= len(scene.tree):
         raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
     return node

@@ -29,13 +29,13 @@ from hilsplat.viewer.wire import Style
 from hilsplat.web.scene_thread import ShownScene
 
 VIEWS_MIB = 256.0
-"""Memory limit for cached results of views, such as their compositing weights."""
+"""Memory limit for cached per-view results, such as compositing weights."""
 
 KEPT_RELEVANCIES = 8
-"""Number of cached field relevancies (one per variant, text and level), of one byte per Gaussian."""
+"""Number of cached field relevancies (per variant, text and level), each with one byte per Gaussian."""
 
 MAX_GAUSSIANS = 4_000_000
-"""Maximum number of Gaussians; more do not fit textures of 2048 x 8192 texels or a server of a few GiB."""
+"""Maximum number of Gaussians; more don't fit in textures of 2048 x 8192 texels or a server's few GiB."""
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class ViewerScene(ShownScene):
     """The existing parts of a scene. Not thread-safe: use it and all objects it returns on one thread.
 
     Args:
-        folder: `results/<dataset>/<scene>`, or a copy of it anywhere.
+        folder: `results/<dataset>/<scene>`, or a copy of that folder.
         variant: the initially selected variant, which may not exist yet.
 
     Raises:
@@ -83,12 +83,12 @@ class ViewerScene(ShownScene):
 
     @property
     def variants(self) -> list[str]:
-        """Variants that accept queries now, the initially selected one first."""
+        """Variants that currently accept queries, the initially selected variant first."""
         names = finished_variants(self.folder)
         return sorted(names, key=lambda name: (name != self.first, name != "default", name))
 
     def answering(self, variant: str) -> LanguageScene:
-        """Return a variant, opened at its first use and reopened once its field exists.
+        """Return a variant, which is opened on first use and reopened once its field exists.
 
         Raises:
             SettingsError: the variant does not exist (yet).
@@ -140,7 +140,7 @@ class ViewerScene(ShownScene):
 
     @cached_property
     def order(self) -> np.ndarray:
-        """Rows of the Gaussians in the order in which the page loads them."""
+        """Rows of the Gaussians, in the order in which the page loads them."""
         return payload.arrival_order(self.gaussians)
 
     @cached_property
@@ -148,14 +148,14 @@ class ViewerScene(ShownScene):
         return fractional_bits(self.gaussians)
 
     def chunk(self, number: int) -> bytes:
-        """Return a chunk of the Gaussians as SPZ; raise SettingsError if it does not exist."""
+        """Return a chunk of the Gaussians as SPZ; raise SettingsError if there is no such chunk."""
         num_chunks = -(-len(self.gaussians) // payload.CHUNK)
         if number >= num_chunks:
             raise SettingsError(f"chunk {number} does not exist", expected=f"0 to {num_chunks - 1}")
         return self.spz(self.order[number * payload.CHUNK : (number + 1) * payload.CHUNK])
 
     def spz(self, rows: np.ndarray) -> bytes:
-        """Return Gaussians as SPZ."""
+        """Return the given Gaussians as SPZ."""
         return spz_bytes(self.gaussians, rows, self._bits)
 
     @cached_property
@@ -165,12 +165,12 @@ class ViewerScene(ShownScene):
             return self.opened.get(sha256_of_file, self.folder / "gaussians.ply")[:32]
 
     def _field_relevancy(self, variant: str, text: str, level: str) -> UInt8[np.ndarray, " N"]:
-        """Return each Gaussian's field relevancy in steps of 1/255, as `FieldScene.gaussian_relevancy`."""
+        """Return `FieldScene.gaussian_relevancy`, in steps of 1/255."""
         found = self.answering(variant).gaussian_relevancy(text, level)
         return (np.clip(found, 0, 1) * 255 + 0.5).astype(np.uint8)
 
     def _paint(self, variant: str, style: Style) -> Paint | None:
-        """Resolve a style for each Gaussian; None: the scene's own colours.
+        """Resolve a style for each Gaussian; None means the scene's own colours.
 
         Raises:
             SettingsError: the style does not fit the tree.

@@ -1,4 +1,4 @@
-"""Request models of the page, which check shapes, sizes and finiteness."""
+"""Request models of the page; they check shapes, sizes and finiteness."""
 
 import base64
 from typing import Annotated, Literal
@@ -18,7 +18,7 @@ Nodes = Annotated[list[Annotated[int, Field(ge=0)]], Field(max_length=65_534)]
 
 
 class WireCamera(Message):
-    """A camera: OpenCV axes, centre of the top-left pixel at (0.5, 0.5)."""
+    """A camera with OpenCV axes; the centre of the top-left pixel is at (0.5, 0.5)."""
 
     cam_from_world: tuple[Row4, Row4, Row4, Row4]
     K: tuple[Row3, Row3, Row3]
@@ -48,11 +48,11 @@ class Style(Message):
     """Colours of Gaussians by the node that they belong to; see `frames.painted`.
 
     Attributes:
-        table: base64 of RGBA bytes, row 0 for Gaussians without a node, row n + 1 for node n.
-        use: whether each level is used; the finest used one with an alpha above 0 sets the colour.
+        table: base64 of RGBA bytes: row 0 for Gaussians without a node, row n + 1 for node n.
+        use: whether each level is used; the finest used level with an alpha above 0 sets the colour.
         mode: style of Gaussians whose alpha is 0.
-        ramp: base64 of 256 RGB colours; if given, Gaussians are painted by the field's relevancy to `text` at
-            `level` instead.
+        ramp: base64 of 256 RGB colours; if given, Gaussians are coloured by the field's relevancy to `text`
+            at `level` instead.
     """
 
     table: Annotated[str, Field(max_length=400_000)] = ""
@@ -69,11 +69,11 @@ class Style(Message):
         return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
-        """Return the table; with an empty one, every Gaussian is unchanged."""
+        """Return the table; if it is empty, every Gaussian is unchanged."""
         return _rows(self.table, 4, num_nodes + 1)
 
     def colours(self) -> UInt8[np.ndarray, "256 3"]:
-        """Return the ramp."""
+        """Return the ramp's colours."""
         return _rows(self.ramp, 3, 256)
 
 
@@ -92,7 +92,7 @@ def _rows(text: str, width: int, count: int) -> np.ndarray:
 
 
 class Asked(Message):
-    """Base of requests about one variant of the scene."""
+    """Base class of requests about one variant of the scene."""
 
     variant: Annotated[str, Field(max_length=100)] = "default"
 
@@ -113,14 +113,14 @@ class Query(Asked, Question):
 
 
 class Like(Asked):
-    """A search for nodes that look like a node, or like a picture (base64 of an image file)."""
+    """A search for nodes that look like a given node or picture (base64 of an image file)."""
 
     node: Annotated[int, Field(ge=0)] | None = None
     picture: Annotated[str, Field(max_length=900_000)] = ""
 
 
 class FieldRelevancy(Asked):
-    """A query for each Gaussian's field relevancy, in the order of the PLY file or of the page's chunks."""
+    """A query for each Gaussian's field relevancy, in the order of the PLY file or the page's chunks."""
 
     text: Text
     level: LevelName = "auto"
@@ -179,4 +179,4 @@ class Page(Asked):
     kept: Annotated[tuple[Question, ...], Field(max_length=40)] = ()
     last: Question | None = None
     start: Annotated[str, Field(max_length=400, pattern=r"^(v\d+|[-+.,e\d]*)$")] = ""
-    """Initial camera of the page, in the format of its address; empty for the first photograph's camera."""
+    """Initial camera, in the format of the page's address; empty for the first photograph's camera."""

@@ -1,4 +1,4 @@
-"""Errors about files that changed since they were opened or read; versions of saved files."""
+"""Errors about files that changed after they were opened or read, and versions of saved files."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,11 +9,11 @@ from hilsplat.base.errors import ArtifactError
 
 
 class StaleSceneError(ArtifactError):
-    """A part of the scene was rewritten since it was opened."""
+    """A part of the scene was rewritten after it was opened."""
 
 
 class StaleFileError(ArtifactError):
-    """A file changed since the version that is to be replaced was read."""
+    """A file changed after the version to be replaced was read."""
 
 
 NO_FILE = "none"
@@ -21,13 +21,13 @@ NO_FILE = "none"
 
 
 def version_of(path: Path) -> str:
-    """Return the digest of a file, which a page must send to replace it."""
+    """Return the digest of a file; a page must send this digest to replace the file."""
     return sha256_of_bytes(path.read_bytes())[:16] if path.is_file() else NO_FILE
 
 
 @contextmanager
 def replacing(path: Path, version: str, what: str) -> Iterator[None]:
-    """Lock a file while its content is replaced; `what` describes the content in errors (plural).
+    """Lock a file while its content is replaced; `what` (plural) describes the content in errors.
 
     Raises:
         StaleFileError: the file changed since `version` was read.

@@ -1,7 +1,7 @@
 """Access control of the page's server: only the browser that opened the printed address has access.
 
 Loopback alone is no protection: other users of the machine can reach it, and so can any web page open in the
-same browser. Every request therefore needs a cookie that only the printed address sets and a Host that names
+same browser. Every request therefore needs a cookie that only the printed address sets, and a Host that is
 this machine (against DNS rebinding). Requests with a body also need the page's own Origin and a content type
 that no form can send.
 """
@@ -32,14 +32,14 @@ HEADERS = {
 
 
 class Guard:
-    """ASGI middleware that accepts requests from the owner's page only.
+    """ASGI middleware that accepts only requests from the owner's page.
 
     Args:
         token: secret in the printed address.
         max_body: maximum size of a request body, bytes.
         embedded: whether the page is a frame in another page, such as a notebook, possibly behind a proxy.
-            Browsers then send no cookie, so each request contains the token in its address, and Host and
-            Origin are those of the other page. Scripts and styles need no token.
+            Browsers then send no cookie, so each request's address contains the token, and Host and Origin
+            are those of the other page. Scripts and styles need no token.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Guard:
         self.headers = dict(HEADERS)
         if embedded:
             self.headers["content-security-policy"] = CONTENT_POLICY + "frame-ancestors *"
-        self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies, so names differ per server
+        self.cookie = f"hilsplat-{secrets.token_hex(4)}"  # ports share cookies, so names must be unique
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send 403, 413 or 414, or forward the request and add the headers to the response."""
@@ -90,7 +90,7 @@ class Guard:
         await self.app(scope, receive, send_with_headers)
 
     def _refusal(self, method: str, headers: dict[str, str], is_opening: bool) -> str:
-        """Return why a request is refused; empty if it is accepted."""
+        """Return the reason for refusing a request; empty if the request is accepted."""
         host = headers.get("host", "")
         name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
         if name not in LOCAL_NAMES:

@@ -1,4 +1,4 @@
-"""Base of the request models of both pages, and their common limits."""
+"""Base class of both pages' request models, and limits shared by these models."""
 
 from typing import Annotated
 
@@ -10,6 +10,6 @@ Text = Annotated[str, Field(min_length=1, max_length=MAX_TEXT)]
 
 
 class Message(BaseModel):
-    """Base of all request models; unknown keys, NaN and infinity are rejected."""
+    """Base class of all request models; unknown keys, NaN and infinity are rejected."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)

@@ -27,7 +27,7 @@ THUMB_PX = 160
 
 
 class ShownScene:
-    """A scene as a page opened it; `state` identifies this opening. Subclasses set `scene`.
+    """A scene as it was when a page opened it, identified by `state`. Subclasses set `scene`.
 
     Writers always replace the whole file, so `stat` detects a rewritten file without reading it. A folder's
     state is that of its index, which is written last.
@@ -40,14 +40,14 @@ class ShownScene:
         self._seen: dict[Path, tuple[int, int, int] | None] = {}
 
     def note(self, parts: Iterable[Path]) -> None:
-        """Record the current state of parts that are opened next, except those recorded before."""
+        """Record the current state of parts that are about to be opened, unless already recorded."""
         for part in parts:
             self._seen.setdefault(part, _state_of(part))
 
     def changed(self, *parts: Path) -> list[str]:
         """Return the names of recorded parts, by default all, that were rewritten or deleted.
 
-        The page still shows what was opened.
+        The page still shows the parts as they were opened.
         """
         return sorted({part.name for part in parts or self._seen if _state_of(part) != self._seen[part]})
 
@@ -70,7 +70,7 @@ class ShownScene:
             )
 
     def same_photographs(self) -> AbstractContextManager[None]:
-        """Guard reads of photographs, as `unchanged`."""
+        """Guard reads of photographs, like `unchanged`."""
         return self.unchanged()
 
     def news(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class ShownScene:
         return {"of": self.state, "changed": self.changed()}
 
     def opened_again(self) -> Any:
-        """Reopen the scene as it is on disk now."""
+        """Reopen the scene from its current files."""
         raise NotImplementedError
 
     def described(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class SceneThread(Generic[Shown]):
     def get(self, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False) -> Handler:
         """Return a handler that sends the result of `work`, called with the scene and the path's parameters.
 
-        With `behind`, it runs as `do_behind`.
+        With `behind`, `work` is run by `do_behind`.
         """
         do = self.do_behind if behind else self.do
 
@@ -134,7 +134,7 @@ class SceneThread(Generic[Shown]):
     ) -> Handler:
         """Return a handler that sends the result of `work`, called with the scene and the validated body.
 
-        `worker`, if given, runs it instead of the scene thread; its work must have its own caches.
+        `worker`, if given, replaces the scene thread; `work` must then have its own caches.
         """
 
         async def handle(request: Request) -> Response:
@@ -144,9 +144,9 @@ class SceneThread(Generic[Shown]):
         return handle
 
     async def do_behind(self, request: Request, work: Callable[[Shown], Made]) -> Made:
-        """Run like `do`, but one call at a time, so that other requests wait for at most one of them.
+        """Run `work` like `do`, but only one such call at a time, so that other requests need not wait long.
 
-        The outline requests a hundred crops when the page opens.
+        When the page opens, the outline requests a hundred crops; other requests wait for at most one crop.
         """
         async with self.behind:
             return await self.do(request, work)
@@ -154,7 +154,7 @@ class SceneThread(Generic[Shown]):
     async def do(
         self, request: Request, work: Callable[[Shown], Made], worker: ThreadPoolExecutor | None = None
     ) -> Made:
-        """Run on the scene thread (or another worker) if the page shows the current state of the scene.
+        """Run `work` on the scene thread (or `worker`) if the page shows the current state of the scene.
 
         A page sends the state that it was loaded with as `of`, so that its cameras, nodes and Gaussians are
         never mixed with those of another state. Without `of`, the current state is used.
@@ -173,7 +173,7 @@ class SceneThread(Generic[Shown]):
         return await self.run(run, worker)
 
     async def run(self, work: Callable[[], Made], worker: ThreadPoolExecutor | None = None) -> Made:
-        """Run on the scene thread (or another worker), regardless of the scene's state."""
+        """Run `work` on the scene thread (or `worker`), regardless of the scene's state."""
         return await asyncio.get_running_loop().run_in_executor(worker or self.worker, work)
 
     async def _opened_anew(self, request: Request) -> Response:

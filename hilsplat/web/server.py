@@ -1,4 +1,4 @@
-"""Code of both page servers: static files, responses, errors, a local socket."""
+"""Code shared by both page servers: static files, responses, errors, a local socket."""
 
 import json
 import secrets
@@ -50,7 +50,7 @@ class Pages:
 def guarded(
     routes: list[Route], token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
 ) -> Guard:
-    """Return the guarded application, which sends errors as text."""
+    """Return the guarded application; errors are sent as text."""
     handlers: dict[Any, Any] = {
         StaleFileError: _told(412),
         StaleSceneError: _told(409),
@@ -71,19 +71,19 @@ async def read(request: Request, kind: type[Sent]) -> Sent:
 
 
 def version_sent(request: Request) -> str:
-    """Return the version of the file that the page has read and replaces."""
+    """Return the version of the file that the page read and wants to replace."""
     return request.headers.get("if-match", "").strip('"')
 
 
 def answer(made: Any) -> Response:
-    """Return a response of bytes or JSON; a response is returned unchanged."""
+    """Return a response with bytes or JSON; a response is returned unchanged."""
     if isinstance(made, Response):
         return made
     return plain(made, BYTES) if isinstance(made, bytes) else plain(as_json(made), "application/json")
 
 
 def plain(data: bytes, kind: str, status: int = 200, *, cached: bool = False) -> Response:
-    """Return a response of bytes."""
+    """Return a response with bytes."""
     lasting = "private, max-age=3600" if cached else "no-store"
     return Response(data, status, headers={"content-type": kind, "cache-control": lasting})
 
@@ -133,7 +133,7 @@ def listening_at(port: int) -> socket.socket:
         made.close()
         fix = "choose another port, or omit it"
         raise SettingsError(f"port {port} cannot be used: {error}", fix=fix) from error
-    made.listen()  # before the address is printed, so that early connections wait and are not refused
+    made.listen()  # before the address is printed, so that early connections wait instead of failing
     return made
 
 

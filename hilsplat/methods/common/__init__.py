@@ -1,1 +1,1 @@
-"""Code shared by several methods: clusters, codebooks, training on rendered pixels."""
+"""Code shared by several methods: clusters, codebooks, and training on rendered pixels."""

@@ -18,7 +18,7 @@ from hilsplat.settings import MethodSettings
 
 ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
 CENTRES = 256  # k-means centres that `clusters` merges
-KMEANS_ROUNDS = 10  # Lloyd iterations for these
+KMEANS_ROUNDS = 10  # Lloyd iterations for these centres
 MIN_SCORE = 0.2  # minimum score of a mask for a group's code: OpenGaussian's value for ScanNet
 MIN_VIEWS = 2  # minimum number of views for a group's code: as above; OpenGaussian's number for LERF is 5
 
@@ -28,7 +28,7 @@ def kmeans(
 ) -> tuple[Float32[np.ndarray, "E C"], Int64[np.ndarray, " n"]]:
     """Return k-means centroids from distant starts (k-means++), and each vector's nearest centroid.
 
-    If at most `count` vectors are distinct, they are the centroids, and the first is repeated. In the
+    If at most `count` vectors are distinct, these are the centroids, and the first is repeated. In the
     `rounds` Lloyd iterations, a centroid that loses its last vector keeps its position.
     """
     if not len(vectors):
@@ -44,7 +44,7 @@ def kmeans(
 def _distant_rows(
     data: Float[np.ndarray, "n C"], count: int, random: np.random.Generator
 ) -> Float[np.ndarray, "E C"]:
-    """Draw rows by squared distance from previous ones; scipy's sampling takes E times as long."""
+    """Draw rows by squared distance from previously drawn rows; scipy's sampling takes E times as long."""
     chosen = np.full(count, -1, np.int64)
     square, chances = np.full(len(data), np.inf), np.arange(1.0, len(data) + 1)
     for place in range(count):
@@ -69,7 +69,7 @@ def unit_rows(rows: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n D"]:
 
 
 def nearest(points: Shaped[np.ndarray, "n C"], count: int) -> Int64[np.ndarray, "n k"]:
-    """Return each point's `count` nearest points (all if there are fewer), itself included, nearest first."""
+    """Return the `count` nearest points (or all) of each point, itself included, nearest first."""
     count = min(count, len(points))
     return cKDTree(points).query(points, count)[1].reshape(len(points), count)
 
@@ -86,7 +86,7 @@ def group_means(
 def features_of_groups(
     group: Int32[np.ndarray, " N"] | Int64[np.ndarray, " N"], latents: Float32[np.ndarray, "T D"]
 ) -> Float32[np.ndarray, "N D"]:
-    """Return the code of each Gaussian's group, 0 without a group."""
+    """Return the code of each Gaussian's group; 0 for Gaussians without a group."""
     nothing = np.zeros((1, latents.shape[1]), np.float32)
     return np.concatenate([latents, nothing])[group]
 
@@ -102,9 +102,9 @@ def associated_codes(
     Source: yanmin-wu/OpenGaussian `train.py`. Departs: the IoU uses visible weights instead of a group
     rendered alone, so that hidden Gaussians do not count.
 
-    A mask's score is its IoU with the group, times 1 minus the mean difference of their mean `features`, if
-    given. A mask is chosen only if its score is above `MIN_SCORE`. Groups with masks in fewer than
-    `MIN_VIEWS` views get 0; in a scene with one view, one is enough.
+    A mask's score is its IoU with the group, times 1 minus the mean absolute difference between the mean
+    `features` of mask and group, if given. Only masks with scores above `MIN_SCORE` are chosen. Groups with
+    masks in fewer than `MIN_VIEWS` views get 0; in a scene with one view, one is enough.
     """
     contributions = inputs.contributions
     num_groups = int(group.max(initial=NONE)) + 1
@@ -133,7 +133,7 @@ def associated_codes(
 def cluster_field(inputs: MethodInputs, group: Int64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3 D"]:
     """Return the code of each Gaussian's cluster at each level; masks of all levels compete.
 
-    A level without masks gets zeros, as in methods that learn each level from its own masks.
+    A level without masks gets zeros, as in methods that learn each level from that level's masks.
     """
     every, features = np.arange(len(inputs.contributions)), inputs.no_features()
     for level in LEVELS:
@@ -151,7 +151,7 @@ def clusters(
 ) -> Int64[np.ndarray, "N K"]:
     """Return each row's cluster at every distance: k-means centres, merged up to that average distance.
 
-    Clusters of smaller distances are nested in those of larger ones. A cosine distance is 1 - cosine.
+    Clusters at smaller distances are nested in clusters at larger distances. Cosine distance is 1 - cosine.
     """
     _, centre = kmeans(features, count, seed, KMEANS_ROUNDS)
     used, centre = np.unique(centre, return_inverse=True)
@@ -183,7 +183,7 @@ def density_clusters(
 
 
 def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the configured thresholds, or the method's own; raise a `SettingsError` if the order differs."""
+    """Return the configured thresholds or the method's; raise `SettingsError` if their order is wrong."""
     if settings.thresholds == "auto":
         return own
     grow = own[0] < own[-1]

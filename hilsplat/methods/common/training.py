@@ -1,7 +1,7 @@
-"""Train features of Gaussians on rendered pixels of masks, with frozen geometry, for grouping methods.
+"""Train Gaussians' features on rendered mask pixels, with frozen geometry, for grouping methods.
 
-A step renders random labelled pixels of one random view: a product with compositing weights that are computed
-once per view. Losses are written in torch and differentiated automatically.
+A step renders random labelled pixels of one random view, by a product with compositing weights that are
+computed once per view. Losses are written in torch and differentiated automatically.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ from hilsplat.field.adam import in_random_order
 from hilsplat.methods.method import LabelledView
 from hilsplat.settings import MethodSettings
 
-PIXELS = 4096  # maximum per step; published: VCH 4096, OmniSeg3D 32,768, others whole views
+PIXELS = 4096  # maximum per step; published codes use 4096 (VCH), 32,768 (OmniSeg3D) or whole views
 START_NOISE = 0.1  # standard deviation of initial features about their common value
 
 
@@ -38,7 +38,7 @@ def one_torch_thread() -> Iterator[None]:
 
 
 class _Product(torch.autograd.Function):
-    """Product of a constant sparse matrix and features, with scipy: torch's is slower and still in beta."""
+    """Product of a constant sparse matrix and features; scipy's, because torch's is slower and in beta."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, matrix: sp.csr_matrix) -> Tensor:
@@ -51,7 +51,7 @@ class _Product(torch.autograd.Function):
 
 
 def product(matrix: sp.csr_matrix, features: Float[Tensor, "N D"]) -> Float[Tensor, "p D"]:
-    """Return rendered features W F, or means of masks A F; differentiable with respect to the features."""
+    """Return rendered features W F or mask means A F; differentiable with respect to the features."""
     return _Product.apply(features, matrix)
 
 
@@ -72,7 +72,7 @@ def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
     """Return trainable initial features that are almost the same for all Gaussians.
 
     Gaussians with equal features stay together unless a mask separates them; with independent starts, each
-    would retain some of its initial feature.
+    Gaussian would retain some of its initial feature.
     """
     draw = torch.Generator().manual_seed(seed)
     start = torch.randn(1, channels, generator=draw)
@@ -80,12 +80,12 @@ def alike(num_gaussians: int, channels: int, seed: int) -> Float[Tensor, "N D"]:
 
 
 Loss = Callable[[LabelledView, np.random.Generator, float], Tensor]
-"""Loss of the given pixels of a view; the number is the share of completed steps."""
+"""Loss over the given pixels of a view; the number is the share of completed steps."""
 
 
 def train(
     views: list[LabelledView],
-    parameters: list[Any],  # tensors, or groups of `torch.optim.Adam`, which may have their own rate
+    parameters: list[Any],  # tensors, or parameter groups of `torch.optim.Adam` with their own rates
     loss: Loss,
     settings: MethodSettings,
     seed: int,  # for the order of views and the pixels
