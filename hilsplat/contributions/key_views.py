@@ -21,7 +21,7 @@ MIN_WEIGHT = 1 / 255
 """Smaller weights of a Gaussian at a pixel are ignored."""
 
 MIN_VISIBLE_PX = 0.02
-"""A Gaussian is visible in a view if its mass there exceeds this, which is 0.3 px at 800 px resolution."""
+"""A Gaussian is visible in a view if its mass there exceeds this (0.3 px if the longer side is 800 px)."""
 
 
 def run_key_masks(

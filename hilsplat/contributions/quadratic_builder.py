@@ -44,7 +44,7 @@ MAX_WEIGHTS = 2**28
 """Maximum number of non-zeros of W (all views) in memory, 2 GiB."""
 
 CLEARLY_MORE = 2
-"""W is dropped once it has this many times the non-zeros of G: G grows more slowly with the views than W."""
+"""W is dropped once it has this many times as many non-zeros as G, which grows more slowly with the views."""
 
 CHECKPOINT_SECONDS = 300.0
 """Seconds between checkpoints of a long pass; short passes write none."""
@@ -209,7 +209,7 @@ class _Waiting:
         self.nonzeros = after
 
     def held(self) -> StackedWeights:
-        """Return all parts; valid until another part is appended."""
+        """Return all parts; the arrays are valid until another part is appended."""
         indptr = np.concatenate(self._indptr)
         arrays = (self._data[: self.nonzeros], self._indices[: self.nonzeros], indptr)
         matrix = sp.csr_matrix(arrays, shape=(len(indptr) - 1, self._num_gaussians), copy=False)

@@ -37,7 +37,7 @@ def view_contributions(
 ) -> dict[str, np.ndarray]:
     """Return all matrices of one view except W as plain arrays (`A_data`, `A_indices`, `A_indptr`, ...).
 
-    The view's name seeds the random halves; `weights` are normalised. The result is independent of threads.
+    The view's name seeds the random halves; `weights` are normalised. `threads` does not affect the result.
     """
     total_px = np.concatenate([[0], np.cumsum(masks.area_px)])
     shares = np.linspace(0, total_px[-1], max(1, threads) + 1)[1:-1]

@@ -159,7 +159,7 @@ def _choose_precision(
     settings: ClipSettings,
     threads: int,
 ) -> None:
-    """Switch the model to int8 if the settings require int8, or if crops of the scene agree with float32."""
+    """Switch the model to int8 if the settings require it, or if int8 and float32 agree on scene crops."""
     if not considers_int8(settings.precision, model.model):
         return
     entries = read_index(masks_folder)["views"]

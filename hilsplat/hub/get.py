@@ -64,7 +64,7 @@ EXPORT_FACTOR = 4
 NEEDED = ("optimum.exporters.onnx", "transformers", "PIL", "torch")
 """Modules that an export requires. Without Pillow, optimum silently writes no preprocessor_config.json."""
 INSTALL = "pip install --constraint constraints.txt --editable '.[export]'"
-LAST_LINES = 15  # of the exporter's output, shown in an error
+LAST_LINES = 15  # number of lines of the exporter's output shown in an error
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Prepared:
     requested: ModelRequest
     listing: Listing
     choice: Choice
-    staging: Path  # folder of the download; kept after a failure, and resumed
+    staging: Path  # folder of the download; kept after a failure, for resuming
     target: Path
 
     def num_bytes(self, *, missing: bool = False) -> int:
@@ -352,7 +352,7 @@ def _is_installed(module: str) -> bool:
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
-    """Export the networks of a SAM or CLIP saved by transformers; return the exporter's package versions.
+    """Export the networks of a SAM or CLIP model saved by transformers; return the versions of packages used.
 
     If the exporter fails, the error contains its last lines of output.
     """

@@ -33,7 +33,7 @@ class ModelFolder:
     folder: Path
     layout: str  # key of `LAYOUTS`
     config: dict[str, Any]
-    preprocessing: dict[str, Any]  # of images, with the keys of `preprocessor_config.json`
+    preprocessing: dict[str, Any]  # image preprocessing, with the keys of `preprocessor_config.json`
     networks: dict[str, Path]  # file of each network by name, including optional networks that exist
     files: tuple[Path, ...]  # all files included in the digest
 

@@ -40,7 +40,7 @@ class Needs:
         return round(PROCESS_MIB + self.weights_mib + views * self.view_mib)
 
     def views_at_once(self, threads: int, memory_mib: float) -> int:
-        """Return the number of views that fit into the memory: at most one per thread, and at least one."""
+        """Return the number of views that fit into memory: at most one per thread, and at least one."""
         fitting = int((memory_mib - PROCESS_MIB - self.weights_mib) // self.view_mib)
         return max(1, min(threads, fitting))
 

@@ -1,4 +1,4 @@
-"""Opening, checking and running a network of a model folder."""
+"""Open, check and run a network of a model folder."""
 
 import logging
 from collections.abc import Mapping, Sequence

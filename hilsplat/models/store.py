@@ -35,8 +35,8 @@ class Release:
     repository: str
     megabytes: int  # approximate size of the download; the exact size is reported before a transfer
     use: str
-    family: str = "sam"  # or "clip"
-    licence: str = "Apache-2.0"  # of the weights
+    family: str = "sam"  # "sam" or "clip"
+    licence: str = "Apache-2.0"  # licence of the weights
 
 
 RELEASES = (

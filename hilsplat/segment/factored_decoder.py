@@ -15,7 +15,7 @@ are the first per-prompt arrays as large as the image side. Results differ from 
 rounding; `SamModel` checks this on a few prompts before it uses this class.
 
 The two attentions of a layer, its layer norm and the next attention process one block of pixels at a time
-for several prompts (`decoder_kernels`). Operations on tokens alone are plain numpy here.
+for several prompts (`decoder_kernels`). Operations on tokens alone use plain numpy in this module.
 """
 
 from collections import namedtuple

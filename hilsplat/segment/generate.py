@@ -351,7 +351,7 @@ def _upscale(
 def clean_masks(
     masks: HierarchicalMasks, min_area_px: int, keep_small: bool = False
 ) -> tuple[HierarchicalMasks, Bool[np.ndarray, " m"]]:
-    """Fill holes, and drop islands (8-connected) and masks, that are smaller than `min_area_px`.
+    """Fill holes and drop islands (8-connected) and masks that are smaller than `min_area_px`.
 
     The largest island of a mask is always kept. With `keep_small`, masks below `min_area_px` are kept and
     count as changed (SAM). Returns the remaining masks, and which of them were changed.

@@ -27,7 +27,7 @@ THIN_PX = 4.0
 THIN_HURRY = 0.01
 """Factor applied to the cost of merging a seam: seams merge first, into the more similar side."""
 LIGHTNESS = 0.6
-"""Weight of lightness relative to a* and b*: shading changes lightness within an object."""
+"""Weight of lightness relative to a* and b*, because shading changes lightness within an object."""
 CLEAR_EDGE = 40.0
 """Colour difference across a border at and above which the predicted IoU is 1."""
 

@@ -69,7 +69,7 @@ def runs_of_labels(
 def join_rows(parts: Sequence[Any], ragged: str, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Concatenate the rows of several tables (at least one), field by field.
 
-    The field `ragged` has several values per row, delimited by `offsets`; fields in `names` have one.
+    The field `ragged` has several values per row, delimited by `offsets`; fields in `names` have one per row.
     """
     starts = np.cumsum([0, *(len(getattr(part, ragged)) for part in parts)])
     offsets = [part.offsets[1:] + start for part, start in zip(parts, starts[:-1], strict=True)]
@@ -86,7 +86,7 @@ class HierarchicalMasks:
     """M masks of one view; they may overlap, across and within levels."""
 
     runs: UInt32[np.ndarray, " R"]  # run lengths of all masks (`encode_runs`)
-    offsets: Int64[np.ndarray, " M_and_1"]  # start of each mask's runs, and the end of the last ones
+    offsets: Int64[np.ndarray, " M_and_1"]  # start of each mask's runs, and the end of the last mask's runs
     level: UInt8[np.ndarray, " M"]  # `Level` of each mask
     predicted_iou: Float32[np.ndarray, " M"]  # as predicted by the segmenter; SAM's may slightly exceed 1
     stability: Float32[np.ndarray, " M"]  # stability under a changed threshold, in [0, 1]

@@ -102,7 +102,7 @@ def point_grid(points_per_side: int) -> Float[np.ndarray, "P 2"]:
 class SamModel:
     """A SAM model folder, opened for inference."""
 
-    precision: str = "fp32"  # or "int8", of the encoder
+    precision: str = "fp32"  # precision of the encoder: "fp32" or "int8"
     own: Thresholds = REAL_SAM
     stretches: bool = False  # images are stretched to a square (SAM 2), not padded (SAM)
     previewer: Network | None = None  # the decoder at half the resolution (`layouts.PREVIEW`)
@@ -233,7 +233,7 @@ class SamModel:
         return Encoded(features, frame, self.factored.image(features) if self.factored else None)
 
     def prompts_per_call(self, limit: int, prompts: int) -> int:
-        """Return the number of prompts per decoder call: the decoder's fixed one, or min(limit, prompts)."""
+        """Return the number of prompts per decoder call: the decoder's own, or min(limit, prompts)."""
         if self.factored:
             return PROMPTS
         return self.decoder.fixed_axis("input_points", 1) or min(limit, prompts)
@@ -390,7 +390,7 @@ def read_logits(
 def full_stability(
     logits: Float32[np.ndarray, "K h w"], offset: float, frame: Frame
 ) -> Float32[np.ndarray, " K"]:
-    """Return the stability at the image's size, from unrounded logits, as in SAM."""
+    """Compute the stability at the image's size from unrounded logits, as in SAM."""
     number, height, width = logits.shape
     areas = []
     for threshold in (offset, -offset):
@@ -409,7 +409,7 @@ def full_stability(
 
 
 def frame_taps(low_hw: tuple[int, int], frame: Frame) -> tuple[np.ndarray, ...]:
-    """Return the taps (`taps`) from low-resolution rows, then columns, to those of the image."""
+    """Return the taps (`taps`) that map low-resolution rows, then columns, to image rows and columns."""
     padded, resized = (low_hw, low_hw) if frame.stretched else (frame.padded_hw, frame.resized_hw)
     along_y, along_x = map(taps, low_hw, padded, resized, frame.original_hw)
     return *along_y, *along_x

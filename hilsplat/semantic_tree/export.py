@@ -56,7 +56,7 @@ def write_selection_ply(
     """Copy some Gaussians of a 3DGS PLY, such as those selected by a query.
 
     Args:
-        labels: label of each Gaussian, from 1; written as the property `label`.
+        labels: label of each Gaussian, counted from 1; written as the property `label`.
         names: name of each label; the header gets one comment per label, such as `label 1: mug`.
     """
     # PLY headers are ASCII, and a comment is one line.

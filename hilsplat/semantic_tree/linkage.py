@@ -92,7 +92,7 @@ def _merged_run(begin, end, first, neighbour, inter, extra, root, place_of, self
 
 @compiled
 def _plus_sizes(total, i, j, seen, members, shown, shows):
-    """Add to `total`, for each view, each cluster's size in the view times the other's number of members."""
+    """Add to `total`, per view, each cluster's size there times the number of the other's members there."""
     num_views = seen.shape[1]
     at_i = at_j = 0
     while at_i < shows[i] or at_j < shows[j]:

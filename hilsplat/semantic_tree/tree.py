@@ -147,7 +147,7 @@ class SemanticTree:
 
     @staticmethod
     def load(folder: Path, clip_folder: Path | None = None) -> "SemanticTree":
-        """Read a finished semantic tree; node vectors come from the masks' CLIP vectors in `clip_folder`.
+        """Read a finished semantic tree; node vectors are computed from the CLIP vectors in `clip_folder`.
 
         Raises:
             ArtifactError: the tree is missing, damaged or from another version.

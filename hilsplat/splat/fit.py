@@ -55,7 +55,7 @@ MAX_SHOWN = 8
 SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
 """Report entries that are copied to the index."""
 ERROR_GAIN = 4
-"""Factor by which displayed errors are magnified."""
+"""Factor by which displayed errors are multiplied."""
 TABLES = ("parameters", "first", "second")
 """Names of the tables of `Adam` in a checkpoint."""
 

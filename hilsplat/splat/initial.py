@@ -48,7 +48,7 @@ def load_views(scene: Scene, split: str, image_scale: float) -> list[TrainingVie
 
 
 def camera_extent(cameras: list[Camera]) -> float:
-    """Return 1.1 times the largest distance of a camera from the cameras' mean (3DGS); scene units."""
+    """Return 1.1 times the largest distance of a camera from the mean camera centre (3DGS); scene units."""
     centres = np.stack([camera.centre for camera in cameras])
     radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     return float(1.1 * radius) if radius > 0 else 1.0
@@ -57,7 +57,7 @@ def camera_extent(cameras: list[Camera]) -> float:
 def first_gaussians(
     scene: Scene, cameras: list[Camera], settings: GaussiansSettings, generator: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return round Gaussians at the sparse points, as wide as the mean distance to 3 neighbours (3DGS).
+    """Return round Gaussians at the sparse points, as wide as the mean distance to the nearest 3 (3DGS).
 
     If there are fewer than MIN_POINTS sparse points, random grey points in front of random cameras are added.
     If `settings.initial` is "random", random points replace all sparse points. If it is "frozen", every

@@ -1,9 +1,9 @@
 """Write Gaussians as SPZ, the compressed format of Niantic Labs (version 2), which many viewers read.
 
-A gzip stream of a 16-byte header and six columns: positions in 24-bit fixed point, then opacity, colour,
-log scales, rotation and harmonics in one byte each, with axes x right, y up, z backwards. The format fixes
-the quantisation of all but positions and harmonics. At 17 bytes per Gaussian, renders of a synthetic scene of
-degree 2 have a PSNR of 43 dB compared with the original.
+The file is a gzip stream of a 16-byte header and six columns: positions in 24-bit fixed point, then opacity,
+colour, log scales, rotation and harmonics in one byte each, with axes x right, y up, z backwards. The format
+fixes the quantisation of all but positions and harmonics. At 17 bytes per Gaussian, renders of a synthetic
+scene of degree 2 have a PSNR of 43 dB compared with the original.
 """
 
 import gzip

@@ -1,7 +1,7 @@
 """Blending of tile lists into pixels, its gradient, and the blending weights.
 
 A tile is 16x16 pixels in sixteen 4x4 blocks; a block is one vector of 16 lanes. Lanes outside the image
-start with zero transmittance. Lists are processed in chunks of CHUNK entries: their Gaussians are copied to
+start with zero transmittance. Lists are processed in chunks of CHUNK entries, whose Gaussians are copied to
 contiguous memory; each entry has a bit for every block that it can reach (the sixteen blocks are also one
 vector). The forward pass blends each block's own Gaussians and keeps the sums in registers. The backward pass
 sums the gradient of each Gaussian over its blocks.
@@ -12,7 +12,7 @@ Gaussians) x (gradient); then dL/dalpha = T (colour . gradient) - R / (1 - alpha
 its own slot for the sums, so the result does not depend on the distribution of tiles over threads.
 
 Alpha is an additional channel with colour 1: the image's alpha is the sum of the weights. Sparse rows of
-weights take two passes: the first counts the entries of each row, the second writes them.
+weights need two passes: the first counts the entries of each row, and the second writes them.
 
 Arguments shared by the kernels: tiles begin..end of a row-major grid with `tiles_x` per row; the list
 of tile t is gaussian[tile_start[t] - base] .. gaussian[tile_end[t] - base]; geometry as written by

@@ -46,7 +46,7 @@ def _has_driver() -> bool:
 def choose_device(requested: Literal["auto", "cpu", "cuda"]) -> Device:
     """Return the device that a setting selects on this machine, and log it the first time.
 
-    `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test matches the CPU.
+    `auto` uses CUDA if torch finds a device, gsplat can be imported, and a self-test agrees with the CPU.
     If gsplat or a driver is missing, or for `cpu`, torch isn't imported (1.3 to 3 s).
 
     Raises:

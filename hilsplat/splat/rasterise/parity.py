@@ -11,7 +11,7 @@ from hilsplat.splat.rasterise import api
 from hilsplat.splat.rasterise.device import Device
 
 MAX_DIFFERENCES = {"image": 1e-3, "alpha": 1e-3, "weights": 1e-3, "gradients": 1e-2}
-"""Maximum differences attributed to rounding. The one of gradients is relative and covers all Gaussians."""
+"""Maximum differences caused by rounding. The limit for gradients is relative and covers all Gaussians."""
 
 
 def cuda_disagreement() -> str | None:
