@@ -36,7 +36,7 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 @compiled
 @no_type_check
 def multiply(y, y0, y_step, a, a0, a_step, x, x0, x_step, rows, inner, columns, begin):
-    """Compute sum over k of a[r, k] x[k, c]; set y[r, c] to it if `begin`, otherwise add it to y[r, c].
+    """Compute y[r, c] = sum over k of a[r, k] x[k, c]; unless `begin`, add the sum to y[r, c] instead.
 
     Each flat array comes with the index of its first element and a row stride. `columns`: multiple of 16.
     """

@@ -322,8 +322,8 @@ def enlarged(logits: Float32[np.ndarray, "K h w"], frame: Frame) -> Bool[np.ndar
 def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int) -> float:
     """Return the largest difference between the factored decoder and the network on random inputs.
 
-    Compared are predicted IoUs, and logits divided by the largest logit (at least 1). A ModelError is raised
-    if the network doesn't declare the shapes of its inputs.
+    The comparison covers predicted IoUs, and logits divided by the largest logit (at least 1). A ModelError
+    is raised if the network doesn't declare the shapes of its inputs.
     """
     rng = np.random.default_rng(0)
     features = {}

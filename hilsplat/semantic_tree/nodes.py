@@ -137,8 +137,8 @@ def gaussian_nodes(
     to a large object whose masks sometimes cover them. Masks of one view may overlap, and a node may have
     several masks in one view, so a Gaussian's weight in a view is capped at its visible mass there.
 
-    `cluster` is the node of each mask, -1 for none; `weights`, `view` and `mass` belong to the same masks, as
-    in `linked_nodes`; `total_mass` is the sum of `mass` over views.
+    `cluster` is the node of each mask, -1 for none; `weights` and `view` describe the same masks. `mass` is
+    as in `linked_nodes`; `total_mass` is the sum of `mass` over views.
 
     Returns:
         node of each Gaussian, -1 for none (on a tie, the lowest node), and its share in all views.
