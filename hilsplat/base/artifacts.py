@@ -230,7 +230,7 @@ def parse_json(text: str | bytes) -> Any:
 def _readable(
     path: Path, problem: str = "cannot be read", errors: tuple[type[Exception], ...] = DAMAGE
 ) -> Iterator[None]:
-    """Raise ArtifactError if the file is missing, or if reading it raises one of these errors."""
+    """Raise ArtifactError if the file is missing, or if reading it raises one of `errors`."""
     try:
         yield
     except FileNotFoundError as error:

@@ -59,7 +59,7 @@ class Statement:
 
 @dataclass
 class Module:
-    """Statements of a module: those that bind names, by name, and those with effects on import."""
+    """Statements of a module: bindings by name, and statements with effects on import."""
 
     bindings: dict[str, Statement] = field(default_factory=dict)
     effects: list[Statement] = field(default_factory=list)

@@ -93,7 +93,7 @@ def overview(data_root: Path | None) -> str:
 
 
 def _presence(dataset: Dataset, data_root: Path) -> list[str]:
-    """Return lines that list a data set's complete scenes, and what is missing from the others."""
+    """Return lines that list a data set's complete scenes, and what is missing from the other scenes."""
     try:
         root = dataset.locate(data_root)
     except SceneError as error:

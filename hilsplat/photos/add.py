@@ -96,7 +96,7 @@ def inspect_photos(folder: Path, poses: Path | None = None) -> PhotoReport:
     If given, `poses` are used instead of those in the folder (`has_known_poses`).
 
     Raises:
-        SceneError: a photograph has an unusable name, or two differ only in their suffix.
+        SceneError: a photograph has an unusable name, or two photographs differ only in their suffix.
     """
     where = photo_folder(folder)
     photos = list_images(where)

@@ -98,8 +98,10 @@ def unpack_photographs(archive: Path, folder: Path) -> None:
 
     Every entry is checked before anything is written, and at most the declared sizes are written.
 
-    Raises: SceneError: it is not a zip archive, is damaged, encrypted or too large, or contains links or
-    names that lead out of the folder. DiskSpaceError: there is too little free space.
+    Raises:
+        SceneError: the file is not a zip archive, is damaged, encrypted or too large, or contains links or
+            names that lead out of the folder.
+        DiskSpaceError: there is too little free space.
     """
     try:
         with zipfile.ZipFile(archive) as opened:

@@ -316,7 +316,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
 
 
 def name_neighbours(database: Path, views: Mapping[str, dict[str, Any]]) -> None:
-    """Add `belongs_near` to a report's unregistered views: the registered ones with the most matches."""
+    """Add `belongs_near` to a report's unregistered views: the registered views with the most matches."""
     shared = verified_matches(database)
     for view, entry in views.items():
         if entry["registered"]:

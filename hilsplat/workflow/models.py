@@ -45,7 +45,7 @@ def _require_model(folder: Path, kind: str, variant: str) -> None:
 
 
 def describe_models(stages: StageSettings, features: Path | None = None) -> str:
-    """Describe the segmenter and CLIP of settings without `auto`, or LangSplat's files in place of both."""
+    """Describe the segmenter and CLIP of settings without `auto`, or LangSplat's files that replace them."""
     if features is not None:
         return f"masks and their vectors from {features}; text queries by {Path(stages.clip.model).name}"
     masks = {

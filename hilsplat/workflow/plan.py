@@ -33,7 +33,7 @@ LEAST_PHOTOGRAPHS = 16
 
 
 def any_of(names: Iterable[str]) -> str:
-    """Return a regular expression that matches exactly these names."""
+    """Return a regular expression that matches exactly the given names."""
     return "|".join(sorted({re.escape(name) for name in names})) or "(?!)"
 
 

@@ -151,7 +151,7 @@ class Records:
     """Comparison of artifacts' provenance with their files.
 
     Args:
-        results: results folder. Provenance records paths in it as `results/...`, even after it was moved.
+        results: results folder; provenance records its paths as `results/...`, even if the folder was moved.
         every_byte: compare contents instead of sizes.
     """
 

@@ -55,7 +55,7 @@ NETWORK_S = 10.0  # core seconds to train an autoencoder
 EMBEDDED_S = {"masks": 1.5, "clip": 0.1}  # core seconds of the embedded models per view
 
 SAM_S, OTHER_SAM_S = {"huge": 87.0, "large": 44.0, "base": 14.1}, 5.7
-"""Part of a SAM model's name -> core seconds per picture; others: SAM 2.1 small (docs/benchmarks.md)."""
+"""Part of a SAM model's name -> core seconds per picture; otherwise, SAM 2.1 small's (docs/benchmarks.md)."""
 
 PROMPT_S, PICTURE_S, CROP_S = 0.02, 1.0, 0.3
 """Core seconds per SAM prompt, per picture from logits to masks, and per crop in CLIP B/16."""

@@ -146,7 +146,7 @@ class SceneData:
         return sorted(str(path) for path in folder.glob("*_[sf].npy")) if folder is not None else []
 
     def labels(self, row: SceneRow) -> tuple[str, ...]:
-        """Return the labels of a scene, as `data set/scene`: published ones and your own annotations."""
+        """Return the labels of a scene, as `data set/scene`: published labels and your own annotations."""
         return () if row.world else self._labels(row)
 
     def label_readers(self, job: Job) -> tuple[str, ...]:
@@ -163,7 +163,7 @@ class SceneData:
         return [self.path(job, "world/truth")] if self.row(job).world else []
 
     def truth_or_labels(self, job: Job) -> list[str]:
-        """Return the input of `evaluate`: the annotations of a synthetic scene, or label files of others."""
+        """Return the input of `evaluate`: a synthetic scene's annotations, or another scene's label files."""
         return self.truth(job) or self._label_files(self.row(job))
 
     def truth_option(self, job: Job, input: Any) -> str:

@@ -84,7 +84,7 @@ class PointScene:
     """A scene of a data set with labelled points.
 
     Attributes:
-        images: posed images, without unusable frames (those without a pose).
+        images: posed images; frames without a pose are omitted.
         truth: labelled points by labelling. Only `evaluate` may read them.
         warnings: one sentence for each item that was skipped or reinterpreted.
     """

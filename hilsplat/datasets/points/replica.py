@@ -85,7 +85,7 @@ def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
         image
         for image in list_images(folder / image_folder)
         if image.stem.startswith(prefix) and image.stem.removeprefix(prefix).isdecimal()
-    ]  # the others are depth or colour visualisations
+    ]  # other images are depth or colour visualisations
     frames = by_number(named, prefix)
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:

@@ -77,7 +77,7 @@ def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Erro
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
-    """Return the views; refuse invalid lenses and poses, and three or more views that all have one pose."""
+    """Return the views; refuse invalid lenses or poses, and three or more views if all poses are the same."""
     for view in views:
         values = np.array([*view.camera.params, view.camera.width, view.camera.height], np.float64)
         focal = [view.camera.params[row] for row in view.camera.focal_length_idxs()]
