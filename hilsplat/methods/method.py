@@ -55,7 +55,7 @@ class MethodInputs:
         return load_latents(self.autoencoder_folder, self.contributions)
 
     def view_weights(self, view: str) -> sp.csr_matrix:
-        """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or are empty if uncovered."""
+        """Return a view's compositing weights (pixels x Gaussians); rows sum to 1, or 0 if uncovered."""
         gaussians, scene = self._loaded
         least = self.contributions.min_weight
         weights = pixel_weights(gaussians, scene.cameras[view], min_weight=least, threads=self.threads)

@@ -63,7 +63,7 @@ def hierarchical_loss(
     A pixel's loss is -log of the softmax over prototypes, weighted by 1 at the pixel's own patch and by 1/5
     (1/25) at patches that share one mask fewer (two fewer). The loss at each number of shared masks is at
     least the loss at the next larger number, so that patches that share more masks are closer. Patches
-    without a shared mask are only negatives. Rendered features have unit length; `shared` counts shared masks.
+    without a shared mask are only negatives. Rendered features have unit length; `shared` is as in `patches`.
     """
     num = len(shared)
     prototypes, _ = segment_means(rendered, patch, num)

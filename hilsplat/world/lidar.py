@@ -1,8 +1,8 @@
-"""Simulated scan of a synthetic street by a spinning laser scanner on the roof of the car (metres).
+"""Simulated scan of a synthetic street by a spinning laser scanner on the car's roof; lengths are metres.
 
-It simulates the top lidar of the Waymo data: 64 beams between 17.6 degrees below the horizon and 2.4 above.
+The scanner simulates Waymo's top lidar: 64 beams between 17.6 degrees below and 2.4 above the horizon.
 Rays are cast exactly; then noise is added to each range, and some returns are dropped. As in a logged drive,
-the scanner's positions are recorded and not estimated from the images.
+the scanner's positions are recorded, not estimated from the images.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from hilsplat.world.scenes.scene import WorldScene
 
 BEAMS = 64
 INCLINATION_DEG = (-17.6, 2.4)
-"""Lowest and highest beam, as in Waymo's top lidar."""
+"""Inclinations of the lowest and highest beams, as in Waymo's top lidar."""
 AZIMUTH_STEPS = 400
-"""Directions per turn; Waymo has 2650."""
+"""Number of directions per turn; Waymo's lidar has 2650."""
 POSES = 5
 """Number of positions along the drive at which a turn is recorded."""
 ABOVE_CAMERA_M = 0.35
@@ -34,13 +34,13 @@ GLANCING_COSINE = 0.03
 
 @dataclass(frozen=True, eq=False)
 class LidarScan:
-    """P measured points, with the nodes that were hit.
+    """P measured points and the nodes that were hit.
 
     Attributes:
         points: positions in the frame of the ground-truth cameras, with noise, metres.
-        node_ids: whole, part and subpart; -1 for none.
-        pose_index: row of `origins` from which each point was measured.
-        range_m: measured distance to that origin.
+        node_ids: whole, part and subpart of each point; -1 for none.
+        pose_index: row in `origins` of the position from which each point was measured.
+        range_m: measured distance to that position.
         beam: number of the beam, 0 to 63 from the lowest.
         origins: positions of the scanner.
     """
@@ -53,12 +53,12 @@ class LidarScan:
     origins: Float[np.ndarray, "S 3"]
 
     def save(self, path: Path) -> None:
-        """Write all fields as .npz; equal scans give equal bytes."""
+        """Write all fields as .npz; identical scans produce identical bytes."""
         write_npz(path, **vars(self))
 
 
 def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:
-    """Return the unit vectors of one turn, ordered by beam from the lowest, then by azimuth from +x to +y."""
+    """Return one turn's unit vectors, ordered by beam from the lowest, then by azimuth from +x to +y."""
     share = (np.arange(BEAMS) + 0.5) / BEAMS
     up = np.radians(INCLINATION_DEG[0] + share * (INCLINATION_DEG[1] - INCLINATION_DEG[0]))[:, None]
     around = 2 * np.pi * (np.arange(azimuth_steps) + 0.5)[None] / azimuth_steps
@@ -75,9 +75,9 @@ def scan_street(
     range_noise_m: float = RANGE_NOISE_M,
     lost_share: float = LOST_SHARE,
 ) -> LidarScan:
-    """Scan a street from above evenly chosen camera centres, which are in the order of the drive.
+    """Scan a street from above evenly spaced camera centres; the centres are in the order of the drive.
 
-    The scene's seed also determines noise and losses. The sky returns nothing.
+    The scene's seed also determines noise and losses. The sky yields no returns.
     """
     rng = np.random.default_rng([scene.seed, 31])
     chosen = np.unique(np.linspace(0, len(camera_centres) - 1, poses).round().astype(int))
@@ -92,7 +92,7 @@ def scan_street(
         triangle = scene.triangles[prim].astype(np.float64)
         normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
         facing = np.abs((normal * directions).sum(axis=1)) / np.linalg.norm(normal, axis=1)
-        # Both are drawn for every ray, so that a lost point does not change the noise of the others.
+        # Both numbers are drawn for every ray, so that a lost point does not change the others' noise.
         noise, luck = rng.normal(0.0, 1.0, len(directions)), rng.random(len(directions))
         ids = np.where((prim >= 0)[:, None], scene.node_ids[prim], NONE)
         kept = (prim >= 0) & ~np.isin(ids[:, 0], sky) & (away < MAX_RANGE_M)

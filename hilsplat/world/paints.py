@@ -1,4 +1,4 @@
-"""Colours and solid materials of the objects of the synthetic world."""
+"""Colours and solid materials of synthetic objects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ class Texture(NamedTuple):
 
     Attributes:
         adjective: adjective for an object with the texture, or None.
-        second_share: average share of the texture in its second colour (measured by a test).
+        second_share: average share of the second colour in the texture (measured by a test).
         cells: typical number of pattern cells per scene unit.
     """
 
@@ -61,7 +61,7 @@ COLOURS: dict[str, Colour] = {
 }
 """sRGB values in [0, 1] by colour word."""
 
-# (kinds to draw from, specular strength, shininess) per group of materials.
+# (kinds of texture to draw from, specular strength, shininess) per group of materials.
 GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "plastic": (("mottled", "mottled", "spots", "stripes"), 0.35, 40.0),
     "ceramic": (("mottled", "stripes", "spots", "checks"), 0.45, 60.0),
@@ -78,7 +78,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], float, float]] = {
 }
 
 PATTERNS = ("stripes", "checks", "spots")
-"""Kinds whose second colour may be something other than a shade of the first."""
+"""Kinds of texture whose second colour need not be a shade of the first."""
 
 PATTERN_CONTRAST = 22.0
 """Minimum distance between the two colours of a pattern, in L*a*b*."""
@@ -88,7 +88,7 @@ WOOD_COLOURS = ("brown", "beige", "orange")
 
 @dataclass(frozen=True)
 class Paint:
-    """One solid material: a texture of two colours, evaluated in object coordinates.
+    """One solid material: a two-colour texture, evaluated in object coordinates.
 
     Attributes:
         colour: word for the prevailing (first) colour.
@@ -121,23 +121,23 @@ class Paint:
 
     @property
     def seen(self) -> Float[np.ndarray, " 3"]:
-        """Average colour of the paint, sRGB: both colours mixed in linear light as in the texture."""
+        """Average colour of the paint, sRGB: both colours, mixed in linear light as in the texture."""
         share = TEXTURES[self.kind].second_share
         first, second = (linear_from_srgb(np.array(colour)) for colour in (self.first, self.second))
         return srgb_from_linear((1 - share) * first + share * second)
 
     def paled(self, share: float) -> "Paint":
-        """Return the paint with a share of light grey in both colours, and the matching colour word."""
+        """Return the paint with light grey mixed into both colours, and the matching colour word."""
         return self._changed(lambda value: (1 - share) * value + share * 0.68)
 
     def shaded(self, factor: float) -> "Paint":
-        """Return the paint darker (factor below 1) or nearer to white, with the matching colour word."""
+        """Return the paint darkened (factor below 1) or lightened, with the matching colour word."""
         if factor <= 1:
             return self._changed(lambda value: max(0.03, factor * value))
         return self._changed(lambda value: value + (factor - 1) * (0.95 - value))
 
     def recoloured(self, word: str) -> "Paint":
-        """Return the same texture in another colour, whose shade becomes the second colour."""
+        """Return the same texture in another colour; a shade of this colour becomes the second colour."""
         first = np.array(COLOURS[word])
         second = _relative(first)
         return replace(self, colour=word, first=tuple(first.tolist()), second=tuple(second.tolist()))
@@ -194,7 +194,7 @@ _LAB = lab_from_srgb(np.array(list(COLOURS.values())))
 
 
 def colour_word(colour: Float[np.ndarray, " 3"]) -> str:
-    """Return the word of the listed colour nearest to an sRGB colour, in L*a*b*.
+    """Return the word of the listed colour that is nearest to an sRGB colour in L*a*b*.
 
     Example:
         >>> colour_word(np.array([0.9, 0.1, 0.1]))
@@ -208,13 +208,13 @@ def difference(first: Paint, second: Paint) -> float:
     return float(np.linalg.norm(_seen_lab(first) - _seen_lab(second)))
 
 
-@lru_cache(maxsize=4096)  # a builder compares each paint with many
+@lru_cache(maxsize=4096)  # a builder compares each paint with many others
 def _seen_lab(paint: Paint) -> Float[np.ndarray, " 3"]:
     return lab_from_srgb(paint.seen)
 
 
 def _relative(first: np.ndarray) -> np.ndarray:
-    """Return a shade of a colour: darker if it is light, lighter if it is dark."""
+    """Return a shade of a colour: a darker shade of a light colour, a lighter shade of a dark colour."""
     light = float(first.mean()) > 0.5
     return np.clip(first * (0.66 if light else 1.4) + (0.0 if light else 0.04), 0.02, 0.95)
 
@@ -231,8 +231,8 @@ class PaintBox:
 
         Args:
             spec: one of `GROUPS`, then the colour words to choose from, as in "plain red blue"; without
-                words, all unused colours.
-            scale: factor on the pattern's number of cells per unit.
+                words, any unused colour is chosen.
+            scale: factor on the pattern's cells per unit.
         """
         rng = self._rng
         group, *colours = spec.split()
@@ -265,7 +265,7 @@ class PaintBox:
     def _patterned(self, paint: Paint) -> Paint:
         """Return the paint with a visible second colour that does not change its colour word.
 
-        Otherwise texts would be wrong: "red mug" for a mug that looks brown from a distance.
+        Otherwise texts would be wrong, such as "red mug" for a mug that looks brown from a distance.
         """
         first = np.array(paint.first)
         for word in self._rng.permutation(list(COLOURS)):

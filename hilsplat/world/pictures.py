@@ -1,4 +1,4 @@
-"""Pictures of the synthetic world: one object of each class, scenes with their labels, contact sheets."""
+"""Pictures of the synthetic world: one object per class, scenes with labels, and contact sheets."""
 
 import logging
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ OBJECTS = 7
 AZIMUTH_DEG = 25.0
 ELEVATION_DEG = 30.0
 RADIUS = 0.36
-"""Radius to which an object is scaled in its picture; tall objects are scaled by their height."""
+"""Radius to which an object is scaled in its picture; tall objects are scaled by height."""
 
 VIEWS_SHOWN = 4
 LINES_SHOWN = 52
@@ -50,7 +50,7 @@ _GROUND = Paint("grey", "mottled", *_GREYS, 3.0, 0.0, 10.0, 0.1, (5.0, 6.0, 7.0)
 
 
 def draw_classes(out: Path, names: Sequence[str] = TABLETOP) -> None:
-    """Draw one object of each named tabletop class, as PNG."""
+    """Draw one object of each named tabletop class as a PNG."""
     from matplotlib.figure import Figure
 
     rows = -(-len(names) // CLASS_COLUMNS)
@@ -67,7 +67,7 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP) -> None:
 
 
 def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
-    """Return a scene with one object on plain ground, and a camera whose view the object fills."""
+    """Return a scene with one object on plain ground, and a camera whose view is filled by the object."""
     centre, radius = footprint_of(model.triangles)
     height = float(model.triangles[..., 2].max())
     scale = min(RADIUS / radius, 2.7 * RADIUS / height)
@@ -84,7 +84,7 @@ def _alone(model: ObjectModel) -> tuple[WorldScene, Camera]:
 
 
 def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
-    """Draw one view per scene with its ground-truth labels by level, as PNG.
+    """Draw one view per scene with its ground-truth labels by level, as a PNG.
 
     Raises:
         SceneError: if the kind is unknown.
@@ -102,7 +102,7 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
         camera = cameras[cameras.names[(17 + 6 * index) % len(cameras)]]
         labels, colours = label_view(scene, camera), node_colours(len(scene.nodes))
         for shade, node in enumerate(sorted(scene.background)):
-            colours[node] = 60 + 18 * shade  # greys: never scored
+            colours[node] = 60 + 18 * shade  # grey because it is never scored
         panels = [render_view(scene, camera, 3)]
         nearest = labels[0]  # the node at the level, or at the next coarser level that has one
         for level in LEVELS:
@@ -127,7 +127,7 @@ def _write_name(axes: "Axes", x: float, name: str, fontsize: float | int) -> Non
 
 
 def _write(figure: "Figure", out: Path) -> None:
-    """Write a figure as PNG with a dithered palette of 256 colours, which halves the file size."""
+    """Write a figure as a PNG with a dithered palette of 256 colours, which halves the file size."""
     from PIL import Image, PngImagePlugin
 
     full = BytesIO()
@@ -145,9 +145,9 @@ def _write(figure: "Figure", out: Path) -> None:
 
 
 def show_world(world_folder: Path, out: Path) -> None:
-    """Draw some views of a finished world stage with their labels by level, and the tree of texts, as PNG.
+    """Draw views of a finished world stage with labels by level, and the tree of texts, as a PNG.
 
-    Each text is marked in the colour of its region; texts that no view annotates are in brackets.
+    Each text is marked with the colour of its region; texts annotated in no view are in brackets.
 
     Raises:
         ArtifactError: if the folder is missing or incomplete.
@@ -204,7 +204,7 @@ def show_world(world_folder: Path, out: Path) -> None:
 def _panel(
     truth: HierarchyAnnotations, view: str, level: Level, colours: UInt8[np.ndarray, "N 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the labels of a level as colours, with the whole in dark grey where the level has no node."""
+    """Return a level's labels as colours, and the whole in dark grey where the level has no node."""
     labels = truth.label_image(view, level)
     panel = coloured(labels, colours)
     whole = coloured(truth.label_image(view, Level.WHOLE), colours).mean(axis=-1, keepdims=True)
@@ -230,7 +230,7 @@ def coloured(
 
 
 def tree_lines(nodes: tuple[AnnotatedNode, ...]) -> list[tuple[int, AnnotatedNode]]:
-    """Return nodes with their depth, depth first; siblings with the same text are listed once."""
+    """Return nodes and their depths in depth-first order; siblings with the same text are listed once."""
     children: dict[int, list[AnnotatedNode]] = {}
     for node in nodes:
         children.setdefault(node.parent, []).append(node)

@@ -1,8 +1,8 @@
-"""Ray casting at triangles with Embree, in packets of sixteen rays.
+"""Ray casting against triangles with Embree, in packets of sixteen rays.
 
 The embreex package provides Embree but casts rays one by one. Compiled loops here call Embree's C interface,
 which takes a fifth of the time for nearly parallel neighbouring rays. Results are bit-identical, except where
-two triangles are at the same distance: the one that is reported then depends on the other rays in the packet.
+two triangles are at the same distance: which one is reported then depends on the other rays in the packet.
 """
 
 import ctypes
@@ -27,7 +27,7 @@ _INDICES, _VERTICES = 0, 1
 _THREE_UINTS, _THREE_FLOATS = 0x5003, 0x9003
 _COHERENT = 1 << 16
 
-# Rows of RTCRayHit16: 12 for the rays, 9 for their hits.
+# Rows of RTCRayHit16: 12 for the rays and 9 for the hits.
 _DIRECTION, _FAR, _MASK, _U, _V, _TRIANGLE, _GEOMETRY = 4, 8, 9, 15, 16, 17, 18
 _RAY_ROWS, _ROWS = 12, 21
 
@@ -41,10 +41,10 @@ class Hits:
     """First hits of R rays.
 
     Attributes:
-        triangle: row of the triangle; -1 if a ray hits none.
+        triangle: row of the triangle; -1 if a ray hits nothing.
         u: weight of the triangle's second corner at the hit.
-        v: weight of its third corner.
-        distance: from the origin, in lengths of the direction; inf if a ray hits none.
+        v: weight of the triangle's third corner at the hit.
+        distance: distance from the origin, in lengths of the direction; inf if a ray hits nothing.
     """
 
     triangle: Int32[np.ndarray, " R"]
@@ -81,7 +81,7 @@ class RayCaster:
         """Return the first hit of each ray.
 
         Args:
-            origins: one for each ray, or one for all.
+            origins: one origin per ray, or one for all rays.
             directions: vectors of any length; sixteen consecutive rays are cast together.
         """
         count = len(directions)
@@ -110,7 +110,7 @@ def _embree() -> tuple[ctypes.CDLL, int]:
     """Return Embree's functions and a single-threaded device."""
     from embreex import rtcore_scene
 
-    embree = ctypes.CDLL(rtcore_scene.__file__)  # this module is linked to Embree and exposes its symbols
+    embree = ctypes.CDLL(rtcore_scene.__file__)  # this module links to Embree and exposes Embree's symbols
     for name in ("rtcIntersect16", "rtcOccluded16"):
         llvmlite.binding.add_symbol(name, ctypes.cast(getattr(embree, name), ctypes.c_void_p).value)
     pointer, number, size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t

@@ -2,7 +2,7 @@
 
 Soft shadows and ambient occlusion use fixed directions: sub-sample k of every pixel samples stratum k of the
 light and of the hemisphere, jittered by a hash of the surface point. A point therefore looks the same in
-every view. Random rays would add noise that differs between views and is averaged to a blur in the Gaussians.
+every view. Random rays would add noise that differs between views and blurs the Gaussians.
 """
 
 import math
@@ -25,14 +25,14 @@ OCCLUSION_REACH = 0.55
 """Maximum distance at which a surface occludes another, scene units at `Style.scale` 1."""
 
 BAND_RAYS = 1 << 15
-"""Camera rays that are shaded at once; each takes 120 bytes of working memory."""
+"""Number of camera rays that are shaded at once; each takes 120 bytes of working memory."""
 
 _LIFT = 2e-3  # offset of a ray's start from the surface, scene units at scale 1
-_HASH_CELLS = 160.0  # cells per unit, at scale 1, of the hash that jitters rays: about a pixel at 384 px
+_HASH_CELLS = 160.0  # cells per unit, at scale 1, of the ray-jitter hash: about one per pixel at 384 px
 
 
 def label_view(scene: WorldScene, camera: Camera) -> Int32[np.ndarray, "3 H W"]:
-    """Return the node id per level and pixel (-1 none), from one ray through each pixel's centre."""
+    """Return the node id per level and pixel (-1: none), from one ray through each pixel's centre."""
     return _labels(scene, scene.caster.nearest(*_rays(camera, 1)).triangle, camera.size_hw)
 
 
@@ -40,7 +40,7 @@ def render_view(scene: WorldScene, camera: Camera, samples: int) -> UInt8[np.nda
     """Render a view with soft shadows, occluded sky light, highlights and solid textures.
 
     Args:
-        samples: sub-samples per pixel side; 3 gives clean edges, 1 is for previews.
+        samples: sub-samples per pixel side; use 3 for clean edges, 1 for previews.
     """
     return _rendered(scene, camera, samples)[0]
 
@@ -61,7 +61,7 @@ def _labels(scene: WorldScene, prim: np.ndarray, size_hw: tuple[int, int]) -> In
 def _rendered(
     scene: WorldScene, camera: Camera, samples: int
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int32[np.ndarray, " P"]]:
-    """Return a view, and the triangle that the middle sub-sample of each pixel hits (-1 none).
+    """Return a view, and the triangle that the middle sub-sample of each pixel hits (-1: none).
 
     Rows are rendered in bands whose rays fit in the processor's cache.
     """
@@ -82,7 +82,7 @@ def _rendered(
 def _reflected(
     scene: WorldScene, hits: Hits, directions: np.ndarray, samples: int
 ) -> Float32[np.ndarray, "P 3"]:
-    """Return the linear light of pixels from the hits and directions of their sub-samples."""
+    """Return the linear light of pixels, from the hits and directions of the sub-samples."""
     prim, style = hits.triangle, scene.style
     count = len(prim)
     points, facets, shading, colours = (np.empty((count, 3), np.float32) for _ in range(4))
@@ -114,7 +114,7 @@ def _reflected(
 
 
 def _rays(camera: Camera, samples: int, rows: range | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the origin and unit directions of all sub-samples of some rows (None: all), pixel by pixel."""
+    """Return the origin and all sub-samples' unit directions, pixel by pixel, for `rows` (None: all)."""
     height, width = camera.size_hw
     rows = rows or range(height)
     step = (np.arange(samples) + 0.5) / samples
@@ -174,7 +174,7 @@ def _surfaces(prim, u, v, directions, mesh, surface):
         nx, ny, nz = ey * gz - ez * gy, ez * gx - ex * gz, ex * gy - ey * gx
         length = math.sqrt(nx * nx + ny * ny + nz * nz)
         if nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2] > 0:
-            length = -length  # seen from behind: both normals face the viewer
+            length = -length  # seen from behind: make both normals face the viewer
         facets[i, 0], facets[i, 1], facets[i, 2] = nx / length, ny / length, nz / length
         side = 1.0 if length > 0 else -1.0
         total = 0.0
@@ -201,7 +201,7 @@ def _surfaces(prim, u, v, directions, mesh, surface):
 
 @compiled
 def _to_light(points, facets, shading, i, light):
-    """Return direction and distance of the light, and its cosine at point i, 0 from behind."""
+    """Return the light's direction and distance at point i, and its cosine, 0 if it is behind."""
     lx, ly, lz = light[0] - points[i, 0], light[1] - points[i, 1], light[2] - points[i, 2]
     distance = math.sqrt(lx * lx + ly * ly + lz * lz)
     lx, ly, lz = lx / distance, ly / distance, lz / distance
@@ -213,7 +213,7 @@ def _to_light(points, facets, shading, i, light):
 
 @compiled
 def _receivers(prim, surface, light, samples):
-    """Return the rows that the sky lights (hits on non-luminous surfaces), and those that face the light.
+    """Return the rows lit by the sky (hits on non-luminous surfaces), and the rows that face the light.
 
     Sky rows are ordered by sub-sample: rays cast together should be nearly parallel, and neighbouring pixels
     use similar directions for the same sub-sample.
@@ -244,12 +244,12 @@ def _cell(points, i, cells, salt):
 def _light_rays(
     rows, points, facets, lift, samples, ray, rays_each, cells, light, shadow_reach, starts, toward, reach
 ):
-    """Compute start, direction and reach of each row's ray to its stratum of the (flat, round) light."""
+    """Compute each row's ray (start, direction, reach) to its stratum of the flat, round light."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
     for n, i in enumerate(rows):
         stratum = (i % per_pixel) * rays_each + ray
-        # Sunflower arrangement: equal areas, all directions, for any number of strata.
+        # A sunflower arrangement has equal areas and all directions, for any number of strata.
         radius = light[3] * math.sqrt((stratum + 0.15 + 0.7 * _cell(points, i, cells, 301)) / strata)
         angle = 2.399963 * stratum + 0.9 * (_cell(points, i, cells, 302) - 0.5)
         for c in range(3):
@@ -264,7 +264,7 @@ def _light_rays(
 
 @compiled
 def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_reach, starts, toward, reach):
-    """Compute a cosine-weighted direction above each row's point, from its stratum of the hemisphere."""
+    """Compute each row's ray in a cosine-weighted direction, from its stratum of the hemisphere."""
     per_pixel = samples * samples
     strata = per_pixel * rays_each
     for n, i in enumerate(rows):
@@ -288,7 +288,7 @@ def _sky_rays(rows, points, facets, lift, samples, ray, rays_each, cells, sky_re
 
 @compiled
 def _shade(prim, directions, surface, lit, open_sky, light, lights, exposure, samples, image):
-    """Average the reflected light of all sub-samples into pixels (linear light, compressed highlights)."""
+    """Average all sub-samples' reflected light into pixels (linear light, compressed highlights)."""
     points, facets, shading, colours, gloss = surface
     per_pixel = samples * samples
     for i in range(len(prim)):

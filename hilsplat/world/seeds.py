@@ -3,7 +3,7 @@
 from hilsplat.base.errors import SceneError
 
 TRAINING_SEEDS = range(1_000_000, 2_000_000)
-"""Scenes that the small embedded models are trained on."""
+"""Scenes on which the small embedded models are trained."""
 
 DEVELOPMENT_SEEDS = range(100, 200)
 """Scenes for choosing settings; never used for training or reported results."""

@@ -12,12 +12,12 @@ Number = float | int
 Point = tuple[Number, Number, Number]
 
 SMOOTH_BELOW_DEG = 40.0
-"""Corners of lathed profiles are shaded smoothly below this angle and sharply above it."""
+"""Corners of lathed profiles are shaded smoothly below this angle, and sharply above it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """F triangles with a shading normal per corner; z is up.
+    """A mesh of F triangles with a shading normal per corner; z is up.
 
     Attributes:
         triangles: corner positions.
@@ -83,7 +83,7 @@ def _fan(polygon: np.ndarray) -> list[np.ndarray]:
 
 
 def _strip(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles between two rows of points: those with an edge on `low`, and those on `high`."""
+    """Return the triangles between two rows of points: those with an edge on `low`, then those on `high`."""
     return np.stack([low[:-1], low[1:], high[1:]], axis=1), np.stack([low[:-1], high[1:], high[:-1]], axis=1)
 
 
@@ -92,7 +92,7 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
     Args:
         size: lengths along x, y, z.
-        bevel: length cut off each edge; 0 gives 12 triangles, else 44.
+        bevel: length cut off each edge; the box has 12 triangles at 0, otherwise 44.
     """
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = float(min(bevel, 0.45 * 2 * half.min()))
@@ -102,9 +102,9 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
 @cache
 def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 3"]]:
-    """Return the sides of each triangle's corners on each axis (-1 or 1), and 1 where a bevel insets them.
+    """Return the side of each triangle corner on each axis (-1 or 1), and 1 where a bevel insets it, else 0.
 
-    A bevel insets a corner along the two axes other than the normal of its face.
+    A bevel insets a corner along the two axes other than its face's normal.
     """
     triangles: list[np.ndarray] = []
 
@@ -140,7 +140,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
 
     Args:
         profile: (radius, z) from bottom to top along the outside, so that normals point outwards.
-        segments: facets around the axis.
+        segments: number of facets around the axis.
     """
     points = np.asarray(profile, dtype=np.float64)
     steps = np.diff(points, axis=0)
@@ -200,8 +200,8 @@ def sweep(
 
     Args:
         path: points of the centre line.
-        radius: radius of the tube, one for all points or one for each.
-        segments: facets around the tube.
+        radius: radius of the tube: one for all points, or one per point.
+        segments: number of facets around the tube.
     """
     points = np.asarray(path, dtype=np.float64)
     radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(points),))
@@ -234,7 +234,7 @@ def sweep(
 def arc(
     radii: tuple[Number, Number], start_deg: Number, stop_deg: Number, centre: Point, axis: str = "y"
 ) -> Float[np.ndarray, "15 3"]:
-    """Return an elliptic arc about y or x as a path for `sweep`; 0 degrees is +x or +y, and 90 is +z."""
+    """Return an elliptic arc about y or x, as a path for `sweep`; 0 degrees is +x or +y, and 90 is +z."""
     points = np.zeros((15, 3))
     for row, angle in enumerate(np.radians(np.linspace(start_deg, stop_deg, len(points)))):
         points[row, 0 if axis == "y" else 1] = radii[0] * np.cos(angle)
@@ -262,8 +262,8 @@ def loft(sections: Sequence[Sequence[Point] | np.ndarray]) -> Mesh:
     """Return a closed flat-shaded solid through convex outlines with equal numbers of points.
 
     Args:
-        sections: outlines in order along the solid, either all clockwise or all counter-clockwise; the
-            solid is wound so that its volume is positive.
+        sections: outlines in order along the solid, either all clockwise or all counter-clockwise; triangles
+            are wound so that the volume is positive.
     """
     outlines = [np.asarray(section, dtype=np.float64) for section in sections]
     triangles = [*_fan(outlines[0][::-1]), *_fan(outlines[-1])]
@@ -285,7 +285,7 @@ def plate(outline: Sequence[tuple[Number, Number]], back: Number, front: Number)
 
 
 def disc(radius: Number, back: Number, front: Number, segments: int = 28, bevel: Number = 0.0) -> Mesh:
-    """Return a closed cylinder about x, from x = back to x = front, for discs on an object's front."""
+    """Return a closed cylinder about x, from x = back to x = front, such as a disc on an object's front."""
     return cylinder(radius, back, front, segments, bevel).turned("y", 90)
 
 

@@ -26,14 +26,14 @@ from hilsplat.world.truth import annotated_nodes, smallest_areas, write_mesh
 logger = logging.getLogger(__name__)
 
 MESH_EDGE: dict[str, float] = {"room": 0.08}
-"""Longest mesh edge, scene units, for scene kinds whose vertices are scored; others are not refined."""
+"""Longest mesh edge, scene units, for scene kinds whose vertices are scored; other meshes are not refined."""
 
 
 def parse_source(source: str) -> tuple[str, int]:
-    """Return the kind of scene and the seed that a source such as "world:tabletop:201" names.
+    """Return the kind of scene and the seed in a source such as "world:tabletop:201".
 
     Raises:
-        SceneError: if the form differs, the kind is unknown, or the seed is reserved for training.
+        SceneError: if the format is wrong, the kind is unknown, or the seed is reserved for training.
     """
     words = source.split(":")
     if len(words) != 3 or words[0] != "world" or words[1] not in KINDS or not words[2].isdecimal():
@@ -57,8 +57,8 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
 
     Each of the two output folders is complete or absent. The next stages read only `out/images` (000.png,
     001.png, ...). Only `evaluate` may read `out/truth`: annotations.json and labels/ in the hierarchy format,
-    cameras.npz, mesh.ply, scene.json, and for a street lidar.npz. The bytes depend on source and settings,
-    not on `threads`.
+    cameras.npz, mesh.ply, scene.json and, for a street, lidar.npz. The files' bytes depend on `source` and
+    `settings`, not on `threads`.
 
     Raises:
         SceneError: if the source does not name a scene, or no object fits into it.
@@ -119,7 +119,7 @@ _scene = lru_cache(maxsize=1)(build_scene)
 
 
 def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render one view and its labels; a module-level function, so that worker processes can import it."""
+    """Render one view and its labels; at module level, so that worker processes can import it."""
     scene = _scene(kind, seed, settings.objects)
     cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
     return render_and_label(scene, cameras[cameras.names[row]], settings.samples)

@@ -1,4 +1,4 @@
-"""Solid textures: colour as a compiled function of the position.
+"""Solid textures: colour as a compiled function of position.
 
 All textures are computed from hashes of lattice cells, without image files or texture coordinates. A surface
 point has the same colour in all views, as structure from motion and 3D Gaussians require.
@@ -31,7 +31,7 @@ def _key(i, j, k, salt):
 
 @compiled
 def hash01(x: int, y: int, z: int, salt: int) -> float:
-    """Return the hash of a lattice cell in [0, 1)."""
+    """Return a lattice cell's hash, in [0, 1)."""
     return _mixed(_key(x, y, z, salt))
 
 
@@ -57,7 +57,7 @@ def value_noise(x: float, y: float, z: float, salt: int) -> float:
 
 @compiled
 def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> float:
-    """Return the sum of octaves of `value_noise`, each at half the size and amplitude, in [0, 1)."""
+    """Return a sum of `value_noise` octaves in [0, 1), each with half the previous size and amplitude."""
     total, amplitude, reach = 0.0, 0.5, 0.0
     for octave in range(octaves):
         total += amplitude * value_noise(x, y, z, salt + octave)
@@ -69,10 +69,10 @@ def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> floa
 
 @compiled
 def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, float]:
-    """Find the nearest and second nearest of one random point per cell (Worley noise).
+    """Find the two nearest points among one random point per cell (Worley noise).
 
     Returns:
-        Distances to the two, in cells, and the nearest point's random number in [0, 1).
+        Distances to these two points, in cells, and the nearest point's random number in [0, 1).
     """
     i0, j0, k0 = math.floor(x), math.floor(y), math.floor(z)
     nearest, second, identity = 9.0, 9.0, 0.0
@@ -93,7 +93,7 @@ def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, f
 
 @compiled
 def step_between(value: float, low: float, high: float) -> float:
-    """Return 0 below `low`, 1 above `high` and a smooth transition between."""
+    """Return 0 below `low`, 1 above `high`, and a smooth transition in between."""
     t = min(1.0, max(0.0, (value - low) / (high - low)))
     return t * t * (3 - 2 * t)
 
@@ -120,7 +120,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         nearest, _, identity = cell_noise(0.7 * x, 0.7 * y, 0.7 * z, 31)
         share = 1 - step_between(nearest, 0.22 + 0.14 * identity, 0.27 + 0.14 * identity)
         return share, 0.92 + 0.16 * value_noise(3 * x, 3 * y, 3 * z, 35)
-    if kind == 4:  # wood: rings around a tilted axis and fine fibres along it
+    if kind == 4:  # wood: rings around a tilted axis, and fine fibres along the axis
         rx = x + 0.9 * value_noise(0.4 * x, 0.4 * y, 0.12 * z, 41)
         ry = y + 0.25 * z
         bend = value_noise(0.6 * x, 0.6 * y, 0.2 * z, 42)
@@ -143,7 +143,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
         streak = value_noise(0.8 * x, 0.8 * y, 11 * z, 81)
         cloud = fractal_noise(0.9 * x, 0.9 * y, 0.9 * z, 3, 83)
         return 0.5 * streak + 0.35 * cloud, 0.85 + 0.3 * streak
-    if kind == 9:  # brick: courses along z, joints along x + y so that every upright face shows them
+    if kind == 9:  # brick: courses along z, joints along x + y, so that every upright face shows joints
         course = math.floor(0.9 * z)
         along = 0.36 * (x + y) + 0.5 * (course & 1)
         brick = math.floor(along)
@@ -169,7 +169,7 @@ def pattern(kind: int, x: float, y: float, z: float) -> tuple[float, float]:
 def grains(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return `fractal_noise(16 x, 16 y, 16 z, 4, 201)` of many points, vectorised and bit-identical.
 
-    The grain measures 0.06 down to 0.008 scene units; the finest is about a pixel of a 256 px view.
+    Grain sizes range from 0.06 to 0.008 scene units; the finest grain is about one pixel of a 256 px view.
     """
     out = np.zeros(len(x))
     amplitude, reach, size = 0.5, 0.0, 16.0

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic scene: annotated regions per view, its mesh with node ids, and exact depth."""
+"""Ground truth of a synthetic scene: annotated regions per view, a mesh with node ids, and exact depth."""
 
 from collections import defaultdict
 from collections.abc import Collection
@@ -19,10 +19,10 @@ from hilsplat.world.rays import RayCaster
 from hilsplat.world.scenes.scene import WorldScene
 
 MIN_SUBPART_AREA = 100 / 384**2
-"""Minimum visible area of a scored subpart, as a share of the view: 100 px of 384 x 384."""
+"""Minimum visible area of a scored subpart, as a fraction of the view: 100 px of 384 x 384."""
 
 HIDDEN_BY = 2e-3
-"""A point is hidden if something is nearer to the camera by at least this share of its distance."""
+"""A point is hidden if a surface is nearer to the camera by at least this fraction of the distance."""
 
 
 def smallest_areas(image_px: int, min_area_px: int) -> dict[Level, float | int]:
@@ -40,8 +40,8 @@ def annotated_nodes(
     """Return the ids of the nodes that are scored in a view, in ascending order.
 
     Nodes with the same text (four legs) match one query, so the size limit applies to their union: either
-    all visible ones are annotated or none. The ground truth would be wrong if one large leg were annotated
-    and three small ones were not.
+    all visible nodes are annotated or none. The ground truth would be wrong if one large leg were annotated
+    and three small legs were not.
 
     Args:
         labels: node id per level and pixel, -1 for none.
@@ -64,14 +64,14 @@ def annotated_nodes(
 
 
 def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: float | None = None) -> None:
-    """Write the scene as binary PLY, with node ids of faces and of vertices.
+    """Write the scene as binary PLY, with node ids of faces and vertices.
 
-    Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1 none) and `views`, the number of cameras
+    Vertices have x, y, z, the ids `whole`, `part` and `subpart` (-1: none) and `views`, the number of cameras
     in which they are visible (at most 255). Faces have the same three ids. Corners at one position share a
-    vertex only if their faces have equal ids, so both sides of a border have their own vertices. Protocols
+    vertex only if their faces have the same ids, so both sides of a border have separate vertices. Protocols
     that score vertices, such as ScanNet's, need evenly spaced visible vertices; a plain wall has only four.
 
-    Edges longer than `longest_edge` (scene units) are halved until none is left; None keeps the triangles.
+    Edges longer than `longest_edge` (scene units) are halved until none remain; None keeps the triangles.
     """
     triangles, owner = scene.triangles, np.arange(len(scene.triangles))
     if longest_edge is not None:
@@ -102,7 +102,7 @@ def write_mesh(path: Path, scene: WorldScene, cameras: Cameras, longest_edge: fl
 def unique_rows(
     rows: Float32[np.ndarray, "N C"],
 ) -> tuple[Float32[np.ndarray, "U C"], Int64[np.ndarray, " N"]]:
-    """Return `np.unique(rows, axis=0, return_inverse=True)`, sorted by column in a quarter of the time."""
+    """Return `np.unique(rows, axis=0, return_inverse=True)` in a quarter of the time, sorting by column."""
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
     is_new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
@@ -114,7 +114,7 @@ def unique_rows(
 def views_of_points(
     scene: WorldScene, cameras: Cameras, points: Float32[np.ndarray, "N 3"]
 ) -> Int32[np.ndarray, " N"]:
-    """Count the cameras in which each point of the scene's surface is inside the image and not hidden."""
+    """Count the cameras in which each surface point of the scene is inside the image and not hidden."""
     seen = np.zeros(len(points), np.int32)
     for name in cameras.names:
         camera = cameras[name]
@@ -136,12 +136,12 @@ def views_of_points(
 def refined(
     triangles: Float32[np.ndarray, "F 3 3"], longest_edge: float
 ) -> tuple[Float32[np.ndarray, "G 3 3"], Int64[np.ndarray, " G"]]:
-    """Halve all edges longer than `longest_edge` until none is left.
+    """Halve all edges longer than `longest_edge` until none remain.
 
     Whether an edge is halved depends only on its two ends, so no cracks open between adjacent triangles.
 
     Returns:
-        The smaller triangles, and the row of `triangles` that contains each.
+        The smaller triangles, and the row in `triangles` that contains each of them.
     """
     owner = np.arange(len(triangles))
     done, done_owner = [], []
@@ -173,7 +173,7 @@ def refined(
 
 @dataclass(frozen=True, eq=False)
 class TrueMesh:
-    """Triangles of a scene, in the frame of its ground-truth cameras, scene units."""
+    """Triangles of a scene, in the frame of the ground-truth cameras, scene units."""
 
     triangles: Float32[np.ndarray, "F 3 3"]
 
@@ -204,7 +204,7 @@ class TrueMesh:
         y, x = np.mgrid[:height, :width] + 0.5
         pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         rotation = camera.cam_from_world[:3, :3]
-        # directions of depth 1, so the distance is the depth
+        # directions have depth 1, so the distance is the depth
         directions = (pixels @ np.linalg.inv(camera.K).T @ rotation).astype(np.float32)
         hits = self.caster.nearest(camera.centre.astype(np.float32)[None], directions)
         return hits.distance.reshape(height, width)

@@ -2,12 +2,12 @@
 
 It separates errors of the method from errors of the small segmenter. It is the only code before `evaluate`
 that reads annotations, and it is never a default: the rule and the command pass the truth folder only if the
-settings request it, the index records the faults, and every row built on such masks has `SEGMENTER` in its
+settings request it, the index records the faults, and every row based on such masks has `SEGMENTER` in its
 masks column.
 
 Every decision about a fault uses a random number derived from a name (seed, scene, kind of fault, view,
 node), so it depends neither on the order of views nor on other kinds of faults. A higher probability keeps
-the faults of a lower one and adds more of the same kind, so the steps of a sweep over a setting are
+the faults of a lower probability and adds more of the same kind, so the steps of a sweep over a setting are
 comparable.
 """
 
@@ -38,7 +38,7 @@ from hilsplat.settings import PerturbSettings
 logger = logging.getLogger(__name__)
 
 SEGMENTER = "truth-perturbed"
-"""Name of the segmenter, and prefix of its masks' label."""
+"""Name of the segmenter, and label prefix of its masks."""
 
 FAULTS = PerturbSettings.model_fields.keys() - {
     *("seed", "background", "boundary_smooth_px", "systematic_share", "score_noise")
@@ -46,7 +46,7 @@ FAULTS = PerturbSettings.model_fields.keys() - {
 """Settings that change masks; if all are 0, the masks are exact."""
 
 REACH = 3.0
-"""Maximum displacement of a boundary, standard deviations."""
+"""Maximum displacement of a boundary, in standard deviations."""
 
 WAVES = 48
 """Number of plane waves that are summed for a boundary's displacement."""
@@ -58,13 +58,13 @@ Borders = dict[int, dict[int, int]]
 def run_truth_masks(
     scene_folder: Path, truth: Path, out: Path, settings: PerturbSettings, min_area_px: int, threads: int
 ) -> None:
-    """Write masks of every training view from its ground-truth labels, with faults (see `faulty_masks`).
+    """Write each training view's masks from its ground-truth labels, with faults (see `faulty_masks`).
 
     The index also contains the requested faults and, per view, the number of faults. The result does not
     depend on `threads`.
 
     Raises:
-        MisalignedArtifactError: if label images differ in size from the cameras.
+        MisalignedArtifactError: if label images and cameras differ in size.
         ArtifactError: if the truth folder is missing or incomplete.
     """
     scene = Scene.load(scene_folder)
@@ -105,7 +105,7 @@ def run_truth_masks(
 
 
 def true_labels(annotations: HierarchyAnnotations, view: str) -> Int32[np.ndarray, "3 H W"]:
-    """Return the node id per level and pixel, -1 if the level has none."""
+    """Return the node id per level and pixel, -1 if there is no node."""
     return np.stack([annotations.label_image(view, level) for level in LEVELS])
 
 
@@ -138,7 +138,7 @@ class Draws:
         return np.random.default_rng(int(digest[:32], 16))
 
     def chance(self, *name: str | int) -> float:
-        """Return a number in [0, 1) derived from a name; an event of probability p happens below p."""
+        """Return a number in [0, 1) derived from a name; events of probability p occur if it is below p."""
         return int(sha256_of_json([self.seed, self.scene, *name])[:13], 16) / 16**13
 
 
@@ -149,8 +149,8 @@ class TrueNodes:
     Attributes:
         nodes: all nodes by id.
         background: ids of the surroundings, which are never merged.
-        partner: for each node, the sibling with which it shares the longest border over all views; a
-            systematic merge joins the two. Nodes without an adjacent sibling are absent.
+        partner: maps each node to the sibling with which it shares the longest border over all views; a
+            systematic merge joins these two. Nodes without an adjacent sibling are absent.
     """
 
     nodes: tuple[AnnotatedNode, ...]
@@ -175,7 +175,7 @@ class TrueNodes:
 
 
 def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borders:
-    """Return the common borders of sibling nodes of one level, without the surroundings."""
+    """Return the common borders of sibling nodes at one level, without the surroundings."""
     borders: Borders = defaultdict(lambda: defaultdict(int))
     for first, second in ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:])):
         differ = (first != second) & (first != NONE) & (second != NONE)
@@ -190,7 +190,7 @@ def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borde
 
 
 def longest_border(around: Mapping[int, int]) -> int:
-    """Return the neighbour with the longest border, or the lower id on a tie."""
+    """Return the neighbour with the longest border; the lower id wins ties."""
     return min(around, key=lambda other: (-around[other], other))
 
 
@@ -200,8 +200,8 @@ def merged_groups(
     """Group the nodes of one level into the masks of a view; `ids` and each group are in ascending order.
 
     With probability `merge`, a node is merged with the sibling with which it shares the longest border in
-    the view. A node drawn for a systematic merge is merged with its `partner` in `systematic_share` of the
-    views in which the two are adjacent.
+    the view. A node selected for a systematic merge is merged with its `partner` in `systematic_share` of
+    the views in which the two are adjacent.
     """
     if not ids:
         return []
@@ -220,7 +220,7 @@ def merged_groups(
 
 
 def systematic(fault: str, node: int, view: str, draws: Draws, settings: PerturbSettings) -> bool:
-    """Return whether a systematic fault ("merge" or "missing") of a node happens in a view."""
+    """Return whether a node's systematic fault ("merge" or "missing") occurs in a view."""
     probability = getattr(settings, f"systematic_{fault}")
     return (
         draws.chance(f"systematic {fault}", node) < probability
@@ -231,7 +231,7 @@ def systematic(fault: str, node: int, view: str, draws: Draws, settings: Perturb
 def cut_in_two(
     mask: Bool[np.ndarray, "H W"], generator: np.random.Generator
 ) -> tuple[Bool[np.ndarray, "H W"], ...]:
-    """Cut a mask along a line that leaves 30 to 70 % on either side, or return it if it is too small."""
+    """Cut a mask along a line that leaves 30 to 70 % on either side; a mask too small to cut is unchanged."""
     angle, share = generator.uniform(0, np.pi), generator.uniform(0.3, 0.7)
     y, x = np.nonzero(mask)
     along = x * np.cos(angle) + y * np.sin(angle)
@@ -254,7 +254,7 @@ def displaced(
     A pixel is inside the new mask if its signed distance to the boundary (positive inside, half a pixel next
     to it) exceeds `amplitude_px` times a random field of unit variance. The field is a sum of plane waves, so
     it depends only on the position: with the same generator, a larger amplitude changes all pixels that a
-    smaller one changes, and more.
+    smaller amplitude changes, and more.
 
     The boundary moves inwards by at most half the distance to the innermost pixel, so thin regions become
     thinner but do not vanish. Image borders are not boundaries.
@@ -288,7 +288,7 @@ def displaced(
 
 
 def _distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Return each inside pixel's distance to the nearest outside pixel, between centres, px; 0 outside."""
+    """Return the distance of inside pixels to the nearest outside pixel, between centres, px; 0 outside."""
     return cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
@@ -311,19 +311,19 @@ def faulty_masks(
 
     1. Dropped views, missing levels.
     2. Merges: a group of nodes becomes one mask (`merged_groups`).
-    3. Missing masks: the draw of a group's lowest node or a systematic fault of any of its nodes drops it.
+    3. Missing masks: a group is dropped by its lowest node's draw, or by any node's systematic fault.
     4. Splits (`cut_in_two`), then boundaries (`displaced`). Each mask is changed separately, so masks may
        then overlap or leave gaps.
     5. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
 
     `predicted_iou` is the mask's best IoU with the true region of one of its nodes, plus noise. `stability`
-    is the mean of that IoU and 1, plus noise. Both are clipped to [0, 1]. A systematic merge thus lowers the
-    scores as much as any other merge; a wrong level does not lower them. SAM's thresholds and suppressions
-    are not applied: the masks are written exactly as specified.
+    is the mean of that IoU and 1, plus noise. Both scores are clipped to [0, 1]. A systematic merge thus
+    lowers the scores as much as any other merge; a wrong level does not lower them. SAM's thresholds and
+    suppressions are not applied: the masks are written exactly as specified.
 
     Args:
         labels: node id per level and pixel, -1 for none.
-        min_area_px: smaller true regions give no mask.
+        min_area_px: minimum area of a true region with a mask.
 
     Returns:
         The masks in `content_order`, and the number of faults of each kind.
@@ -374,7 +374,7 @@ def faulty_masks(
 def _visible(
     of_level: Int32[np.ndarray, "H W"], truth: TrueNodes, settings: PerturbSettings, min_area_px: int
 ) -> list[int]:
-    """Return the nodes of a level that are large enough in a view for a mask, in ascending order."""
+    """Return the nodes of a level that are large enough for a mask in a view, in ascending order."""
     areas = zip(*np.unique(of_level, return_counts=True), strict=True)
     ids = [int(node) for node, area_px in areas if node != NONE and area_px >= min_area_px]
     return [node for node in ids if settings.background or node not in truth.background]
@@ -383,7 +383,7 @@ def _visible(
 def _scores(
     quality: float, draws: Draws, settings: PerturbSettings, name: tuple[str | int, ...]
 ) -> tuple[float, float]:
-    """Return predicted IoU and stability of a mask whose true IoU is `quality`."""
+    """Return the predicted IoU and stability of a mask whose true IoU is `quality`."""
     predicted, stability = quality, (1 + quality) / 2
     if settings.score_noise:
         noise = settings.score_noise * draws.generator("scores", *name).standard_normal(2)

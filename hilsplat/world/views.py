@@ -8,7 +8,7 @@ from jaxtyping import Float
 from hilsplat.scene.cameras import Camera, Cameras
 
 Sight = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
-"""Position of a camera, and the point that it looks at."""
+"""Position of a camera, and the point at which it looks."""
 
 
 def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
@@ -30,7 +30,7 @@ def pinhole(image_px: int, fov_deg: float | int) -> Float[np.ndarray, "3 3"]:
 
 
 def on_sphere(azimuth_deg: float, elevation_deg: float, distance: float) -> Float[np.ndarray, " 3"]:
-    """Return the point at a distance from the origin in a direction."""
+    """Return the point at the given distance and direction from the origin."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     return distance * np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]

@@ -106,7 +106,7 @@ def lantern(b: Builder) -> None:
     base.subpart("knob, wick wheel", "plastic", disc(0.075, 0, 0.16, 20, 0.02).moved(r * 0.92, 0, 0.085))
     profile = [(r * 0.62, low), (r * 0.8, low + h * 0.35), (r * 0.8, low + h * 0.6), (r * 0.6, low + h)]
     lamp = b.part("glass, globe, window", glass, lathe(profile))
-    # The flame is on each side of the glass, because the inside of an opaque globe is never visible.
+    # Each side of the glass shows a flame, because the inside of an opaque globe is never visible.
     flame = lathe([(0, -0.02), (0.085, 0.06), (0.06, 0.14), (0, 0.25)]).scaled(0.3, 1, 1)
     flame = flame.moved(r * 0.8, 0, low + h * 0.28)
     lamp.subpart("flame, light", glow, *[flame.turned("z", a) for a in (45, 135, 225, 315)])

@@ -1,4 +1,4 @@
-"""Construction of an object of the synthetic world as a true tree of whole, parts and subparts."""
+"""Construction of a synthetic object as a ground-truth tree of whole, parts and subparts."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
 """Signs of x and y, for legs and wheels."""
 
 _SHADES = (1.0, 0.85, 1.15, 0.72, 1.3, 0.6, 1.45, 0.5, 1.6)
-_TOUCH = 0.03  # maximum gap between touching boxes, as a share of the object's size
+_TOUCH = 0.03  # maximum gap between touching boxes, relative to the object's size
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class ModelNode:
 
     Attributes:
         level: 1 whole, 2 part, 3 subpart.
-        parent: row of the node one level up in the object, -1 for the whole.
+        parent: row of the parent node in the object, -1 for the whole.
         text: canonical query for the node, such as "bear head"; `synonyms` are equivalent.
-        colour: word for its prevailing colour.
+        colour: word for the node's prevailing colour.
     """
 
     level: int
@@ -49,10 +49,10 @@ class ObjectModel:
     """One object in its own frame, with its lowest point at z = 0 and its front towards +x.
 
     Attributes:
-        nodes: its tree; row 0 is the whole.
+        nodes: tree of the object; row 0 is the whole.
         triangles: corner positions; `normals` are the shading normals at the corners.
-        node_ids: rows in `nodes` of each triangle (whole, part, subpart; -1 none).
-        material_ids: rows of `materials`.
+        node_ids: rows in `nodes` for each triangle (whole, part, subpart; -1: none).
+        material_ids: row in `materials` for each triangle.
         materials: shader parameters (`Paint.row`).
     """
 
@@ -69,8 +69,8 @@ class Node(NamedTuple):
     """A node of an unfinished object.
 
     Attributes:
-        word: its name without the object's.
-        at: preposition before its parent, as in "knob on the kettle lid".
+        word: name of the node without the object's name.
+        at: preposition before the parent, as in "knob on the kettle lid".
     """
 
     builder: "Builder"
@@ -97,7 +97,7 @@ class Builder:
     """Nodes and meshes of one object while it is being drawn.
 
     Args:
-        names: class and its aliases, separated by ", ".
+        names: class and aliases, separated by ", ".
     """
 
     def __init__(self, names: str, rng: np.random.Generator) -> None:
@@ -123,9 +123,9 @@ class Builder:
         """Add a part and return it.
 
         Args:
-            names: the part's name without the object's, and its aliases, separated by ", ".
-            paint: paint of the meshes; a string draws a new one (`PaintBox.draw`).
-            meshes: its shape, if it has one besides those of its subparts.
+            names: the part's name without the object's name, and aliases, separated by ", ".
+            paint: paint of the meshes; a string draws a new paint (`PaintBox.draw`).
+            meshes: shape of the part itself, if any, without its subparts.
         """
         return self.added(2, 0, names).put(paint, *meshes)
 
@@ -140,7 +140,7 @@ class Builder:
         self.pieces = [(row, mesh.turned("z", degrees), paint) for row, mesh, paint in self.pieces]
 
     def build(self) -> ObjectModel:
-        """Return the object with its lowest point at z = 0 and contrast between parts that touch."""
+        """Return the object, with its lowest point at z = 0 and contrast between touching parts."""
         triples = []
         for node in self.nodes:
             part, subpart = {1: (NONE, NONE), 2: (node.row, NONE), 3: (node.parent, node.row)}[node.level]
@@ -166,11 +166,11 @@ class Builder:
         )
 
     def _contrasted(self) -> list[tuple[int, Mesh, Paint]]:
-        """Return the pieces, with parts and subparts repainted that look too similar to a neighbour.
+        """Return the pieces; parts and subparts that look too similar to a neighbour are repainted.
 
-        Nodes of the same name (four legs) form a group with a common look. Groups are processed in order of
-        creation. The main paint of each is replaced by a shade of itself, or by another colour if no shade
-        is sufficient, so that it differs from its parent and from earlier neighbours.
+        Nodes with the same name (four legs) form a group with a common look. Groups are processed in order of
+        creation. Each group's main paint is replaced by a shade of itself, or by another colour if no shade
+        suffices, so that the group differs from its parent and from earlier neighbours.
         """
         groups: dict[tuple[int, str, str], list[int]] = {}
         surface: dict[int, dict[Paint, float]] = defaultdict(lambda: defaultdict(float))
@@ -211,7 +211,7 @@ class Builder:
         return [(row, mesh, repaint.get((row, paint), paint)) for row, mesh, paint in self.pieces]
 
     def _described(self, node: Node, area: dict[Paint, float]) -> ModelNode:
-        """Return a node with its texts: the canonical name, then aliases, relations and attributes."""
+        """Return a node with its texts: canonical name, then aliases, relations and attributes."""
         whole = self.nodes[0]
         text, others = whole.word, list(whole.aliases)
         if node.level > 1:
@@ -239,26 +239,26 @@ def _surface(mesh: Mesh) -> float:
 
 
 def _touch(first: np.ndarray, second: np.ndarray, reach: float) -> bool:
-    """Return whether two boxes (lowest and highest corner) are nearer than `reach` on every axis."""
+    """Return whether two boxes (lowest and highest corner) are less than `reach` apart on every axis."""
     return bool((np.maximum(first[0], second[0]) - np.minimum(first[1], second[1]) < reach).all())
 
 
 def _distinct(paint: Paint, rivals: list[tuple[Paint, float]]) -> Paint:
-    """Return the paint with the smallest change that meets the minimum distance to every rival."""
+    """Return the least changed version of a paint that has the minimum distance to every rival."""
 
     def short(candidate: Paint) -> float:
-        """Return the largest shortfall of a candidate's distance to a rival, 0 if there is none."""
+        """Return the largest shortfall in a candidate's distance to a rival; 0 without a shortfall."""
         return max([0.0, *(minimum - difference(candidate, rival) for rival, minimum in rivals)])
 
     shades = [paint if factor == 1 else paint.shaded(factor) for factor in _SHADES]
     allowed = paint.choices or tuple(COLOURS)
     tried = [shade for shade in shades if shade.colour in allowed]
     tried += [paint.recoloured(word) for word in allowed if word != paint.colour]
-    return min(tried or [paint], key=short)  # on a tie the first, which is the smallest change
+    return min(tried or [paint], key=short)  # the first, which is the smallest change, wins ties
 
 
 def _prevailing(sizes: list[tuple[Word, float]], share: float) -> tuple[Word, bool]:
-    """Return the word for most of a surface, and whether it covers at least a share of the surface."""
+    """Return the word for most of a surface, and whether it covers at least `share` of the surface."""
     per_word: dict[Word, float] = defaultdict(float)
     for word, size in sizes:
         per_word[word] += size

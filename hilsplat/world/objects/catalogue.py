@@ -9,7 +9,7 @@ from hilsplat.world.objects import belongings, furniture, household, kitchen, st
 from hilsplat.world.objects.builder import Builder, ObjectModel
 
 GENERATOR_VERSION = 2
-"""Incremented whenever a seed gives a different scene or different texts; small models must be trained on
+"""Incremented whenever a seed yields a different scene or different texts; small models must be trained with
 the same version."""
 
 CLASSES: dict[str, dict[str, tuple[str, Callable[[Builder], None]]]] = {
@@ -95,7 +95,7 @@ CLASSES: dict[str, dict[str, tuple[str, Callable[[Builder], None]]]] = {
         "fence": ("railing, picket fence", street.fence),
     },
 }
-"""Object classes by kind of scene and name. Each has aliases, and a function that adds its parts, subparts
+"""Object classes by kind of scene and name. Each class has aliases, and a function that adds parts, subparts
 and meshes to a builder, with random sizes and paints."""
 
 TABLETOP = tuple(CLASSES["tabletop"])
@@ -105,7 +105,7 @@ ROOM_THINGS: tuple[str, ...] = (
     *("mug", "kettle", "bottle", "cake", "fruit basket", "toaster"),
     *("radio", "camera", "backpack", "lantern", "plant", "cactus", "clock"),
 )
-"""Tabletop classes that are placed on furniture in a room; small chairs and cabinets are excluded."""
+"""Tabletop classes placed on furniture in a room; small chairs and cabinets are excluded."""
 
 
 def build_object(kind: str, name: str, rng: np.random.Generator) -> ObjectModel:
@@ -113,7 +113,7 @@ def build_object(kind: str, name: str, rng: np.random.Generator) -> ObjectModel:
 
     Args:
         kind: kind of scene whose classes include the object.
-        name: its class, one of `CLASSES[kind]`.
+        name: class of the object, one of `CLASSES[kind]`.
 
     Raises:
         SceneError: if there is no such class.

@@ -23,7 +23,7 @@ from hilsplat.world.shapes import (
 
 
 def _legs(b: Builder, x: float, y: float, top: float, paints: list[Paint], width: float) -> None:
-    """Add four square legs at (+-x, +-y), each with a foot, in the paints of leg and foot."""
+    """Add four square legs at (+-x, +-y), each with a foot; `paints` are those of leg and foot."""
     foot_height = max(0.05, 0.22 * top)
     shape = box((width, width, top - foot_height), (0, 0, (top + foot_height) / 2), 0.008)
     foot = box((width * 1.3, width * 1.3, foot_height), (0, 0, foot_height / 2), 0.01)
@@ -33,7 +33,7 @@ def _legs(b: Builder, x: float, y: float, top: float, paints: list[Paint], width
 
 
 def _pillow(size: tuple[float, float, float]) -> Mesh:
-    """Return a soft pillow about the origin: a bevelled box and a bulge."""
+    """Return a soft pillow centred at the origin: a bevelled box and a bulge."""
     x, y, z = size
     return joined(box(size, bevel=0.42 * min(size)), ellipsoid((0.44 * x, 0.44 * y, 0.62 * z)))
 
@@ -334,7 +334,7 @@ def bookshelf(b: Builder) -> None:
 
 
 def _book_row(b: Builder, depth: float, width: float, bottom: float, clear: float) -> None:
-    """Add a row of books that fills part of a shelf from one side; the last book leans slightly."""
+    """Add a row of books that fills part of a shelf from one end; the last book leans slightly."""
     books = b.part("books, row of books")
     end = width / 2 - 0.06 - (b.between(0.1, 0.35) if b.chance(0.7) else 0.0)
     y, mirror = -width / 2 + 0.055, -1 if b.chance(0.5) else 1

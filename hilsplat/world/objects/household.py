@@ -297,7 +297,7 @@ def toaster(b: Builder) -> None:
     shape = roller(0.125, 0, 0.07, 24, 0.015).moved(0, -end + 0.01, h * 0.5)
     dial = b.part("dial, timer, browning knob", "metal", shape)
     dial.subpart("pointer, mark", "plastic", box((0.085, 0.06, 0.25), (0, -end - 0.07, h * 0.5), 0.015))
-    b.turn(35)  # so that lever and side are visible from the front
+    b.turn(35)  # so that the lever and one side are visible from the front
 
 
 def headphones(b: Builder) -> None:
@@ -318,4 +318,4 @@ def headphones(b: Builder) -> None:
         cup.subpart("pad, ear cushion", pad, ring(0.145, 0.075, (0, side * (r - 0.08), z - 0.18), "y"))
         shape = roller(0.125, -0.025, 0.025, 24, 0.01).moved(0, side * (r + 0.12), z - 0.18)
         cup.subpart("cap, logo plate", metal, shape)
-    b.turn(b.between(35, 60))  # so that both cups show their outside or inside to the front
+    b.turn(b.between(35, 60))  # so that each cup's outside or inside is visible from the front

@@ -1,4 +1,4 @@
-"""Full-size objects of a street and their paints, in metres. Fronts face +x; the base is at z = 0."""
+"""Full-size street objects and their paints. Lengths are metres; fronts face +x; the base is at z = 0."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ FOLIAGE = {
     "green": ((0.2, 0.46, 0.14), (0.42, 0.62, 0.22)),
     "orange": ((0.78, 0.42, 0.12), (0.88, 0.62, 0.22)),
 }
-"""sRGB of leaves, in shade and in light, by colour word."""
+"""sRGB of leaves in shade and in light, by colour word."""
 
 
 def _faded(colour: Colour, factor: float) -> Colour:
@@ -46,13 +46,13 @@ def _faded(colour: Colour, factor: float) -> Colour:
 
 
 def lacquer(b: Builder, colours: str) -> Paint:
-    """Return a glossy paint in one of the colours, as on vehicles."""
+    """Return a glossy vehicle paint in one of the colours."""
     paint = b.paint(f"plain {colours}")
     return replace(paint, second=_faded(paint.first, 0.86), specular=0.4, shininess=50.0)
 
 
 def glass(b: Builder) -> Paint:
-    """Return dark, glossy, slightly cloudy glass, so that a window pane has some visible detail."""
+    """Return dark, glossy glass, slightly cloudy so that a window pane has some visible detail."""
     paint = b.paint("plain black")
     paint = replace(paint, first=(0.15, 0.19, 0.26), second=(0.36, 0.45, 0.55), scale=7.0)
     paint = replace(paint, specular=0.6, shininess=60.0, choices=("black", "grey", "blue", "teal"))
@@ -65,7 +65,7 @@ def rubber(b: Builder) -> Paint:
 
 
 def lit(paint: Paint) -> Paint:
-    """Return the paint as self-luminous, because the shader does not shade a paint without shininess."""
+    """Make a paint self-luminous: the shader does not shade a paint without shininess."""
     return replace(paint, specular=0.0, shininess=0.0)
 
 
@@ -210,7 +210,7 @@ DEPTH = 6.0
 
 
 def _wall(b: Builder, avoid: str = "") -> Paint:
-    """Return the paint of a brick or stained wall, not of the colour to avoid."""
+    """Return the paint of a brick or stained wall, in a colour other than `avoid`."""
     if b.chance(0.35):
         colours = [word for word in ("red", "brown", "beige", "orange", "grey") if word != avoid]
         return b.paint(f"brick {' '.join(colours)}", scale=1.9)
@@ -221,7 +221,7 @@ def _wall(b: Builder, avoid: str = "") -> Paint:
 
 
 def _block(w: float, bottom: float, top: float, out: float = 0.0) -> Mesh:
-    """Return a storey of the house whose front projects beyond x = 0 by `out`."""
+    """Return a storey of a house; its front projects beyond x = 0 by `out`."""
     return box((DEPTH + out, w, top - bottom), ((out - DEPTH) / 2, 0, (bottom + top) / 2))
 
 
@@ -313,7 +313,7 @@ def _upper_floors(
 
 
 def _roof(b: Builder, w: float, eaves: float) -> None:
-    """Add a gabled roof with its ridge along the street, or a flat one with a parapet."""
+    """Add a gabled roof with its ridge along the street, or a flat roof with a parapet."""
     roof = b.part("roof")
     tiles = b.paint("brick red brown orange grey black", scale=1.7)
     chimney, dormer = roof.subpart("chimney"), roof.subpart("dormer window, skylight")
@@ -403,7 +403,7 @@ def car(b: Builder) -> None:
 
 
 def _contrasting(b: Builder, paint: Paint) -> Paint:
-    """Return a paint that contrasts with another."""
+    """Return a paint that contrasts with the given paint."""
     return lacquer(b, "red blue green purple" if sum(paint.first) > 1.5 else "white yellow beige")
 
 
@@ -452,7 +452,7 @@ def bus(b: Builder) -> None:
     for side in (-1, 1):
         for i in range(bays):
             x = -half + 0.75 + (i + 0.5) * pitch
-            if side == -1 and i in (2, bays - 1):  # the doors are on the kerb's side
+            if side == -1 and i in (2, bays - 1):  # the doors are on the kerb side
                 door.put(second, box((1.0, 0.09, 1.9), (x, -w / 2, low + 1.05), 0.02))
             else:
                 windows.put(pane, box((0.86 * pitch, 0.07, 0.9), (x, side * w / 2, belt + 0.52), 0.02))

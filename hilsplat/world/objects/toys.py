@@ -368,7 +368,7 @@ def sailboat(b: Builder) -> None:
     length, beam = b.between(0.95, 1.1), b.between(0.36, 0.42)
 
     def section(x: float, lower: float, upper: float, low: float, high: float) -> list[Point]:
-        """Return a cross-section with the given half widths at its lower and upper edge."""
+        """Return a cross-section with the given half widths at its lower and upper edges."""
         return [(x, -lower, low), (x, lower, low), (x, upper, high), (x, -upper, high)]
 
     stations = [(-0.5, 0.78, 0.07, 0.32), (-0.2, 1.0, 0.0, 0.3), (0.18, 0.86, 0.0, 0.31)]
@@ -406,7 +406,7 @@ def sailboat(b: Builder) -> None:
     jib = b.part("jib, front sail", "cloth", shape)
     shape = roller(0.115, -0.035, 0.035, 20).moved(mast_x + 0.05 + foot * 0.28, 0, low - 0.1 + tall * 0.3)
     jib.subpart("emblem, badge", "plain", shape)
-    b.turn(55)  # so that the sails are broad from the front
+    b.turn(55)  # so that the sails look broad from the front
 
 
 def airplane(b: Builder) -> None:
@@ -428,7 +428,7 @@ def airplane(b: Builder) -> None:
     span = b.between(0.5, 0.58)
 
     def wing_part(side: int, low: Number, high: Number, grow: float) -> Mesh:
-        """Return a part of a wing, between two shares of its span."""
+        """Return a part of a wing, between two fractions of the span."""
         sections = []
         for share in (low, high):
             chord, thick = 0.34 - 0.12 * share, 0.032 * grow + 0.012

@@ -1,4 +1,4 @@
-"""Placement of furniture along the walls of a room, without collisions and clear of the camera path."""
+"""Placement of furniture along a room's walls, without collisions and clear of the camera path."""
 
 from dataclasses import dataclass
 
@@ -8,10 +8,10 @@ from jaxtyping import Float
 from hilsplat.world.shapes import rotation_about
 
 WALL_GAP = 0.03
-"""Distance between furniture and wall, where the skirting fits, m."""
+"""Distance between furniture and wall, m, which leaves space for the skirting."""
 PIECE_GAP = 0.05
 PATH_GAP = 0.28
-"""Minimum horizontal distance of the camera path from objects taller than `PATH_LOW`, m."""
+"""Minimum horizontal distance between the camera path and objects taller than `PATH_LOW`, m."""
 PATH_LOW = 1.16
 """Height well below all cameras, m; objects up to this height may be under the camera path."""
 TRIES = 120
@@ -34,14 +34,14 @@ class Room:
         return self.depth if wall % 2 == 0 else self.width
 
     def at_wall(self, wall: int, along: float, away: float) -> Float[np.ndarray, " 2"]:
-        """Return the point `away` from a wall into the room and `along` it from its middle, m."""
+        """Return the point `away` from a wall into the room, and `along` the wall from its middle, m."""
         half = self.width / 2 if wall % 2 == 0 else self.depth / 2
         return rotation_about("z", 90.0 * wall)[:2, :2] @ np.array([away - half, along])
 
 
 @dataclass(frozen=True)
 class Space:
-    """Lowest and highest corner of an axis-aligned box of occupied space, m."""
+    """Axis-aligned box of occupied space, given by its lowest and highest corners, m."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -52,7 +52,7 @@ class Space:
         return Space(tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist()))
 
     def meets(self, other: "Space", gap: float) -> bool:
-        """Return whether two boxes are nearer than `gap` in x and y and overlap in z."""
+        """Return whether two boxes are less than `gap` apart in x and y, and overlap in z."""
         sides = all(self.low[a] < other.high[a] + gap and other.low[a] < self.high[a] + gap for a in range(2))
         return sides and self.low[2] < other.high[2] and other.low[2] < self.high[2]
 
@@ -62,13 +62,13 @@ class Space:
         return any(self.low[a] < -half[a] or self.high[a] > half[a] for a in range(2))
 
     def distance_xy(self, points: Float[np.ndarray, "N 2"]) -> float:
-        """Return the minimum horizontal distance of the points from the box."""
+        """Return the minimum horizontal distance between the points and the box."""
         low, high = np.array(self.low[:2]), np.array(self.high[:2])
         return float(np.linalg.norm(np.maximum(0, np.maximum(low - points, points - high)), axis=1).min())
 
 
 class FloorPlan:
-    """Occupied space of a room while it is being furnished."""
+    """Occupied space of a room that is being furnished."""
 
     def __init__(self, room: Room, path: Float[np.ndarray, "N 2"]) -> None:
         self.room, self.path = room, path
@@ -99,12 +99,12 @@ class FloorPlan:
 
         Args:
             size: depth, width and height of the object in its own frame, m.
-            base_z: height of its lowest point, m.
-            clear: depth that must be free in front of it, m; it is not occupied.
+            base_z: height of the object's lowest point, m.
+            clear: depth that must be free in front of the object, m; this space is not occupied.
             gap: distance from the wall, m.
 
         Returns:
-            The object's yaw in degrees, and its centre in x and y; None if no place is found.
+            The object's yaw in degrees and its centre in x and y; None if no place is found.
         """
         for _ in range(TRIES):
             wall = int(rng.choice((0, 1, 2, 3)))

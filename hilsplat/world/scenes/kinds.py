@@ -1,4 +1,4 @@
-"""Kinds of synthetic scene, with the functions that build and view them."""
+"""Kinds of synthetic scene, with functions that build the scenes and choose their cameras."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,10 +16,10 @@ class SceneKind(NamedTuple):
     """One kind of scene.
 
     Attributes:
-        build: builds a scene, (seed, objects).
-        sights: returns cameras and their field of view in degrees, (scene, views, arc_deg). The cameras are
-            jittered by the scene's seed, and close enough for structure from motion.
-        training_sight: draws a random camera for training and its field of view, (scene, rng).
+        build: builds a scene from (seed, objects).
+        sights: returns cameras and their field of view in degrees for (scene, views, arc_deg). The cameras
+            are jittered by the scene's seed, and close enough for structure from motion.
+        training_sight: draws a random training camera and its field of view for (scene, rng).
     """
 
     build: Callable[[int, int], WorldScene]
@@ -32,13 +32,13 @@ KINDS: dict[str, SceneKind] = {
     "room": SceneKind(room.build_room, room.loop_sights, room.training_sight),
     "street": SceneKind(street.build_street, street.drive_sights, street.training_sight),
 }
-"""Scene kinds by their name in the scene sheet."""
+"""Scene kinds by name in the scene sheet."""
 
 
 def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
-    """Build a scene with a number of objects; on a street, of vehicles and people.
+    """Build a scene with a number of objects (on a street, vehicles and people).
 
-    The same seed and number give the same scene.
+    The same seed and number always yield the same scene.
 
     Raises:
         SceneError: if the kind is unknown or a number is out of range.

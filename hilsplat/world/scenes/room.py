@@ -19,19 +19,19 @@ from hilsplat.world.views import Sight, arc_azimuths
 logger = logging.getLogger(__name__)
 
 FURNITURE_SHARE = 0.65
-"""Share of furniture among the requested objects; the others are small objects on it ("things")."""
+"""Share of furniture among the requested objects; the others are small objects on furniture ("things")."""
 PATTERN_FACTOR = 2.0
-"""Factor on the pattern frequency of things, which are drawn about 0.5 m large and placed at half that."""
+"""Factor on the pattern frequency of things, which are drawn about 0.5 m large and placed at half size."""
 
 
 class Piece(NamedTuple):
     """Placement of a class of furniture.
 
     Attributes:
-        name: its class.
-        above: height kept free above it for the things on it, m.
-        clear: depth kept free in front of it, m.
-        partners: classes placed with it if they fit, and where ("before", "beside", "on").
+        name: class of the piece.
+        above: height kept free above the piece for things on it, m.
+        clear: depth kept free in front of the piece, m.
+        partners: classes placed with the piece if they fit, and where ("before", "beside", "on").
     """
 
     name: str
@@ -50,38 +50,38 @@ LARGE: tuple[Piece, ...] = (
     Piece("refrigerator", 0.0, 0.4),
     Piece("cabinet", 0.45, 0.3),
 )
-"""Pieces placed at a wall, drawn in random order; none repeats before all have been drawn."""
+"""Pieces placed at a wall, drawn in random order; no piece repeats before all have been drawn."""
 
 SUPPORTS = ("table", "desk", "cabinet", "nightstand", "counter", "tv stand")
-"""Furniture that can carry things, on its part or subpart "top"."""
+"""Furniture that can carry things, on the part or subpart "top"."""
 
 THING_SIZES: dict[str, tuple[float, float]] = {
     "mug": (0.15, 0.2), "kettle": (0.24, 0.3), "bottle": (0.3, 0.36), "cake": (0.22, 0.28),
     "fruit basket": (0.22, 0.28), "toaster": (0.2, 0.26), "radio": (0.22, 0.28), "camera": (0.18, 0.24),
     "lantern": (0.3, 0.36), "clock": (0.26, 0.32), "backpack": (0.4, 0.46), "plant": (0.42, 0.55),
 }  # fmt: skip
-"""Heights of some things, m; slightly oversized, so that their subparts are visible across a room."""
+"""Heights of some things, m; slightly oversized, so that subparts are visible across a room."""
 TOY_SIZE = (0.34, 0.44)
 """Heights of all other things, m."""
 MAX_THING_RADIUS = 0.21
 EDGE = 0.03
-"""Minimum distance of things from the edge of their support, and from the wall behind a counter, m."""
+"""Minimum distance between things and the edge of their support, or the wall behind a counter, m."""
 MAX_FLAT = 0.05
 """Maximum height above a board of a flat item that can itself carry things, m."""
 
 WALL_PALE, FLOOR_PALE, CEILING_PALE = 0.6, 0.4, 0.2
-"""Shares of grey in the colours of walls, floor and ceiling, so that the objects stand out."""
+"""Shares of grey mixed into the colours of walls, floor and ceiling, so that objects stand out."""
 
 FOV_DEG = 62.0
 EYE_HEIGHTS = (1.34, 1.7)
-"""Alternating heights of the cameras, m; the difference adds parallax that the loop alone lacks."""
+"""Alternating camera heights, m; the difference adds parallax that the loop alone lacks."""
 PATH_SHARE = 0.27
 """Semi-axes of the camera loop, as shares of the room's width and depth."""
 LOOK_AT_Z = 0.78
 
 
 class _Furnishing:
-    """A room while it is being furnished: the scene so far, occupied space, and supports for things."""
+    """A room that is being furnished: the scene so far, occupied space, and supports for things."""
 
     def __init__(self, seed: int, rng: np.random.Generator, plan: FloorPlan) -> None:
         self.rng, self.plan = rng, plan
@@ -110,9 +110,9 @@ class Support(NamedTuple):
     """Top of a piece of furniture.
 
     Attributes:
-        top: the space of its board.
-        flat: spaces of flat items on it, such as a table runner.
-        stand: centre and radius of the footprints already on it.
+        top: space of the board.
+        flat: spaces of flat items on the board, such as a table runner.
+        stand: centres and radii of the footprints already on the board.
     """
 
     top: Space
@@ -120,14 +120,14 @@ class Support(NamedTuple):
     stand: list[tuple[np.ndarray, float]]
 
     def height_at(self, spot: np.ndarray, radius: float) -> float:
-        """Return the base height of a thing with this footprint: the board or the highest flat item below."""
+        """Return the base height for a footprint: that of the board or the highest flat item below it."""
         reach = np.array([radius, radius])
         below = Space((*(spot - reach).tolist(), -1.0), (*(spot + reach).tolist(), 1e3))
         return max([self.top.high[2], *(space.high[2] for space in self.flat if space.meets(below, 0.0))])
 
 
 def _support(model: ObjectModel, triangles: np.ndarray) -> Support:
-    """Return the support that the top of an object added as `triangles` provides."""
+    """Return the support provided by the top of an object that was added as `triangles`."""
     node = next(row for row, found in enumerate(model.nodes) if found.text == f"{model.name} top")
     own = model.node_ids[:, model.nodes[node].level - 1] == node
     board = own & (model.node_ids[:, 2] == NONE) if model.nodes[node].level == 2 else own
@@ -146,11 +146,11 @@ def size_of(model: ObjectModel) -> Float[np.ndarray, " 3"]:
 
 
 def build_room(seed: int, objects: int) -> WorldScene:
-    """Build a room of about 4 x 5 m with furniture at its walls, in metres, with its floor at z = 0.
+    """Build a room of about 4 x 5 m, in metres, with furniture at the walls and the floor at z = 0.
 
     Every room has a door, a window with a curtain, and two pictures (or a picture and a mirror). About two
-    thirds of `objects` are furniture; the others are things on it, or on the floor if no support is free.
-    Objects that do not fit are omitted, and the camera loop stays free.
+    thirds of `objects` are furniture; the others are things on furniture, or on the floor if no support is
+    free. Objects that do not fit are omitted, and the camera loop stays free.
     """
     rng = np.random.default_rng([seed, 21])
     room = Room(float(rng.uniform(4.4, 5.0)), float(rng.uniform(3.8, 4.3)), 2.55)
@@ -196,11 +196,11 @@ def _add_fixtures(work: _Furnishing) -> None:
 
 
 def _furnish(work: _Furnishing, count: int) -> int:
-    """Place large pieces with their partners at the walls, and a table in the middle; return their number."""
+    """Place large pieces and partners at the walls, and a table in the middle; return the number placed."""
     done, failures = 0, 0
     queue: list[Piece] = []
     with_rug = count >= 4 and bool(work.rng.random() < 0.5)
-    # The table is placed last, in the space that is left; lamp and stool need a minimum number of pieces.
+    # The table is placed last, in the remaining space; lamp and stool need a minimum number of pieces.
     extras = [(5, "lamp"), (7, "stool")]
     table_at = count - 1 - with_rug if count >= 3 else count
     while done < count and failures < 2 * len(LARGE):
@@ -242,11 +242,11 @@ def _put_at_wall(work: _Furnishing, piece: Piece, base_z: float = 0.0, gap: floa
 
 
 ON_TOP: dict[str, float] = {"television": -0.03, "monitor": -0.12, "sink": 0.0}
-"""Offset of a partner towards the front of its support, from the support's middle, m."""
+"""Offset of a partner from the middle of its support towards the front, m."""
 
 
 def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bool:
-    """Place a partner of a piece before it, beside it or on it; return whether it fits."""
+    """Place a partner before, beside or on its owner; return whether it fits."""
     model = work.assembly.draw(name)
     size = size_of(model)
     owner = work.placed[owner_row]
@@ -276,7 +276,7 @@ def _put_partner(work: _Furnishing, owner_row: int, name: str, where: str) -> bo
 
 
 def _put_table(work: _Furnishing, with_rug: bool) -> int:
-    """Place a table near the middle of the room, optionally on a rug; return the number of pieces."""
+    """Place a table near the middle of the room, optionally on a rug; return the number of pieces placed."""
     model, rug = work.assembly.draw("table"), work.assembly.draw("rug")
     size = size_of(rug) if with_rug else size_of(model)
     base_z = float(size_of(rug)[2]) if with_rug else 0.0
@@ -293,7 +293,7 @@ def _put_table(work: _Furnishing, with_rug: bool) -> int:
 
 
 def _hang_pictures(work: _Furnishing) -> int:
-    """Hang a picture, and another or a mirror, on free wall space at eye height; return their number."""
+    """Hang a picture, and a second picture or a mirror, at eye height; return the number hung."""
     names = ("picture", str(work.rng.choice(["picture", "mirror"])))
     pieces = [Piece(name, 0.0, 0.25) for name in names]
     return sum(_put_at_wall(work, piece, float(work.rng.uniform(1.28, 1.4)), gap=0.0) for piece in pieces)
@@ -308,7 +308,7 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
     scale = min(target / height, MAX_THING_RADIUS / radius)
     radius *= scale
     pattern = model.materials.copy()
-    pattern[:, 7] *= PATTERN_FACTOR  # cells of the texture per metre, see Paint.row
+    pattern[:, 7] *= PATTERN_FACTOR  # texture cells per metre, see Paint.row
     model = replace(model, materials=pattern)
     found = _thing_spot(work, radius, height * scale)
     if found is None:
@@ -316,13 +316,13 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
         return False
     spot, base_z = found
     yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + work.rng.uniform(-50, 50))
-    # The footprint is a circle that rotates about its centre, so any yaw keeps it in place.
+    # The footprint is a circle that rotates about its centre, so the yaw does not move it.
     work.put(model, spot, yaw, base_z, scale)
     return True
 
 
 def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.ndarray, float] | None:
-    """Return x, y and base height on the emptiest support with a free place, else on the floor at a wall."""
+    """Return a spot and base height on the emptiest support with free space, else on the floor at a wall."""
     for support in sorted(work.supports, key=lambda each: (len(each.stand), work.rng.random())):
         low = np.array(support.top.low[:2]) + radius + EDGE
         high = np.array(support.top.high[:2]) - radius - EDGE
@@ -339,7 +339,7 @@ def _thing_spot(work: _Furnishing, radius: float, height: float) -> tuple[np.nda
 
 
 def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None:
-    """Add floor, walls with skirting and ceiling, textured for structure from motion."""
+    """Add floor, walls with skirting, and ceiling, textured for structure from motion."""
     paints = PaintBox(rng)
     w, d, h = room.width, room.depth, room.height
     group = str(rng.choice(["wood", "wood", "stone", "collage", "cloth"]))
@@ -362,7 +362,7 @@ def _add_shell(assembly: Assembly, room: Room, rng: np.random.Generator) -> None
 
 
 def _plane(x: float, y: float) -> Mesh:
-    """Return a rectangle about the origin that faces up."""
+    """Return a rectangle that is centred at the origin and faces up."""
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]) / 2
     triangles = corners[[[0, 1, 2], [0, 2, 3]]]
     return Mesh(triangles, np.broadcast_to([0.0, 0.0, 1.0], triangles.shape).copy())
@@ -371,7 +371,7 @@ def _plane(x: float, y: float) -> Mesh:
 def _style(room: Room, rng: np.random.Generator) -> Style:
     """Draw the light of a closed room: a wide ceiling lamp and strong ambient light.
 
-    The lamp does not light the ceiling, which would be overexposed around it.
+    The lamp does not light the ceiling, which would be overexposed around the lamp.
     """
     warm = rng.uniform(-1, 1)
     place = rng.uniform(-0.4, 0.4, 2)
@@ -385,7 +385,7 @@ def _style(room: Room, rng: np.random.Generator) -> Style:
 
 
 def path_points(room: Room, azimuths_deg: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 2"]:
-    """Return x and y of points on the camera loop, an ellipse about the middle of the room."""
+    """Return points (x, y) on the camera loop, an ellipse about the middle of the room."""
     angle = np.radians(azimuths_deg)
     axes = PATH_SHARE * np.array([room.width, room.depth])
     return np.stack([np.cos(angle), np.sin(angle)], axis=1) * axes
@@ -398,10 +398,10 @@ def room_of(scene: WorldScene) -> Room:
 
 
 def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:
-    """Return cameras on a loop through the room that look across its middle from two alternating heights.
+    """Return cameras on a loop through the room, looking across its middle from two alternating heights.
 
-    The views show the far wall with everything in front of it, and the middle from all sides. A camera that
-    rotates in place and looks outwards would give no parallax.
+    The views show the far wall with everything in front of it, and the middle from all sides. Views of a
+    camera that rotates in place would have no parallax.
     """
     rng = np.random.default_rng([scene.seed, 25])
     spots = path_points(room_of(scene), arc_azimuths(views, arc_deg) + rng.uniform(-1, 1, views))
@@ -413,7 +413,7 @@ def loop_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[li
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a camera for training: a third of the draws as in `loop_sights`, the others near one object.
+    """Draw a training camera: a third are similar to those of `loop_sights`, the others near one object.
 
     The position is inside the room and outside all objects.
     """
@@ -433,7 +433,7 @@ def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, 
 def _free_centre(
     scene: WorldScene, room: Room, target: np.ndarray, size: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return a position outside all objects from which an object of this size fills much of a view."""
+    """Return a position, outside all objects, from which an object of this size fills much of a view."""
     things = [scene.triangles[scene.node_ids[:, 0] == thing.node] for thing in scene.placed]
     boxes = [(corners.min(axis=(0, 1)), corners.max(axis=(0, 1))) for corners in things]
     half = np.array([room.width, room.depth]) / 2 - 0.2
@@ -445,6 +445,6 @@ def _free_centre(
             ((centre < low - 0.12) | (centre > high + 0.12)).any() for low, high in boxes
         ):
             return centre
-    # Near an object enclosed by furniture, only the loop is certain to be free.
+    # No free position near the object was found; the loop is always free.
     spot = path_points(room, np.array([rng.uniform(0, 360)]))[0]
     return np.array([*spot, rng.uniform(1.3, 1.75)])

@@ -23,12 +23,12 @@ class Style:
     Attributes:
         light_position: centre of the round area light, scene units.
         light_radius: radius of the light, scene units.
-        light_colour: linear RGB of its light on a surface that faces it.
+        light_colour: linear RGB of the area light on a surface that faces it.
         sky_colour: linear RGB of the light from above.
         ground_colour: linear RGB of the light from below.
         exposure: factor on all reflected light.
-        scale: size of the scene relative to a tabletop (1 for a table, 4 for a street), which scales
-            grain, occlusion distance and ray jitter.
+        scale: size of the scene relative to a tabletop (1 for a table, 4 for a street); scales grain,
+            occlusion distance and ray jitter.
         shadow_reach: maximum distance of shadow casters, scene units; keeps the sky dome from hiding the sun.
     """
 
@@ -61,13 +61,13 @@ class PlacedObject:
     """Class and position of a placed object.
 
     Attributes:
-        name: its class.
-        node: id of its whole in the scene.
-        centre_xy: centre of its footprint, scene units.
-        footprint: radius of the circle that encloses it in the x-y plane, scene units.
-        height: scene units.
-        yaw_deg: rotation about the vertical axis; its front faces +x at 0.
-        base_z: height of the surface under it, scene units.
+        name: class of the object.
+        node: id of the object's whole in the scene.
+        centre_xy: centre of the footprint, scene units.
+        footprint: radius of the enclosing circle in the x-y plane, scene units.
+        height: height of the object, scene units.
+        yaw_deg: rotation about the vertical axis; the front faces +x at 0.
+        base_z: height of the surface under the object, scene units.
     """
 
     name: str
@@ -84,16 +84,16 @@ class WorldScene:
     """A scene as triangles with their nodes. z is up.
 
     Attributes:
-        seed: with the number of objects, determines everything random in the scene.
+        seed: determines, with the number of objects, everything random in the scene.
         asked: number of requested objects.
         triangles: corner positions, scene units.
         normals: shading normals at the corners.
-        coords: object coordinates of the corners, scene units; solid textures are evaluated at them.
-        node_ids: nodes of each triangle (whole, part, subpart; -1 none).
-        material_ids: row of `materials` of each triangle.
+        coords: object coordinates of the corners, scene units, at which solid textures are evaluated.
+        node_ids: nodes of each triangle (whole, part, subpart; -1: none).
+        material_ids: row in `materials` for each triangle.
         materials: shader parameters (`Paint.row`).
-        nodes: all nodes by id. Those of the surroundings (table, floor, wall) are wholes without parts.
-        background: ids of the surroundings. They are labelled but never scored, because large, easy regions
+        nodes: all nodes by id. The surroundings (table, floor, wall) are wholes without parts.
+        background: ids of the surroundings, which are labelled but never scored, because large, easy regions
             would raise every mean.
         style: light of this scene.
     """
@@ -114,7 +114,7 @@ class WorldScene:
 
     @cached_property
     def caster(self) -> RayCaster:
-        """Ray caster over the triangles; built on first use."""
+        """Ray caster for the triangles, built on first use."""
         return RayCaster(self.triangles)
 
 
@@ -136,9 +136,9 @@ class Assembly:
         self.background: list[int] = []
 
     def draw(self, name: str, kind: str | None = None) -> ObjectModel:
-        """Draw the next object of a class of this kind of scene, or of another kind.
+        """Draw the next object, of a class from this kind of scene or from `kind`.
 
-        Its look depends on the seed and the number of objects drawn before.
+        The object's appearance depends on the seed and the number of objects drawn before.
         """
         self.drawn += 1
         return build_object(kind or self.kind, name, np.random.default_rng([self.seed, 22, self.drawn]))
@@ -186,7 +186,7 @@ class Assembly:
 
 
 def footprint_of(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, " 2"], float]:
-    """Return centre and radius of a circle that encloses the triangles in the x-y plane."""
+    """Return the centre and radius of a circle that encloses the triangles in the x-y plane."""
     points = triangles.reshape(-1, 3)[:, :2]
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre, float(np.linalg.norm(points - centre, axis=1).max())

@@ -20,7 +20,7 @@ from hilsplat.world.views import Sight, on_sphere
 logger = logging.getLogger(__name__)
 
 COUNTED = ("car", "pedestrian", "heavy", "cyclist", "car", "pedestrian", "car")
-"""Mix of the requested vehicles and people; "heavy" is a truck or a bus."""
+"""Mix of the requested vehicles and people; "heavy" means a truck or a bus."""
 FURNITURE = (
     "traffic light", "traffic sign", "tree", "street lamp", "tree", "bush", "fence", "tree", "traffic sign",
     "bush", "street lamp", "tree", "fence", "bush",
@@ -29,18 +29,18 @@ FURNITURE = (
 STREET_X = (-26.0, 42.0)
 """Extent of the rows of buildings, m; other buildings close both ends of the street."""
 THINGS_X = (-9.0, 25.0)
-"""Extent of vehicles, people and furniture, m, in view of the drive."""
+"""Extent of vehicles, people and street furniture, m; all are in view during the drive."""
 GAP = 0.12
 TRIES = 200
 
 LANE = 3.2
 KERB = 5.7
-"""Half the width of the road, m: a lane and a parking strip."""
+"""Half the width of the road, m: one lane and one parking strip."""
 FRONT = 8.7
-"""Distance of the house fronts from the middle of the road, m."""
+"""Distance between the house fronts and the middle of the road, m."""
 WALK_Z = 0.14
 SCALE = 4.0
-"""`Style.scale`: textures and occlusion distance are four times as large as on a table."""
+"""Value of `Style.scale`: textures and occlusion distance are four times as large as on a table."""
 ROAD_X = (-34.0, 50.0)
 DOME_RADIUS = 115.0
 DOME_HEIGHT = 62.0
@@ -57,9 +57,9 @@ SWEEP_VIEWS = 16
 SWEEP_DEG = 36.0
 """Amplitude of the sweep to either side of straight ahead."""
 SWAY_M = 0.8
-"""Lateral amplitude of the camera about the lane's middle in one sweep. Without it, the error of structure
-from motion was 2.5 m instead of 0.04 m: views that rotate on a straight path share little parallax, so the
-two sides of the street were reconstructed at different scales."""
+"""Lateral amplitude of the camera about the lane's middle in one sweep. Without this sway, the error of
+structure from motion was 2.5 m instead of 0.04 m: views that rotate on a straight path have little parallax,
+so the two sides of the street were reconstructed at different scales."""
 FOV_DEG = 62.0
 SUN_DISTANCE = 1000.0
 
@@ -76,13 +76,13 @@ class _Spot(NamedTuple):
 def part_boxes(
     triangles: Float[np.ndarray, "F 3 3"], parts: np.ndarray
 ) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, "P 3"]]:
-    """Return the lowest and highest corner of the box around each part of an object."""
+    """Return the lowest and highest corners of the boxes around an object's parts."""
     pieces = [triangles[parts == part].reshape(-1, 3) for part in np.unique(parts)]
     return np.stack([p.min(axis=0) for p in pieces]), np.stack([p.max(axis=0) for p in pieces])
 
 
 class _Street:
-    """A street while it is being filled."""
+    """A street under construction."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng([seed, 21])
@@ -90,7 +90,7 @@ class _Street:
         self.low, self.high = np.zeros((0, 3)), np.zeros((0, 3))  # boxes around the parts placed so far
 
     def put(self, model: ObjectModel, spot: _Spot) -> PlacedObject | None:
-        """Place an object at a spot and return it, or return None if it would intersect another."""
+        """Place an object at a spot and return it, or return None if it would intersect another object."""
         turned = model.triangles @ rotation_about("z", spot.yaw_deg).T + np.array([spot.x, spot.y, spot.z])
         low, high = part_boxes(turned, model.node_ids[:, 1])
         apart = (low[:, None] - GAP > self.high) | (high[:, None] + GAP < self.low)
@@ -104,7 +104,7 @@ class _Street:
         return PlacedObject(model.name, node, xy, radius, height, spot.yaw_deg, spot.z)
 
     def try_spots(self, name: str, spot: Callable[[ObjectModel], _Spot]) -> PlacedObject | None:
-        """Place an object at the first free one of `TRIES` random spots, or return None."""
+        """Place an object at the first free spot among `TRIES` random spots, or return None."""
         model = self.assembly.draw(name)
         for _ in range(TRIES):
             placed = self.put(model, spot(model))
@@ -113,7 +113,7 @@ class _Street:
         return None
 
     def vehicle_spot(self, model: ObjectModel) -> _Spot:
-        """Draw a spot parked at either kerb, oncoming, or ahead in the driver's lane."""
+        """Draw a spot: parked at either kerb, oncoming, or ahead in the driver's lane."""
         rng, width = self.rng, float(np.ptp(model.triangles[..., 1]))
         half = float(np.ptp(model.triangles[..., 0])) / 2
         x = float(rng.uniform(THINGS_X[0] + half, THINGS_X[1] - half))
@@ -136,7 +136,7 @@ class _Street:
         return _Spot(float(rng.uniform(2, 20)), -LANE - 0.3, 0.0, float(rng.uniform(-8, 8)))
 
     def pedestrian_spot(self, model: ObjectModel) -> _Spot:
-        """Draw a spot on a sidewalk, facing roughly along it."""
+        """Draw a spot on a sidewalk, facing roughly along the sidewalk."""
         rng = self.rng
         side = -1 if rng.random() < 0.6 else 1
         yaw = float(rng.choice([0.0, 180.0]) + rng.uniform(-35, 35))
@@ -162,8 +162,8 @@ def build_street(seed: int, objects: int) -> WorldScene:
     """Build a stretch of street with houses, street furniture, and `objects` vehicles and people.
 
     Vehicles are in the lanes or parked at the kerbs, people on the sidewalks, and trees, lamps, signs and
-    fences beside the kerb. The boxes around the parts of one object intersect no box of another; objects that
-    do not fit are omitted; about 16 vehicles and people fit. `placed` lists only these.
+    fences beside the kerb. The part boxes of different objects do not intersect; objects that do not fit are
+    omitted. About 16 vehicles and people fit; `placed` lists only vehicles and people.
     """
     street = _Street(seed)
     rng = street.rng
@@ -198,7 +198,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
 
 
 def _add_buildings(street: _Street) -> int:
-    """Add rows of houses on both sides and across both ends; return their number."""
+    """Add rows of houses on both sides and across both ends; return the number of houses."""
     rng, count = street.rng, 0
     for side in (-1, 1):
         x = STREET_X[0] + float(rng.uniform(0, 2))
@@ -220,7 +220,7 @@ def _add_buildings(street: _Street) -> int:
 def _add_ground(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add the surroundings as wholes without parts.
 
-    Their texts are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
+    The texts are those of the Waymo classes (road, lane marker, curb, sidewalk, other ground).
     """
     middle, length = (ROAD_X[0] + ROAD_X[1]) / 2, ROAD_X[1] - ROAD_X[0]
     tar, pale = float(rng.uniform(0.34, 0.44)), rng.uniform(0.02, 0.06, 3)
@@ -266,7 +266,7 @@ def _patches(rng: np.random.Generator) -> Mesh:
 
 
 def _markings() -> Mesh:
-    """Return lane dashes, lines and ticks of the parking strips, a zebra crossing and a stop line."""
+    """Return lane dashes, lines and ticks for parking strips, a zebra crossing and a stop line."""
     pieces = []
 
     def mark(x0: float, x1: float, y0: float, y1: float) -> None:
@@ -290,7 +290,7 @@ def _markings() -> Mesh:
 
 
 def _dome(middle: float) -> Mesh:
-    """Return the sky: half an ellipsoid over the scene, near enough for its clouds to show parallax."""
+    """Return the sky: half an ellipsoid over the scene, so near that clouds show parallax."""
     angle = np.linspace(-0.02, np.pi / 2, 15)
     profile = [(max(0.0, float(np.cos(a))), float(np.sin(a))) for a in angle]
     profile[-1] = (0.0, 1.0)
@@ -298,7 +298,7 @@ def _dome(middle: float) -> Mesh:
 
 
 def _daylight(rng: np.random.Generator) -> Style:
-    """Draw sun and sky; the sun is far away, so that its light is nearly constant along the street."""
+    """Draw sun and sky; the sun is distant, so that its light is nearly constant along the street."""
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38, 62))
     warm = rng.uniform(0, 1)
     toward = np.array(
@@ -318,7 +318,7 @@ def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[l
     """Return the cameras of a drive along the street, for the global mapper (see `docs/world.md`).
 
     The camera moves along its lane and sways, while its yaw sweeps between the two sides of the street in
-    steps of 9 degrees. Fewer views shorten the drive rather than increase the steps. `arc_deg` is unused,
+    steps of 9 degrees. With fewer views, the drive is shorter and the steps do not grow. `arc_deg` is unused,
     because a drive is not a ring.
     """
     rng, pitch_rng = np.random.default_rng([scene.seed, 25]), np.random.default_rng([scene.seed, 26])
@@ -336,7 +336,7 @@ def drive_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[l
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a camera for training: a view from the road, or a close-up of a visible object."""
+    """Draw a training camera: a view from the road, or a close-up of a visible object."""
     fov_deg = float(rng.uniform(56, 66))
     sight = _close_up(scene, rng) if rng.random() < 0.5 else None
     if sight is None:
@@ -347,7 +347,7 @@ def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, 
 
 
 def _close_up(scene: WorldScene, rng: np.random.Generator) -> Sight | None:
-    """Return a camera on the road side of a random unoccluded object, or None if none is found."""
+    """Return a camera on the road side of a random unoccluded object, or None if no object qualifies."""
     wholes = sorted(set(np.unique(scene.node_ids[:, 0]).tolist()) - scene.background)
     for _ in range(30):
         node = wholes[int(rng.integers(len(wholes)))]

@@ -20,7 +20,7 @@ ROOM_HALF = 3.0
 FLOOR_Z = -0.75
 WALL_HEIGHT = 3.4
 COVERED_SHARE = 0.58
-"""Share of the table top covered by the objects' footprints if all are placed."""
+"""Share of the table top that the objects' footprints cover if all objects are placed."""
 MAX_FOOTPRINT = 0.36
 MAX_HEIGHT_TO_FOOTPRINT = 2.7
 GAP = 0.015
@@ -33,14 +33,14 @@ DISTANCE = 2.15 * TABLE_RADIUS
 LOOK_AT_Z = 0.16
 TRIES = 150
 LAYOUTS = 25
-"""Maximum number of layouts tried; the first that fits all objects is used, otherwise the fullest."""
+"""Maximum number of layouts tried; the first layout that fits all objects is used, else the fullest."""
 
 
 def build_tabletop(seed: int, objects: int) -> WorldScene:
     """Build a scene of objects on a table whose top is z = 0.
 
-    The more objects are requested, the smaller each is. No class repeats before all have been used. Each
-    object is placed at random without overlap of footprints; objects that do not fit are omitted.
+    The more objects are requested, the smaller they are. No class repeats before all have been used. Objects
+    are placed at random without overlapping footprints; objects that do not fit are omitted.
     """
     rng = np.random.default_rng([seed, 1])
     assembly = Assembly("tabletop", seed)
@@ -72,9 +72,9 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
 
 
 def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarray, " 2"] | None]:
-    """Return random places on the table for footprints, given largest first; None for omitted ones.
+    """Return random places on the table for footprints, given largest first; None for omitted objects.
 
-    Each place is redrawn until its footprint overlaps no earlier one, at most `TRIES` times.
+    Each place is redrawn, at most `TRIES` times, until its footprint overlaps no earlier footprint.
     """
     best: list[np.ndarray | None] = []
     most = -1
@@ -82,7 +82,7 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
         spots: list[np.ndarray | None] = []
         taken: list[tuple[np.ndarray, float]] = []
         for radius in radii:
-            reach = TABLE_RADIUS - 0.6 * radius  # objects may overhang the edge a little, as real ones do
+            reach = TABLE_RADIUS - 0.6 * radius  # objects may overhang the edge slightly, as in reality
             spots.append(None)
             for _ in range(TRIES):
                 angle, away = rng.uniform(0, 2 * np.pi), reach * np.sqrt(rng.uniform())
@@ -99,7 +99,7 @@ def _layout(rng: np.random.Generator, radii: list[float]) -> list[Float[np.ndarr
 
 
 def _add_room(assembly: Assembly, rng: np.random.Generator) -> None:
-    """Add richly textured table, floor and walls, sometimes a cloth, a rug or pictures."""
+    """Add a richly textured table, floor and walls, and sometimes a cloth, a rug or pictures."""
     paints = PaintBox(rng)
     _add_table(assembly, rng, paints)
     half = ROOM_HALF
@@ -176,7 +176,7 @@ def _add_table(assembly: Assembly, rng: np.random.Generator, paints: PaintBox) -
 
 
 def _fabric(paints: PaintBox, scale: float) -> Paint:
-    """Draw cloth with a pattern of the given scale; a weave stays fine, because a coarse one looks wavy."""
+    """Draw cloth with a pattern of the given scale; a weave stays fine, because a coarse weave looks wavy."""
     paint = paints.draw("cloth", scale=scale)
     return replace(paint, scale=paint.scale * 2.2 / scale * 0.5) if paint.kind == "weave" else paint
 
@@ -184,8 +184,8 @@ def _fabric(paints: PaintBox, scale: float) -> Paint:
 def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[list[Sight], float]:
     """Return slightly jittered cameras around the table at two alternating elevations.
 
-    Neighbours should be at most 9 degrees apart: structure from motion failed with larger steps. The arc is
-    centred on +x, where the objects' fronts tend to face.
+    Neighbouring cameras should be at most 9 degrees apart: structure from motion failed with larger steps.
+    The arc is centred on +x, the direction that most objects' fronts face.
     """
     rng = np.random.default_rng([scene.seed, 5])
     target = np.array([0.0, 0.0, LOOK_AT_Z])
@@ -201,7 +201,7 @@ def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[li
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
     """Draw a camera for training that sees the whole table or, in half of the draws, one object."""
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
-    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps sizes
+    nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps image sizes
     if scene.placed and rng.random() < 0.5:
         thing = scene.placed[int(rng.integers(len(scene.placed)))]
         target = np.array([*thing.centre_xy, thing.height * 0.45]) + rng.uniform(-0.08, 0.08, 3)
