@@ -11,7 +11,7 @@ const UNNAMED = "unnamed", NEAR_PX = 8;
 const sheet = new Sheet(), start = new URLSearchParams(location.hash.slice(1));
 let scene, number = 0, chosen = 0, next = { text: "", level: 1, parent: null };
 let draft = [], stroke = null, cross = null, offer = null, working = Promise.resolve();
-let clicks = [], frame = null, found = [], corner = null;   // of the segment tool; the corner that is being moved
+let clicks = [], frame = null, found = [], corner = null;   // of the segment tool; `corner` is the corner that is being moved
 
 function tell(text, error = false) { $("status").textContent = text; $("status").classList.toggle("error", error); }
 const store = new Store({ told: tell, changed: refresh });
@@ -20,7 +20,7 @@ const own = () => labels().find((label) => label.id === chosen) ?? null;
 const tool = () => document.querySelector("[name=tool]:checked").value;
 const radius = () => Number($("radius").value);
 // Requests run one after the other, because each region depends on the previous one.
-let waiting = 0;   // pending requests whose result may have to be saved
+let waiting = 0;   // number of pending requests whose result may have to be saved
 const soon = (work) => {
   waiting++;
   markSaved();
@@ -88,7 +88,7 @@ function setTool(name) {
 const edited = (label) => label.origin === "drawn" ? "drawn" : "edited";
 const ringsOf = (id) => labels().find((label) => label.id === id)?.polygons ?? null;
 
-// A thing has the same id in all photographs.
+// An object has the same id in all photographs.
 function idFor(thing) {
   const same = (label) => label.text.toLowerCase() === thing.text.toLowerCase() && label.level === thing.level && label.parent === thing.parent;
   for (const [id, label] of store.things) if (thing.text !== UNNAMED && same(label) && !store.has(number, id)) return id;
@@ -98,7 +98,7 @@ function idFor(thing) {
 function add(thing) {
   const label = { ...thing, id: idFor(thing) };
   chosen = label.id;
-  next = { ...next, text: "" };   // the next thing has another text
+  next = { ...next, text: "" };   // the next object has another text
   store.change([[number, [...labels(), label]]]);
   if (label.text === UNNAMED) { $("text").focus(); $("text").select(); }
 }
@@ -136,7 +136,7 @@ async function propose([x, y]) {
   $("offers").querySelector("button")?.focus();
 }
 
-// Clicks of one thing: inside, or outside with Alt; or a box.
+// Clicks on one object (outside it with Alt), or a box around it.
 async function segment() {
   if (!frame && !clicks.some(([, , inside]) => inside)) { draw(); return; }
   tell(`${scene.segments} is computing the outline…`);
@@ -171,7 +171,7 @@ function cornerAt(at) {
   return best && { ...best, rings: rings.map((ring) => ring.map((point) => [...point])) };
 }
 
-// The server computes the new outline, cut to its parent.
+// The server computes the new outline and cuts it to the parent.
 function reshape(rings) {
   const label = own(), view = number;
   soon(async () => {
@@ -182,7 +182,7 @@ function reshape(rings) {
   });
 }
 
-// Pressing on a side adds a corner there.
+// Pressing on a side of the outline adds a corner there.
 function sideAt(at) {
   const rings = own()?.polygons ?? [];
   let best = null, least = NEAR_PX;
@@ -214,7 +214,7 @@ async function carry() {
 
 // -- things ----------------------------------------------------------------------------------------
 
-// The text, level and parent of a thing change in all photographs.
+// A change of an object's text, level or parent applies to all photographs.
 function edit(patch) {
   if (!own()) { Object.assign(next, patch); refresh(); return; }
   const id = chosen, after = [];

@@ -1,4 +1,4 @@
-// Requests to the server. Each names the state of the scene that this page was loaded with; the server refuses any other state.
+// Requests to the server. Each contains the scene state with which this page was loaded; the server refuses any other state.
 
 import { $ } from "./elements.js";
 import { get, send } from "./http.js";
@@ -20,7 +20,7 @@ export const photoUrl = (number) => at(`/api/photo/${number}`);
 export const thumbUrl = (number) => at(`/api/thumb/${number}`);
 export const exportUrl = (kind) => at(`/api/export/${kind}`);
 
-// Check regularly whether files of the scene changed; the page keeps showing its state until a reload.
+// Check regularly whether files of the scene changed; the page keeps its loaded state until a reload.
 export async function watch() {
   while ($("changed").hidden) {
     await new Promise((done) => setTimeout(done, POLL_MS));

@@ -4,7 +4,7 @@ import { photoUrl } from "./api.js";
 import { $ } from "./elements.js";
 import { colourOf } from "./styles.js";
 
-const MOST_CORNERS = 600;   // corners of outlines with more are not drawn: they are too close together
+const MOST_CORNERS = 600;   // outlines with more corners are drawn without corners, which would be too close together
 const NS = "http://www.w3.org/2000/svg";
 export const colour = (id) => `rgb(${colourOf(id).join(" ")})`;
 
@@ -65,13 +65,13 @@ export class Sheet {
 
   inside(at) { return at.map((value, k) => Math.max(0, Math.min(this.size[k] - 1, Math.floor(value)))); }
 
-  // The things, which change rarely.
+  // Draw the objects, which change rarely.
   things(labels, chosen) {
     $("outlines").replaceChildren(...[...labels].sort((a, b) => a.level - b.level).map((label) => element("path", { d: outline(label.polygons), "data-id": label.id,
       class: `thing ${label.origin === "proposed" ? "proposed" : ""} ${label.id === chosen ? "chosen" : ""}`, fill: colour(label.id), stroke: colour(label.id) })));
   }
 
-  // The shape being drawn, at most once per frame.
+  // Draw the unfinished shape, at most once per frame.
   hand(state) {
     if (!this.waiting) requestAnimationFrame(() => { const last = this.waiting; this.waiting = null; this.drawHand(last); });
     this.waiting = state;

@@ -1,4 +1,4 @@
-// Annotations of all photographs: each change can be undone, and is saved at once with the version that was read.
+// Annotations of all photographs. Each change can be undone, and is saved at once, with the file version that was read.
 
 import * as api from "./api.js";
 
@@ -43,7 +43,7 @@ export class Store {
   labels(number) { return this.views[number].labels; }
   has(number, id) { return this.labels(number).some((label) => label.id === id); }
 
-  // Things of all photographs by id, with the label of the first photograph that shows each.
+  // Return the objects of all photographs by id, with the label from the first photograph that shows each object.
   get things() {
     const found = new Map();
     for (const view of this.views) for (const label of view.labels) if (!found.has(label.id)) found.set(label.id, label);
@@ -60,7 +60,7 @@ export class Store {
   redo() { this.step(this.future, this.past); }
   step(from, to) { if (from.length) to.push(this.swap(from.pop().before)); }
 
-  // An entry of the history: the previous labels, and photographs whose change the server has not accepted yet.
+  // Return a history entry: the previous labels, and the photographs whose change the server has not accepted yet.
   swap(after) {
     const before = after.map(([number]) => [number, this.labels(number)]);
     for (const [number, labels] of after) { this.views[number].labels = labels; this.save(number); }
@@ -74,12 +74,12 @@ export class Store {
   }
 
   async put(number) {
-    await null;   // until the change being saved is in the history
+    await null;   // wait until the change to be saved is in the history
     const view = this.views[number], sent = view.labels, entries = [...this.past, ...this.future];
     try {
       const kept = await api.save(number, sent, view.version);
       view.version = kept.version;
-      if (view.labels === sent) view.labels = kept.labels;   // cut to their parents
+      if (view.labels === sent) view.labels = kept.labels;   // the server cuts labels to their parents
       for (const entry of entries) entry.unsaved.delete(number);
     } catch (error) {
       this.handlers.told(error.message, true);
@@ -95,7 +95,7 @@ export class Store {
     const refused = this.past.splice(first), touched = new Set();
     this.future = [];
     for (const { before } of refused.reverse()) for (const [other, labels] of before) { this.views[other].labels = labels; touched.add(other); }
-    touched.delete(number);   // the server still has its previous labels
+    touched.delete(number);   // the server still has the previous labels of this photograph
     for (const other of touched) this.save(other);
   }
 }

@@ -1,4 +1,4 @@
-// The things of a photograph as a tree widget, the form of the chosen one, and the strip of photographs.
+// The objects of a photograph as a tree widget, the form of the chosen object, and the strip of photographs.
 
 import { thumbUrl } from "./api.js";
 import { $, counted, LEVELS, make } from "./elements.js";
@@ -44,7 +44,7 @@ export function attachThings(choose) {
 export const level = () => Number(document.querySelector("[name=level]:checked").value);
 export const setLevel = (value) => { document.querySelector(`[name=level][value="${value}"]`).checked = true; };
 
-// The form shows the chosen thing, or the settings of the next one.
+// Show the chosen object in the form, or the settings of the next object.
 export function fillForm(labels, label, next) {
   const own = label ?? next;
   $("title").textContent = label ? `${label.text}, ${LEVEL(label)}${label.origin === "proposed" ? ": proposed" : ""}` : "New thing";

@@ -5,11 +5,11 @@ import { $, counted, make, nameOf } from "./elements.js";
 import { picture } from "./pictures.js";
 import { shownHits } from "./styles.js";
 
-// beside: {outline, answer, by} of the right side, or undefined.
+// beside: {outline, answer, by} of the right pane, or undefined.
 export function showAnswers(outline, answer, acts, beside) {
   const theirs = beside?.answer?.hits ?? [], own = answer?.hits ?? [], sameTree = beside?.outline?.tree === outline?.tree;
   $("answers-section").hidden = !own.length && !theirs.length;
-  const caution = (answer ?? outline)?.caution ?? "";   // answers by name or by similarity have none
+  const caution = (answer ?? outline)?.caution ?? "";   // answers by name or by similarity have no caution
   $("caution").hidden = !caution;
   $("caution").textContent = caution;
   const only = (hit, others) => sameTree && !others.some((other) => other.node === hit.node);
@@ -21,7 +21,7 @@ export function showAnswers(outline, answer, acts, beside) {
   $("answers-beside").replaceChildren(...theirs.map((hit, rank) => item(beside.outline, hit, rank, sameTree ? acts : null, only(hit, own) ? ", only on the right" : "")));
 }
 
-// Nodes of another tree than the left side's cannot be chosen.
+// Nodes cannot be chosen if their tree differs from that of the left pane.
 function item(outline, hit, rank, acts, note) {
   const look = acts && { onclick: () => acts.choose(hit.node), onpointerenter: () => acts.hover(hit.node), onpointerleave: () => acts.hover(-1), onfocus: () => acts.hover(hit.node), onblur: () => acts.hover(-1) };
   return make("li", { "data-node": hit.node }, make("button", { type: "button", disabled: !acts, ...look },

@@ -5,7 +5,7 @@ import { get, send, streamed } from "./http.js";
 export const offline = false;
 export const texts = [], kept = [], first = "", opening = "";   // answered queries and initial camera of an exported page
 
-// Each request names the state of the scene that this page was loaded with; the server refuses any other state.
+// Each request contains the scene state with which this page was loaded; the server refuses any other state.
 let state = "";
 // In a notebook, the page is a frame on another site and gets no cookie, so its address contains the token. Paths are
 // relative, because a proxy may serve the page under any path.

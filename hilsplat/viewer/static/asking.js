@@ -30,7 +30,7 @@ async function askAll(what, work) {
   await fillField(signal);
 }
 
-// The previous answer is removed, so that it isn't mistaken for this query's.
+// Remove the previous answer, so that it isn't mistaken for the new query's answer.
 function refused(error) {
   if (error.name === "AbortError") return;
   showNothing();
@@ -76,7 +76,7 @@ export async function ask(keepChoice = false) {
   }
   const view = $("here").checked ? page.camera.view : -1;
   if ($("here").checked && view < 0) { refused(new Error("Go to a photograph first: choose one below.")); return; }
-  if (!keepChoice && page.chosen >= 0) choose(-1);   // otherwise the view is drawn only with the answer
+  if (!keepChoice && page.chosen >= 0) choose(-1);   // without a choice, the view is drawn only with the answer
   const asked = asking(text);
   await askAll({ text, query: asked }, (pane, signal) => api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...asked }, signal));
 }
@@ -112,7 +112,7 @@ export async function like(node) {
   tell(`Like ${name}: ${$("status").textContent}`);
 }
 
-// A picture, or a part of one: [x, y, width, height] in its pixels.
+// Query with a picture, or with its part [x, y, width, height], px.
 export async function askPicture(source, part = null) {
   try {
     const image = await createImageBitmap(source), [x, y, w, h] = part ?? [0, 0, image.width, image.height];

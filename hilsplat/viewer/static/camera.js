@@ -12,7 +12,7 @@ export function turned(v, k, angle) {
   return [v[0] * c + x[0] * s + k[0] * d, v[1] * c + x[1] * s + k[1] * d, v[2] * c + x[2] * s + k[2] * d];
 }
 
-const FARTHEST = 20;   // in mean distances of the photographs; the scene then covers a few pixels
+const FARTHEST = 20;   // in mean distances of the photographs; at this distance, the scene covers a few pixels
 
 export class Camera {
   constructor(scene) {
@@ -60,7 +60,7 @@ export class Camera {
     this.view = -1;
   }
 
-  // Move along the camera's axes, in shares of the distance to the target.
+  // Move along the camera's axes, by fractions of the distance to the target.
   move(x, y, z) {
     const far = norm(add(this.c, this.target, -1));
     for (const [axis, by] of [[0, x], [1, y], [2, z]]) {
@@ -70,7 +70,7 @@ export class Camera {
     this.view = -1;
   }
 
-  // Return a camera that shows a ball of this diameter around a point, from the same side.
+  // Return a camera that shows a ball of the given diameter around a point, from the same side.
   lookingAt(point, size) {
     const next = this.copy(), { fx, fy, w, h } = this.lens;
     const back = Math.max(size * (0.5 + Math.max(fx / w, fy / h)), 0.02 * this.reach);   // the front of the ball is nearer than its centre
@@ -80,7 +80,7 @@ export class Camera {
     return next;
   }
 
-  tidy() {   // rounding: keep the axes orthogonal
+  tidy() {   // keep the axes orthogonal in spite of rounding
     this.R[2] = unit(this.R[2]);
     this.R[0] = unit(add(this.R[0], this.R[2], -dot(this.R[0], this.R[2])));
     this.R[1] = cross(this.R[2], this.R[0]);
@@ -91,7 +91,7 @@ export class Camera {
     return Object.assign(next, this, { R: this.R.map((r) => r.slice()), c: this.c.slice(), target: this.target.slice(), lens: { ...this.lens } });
   }
 
-  // Interpolate between two cameras, t in [0, 1]; the mixed axes are made orthogonal.
+  // Interpolate between two cameras, t in [0, 1]; the interpolated axes are made orthogonal.
   between(to, t) {
     const next = to.copy(), mix = (a, b) => a.map((v, k) => v + t * (b[k] - v));
     next.c = mix(this.c, to.c);

@@ -17,7 +17,7 @@ export function choose(node) {
   page.hover = -1;
   markChosen(node);
   if (main()) showCard(main(), node, page.scene.unit === "metre" ? " m" : "", acts);
-  page.outline.select(node);   // after the card, which makes the outline smaller
+  page.outline.select(node);   // after showing the card, because the card makes the outline smaller
   restyle();
 }
 
@@ -38,7 +38,7 @@ const exactPick = async (at, y) => {
 };
 export const quickPick = (at, y) => page.painter.nodesAt(variantOf(panes[at.k]), page.painter.gaussianAt(page.camera, painted()[at.k], at.x, y, at.width, at.height));
 
-// A click chooses the whole; a click on the chosen node goes one level down, and from the finest back to the whole.
+// A click chooses the whole; clicking the chosen node chooses one level down, or the whole again after the finest level.
 function deeper(nodes) {
   const fixed = LEVELS.indexOf(level());
   if (fixed >= 0) return [...nodes.slice(0, fixed + 1)].reverse().find((node) => node >= 0) ?? -1;
@@ -80,7 +80,7 @@ async function rename(node, name) {
     for (const pane of panes) for (const hit of pane.answer?.hits ?? []) if (hit.node === node) hit.name = name;
     page.outline.renamed(node);
     tell(name ? `Named “${name}”. Queries match this name, here and with hilsplat query.` : "The name was removed.");
-    choose(node);   // after the message, which makes the outline smaller
+    choose(node);   // after showing the message, because it makes the outline smaller
     acts.list();
   } catch (error) {
     if (error.status === 412) { await loadVariant(own.variant, true); page.outline.show(main()); choose(node); tell("The names were changed elsewhere and have been reloaded. Name the node again.", true); } else failed(error);

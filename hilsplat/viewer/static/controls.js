@@ -1,5 +1,5 @@
 // Mouse, touch and wheel: drag orbits, two fingers or the right button move, wheel and pinch zoom, a tap picks,
-// and a frame drawn with Alt held is a query with its content.
+// and a frame drawn with Alt held queries with the content of the frame.
 
 const TAP_PX = 4;
 

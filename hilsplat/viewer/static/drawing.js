@@ -74,7 +74,7 @@ export function drawn() {
   remember();
 }
 
-// A new query is an entry in the browser's history, so Back returns to the previous one.
+// A new query is an entry in the browser's history, so Back returns to the previous query.
 let remembering = 0, remembered = null;
 export const rememberedAs = (text) => { remembered = text; };
 function remember() {

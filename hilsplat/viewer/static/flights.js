@@ -39,7 +39,7 @@ export function stand(number) {
 export const flyTo = (node) => {
   if (node < 0 || !main()) return;
   const { corners, size } = main().nodes[node], middle = [0, 1, 2].map((axis) => corners.reduce((sum, corner) => sum + corner[axis], 0) / corners.length);
-  page.hover = -1;   // after the flight, the pointer is over something else
+  page.hover = -1;   // after the flight, the pointer is over another node
   restyle();
   goTo(page.camera.lookingAt(middle, Math.hypot(...size)));
 };

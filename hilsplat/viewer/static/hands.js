@@ -14,7 +14,7 @@ import { save } from "./saves.js";
 import { failed, host, main, page, panes, start, tell, variantOf } from "./state.js";
 import { choosePanes } from "./variants.js";
 
-// The path of a film: its views, in the order in which they were added.
+// The path of a film: views in the order in which they were added.
 function showPath() {
   const count = page.path.length, flies = $("path").querySelector("[value=path]");
   flies.disabled = count < 2;

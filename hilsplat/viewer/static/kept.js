@@ -17,7 +17,7 @@ async function answered(query) {
   for (const pane of panes) query.answers.push(await api.query({ variant: variantOf(pane), answerer: answererOf(pane), ...query.asked }));
 }
 
-// The colour that the fewest kept queries use.
+// Return the colour used by the fewest kept queries.
 function freeColour() {
   const used = KEPT.map((_, k) => page.kept.filter((query) => query.colour === k).length);
   return used.indexOf(Math.min(...used));
@@ -38,14 +38,14 @@ export async function keepFromStart() {
   for (const asked of kept) if (asked?.text) await keep(asked);
 }
 
-// After a change of answerer or tree, all kept queries are sent again.
+// Send all kept queries again after a change of answerer or tree.
 export async function askKeptAgain() {
   if (!page.kept.length) return;
   for (const query of page.kept) await answered(query);
   showKept();
 }
 
-// The nodes of all shown queries, for saved files.
+// Return the nodes of all shown queries, for saved files.
 export function groups() {
   const found = keptIn(0).map(({ answer, text }) => ({ name: text, nodes: answer.hits.map((hit) => hit.node) }));
   const answer = panes[0].answer;
@@ -77,7 +77,7 @@ function drop(query) {
   showKept();
 }
 
-// Report nodes found by several queries, and nodes inside those of another query.
+// Report nodes found by several queries, and nodes inside another query's nodes.
 function overlaps() {
   const shown = [...keptIn(0).map(({ answer }) => answer), ...(page.kept.length && panes[0].answer ? [panes[0].answer] : [])], times = new Map();
   if (!main() || shown.length < 2) return "";

@@ -1,11 +1,11 @@
-// Keys, which are ignored during typing and don't override keys of the browser or of controls.
+// Keyboard shortcuts, which are ignored during typing and don't override keys of the browser or of controls.
 
 const STEPS_PER_MS = 0.012, EASE_MS = 70;
 const ORBITS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0] };
 const MOVES = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
-// A held key moves evenly: it adds steps over time, and each frame performs a share of the remaining ones.
+// A held key moves evenly: it adds steps over time, and each frame performs a fraction of the remaining steps.
 class Glide {
   held = new Map();
   left = { move: [0, 0, 0], orbit: [0, 0, 0] };

@@ -1,4 +1,4 @@
-// At most one request of a kind is pending; a new one replaces the one that waits.
+// Run at most one request of a kind at a time; a new request replaces the waiting request.
 export function latest(work) {
   let busy = false, waiting = null;
   return async function ask(...args) {

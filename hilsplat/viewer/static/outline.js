@@ -1,10 +1,10 @@
-// The semantic tree as a tree widget: keys as in the ARIA practices, names and crops, folded if large.
+// The semantic tree as a tree widget with names and crops; keys follow the ARIA practices, and a large tree is folded.
 
 import * as api from "./api.js";
 import { $, counted, inOrder, LEVELS, make, nameOf } from "./elements.js";
 import { picture } from "./pictures.js";
 
-const FOLD_FROM = 200;   // nodes: a larger tree is folded below its wholes
+const FOLD_FROM = 200;   // number of nodes above which a tree is folded below its wholes
 
 export class Outline {
   constructor({ choose, fly, hover }) {

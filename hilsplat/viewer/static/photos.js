@@ -1,4 +1,4 @@
-// The strip of photographs, and the photograph shown over the view if the camera has its pose.
+// The strip of photographs, and the photograph shown over the view if the camera has the photograph's pose.
 
 import * as api from "./api.js";
 import { $, make } from "./elements.js";

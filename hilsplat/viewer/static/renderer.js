@@ -31,7 +31,7 @@ export class Renderer {
     this.worker.onmessage = ({ data }) => this.ordered(data);
   }
 
-  // Gaussians arrive in chunks of whole rows of texels; received ones are drawn at once.
+  // Gaussians arrive in chunks of whole texel rows; each chunk is drawn as soon as it arrives.
   async load({ gaussians, chunk }, chunkOf, told) {
     const gl = this.gl, first = await readChunk(await chunkOf(0)), { bases, texels } = first;
     if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians exceed the texture size of this browser`);
@@ -78,7 +78,7 @@ export class Renderer {
     (this.nodeValues ??= new Map()).set(variant, values);
   }
 
-  // The field's relevancy of each Gaussian, in the spare channel.
+  // Store each Gaussian's field relevancy in the spare channel.
   loadField(variant, bytes) {
     const values = this.nodeValues.get(variant);
     for (let i = 0; i < bytes.length; i++) values[4 * i + 3] = bytes[i];
@@ -226,7 +226,7 @@ export class Renderer {
     put(this.ramp, ramp, 256, 1);
   }
 
-  // The Gaussian that a pixel of a pane shows, or -1; drawn once per camera.
+  // Return the Gaussian shown at a pixel of a pane, or -1; Gaussian numbers are drawn once per camera.
   gaussianAt(camera, pane, x, y, width, height) {
     const gl = this.gl, w = Math.max(1, Math.round(width / 2)), h = Math.max(1, Math.round(height / 2));
     if (!this.numbers || this.numbers.w !== w || this.numbers.h !== h) {

@@ -29,7 +29,7 @@ export async function save(kind, { variant, groups, style, capture, flown, kept,
   told(`Saved ${name}-${KINDS[kind]}, ${sized(blob.size)}.`);
 }
 
-// Save one file at a time, with progress and Cancel; return null if cancelled.
+// Save one file at a time, with progress and a Cancel button; return null if cancelled.
 async function inSteps(kind, asked, told) {
   const ending = new AbortController(), buttons = $("save").querySelectorAll("[data-long]"), [what, things] = IN_STEPS[kind];
   const progress = (made, of) => { Object.assign($("saving-made"), { value: made, max: of }); $("saving-told").textContent = made < of ? `${what}: ${made} of ${of} ${things}` : `${what}: finishing`; };

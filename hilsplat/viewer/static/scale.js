@@ -1,4 +1,4 @@
-// The colour bar of relevancy, and the number of Gaussians at or above the threshold.
+// The relevancy colour bar, and the number of Gaussians at or above the threshold.
 
 import { $, counted } from "./elements.js";
 import { levelIndex, main, page, panes, threshold } from "./state.js";

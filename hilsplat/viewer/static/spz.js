@@ -1,10 +1,10 @@
-// Read Gaussians in SPZ version 2. Columns become the texels that the shader reads; it unpacks the bytes.
+// Read Gaussians in SPZ version 2. Columns become texels, which the shader reads and unpacks.
 
 export async function unzipped(buffer) {
   return new Response(new Blob([buffer]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 }
 
-// A texel holds position, opacity and log scales; `texels` more hold colour, rotation and harmonics, a byte each.
+// One texel contains position, opacity and log scales; `texels` more contain colour, rotation and harmonics, a byte each.
 export async function readChunk(buffer) {
   const bytes = new Uint8Array(await unzipped(buffer)), head = new DataView(bytes.buffer);
   const count = head.getUint32(8, true), degree = bytes[12], unit = 2 ** -bytes[13], others = 3 * ((degree + 1) ** 2 - 1);

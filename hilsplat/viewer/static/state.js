@@ -1,4 +1,4 @@
-// State of the page: query, choice, camera. Everything else is derived from it.
+// State of the page (query, choice, camera), from which everything else is derived.
 
 import * as api from "./api.js";
 import { $, LEVELS } from "./elements.js";
@@ -17,7 +17,7 @@ export const level = () => document.querySelector("[name=level]:checked").value;
 // Minimum score of an answer, or null for answers near the best.
 export const threshold = () => $("threshold-on").checked ? Number($("threshold-at").value) : null;
 export const levelIndex = (answer) => Math.max(0, LEVELS.indexOf(level() === "auto" ? answer?.level ?? "whole" : level()));
-// Kept queries of a pane that are painted, with their colours.
+// Return a pane's kept queries that are painted, with their colours.
 export const keptIn = (pane) => page.kept.filter((query) => query.shown && query.answers[pane]).map((query) => ({ answer: query.answers[pane], rgb: KEPT[query.colour], text: query.asked.text }));
 export const main = () => outlines.get(variantOf(panes[0]));
 
@@ -27,7 +27,7 @@ export const failed = (error) => {
   if (error.name !== "AbortError") tell(error.message, true);
 };
 
-// Until a reload, the page shows the state that it was loaded with.
+// Until a reload, the page shows the state with which it was loaded.
 export function sceneChanged(parts = []) {
   $("changed").hidden = false;
   $("changed-what").textContent = `The scene has changed${parts.length ? ` (${parts.join(", ")})` : ""}. The page still shows the previous state.`;

@@ -1,4 +1,4 @@
-// Variants of the scene, one or two side by side, including those that appear during a run.
+// Variants of the scene, one or two side by side, including variants that appear during a run.
 
 import * as api from "./api.js";
 import { ask, listAnswers } from "./asking.js";
@@ -33,7 +33,7 @@ export async function useVariants() {
   page.waiting = false;
   await keepFromStart();
   if (text) { $("text").value = text; await ask(); }
-  const [node, tree] = (start.get("node") ?? "").split(".");   // rows of another tree are other nodes
+  const [node, tree] = (start.get("node") ?? "").split(".");   // the row is valid only in the same tree
   if (tree === main().tree && main().nodes[node]) choose(Number(node));
 }
 

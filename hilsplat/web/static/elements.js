@@ -21,5 +21,5 @@ export function nameOf(outline, node) {
   return name || (called === "?" ? `? (${numbered})` : called || numbered);
 }
 
-// Sort things before surfaces, and large before small.
+// Sort things before surfaces, and large nodes before small nodes.
 export const inOrder = (outline) => (a, b) => outline.nodes[a].surface - outline.nodes[b].surface || outline.nodes[b].gaussians - outline.nodes[a].gaussians;

@@ -1,7 +1,7 @@
 // The colours of all nodes, for both painters.
 
 export const ANSWER = [255, 122, 0], CHOSEN = [58, 150, 255], HOVER = [255, 225, 70], SHARED = [255, 255, 255];
-// Colours of kept queries; style.css has the same ones for their chips.
+// Colours of kept queries; style.css has the same colours for the query chips.
 export const KEPT = [[0, 200, 140], [235, 120, 200], [70, 215, 235], [180, 215, 50], [160, 120, 255], [235, 80, 80]];
 const STOPS = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
 
@@ -31,7 +31,7 @@ export function colourOf(node) {
   return [value(0), value(8), value(4)];
 }
 
-// Hits that are painted and boxed; for a similarity query, only the first ones, because all nodes are ranked.
+// Hits that are painted and boxed; only the first few hits for a similarity query, because all nodes are ranked.
 const PAINTED_ALIKE = 5;
 export const shownHits = (answer) => answer?.route === "like" ? answer.hits.slice(0, PAINTED_ALIKE) : answer?.hits ?? [];
 
@@ -44,7 +44,7 @@ export function styleOf({ outline, answer, colour, mode, level, chosen, hover, f
   const nodes = outline?.nodes ?? [], table = new Uint8Array(4 * (nodes.length + 1));
   const set = (node, rgb, a) => { if (node >= 0 && node < nodes.length) table.set([...rgb, Math.round(255 * a)], 4 * (node + 1)); };
   let use = [true, true, true];
-  const range = {};   // of the colours
+  const range = {};   // range of the relevancy colours
   if (colour === "field" && answer && field) return { table, use, mode: "plain", ramp: rampFrom(threshold), field, low: 0, high: 1 };
   if (colour === "nodes" || (colour === "relevancy" && answer)) {
     use = [0, 1, 2].map((each) => each === level);
