@@ -324,7 +324,7 @@ def merged(
     files: Sequence[Mapping[str, Sequence[Label]]],
     sizes_hw: Mapping[str, tuple[int, int]],
 ) -> tuple[dict[str, list[Label]], int, int]:
-    """Add the labels of files to those of a scene.
+    """Add the labels in files to the scene's labels.
 
     Ids are compared only among objects with the same text and level, because shapes without ids are numbered
     from 1 in every photograph. Among the scene's objects with the same text and level, a label is matched to

@@ -38,7 +38,7 @@ SMOOTH_PX = 1.0
 """Maximum deviation of a proposal's outline from its pixels, px; reduces the vertices to correct."""
 MOST_MASKS = 6
 LEAST_SEEN = 0.25
-"""Minimum share of a transferred object's pixel from Gaussians visible in the object's annotated views."""
+"""Minimum share of a pixel that shows Gaussians visible in annotated views, when transferring objects."""
 VIEWS_MIB = 512.0
 KEPT_VIEWS = 3
 """Number of photographs whose SAM features are cached: 4 MB each for ViT-B, up to 40 MB for SAM 2."""
@@ -168,7 +168,7 @@ class Proposals:
         return found
 
     def _members(self, shown: Sequence[tuple[str, Label]]) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether each Gaussian belongs to an object and is visible in the object's views (0 or 1)."""
+        """Return, as 0 or 1, whether each Gaussian belongs to an object, and whether its views show it."""
         assert self.gaussians is not None
         inside = np.zeros(len(self.gaussians), np.float64)
         total = np.zeros(len(self.gaussians), np.float64)

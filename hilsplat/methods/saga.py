@@ -43,7 +43,7 @@ COSINE = 0.95  # minimum average in a cluster; 0.5 doesn't separate parts and su
 
 
 def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
-    """Return twice the standard deviation of each mask's Gaussians, scene units; 0 if a mask has none."""
+    """Return twice the standard deviation of Gaussian positions in each mask, scene units; 0 if none."""
     A = contributions.matrix("A").astype(np.float64)
     means = contributions.means().astype(np.float64)
     means -= means.mean(axis=0)
@@ -52,7 +52,7 @@ def mask_scales(contributions: Contributions) -> Float64[np.ndarray, " M"]:
 
 
 def drawn_scales(scales: Float64[np.ndarray, " m"], random: np.random.Generator) -> Float64[np.ndarray, " s"]:
-    """Draw scales between adjacent mask scales of a view, plus one below and one above all of them."""
+    """Draw scales between a view's adjacent mask scales, plus one below and one above all mask scales."""
     ends = np.concatenate([[0.0], np.sort(scales), [2 * scales.max()]])
     between = 1 + random.permutation(len(scales) - 1)[:SCALES]
     chosen = np.concatenate([[0], between, [len(ends) - 2]])

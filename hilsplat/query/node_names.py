@@ -223,7 +223,7 @@ def named(
 ) -> list[dict[str, Any]]:
     """Name each node by the text nearest to its vector, if that text stands out from the others.
 
-    A whole gets a thing or surface name. A part or subpart gets a part or thing name: a laid table's plate.
+    Wholes get names of things or surfaces. Parts and subparts get names of parts or things (a table's plate).
 
     Args:
         margin: the nodes' cosine margins for the vocabulary's things, parts and surfaces, in this order.

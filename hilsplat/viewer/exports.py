@@ -25,11 +25,11 @@ from hilsplat.web.coco import coco_content, coco_region
 
 FRAMES_PER_S = 24
 STEP = {"mp4": 1, "gif": 2}
-"""Frame step of each format. A GIF uses every second frame; with all, it would be far larger than an MP4."""
+"""Frame step of each format. GIFs use every second frame; with all frames, they are far larger than MP4s."""
 CROP_PX = 160
 CROP_MARGIN = 0.15
 LEAST_ALPHA = 0.1
-"""Minimum alpha for assigning a crop's pixels to the node, which is low: enlarged Gaussians leave gaps."""
+"""Lower bound on alpha when a crop's pixels are assigned to the node; enlarged Gaussians leave gaps."""
 DIMMED, GROUND = 0.2, 110.0
 """Weight of a crop's photograph outside the node, and the grey value that it is blended with."""
 

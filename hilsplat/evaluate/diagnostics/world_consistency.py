@@ -117,7 +117,7 @@ def shared_points(
 def best_ious(
     inside_a: Bool[np.ndarray, "Ma P"], inside_b: Bool[np.ndarray, "Mb P"], min_points: int = MIN_POINTS
 ) -> Float[np.ndarray, " m"]:
-    """Return the highest IoU, in points, of each large enough mask of A with any mask of B."""
+    """Return each sufficiently large A mask's highest IoU, in points, with any mask of B."""
     large = inside_a[inside_a.sum(axis=1) >= min_points]
     return iou_matrix(large, inside_b).max(axis=1, initial=0)
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from hilsplat.base.levels import LEVELS, Level
 
 BOUNDARY_RATIO = 0.02
-"""Width of a boundary as a share of the image diagonal (Cheng et al. 2021)."""
+"""Boundary width as a fraction of the image diagonal (Cheng et al. 2021)."""
 
 
 def iou(prediction: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
@@ -27,7 +27,7 @@ def iou_matrix(
 
 
 def boundary_width_px(size_hw: tuple[int, int]) -> int:
-    """Return the width of the boundary band: a share of the diagonal, rounded half to even, at least 1 px."""
+    """Return the width of the boundary band: a fraction of the diagonal, rounded half to even, at least 1."""
     return max(1, round(BOUNDARY_RATIO * math.hypot(*size_hw)))
 
 

@@ -85,7 +85,7 @@ def run_table(
     out: Path,
     absent: Sequence[str] = (),
 ) -> None:
-    """Build one table and write it as CSV, Markdown, LaTeX and HTML; equal tables give identical files.
+    """Build one table and write it as CSV, Markdown, LaTeX and HTML; equal tables produce identical files.
 
     Args:
         published: file with the paper's values, `published_values(name)`.

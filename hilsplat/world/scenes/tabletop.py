@@ -199,7 +199,7 @@ def ring_sights(scene: WorldScene, views: int, arc_deg: float | int) -> tuple[li
 
 
 def training_sight(scene: WorldScene, rng: np.random.Generator) -> tuple[Sight, float]:
-    """Draw a camera for training that sees the whole table or, in half of the draws, one object."""
+    """Draw a training camera that shows the whole table or, in half of the draws, one object."""
     azimuth, elevation, fov_deg = rng.uniform(0, 360), rng.uniform(16, 60), rng.uniform(42, 64)
     nearer = np.tan(np.radians(FOV_DEG / 2)) / np.tan(np.radians(fov_deg / 2))  # keeps image sizes
     if scene.placed and rng.random() < 0.5:
