@@ -129,7 +129,7 @@ def shapes(shape: str) -> str:
         (shapes('{"label": "a", "points": [[1, NaN], [5, 5]]}'), "read"),
         (shapes('{"label": "a", "points": [[1, 1]], "group_id": [1]}'), "read"),
         (shapes("7"), "read"),
-        ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "does not have the size"),
+        ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "not have the size"),
         ('{"annotations": [7], "images": [], "categories": []}', "COCO"),
         ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
         ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', "file.json, object 0"),
