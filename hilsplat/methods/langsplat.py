@@ -33,7 +33,7 @@ from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
 
 # Four float32 channels of a Gaussian as one numba value, for loops over the entries of a sparse matrix.
-# `hilsplat.base.lanes` has sixteen lanes, of which codes with three channels would waste thirteen. Operations
+# `hilsplat.base.lanes` has sixteen lanes: codes with three channels would waste thirteen of them. Operations
 # are neither fused nor reordered, so results are bit-identical to plain loops over the channels.
 WIDTH = 4
 _FLOAT = ir.FloatType()

@@ -60,7 +60,7 @@ def measured_blocks(
 
     Args:
         protocols: prefixes of the protocols that have rows.
-        cells_of: computes a row's values from the scores of one seed; `over_seeds` uses all seeds at once.
+        cells_of: computes a row's values from one seed's scores; `over_seeds` uses all seeds at once.
         columns_of: returns the value columns, from the scores of a data set.
         label_of: maps protocols to labels; those with the same label share a row.
     """

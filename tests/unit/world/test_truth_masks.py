@@ -195,7 +195,7 @@ def test_a_systematic_fault_repeats_in_its_share_of_the_views(fault, level, rate
     times = found if fault == "merge" else views - found
     assert 0 < (times > 0).sum() < len(nodes)
     assert within_binomial_bounds(int((times > 0).sum()), len(nodes), rate)
-    # A pair of which both parts are drawn merges more often, never less: four deviations below 0.9.
+    # A pair whose parts are both drawn merges more often, never less: four deviations below 0.9.
     assert (times[times > 0] >= 0.9 * views - 4 * np.sqrt(views * 0.09)).all()
 
 

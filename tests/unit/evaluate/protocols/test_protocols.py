@@ -36,7 +36,7 @@ def truth_of(folder, nodes, regions):
 class HandMade:
     """Given answers: nodes, rows of `masks`, by text or path and level; relevancy maps by text.
 
-    `scene_wide` has the answers that differ when the whole scene is searched.
+    `scene_wide` contains those answers that differ if the whole scene is searched.
     """
 
     def __init__(self, masks, answers, relevancy=None):
