@@ -158,7 +158,7 @@ def blur(grey: UInt8[np.ndarray, "h w"]) -> float:
     """Return the blur of a picture, 0 to 1: the share of its gradient magnitude that another blur preserves.
 
     Crete et al., "The blur effect" (2007), with a box of 11 px; the result is the larger of the values along
-    x and y. It depends little on the content, unlike the variance of the Laplacian. A flat picture has blur 1.
+    x and y. Unlike the Laplacian's variance, it depends little on the content. A flat picture has blur 1.
     """
     values = grey.astype(np.float32)
     shares = []
