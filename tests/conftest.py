@@ -26,6 +26,9 @@ files = [path.relative_to(PROJECT).with_suffix("") for path in sources]
 checked = [name for name in map(".".join, (file.parts for file in files)) if not name.startswith(UNCHECKED)]
 install_import_hook(checked, "beartype.beartype")
 
+# Two test processes with two threads each on two cores are five times as slow.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[name] = "1"  # as in hilsplat.cli.main
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["HILSPLAT_MODELS"] = "models"  # whatever the user of this machine has fetched
 

@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -167,32 +167,31 @@ class Training:
         since = 0
         sums: dict[str, float] = {}
         progress, clock = self.progress, time.monotonic()
-        steps = prefetched(make, progress.step)
-        while not progress.is_finished:
-            if progress.decay_from < 0 and budget.is_time_to_decay(progress.step, progress.minutes):
-                if progress.step:
-                    self._save(self.constant)
-                progress.decay_from = progress.step
-                progress.decay_steps = budget.decay_steps(progress.step, progress.minutes)
-                logger.info("the learning rate decays over the last %d steps", progress.decay_steps)
-                continue
-            terms = self._step(next(steps), loss_of)
-            since += 1
-            for key, value in terms.items():
-                sums[key] = sums.get(key, 0.0) + value
-            now = time.monotonic()
-            progress.minutes, clock = progress.minutes + (now - clock) / 60, now
-            if progress.step % self.tuning.measure_every == 0 or progress.is_finished:
-                with self._averaged_weights():
-                    found = measure()
-                losses = {f"{key}_loss": value / since for key, value in sums.items()}
-                values = {"step": progress.step, "minutes": progress.minutes, **losses, **found}
-                progress.rows.append({key: float(f"{value:.5g}") for key, value in values.items()})
-                logger.info("  ".join(f"{key} {value:g}" for key, value in progress.rows[-1].items()))
-                sums, since = {}, 0
-            if progress.step % self.tuning.save_every == 0 or progress.is_finished:
-                self._save(self.now)
-        steps.close()
+        with closing(prefetched(make, progress.step)) as steps:
+            while not progress.is_finished:
+                if progress.decay_from < 0 and budget.is_time_to_decay(progress.step, progress.minutes):
+                    if progress.step:
+                        self._save(self.constant)
+                    progress.decay_from = progress.step
+                    progress.decay_steps = budget.decay_steps(progress.step, progress.minutes)
+                    logger.info("the learning rate decays over the last %d steps", progress.decay_steps)
+                    continue
+                terms = self._step(next(steps), loss_of)
+                since += 1
+                for key, value in terms.items():
+                    sums[key] = sums.get(key, 0.0) + value
+                now = time.monotonic()
+                progress.minutes, clock = progress.minutes + (now - clock) / 60, now
+                if progress.step % self.tuning.measure_every == 0 or progress.is_finished:
+                    with self._averaged_weights():
+                        found = measure()
+                    losses = {f"{key}_loss": value / since for key, value in sums.items()}
+                    values = {"step": progress.step, "minutes": progress.minutes, **losses, **found}
+                    progress.rows.append({key: float(f"{value:.5g}") for key, value in values.items()})
+                    logger.info("  ".join(f"{key} {value:g}" for key, value in progress.rows[-1].items()))
+                    sums, since = {}, 0
+                if progress.step % self.tuning.save_every == 0 or progress.is_finished:
+                    self._save(self.now)
         self._load_averages()
         return progress.rows
 

@@ -17,10 +17,11 @@ METRICS = ("iou", "localization_box", "hc_containment", "view_consistency")
 SAME_FIT = {"iou": 0.01, "localization_box": 0.03, "hc_containment": 0.01, "view_consistency": 0.01}
 """Tolerances if the Gaussians equal the recorded ones byte for byte, as on all processors of the same kind.
 A difference above 0.01, or more than one of 32 localization hits, is then caused by a change of code."""
-OTHER_FIT = {"iou": 0.12, "localization_box": 0.2, "hc_containment": 0.15, "view_consistency": 0.15}
+OTHER_FIT = {"iou": 0.18, "localization_box": 0.2, "hc_containment": 0.15, "view_consistency": 0.15}
 """Tolerances for other Gaussians. A fit of 600 steps amplifies differences in the last bits between
 processors. Measured: float64 scales in the fit changed mIoU by up to 0.06, localization by 0.14, HC and
-consistency by 0.06 and the fit by 0.73 dB; SSE4 in all libraries by 0.09, 0.12, 0.08, 0.10 and 0.14 dB."""
+consistency by 0.06 and the fit by 0.73 dB; SSE4 in all libraries by 0.09, 0.12, 0.08, 0.10 and 0.14 dB; an
+Intel processor with AVX-512 by 0.14 (one of nine wholes, at theta 0.6), 0.09, 0.08, 0.08 and 0.05 dB."""
 COUNTS = {
     "poses/registered views": 0,
     "poses/points": 5,
@@ -31,8 +32,8 @@ COUNTS = {
     "masks/best_iou": 0.02,
     "nodes": 4,
 }
-"""Tolerances of the earlier stages. Both measurements changed nodes by 1, Gaussians by 76, and neither poses
-nor masks."""
+"""Tolerances of the earlier stages. The measurements changed nodes by up to 3, Gaussians by up to 117, and
+neither poses nor masks."""
 
 
 @dataclass(frozen=True)
