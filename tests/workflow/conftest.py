@@ -139,6 +139,6 @@ def copy_of_finished(finished: Project, tmp_path: Path) -> Project:
 
 
 @pytest.fixture
-def plain(project: Path, tmp_path: Path) -> Project:
-    """A fresh copy of the project without results, to edit."""
-    return copy_project(project, tmp_path / "project", results=False)
+def plain(finished: Project, tmp_path: Path) -> Project:
+    """A fresh copy of the project without results, to edit, with the compiled kernels of `finished`."""
+    return copy_project(finished.root, tmp_path / "project", results=False)

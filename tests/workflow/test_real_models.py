@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hilsplat.models.store import RECOMMENDED, RELEASES
 from tests.loopback_hub import LoopbackHub, loopback_hub
-from tests.workflow.conftest import Project, copy_project
+from tests.workflow.conftest import Project
 
 SMALL = {
     # a run of seconds; the photographs are renders of the tiny scene, so the lens is known
@@ -31,8 +31,8 @@ def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
         hub.repositories[repository_of[name]] = folder / name
 
 
-def test_get_new_run_and_query(project: Path, tmp_path: Path) -> None:
-    copy = copy_project(project, tmp_path / "project", results=False)
+def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) -> None:
+    copy = plain
     (copy.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
     world = {"views": 12, "image_px": 128, "arc_deg": 100, "objects": 3, "samples": 2}
     source = ("--source", "world:tabletop:210", "--out", "drawn", "--settings", json.dumps(world))

@@ -5,7 +5,6 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -16,9 +15,9 @@ RUN = (sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml")
 
 
 @pytest.fixture(scope="module")
-def drawn(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Project:
+def drawn(finished: Project, tmp_path_factory: pytest.TempPathFactory) -> Project:
     """A project in which the views of the tiny scene are rendered."""
-    made = copy_project(project, tmp_path_factory.mktemp("drawn") / "project", results=False)
+    made = copy_project(finished.root, tmp_path_factory.mktemp("drawn") / "project", results=False)
     made.hilsplat_run(IMAGES)
     return made
 
