@@ -22,7 +22,7 @@ from benchmarks.real_size import PHOTOGRAPHS, SIZES, export_clip, export_sam, ex
 
 PROJECT = Path(__file__).resolve().parents[1]
 SCENE = "photos/rehearsal"
-READY, COMPLETE = "is ready to query", "answers from all photographs"
+READY, COMPLETE = "is ready to query", "uses all photographs"
 
 PATCH = """
 import importlib.abc, importlib.util, sys

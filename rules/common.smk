@@ -27,7 +27,7 @@ LOCK = prepare_process()
 
 
 def own_cores():
-    """Return the cores of this machine if it runs the jobs; None on a cluster, which is given --jobs instead."""
+    """Return this machine's cores if it runs the jobs, or None on a cluster, where --jobs applies instead."""
     try:
         cores = workflow.cores
     except WorkflowError:
@@ -38,7 +38,7 @@ def own_cores():
 
 
 def cache_folder(wildcards, input):
-    """Parameter: the cache in the results folder, which a module may prefix."""
+    """Return the cache in the results folder, which a module may prefix."""
     return str(Path(input.scene).parents[2] / ".cache")
 
 

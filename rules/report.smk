@@ -112,7 +112,7 @@ rule comparison:
             caption="../workflow/report/views.rst",
             category="Scenes",
             subcategory="{dataset}/{scene}",
-            labels={"figure": "one query over views"},
+            labels={"figure": "one query in several views"},
         ),
         features=report(
             "<results>/figures/{dataset}/{scene}/features.png",

@@ -119,7 +119,7 @@ class OpenedScene(ShownScene):
         if not (self.photographs / "index.json").is_file():
             raise ArtifactError(
                 f"{folder} has no photographs to annotate yet: {self.photographs} is missing",
-                expected="results/<dataset>/<scene> of a run, or a copy of it",
+                expected="a run's results/<dataset>/<scene>, or a copy of it",
                 fix=f"hilsplat run {self.photographs}",
             )
         proposing = (folder / variant / "masks", folder / variant / "semantic_tree")
@@ -261,7 +261,7 @@ def _import(opened: OpenedScene, asked: Given) -> dict[str, Any]:
 def _export(opened: OpenedScene, of: Mapping[str, Any]) -> Response:
     kind = of["kind"]
     if kind not in get_args(Kind):
-        raise SettingsError(f"format {kind!r} is unknown", expected=", ".join(get_args(Kind)))
+        raise SettingsError(f"unknown format {kind!r}", expected=", ".join(get_args(Kind)))
     data = exported(kind, opened.known(), opened.scene.cameras)
     return plain(data, "application/json" if kind == "coco" else BYTES)
 

@@ -164,10 +164,10 @@ def imported(name: str, text: str, cameras: Cameras) -> dict[str, list[Label]]:
                 return read(name, content, cameras)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
         # Any value may be invalid or have an unexpected type: a list as an id, an infinite number.
-        raise SceneError(f"{name} cannot be read: {error}", expected="a whole JSON file") from error
+        raise SceneError(f"{name} cannot be read: {error}", expected="a complete JSON file") from error
     raise SceneError(
         f"{name} has an unknown format",
-        expected="objects (ISAT, LERF-OVS, hilsplat), shapes (labelme) or annotations (COCO)",
+        expected="the key 'objects' (ISAT, LERF-OVS, hilsplat), 'shapes' (labelme) or 'annotations' (COCO)",
         found=f"keys {', '.join(content)}" if isinstance(content, dict) else type(content).__name__,
     )
 
@@ -264,13 +264,13 @@ def _coco_polygons(where: str, value: Any, size_hw: tuple[int, int]) -> list[np.
     counts = value["counts"]
     if tuple(value["size"]) != tuple(size_hw):
         raise SceneError(
-            f"{where} does not have the size of its photograph",
+            f"{where} does not match the size of its photograph",
             expected=f"size {list(size_hw)}",
             found=value["size"],
         )
     runs = unpacked_counts(counts) if isinstance(counts, str) else [int(count) for count in counts]
     if sum(runs) != size_hw[0] * size_hw[1] or min(runs, default=0) < 0:
-        raise SceneError(f"{where}: its run lengths do not fill the photograph", found=f"{sum(runs)} px")
+        raise SceneError(f"{where}: run lengths do not match the photograph's size", found=f"{sum(runs)} px")
     values = np.arange(len(runs)) % 2 == 1  # the inverse of `web.coco.coco_counts`
     return trace_polygons(np.ascontiguousarray(np.repeat(values, runs).reshape(size_hw[::-1]).T))
 
@@ -301,14 +301,14 @@ def _view(name: str, image: str, cameras: Cameras, height: Any, width: Any) -> s
     view = next((each for each in cameras.names if Path(each).stem == stem), None)
     if view is None:
         raise SceneError(
-            f"{name} names no photograph of this scene",
-            expected=f"such as {cameras.names[0]}",
+            f"{name} does not match a photograph in this scene",
+            expected=f"a name such as {cameras.names[0]}",
             found=image,
         )
     size_hw = cameras[view].size_hw
     if (height, width) != (None, None) and (height, width) != tuple(size_hw):
         raise SceneError(
-            f"{name} does not have the size of its photograph",
+            f"{name} does not match the size of its photograph",
             expected=f"{size_hw[1]} x {size_hw[0]} px (width x height), undistorted",
             found=f"{width} x {height} px",
         )

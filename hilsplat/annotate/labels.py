@@ -63,7 +63,7 @@ class Label(Message):
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             raise SceneError(
-                f"{where}: {values['text']!r} cannot be used: {first['loc'][0]}: {first['msg']}",
+                f"{where}: label {values['text']!r} is invalid: {first['loc'][0]}: {first['msg']}",
                 fix="correct it in the file",
             ) from error
 
@@ -93,15 +93,15 @@ def cut_to_parents(labels: Sequence[Label], size_hw: tuple[int, int]) -> list[La
     for label in sorted(labels, key=lambda label: label.level):
         masks[label.id] = mask = label.mask(size_hw)
         if not mask.any():
-            raise SettingsError(f"{label.text!r} has no pixel inside the photograph", fix="draw it again")
+            raise SettingsError(f"{label.text!r} has no pixels inside the photograph", fix="draw it again")
         cut[label.id] = label
         if label.parent is None:
             continue
         parent = own.get(label.parent)
         if parent is None or parent.level != label.level - 1:
-            missing = "no thing in this photograph"
+            missing = "no such thing in this photograph"
             raise SettingsError(
-                f"the parent of {label.text!r} cannot be its parent",
+                f"{label.text!r} has an invalid parent",
                 expected=f"a {Level(label.level - 1).label}" if label.level > 1 else "none: it is a whole",
                 found=f"{parent.text!r}, a {Level(parent.level).label}" if parent else missing,
                 fix="choose another parent or level",
@@ -133,10 +133,10 @@ def read_labels(path: Path, size_hw: tuple[int, int]) -> list[Label]:
     found = read_isat(path)
     if found.size_hw != tuple(size_hw):
         raise SceneError(
-            f"label file {path} does not have the size of its photograph",
+            f"label file {path} does not match the size of its photograph",
             expected=f"{size_hw[1]} x {size_hw[0]} px (width x height)",
             found=f"{found.size_hw[1]} x {found.size_hw[0]} px",
-            fix="annotate the scene that it was drawn on, or move the file away",
+            fix="annotate the scene that it was drawn on, or move the file to another folder",
         )
     return labels_of(found)
 

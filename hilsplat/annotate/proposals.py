@@ -86,7 +86,7 @@ class Proposals:
         """
         height, width = self.scene.cameras[view].size_hw
         if not (0 <= x < width and 0 <= y < height):
-            raise SettingsError(f"({x}, {y}) is outside the photograph", expected=f"below {width} x {height}")
+            raise SettingsError(f"({x}, {y}) is not in the photograph", expected=f"x < {width}, y < {height}")
         if self.tree is not None:
             return self._nodes_at(view, y * width + x)
         return self._masks_at(view, x, y)
@@ -244,7 +244,7 @@ class Clicks:
         """The opened model; raises SettingsError if the scene's masks were computed without SAM."""
         if not self.folder:
             raise SettingsError(
-                "the masks of this scene were made without SAM", fix="draw, or compute masks with SAM"
+                "this scene's masks were computed without SAM", fix="draw by hand, or compute masks with SAM"
             )
         return SamModel.load(Path(self.folder))
 
@@ -268,7 +268,7 @@ class Clicks:
         inside = np.array([each for *_, each in clicks], np.bool_)
         corners = np.array(box if box else (0, 0, 0, 0))
         if not (inside.any() or box) or (points < 0).any() or (points > (width, height)).any():
-            raise SettingsError("no pixel of the thing is clicked", expected="one inside the photograph")
+            raise SettingsError("no click marks the thing", expected="a click inside the photograph")
         encoded = self.encoded(view)
         asked = points[inside] if clicks else _grid(corners)
         iou, logits = self.model.decode(encoded, asked)

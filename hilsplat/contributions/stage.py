@@ -159,7 +159,7 @@ def run_contributions(
             masks = load_masks(masks_folder, camera.name, digests)
             if masks.size_hw != camera.size_hw:
                 raise MisalignedArtifactError(
-                    f"masks of view {camera.name} do not match its camera's size",
+                    f"the masks of view {camera.name} do not match the size of its camera",
                     expected=f"{camera.size_hw[0]} x {camera.size_hw[1]} (height x width)",
                     found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
                     fix="rerun the masks stage",

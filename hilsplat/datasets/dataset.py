@@ -78,9 +78,9 @@ class Dataset:
             if self._has_begun(deeper):
                 raise SceneError(
                     f"{self.title} is one level too deep in {root}",
-                    expected=f"its scenes in {root}",
-                    found=f"its scenes in {deeper}",
-                    fix=f"move the content of {deeper} one level up",
+                    expected=f"scenes in {root}",
+                    found=f"scenes in {deeper}",
+                    fix=f"move the contents of {deeper} one level up",
                 )
         if self._has_begun(data_root):
             raise SceneError(
@@ -91,16 +91,16 @@ class Dataset:
         for deeper in _folders(data_root):
             if self._has_begun(deeper / self.folder):
                 raise SceneError(
-                    f"{self.title} is not in {data_root} but one level deeper",
+                    f"{self.title} is one level too deep in {data_root}",
                     expected=str(root),
                     found=str(deeper / self.folder),
                     fix=f"set data_root to {deeper}",
                 )
         raise SceneError(
-            f"{self.title} is not below {data_root}",
-            expected=f"{root} with one of: {', '.join(self.scenes[:8])}",
+            f"{data_root} does not contain {self.title}",
+            expected=f"{root}, containing at least one of: {', '.join(self.scenes[:8])}",
             found=listing(root if root.is_dir() else data_root),
-            fix="unpack it there; its layout is printed by: hilsplat datasets list",
+            fix="unpack it there; to print its layout, run: hilsplat datasets list",
         )
 
     def require(self, root: Path, scene: str) -> None:

@@ -121,8 +121,8 @@ class LabelledScene:
             raise SceneError(
                 f"labelled views of {self.dataset}/{self.scene} have no pose: {', '.join(missing)}",
                 expected=f"a pose for each of the {len(self.views)} labelled views",
-                found=f"{len(names)} posed views, {', '.join(shown)}",
-                fix="use the poses that come with the data set, or register those images",
+                found=f"{len(names)} posed views: {', '.join(shown)}",
+                fix="use the poses included in the data set, or register these images",
             )
 
     def report(self) -> SceneReport:
@@ -144,7 +144,7 @@ class LabelledScene:
             "texts": len(self.prompts),
         }
         if self.poses is None:
-            warnings.append("no poses come with this scene: they are computed from its images")
+            warnings.append("the data set has no poses for this scene; they will be computed from the images")
         else:
             posed = posed_images(self.poses, self.dataset)
             facts["posed views"] = len(posed)
@@ -158,7 +158,7 @@ def images_by_view(folder: Path) -> dict[str, Path]:
     if not files:
         raise SceneError(
             f"{folder} {'has no images' if folder.is_dir() else 'is missing'}",
-            expected="the images of the scene, .jpg or .png",
+            expected="the scene's images (.jpg or .png)",
             fix="unpack the whole archive again",
         )
     images: dict[str, Path] = {}
@@ -237,13 +237,13 @@ def check_label_size(
     scale = image_hw[1] / label_hw[1]
     if abs(image_hw[0] - label_hw[0] * scale) > max(ROUNDING_PX, ROUNDING_PX * scale, share * image_hw[0]):
         raise SceneError(
-            f"{where} does not fit its image",
+            f"{where} does not match the size of its image",
             expected=f"{image_hw[1]} x {image_hw[0]} px (width x height), or a scaled copy",
             found=f"{label_hw[1]} x {label_hw[0]} px",
-            fix="use the images that the labels were drawn on (undistorted, of the same release)",
+            fix="use the images that the labels were drawn on (undistorted, from the same release)",
         )
     return [
-        f"{where} is {label_hw[1]} x {label_hw[0]} px, its image {image_hw[1]} x {image_hw[0]} px: "
+        f"{where} is {label_hw[1]} x {label_hw[0]} px, but its image is {image_hw[1]} x {image_hw[0]} px; "
         "resized by nearest neighbour"
     ]
 

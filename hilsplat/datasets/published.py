@@ -36,7 +36,7 @@ def differences(
     sentences = []
     for what, views in present.items():
         if missing := sorted(set(FRAMES.get(dataset, {}).get(scene, ())) - set(views)):
-            sentences.append(f"published frames without {what}: {', '.join(missing)}")
+            sentences.append(f"published frames that have no {what}: {', '.join(missing)}")
     listed = PROMPTS.get(dataset, {}).get(scene)
     if listed and (new := sorted(set(texts) - set(listed))):
         sentences.append(f"texts missing from the published list: {', '.join(new)}")

@@ -38,7 +38,7 @@ def readers_of(labels: Collection[str]) -> tuple[str, ...]:
     return tuple(DATASETS.places[name] for name in sorted(names) if name in DATASETS)
 
 
-LISTED = "list them with: hilsplat datasets list"
+LISTED = "to list all data sets and scenes, run: hilsplat datasets list"
 
 
 def open_labelled(name: str, data_root: Path) -> "LabelledScene":

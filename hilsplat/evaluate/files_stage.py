@@ -83,7 +83,7 @@ def run_evaluate_files(
     if bool(labels) == (truth is not None) or (truth is None) != (scene is None):
         raise SettingsError(
             "predictions must be scored against exactly one set of labels",
-            expected="--labels of a data set, or --truth and --scene of a synthetic scene",
+            expected="--labels for a data set, or --truth and --scene for a synthetic scene",
         )
     with stage_log("evaluate-files", str(predictions)) as counts:
         views: dict[str, Callable[[], ViewTruth]] = {}
@@ -309,16 +309,16 @@ def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
         values = np.array(words, dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise ArtifactError(
-            f"{path} does not have one whole number per line",
+            f"{path} does not have one integer per line",
             found=str(error),
-            fix="write class ids, 0 for none",
+            fix="write one class id per line, 0 for none",
         ) from error
     if len(values) != num_points:
         raise MisalignedArtifactError(
-            f"{path} does not fit the labelled points",
+            f"{path} does not match the labelled points",
             expected=f"{num_points} lines, one per point in the order of the labels",
             found=len(values),
-            fix="predict on the points of the ground truth",
+            fix="predict a class for each ground-truth point",
         )
     return values
 
@@ -345,7 +345,7 @@ def read_point_instances(
             confidences.append(float(confidence))
         except ValueError as error:
             raise ArtifactError(
-                f"line {number} of {path} is not an instance",
+                f"line {number} of {path} does not describe an instance",
                 expected="<mask file> <class id> <confidence>",
                 found=line,
                 fix="write one line per predicted instance, in ScanNet's format",
@@ -372,7 +372,7 @@ def _read_png(path: Path) -> Bool[np.ndarray, "h w"]:
 def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
     if array.ndim != 2:
         raise ArtifactError(
-            f"mask {where} is not an image",
+            f"mask {where} is not two-dimensional",
             expected="height x width",
             found=" x ".join(map(str, array.shape)),
         )
@@ -384,7 +384,7 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
             f"mask {where} has non-zero values, but none is foreground",
             expected=f"0 and 255: values above {FOREGROUND} are foreground",
             found=f"values up to {array.max()}",
-            fix="multiply the mask by 255, or store it as bool in a .npz",
+            fix="multiply the mask by 255, or store it as bool in a .npz file",
         )
     return mask
 
@@ -393,4 +393,4 @@ def _text(path: Path) -> str:
     try:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as text") from error
+        raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as UTF-8 text") from error

@@ -170,7 +170,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, 
     if len(shared) < MIN_SHARED:
         raise MisalignedArtifactError(
             "the ground-truth cameras and the scene's cameras belong to different images",
-            expected=f"at least {MIN_SHARED} shared names",
+            expected=f"at least {MIN_SHARED} shared view names",
             found=f"{len(shared)}",
             fix="evaluate the scene with its own ground-truth folder",
         )
@@ -185,9 +185,9 @@ def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, 
     scale = (turned * (there - there_mean)).sum() / spread if spread > 0 else 0.0
     if scale <= 0:
         raise MisalignedArtifactError(
-            "no similarity maps the ground-truth cameras to the scene's",
+            "no similarity transform maps the ground-truth cameras to the scene's cameras",
             expected="camera centres with the same arrangement",
-            found="centres in one place, or mirrored",
+            found="coincident or mirrored centres",
             fix="check registration.png; the poses have probably failed",
         )
     transform = np.eye(4)

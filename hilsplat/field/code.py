@@ -257,7 +257,7 @@ def load_code(folder: Path) -> Code:
         model = Autoencoder.drawn(about["channels"], about["latent"], torch_generator(0))
         for name, values in model.arrays.items():
             if name not in state or state[name].shape != values.shape:
-                raise ValueError(f"{name} of shape {values.shape} is missing")
+                raise ValueError(f"array {name} of shape {values.shape} is missing")
             model.arrays[name] = state[name]
         return model
     except (KeyError, ValueError) as error:

@@ -63,7 +63,7 @@ def run_field(
             made_from = contributions.gaussians_sha256, code_sha256
             if (begun.gaussians_sha256, begun.autoencoder_sha256) != made_from:
                 raise MisalignedArtifactError(
-                    f"{start} was computed from other Gaussians or another code",
+                    f"{start} was computed from different Gaussians or a different code",
                     fix="compute both fields from the same Gaussians and autoencoder",
                 )
             first = begun.features

@@ -23,9 +23,9 @@ def require_method(name: str) -> None:
     """Raise a `SettingsError` unless `name` is our method or a baseline."""
     if name != OURS and name not in METHODS:
         raise SettingsError(
-            f"method.name: there is no method {name!r}",
+            f"method.name: method {name!r} is unknown",
             expected=f"one of {', '.join((OURS, *METHODS))}",
-            fix="correct it, or write the method (docs/extending.md)",
+            fix="correct the name, or implement the method (docs/extending.md)",
         )
 
 

@@ -80,7 +80,7 @@ class PhotoReport:
         if self.num_rotated:
             lines.append(f"  {self.num_rotated:>5}  rotated upright according to their EXIF orientation")
         for names in self.duplicates:
-            lines.append(f"  {len(names):>5}  are the same file: {', '.join(names)}")
+            lines.append(f"  {len(names):>5}  are identical: {', '.join(names)}")
         for suffix, count in sorted(self.passed_over.items()):
             lines.append(f"  {count:>5}  {suffix} skipped: convert them to JPEG or PNG to use them")
         if self.unreadable:
@@ -194,7 +194,7 @@ def add_scene(
         if annotated.exists():
             files = []
         if files:
-            notes.append(f"labels of {len(files)} photographs, for scores: {files[0].parent}")
+            notes.append(f"labels for {len(files)} photographs, used for evaluation: {files[0].parent}")
         report = replace(inspect_photos(folder, poses), notes=tuple(notes))
         _check(report, has_known_poses(folder, poses))
         if files:
@@ -212,7 +212,7 @@ def _trained(folder: Path, named: dict[str, Path | None]) -> dict[str, Path]:
     """
     for what, path in named.items():
         if path is not None and path != NO_POSES and not path.exists():
-            raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass none")
+            raise SceneError(f"--{what} {path} is missing", fix="correct the path, or pass `none`")
     found = {"gaussians": trained_gaussians(folder), "features": langsplat_features(folder)}
     if not has_known_poses(folder, named["poses"]):
         found["gaussians"] = None
@@ -234,7 +234,7 @@ def _notes(folder: Path, extra: dict[str, Path]) -> list[str]:
     if (ply := extra.get("gaussians")) and (dataparser := dataparser_of(ply, folder)):
         notes.append(f"coordinates of the Gaussians: nerfstudio's, from {dataparser}")
     if skipped := [path.name for path in sorted(folder.rglob("*.pth"))[:3]]:
-        notes.append(f"not read, because a pickle can run code: {', '.join(skipped)}")
+        notes.append(f"skipped, because pickle files can run code: {', '.join(skipped)}")
     return notes
 
 
@@ -244,7 +244,7 @@ def _labels(folder: Path, named: Path | None) -> list[Path]:
         return label_files(folder) if named is None else []
     files = sorted(named.glob("*.json"))
     if not files:
-        expected = "a .json for each labelled photograph"
+        expected = "a .json file for each labelled photograph"
         raise SceneError(f"--labels {named} contains no label file", expected=expected)
     return files
 
@@ -258,7 +258,7 @@ def _check(report: PhotoReport, have_poses: bool) -> None:
             fix="remove them from the folder or replace them with intact copies, then try again",
         )
     if report.num_distinct < MIN_PHOTOS and not have_poses:
-        found = [f"{report.num_distinct} different readable ones"]
+        found = [f"{report.num_distinct} distinct readable photographs"]
         found += [f"{count} {suffix} files skipped" for suffix, count in sorted(report.passed_over.items())]
         raise SceneError(
             f"{report.folder} has too few photographs",

@@ -99,14 +99,14 @@ def _lens_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     if len(sizes) > 1:
         listed = ", ".join(f"{long} x {short}" for long, short in sizes[:NAMED])
         return [
-            f"{len(sizes)} sizes of photographs ({listed}): each size gets its own lens, which few "
-            "photographs cannot determine; use one camera, without cropping"
+            f"the photographs have {len(sizes)} sizes ({listed}): each size gets its own lens, which is "
+            "hard to estimate from few photographs; use one camera, without cropping"
         ]
     focals = sorted(photo.focal_px for photo in photos if photo.focal_px is not None)
     if focals and focals[-1] > 1.1 * focals[0]:
         return [
-            f"focal lengths from {focals[0]:.0f} to {focals[-1]:.0f} px: zoom or several lenses; use "
-            "one lens, without zooming"
+            f"the focal lengths range from {focals[0]:.0f} to {focals[-1]:.0f} px (zoom or several lenses): "
+            "use one lens, without zooming"
         ]
     return []
 
@@ -135,14 +135,14 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     doubts = []
     if same:
         doubts.append(
-            f"{_listed(same, photos)} nearly the same as the one before: they cost time and add nothing; "
-            "leave them out"
+            f"{_listed(same, photos)} nearly identical to the previous one: omit such photographs, which "
+            "cost time and add nothing"
         )
     if turned >= MIN_TURN_PAIRS and turned > 2 * moved:
         doubts.append(
-            f"the camera seems to turn in place: a rotation explains {turned} of the {turned + moved} "
+            f"the camera seems to turn in place: rotation alone explains {turned} of the {turned + moved} "
             "pairs of neighbours that could be compared; depth requires different positions: walk around the "
-            "scene, or step aside between photographs"
+            "scene, or step sideways between photographs"
         )
     return doubts
 

@@ -62,7 +62,7 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
 
     else:
         raise SceneError(
-            f"{source} is a file of an unsupported kind",
+            f"{source} has an unsupported file type",
             expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
             fix="pass the folder that contains the photographs",
         )
@@ -73,9 +73,9 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
             notes = make(folder)
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
-        notes = [f"{target} already exists, from the same files"]  # an earlier run made it and was killed
+        notes = [f"{target} already exists, made from the same files"]  # left by a run that was killed
     else:
-        fix = "choose another name for the scene, or move that folder away"
+        fix = "choose another name for the scene, or move that folder"
         raise SceneError(f"{target} already exists", fix=fix)
     try:
         yield unwrapped(target), notes
@@ -146,7 +146,7 @@ def _check_entries(archive: Path, entries: list[zipfile.ZipInfo]) -> None:
     for entry in entries:
         name = PurePosixPath(entry.filename)
         if name.is_absolute() or ".." in name.parts or "\\" in entry.filename:
-            problem = "is outside the archive's folder"
+            problem = "would be unpacked outside the folder"
         elif stat.S_ISLNK(entry.external_attr >> 16):
             problem = "is a link"
         elif entry.flag_bits & 1:

@@ -92,7 +92,7 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
         candidates += _candidates(video, position, CANDIDATES_PER_FRAME * count, decoding)
         if not decoding.num_frames:
             raise SceneError(
-                f"video {video} has no frame that can be decoded",
+                f"no frame of video {video} can be decoded",
                 found=f"{decoding.num_damaged} damaged packets, {video.stat().st_size} bytes",
                 fix="play it to see whether it is intact; copy it again, or convert it to H.264 in an .mp4",
             )
@@ -106,11 +106,11 @@ def extract_frames(videos: Sequence[Path], folder: Path, count: int) -> list[str
             }
         )
         if decoding.num_damaged:
-            notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were left out")
+            notes.append(f"{video.name}: {decoding.num_damaged} damaged packets or frames were skipped")
         if decoding.stated_s is not None and decoding.decoded_s < 0.9 * decoding.stated_s - 1:
             notes.append(
-                f"{video.name} breaks off after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only "
-                "that part is used; copy it again if the rest matters"
+                f"{video.name} ends after {decoding.decoded_s:.1f} of {decoding.stated_s:.1f} s: only that "
+                "part is used; copy it again if you need the rest"
             )
     chosen = choose_frames(candidates, count)
     if len(chosen) < count:
@@ -144,7 +144,7 @@ def _opened(video: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     except (av.error.FFmpegError, OSError) as error:
         raise SceneError(
             f"video {video} cannot be read: {error.strerror or error}",
-            expected="an intact file with a video stream; a truncated .mp4 or .mov has lost its index",
+            expected="an intact file with a video stream; a truncated .mp4 or .mov lacks its index",
             found=f"a file of {video.stat().st_size} bytes" if video.is_file() else "no file",
             fix="copy it again from the camera, or convert it to H.264 in an .mp4",
         ) from error

@@ -80,7 +80,7 @@ def report(scene: LanguageScene, text: str, found: NodeHits, view: str | None = 
     hits, doubts = scene.hits_of(found, LISTED), doubts_of(found)
     if not hits:
         levels = ", ".join(f"--level {each.label}" for each in LEVELS if each is not found.level)
-        other = "" if view is None else ", or leave out --view"
+        other = "" if view is None else ", or omit --view"
         return f"nothing in {place} matches {text!r} at level {found.level.label}; try {levels}{other}"
     lengths = "metres" if scene.scene.unit == "metre" else "scene units"
     width = max(len(hit.name or "?") for hit in hits)

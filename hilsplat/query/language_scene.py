@@ -175,7 +175,7 @@ class LanguageScene(FieldScene):
         from hilsplat.viewer.app import EmbeddedViewer
 
         if self.finished is None:
-            raise ArtifactError("the scene was assembled from parts", fix="open it with hilsplat.open")
+            raise ArtifactError("the scene was not opened from a folder", fix="open it with hilsplat.open")
         return EmbeddedViewer(self.finished, text=text, height=height, proxy=proxy, threads=self.threads)
 
     # -- answers ----------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ class LanguageScene(FieldScene):
             SettingsError: there is no such node.
         """
         if not 0 <= node < len(self.tree):
-            raise SettingsError(f"there is no node {node}", expected=f"0 to {len(self.tree) - 1}")
+            raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(self.tree) - 1}")
         same = self.tree.nodes_of(Level(int(self.tree.level[node])))
         return self._nearest(self.tree.clip[node], same[same != node], limit)
 
@@ -228,7 +228,7 @@ class LanguageScene(FieldScene):
             ModelError: the CLIP of this scene cannot embed pictures.
         """
         if self.encode_picture is None:
-            raise ModelError(f"{self.scene.name} was opened without a model that embeds pictures")
+            raise ModelError(f"{self.scene.name} was opened without a model that embeds images")
         return self._nearest(self.encode_picture(picture), np.arange(len(self.tree)), limit)
 
     def _nearest(
@@ -404,7 +404,7 @@ def path_of(text: str) -> tuple[str, ...]:
     path = tuple(part.strip() for part in text.split(PATH_SEPARATOR))
     if not all(path):
         raise SettingsError(
-            f"a text of the query {text!r} is empty",
-            fix='write words, or a path such as "bear > head > nose"',
+            f"the query {text!r} contains an empty text",
+            fix='enter words, or a path such as "bear > head > nose"',
         )
     return path

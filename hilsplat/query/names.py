@@ -51,10 +51,10 @@ def read_names(folder: Path, semantic_tree: Path) -> NodeNames:
     num_nodes = len(read_npz(Path(semantic_tree) / "tree.npz")["level"]) if kept else 0
     if beyond := [node for node in kept if node >= num_nodes]:
         raise ArtifactError(
-            f"{path} names nodes that the tree does not have",
+            f"{path} contains names of nodes that do not exist",
             expected=f"rows 0 to {num_nodes - 1}",
             found=", ".join(map(str, beyond[:5])),
-            fix="correct it, or move it away to start without names",
+            fix="correct the file, or move it elsewhere to start without names",
         )
     return NodeNames(MappingProxyType(kept), version_of(path))
 
@@ -72,10 +72,10 @@ def write_names(
     given = {node: " ".join(name.split()) for node, name in names.items()}
     for node, name in given.items():
         if not 0 <= node < num_nodes:
-            raise SettingsError(f"there is no node {node} to name", expected=f"0 to {num_nodes - 1}")
+            raise SettingsError(f"node {node} does not exist", expected=f"0 to {num_nodes - 1}")
         if len(name) > LONGEST or PATH_SEPARATOR in name or not name.isprintable():
             raise SettingsError(
-                f"{name!r} cannot be a name",
+                f"{name!r} is not a valid name",
                 expected=f"at most {LONGEST} characters, without {PATH_SEPARATOR!r}, which separates paths",
             )
     with replacing(path, version, f"the names in {path}"):
@@ -102,7 +102,7 @@ def _kept(path: Path) -> NamesFile:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ArtifactError(
-            f"{path} is damaged or of another version: {'.'.join(map(str, first['loc']))}: {first['msg']}",
+            f"{path} is damaged or from another version: {'.'.join(map(str, first['loc']))}: {first['msg']}",
             expected='{"format": "hilsplat-names-1", "trees": {<digest of a tree>: {"<row>": "<name>"}}}',
-            fix="correct it, or move it away to start without names",
+            fix="correct the file, or move it elsewhere to start without names",
         ) from error

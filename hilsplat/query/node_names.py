@@ -75,7 +75,7 @@ class Vocabulary:
             lines = Path(path).read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise SettingsError(
-                f"the vocabulary {path} cannot be read: {error}", expected="a text file in UTF-8"
+                f"the vocabulary {path} cannot be read: {error}", expected="a UTF-8 text file"
             ) from error
         found: dict[str, dict[str, None]] = {section: {} for section in SECTIONS}
         section = SECTIONS[0]
@@ -94,7 +94,7 @@ class Vocabulary:
                     " ".join(each.split()) for each in text.split(",") if each.strip()
                 )
         if not (found["things"] or found["parts"] or found["surfaces"]):
-            raise SettingsError(f"the vocabulary {path} names nothing", expected="a text per line")
+            raise SettingsError(f"the vocabulary {path} contains no texts", expected="one text per line")
         return Vocabulary(**{section: tuple(texts) for section, texts in found.items()})
 
 

@@ -13,7 +13,7 @@ from hilsplat.semantic_tree.tree import SemanticTree
 # Chosen on development scenes; docs/experiments.md ("Query") compares them with other values.
 
 ALIKE = 0.9
-"""Nodes whose vectors have at least this cosine count as alike, such as objects of one kind."""
+"""Nodes whose vectors have at least this cosine count as similar, such as objects of one kind."""
 
 ALIKE_REACH = 3.0
 """Factor on the allowed distance below the best answer, for nodes that look like the best answer."""

@@ -79,7 +79,7 @@ def margin_of_relevancy(score: float, scale: float) -> float:
         SettingsError: the score is not between 0 and 1.
     """
     if not 0 < score < 1:
-        raise SettingsError(f"no answer has a score of {score:g} or more", expected="between 0 and 1")
+        raise SettingsError(f"threshold {score:g} is out of range", expected="between 0 and 1")
     return float(np.log(score / (1 - score)) / scale)
 
 

@@ -22,7 +22,7 @@ MIN_VIEWS_FOR_TEST = 8
 """Number of views below which none is held out, because the fit needs all of them."""
 
 MIN_LEVELNESS_GAP = 3.0
-"""How many times better than the second-best direction the best must fit the cameras' x axes to define up."""
+"""Minimum ratio of the second-smallest to the smallest eigenvalue of the cameras' x axes to define up."""
 
 
 @dataclass(frozen=True)

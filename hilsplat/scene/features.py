@@ -25,16 +25,16 @@ SEQUENTIAL_STEPS = sorted({*range(1, 11), *(2**power for power in range(10))})
 """Distances, in name order, between the two views of a pair in sequential matching."""
 
 MIN_INLIERS = 12
-"""Minimum number of verified matches per pair (reference block, for renders and photographs; COLMAP: 15)."""
+"""Minimum number of verified matches per pair (COLMAP: 15)."""
 
 PEAK_THRESHOLD = 0.02 / 3 / 2
-"""SIFT contrast threshold, half of COLMAP's, because renders and indoor photographs have low contrast."""
+"""SIFT contrast threshold; half of COLMAP's, because renders and indoor photographs have low contrast."""
 
 MAX_TRIALS = 1000
-"""Maximum RANSAC trials per pair (COLMAP: 10000); pairs without common content use all of them."""
+"""Maximum RANSAC trials per pair (COLMAP: 10000); pairs without overlap use all of them."""
 
 WORK_COMPRESSION = 1
-"""zlib level of work images, a third faster than level 6; COLMAP reads the images only once."""
+"""zlib compression level of work images; a third faster than level 6. COLMAP reads each image only once."""
 
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF unit of the focal plane resolution -> mm (default: inch)."""

@@ -113,7 +113,7 @@ class FinishedScene:
         else:
             found = {}
             logger.warning(
-                "%s: neither scores nor a panel record the query settings; using the default settings",
+                "%s: no scores or panel record the query settings; using the defaults",
                 self.folder,
             )
         known = {name: value for name, value in found.items() if name in EvaluateSettings.model_fields}
@@ -121,7 +121,7 @@ class FinishedScene:
             return EvaluateSettings(**known)
         except ValidationError as error:
             raise ArtifactError(
-                f"recorded settings cannot be used: {error.errors(include_url=False)[0]['msg']}",
+                f"the recorded query settings are not valid: {error.errors(include_url=False)[0]['msg']}",
                 expected="values of EvaluateSettings",
                 fix="remove the damaged provenance of the scores, or run the workflow again",
             ) from error
@@ -134,7 +134,7 @@ def require_scene_folder(folder: Path) -> None:
             f"scene folder {folder} is missing",
             expected="results/<dataset>/<scene> of a run, or a copy of it",
             found=f"no such folder in {Path.cwd()}",
-            fix="correct the path, or name the results folder",
+            fix="correct the path, or specify the results folder",
         )
 
 
@@ -142,7 +142,7 @@ def refining(folder: Path) -> str:
     """Return a sentence with the number of key views that are used until the run ends."""
     used = len(read_index(folder / KEY_VIEWS / "masks")["views"])
     train = sum(entry["split"] == "train" for entry in read_index(folder / "scene")["views"].values())
-    return f"{folder.parent.name}/{folder.name} answers from {used} of {train} photographs until the run ends"
+    return f"{folder.parent.name}/{folder.name} uses {used} of {train} photographs until the run ends"
 
 
 def is_drawn(scene: Path) -> bool:
@@ -187,7 +187,7 @@ def require_made_for(path: Path, found_sha256: str, scene: str, made_for: dict[s
     for what, expected in made_for.items():
         if found_sha256 != expected:
             raise MisalignedArtifactError(
-                f"the {what} of {scene} was made for another {Path(path).name}",
+                f"the {what} of {scene} was made for a different {Path(path).name}",
                 expected=f"sha256 {expected[:12]}",
                 found=f"sha256 {found_sha256[:12]} in {path}",
                 fix=f"rerun the stage that writes the {what}",

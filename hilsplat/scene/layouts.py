@@ -156,7 +156,7 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
             f"{folder / 'sparse'} does not contain a complete COLMAP model",
             expected="cameras, images and points3D, all .bin or all .txt, in sparse/0/ or sparse/",
             found=", ".join(sorted(path.name for path in (folder / "sparse").rglob("*"))) or "nothing",
-            fix="complete the model, or rename sparse/ to have the poses computed",
+            fix="complete the model, or rename sparse/ to compute the poses",
         )
     return None
 

@@ -34,10 +34,10 @@ from hilsplat.settings import PosesSettings
 logger = logging.getLogger(__name__)
 
 INIT_MIN_INLIERS = 50
-"""Minimum number of matches of a model's first pair (reference block; COLMAP: 100)."""
+"""Minimum number of matches of a model's first pair (COLMAP: 100)."""
 
 POSE_MIN_INLIERS = 15
-"""Minimum number of visible points for posing each further view (reference block; COLMAP: 30)."""
+"""Minimum number of visible points for posing each further view (COLMAP: 30)."""
 
 LOST_PICTURE = "not_registered.png"
 """Picture written beside the scene folder if too few photographs were registered."""
@@ -230,7 +230,7 @@ def registration_report(
         warnings.append(f"{len(images) - len(errors)} of {len(images)} views are not registered")
     if len(members) > 1:
         sizes = ", ".join(str(len(names)) for names in members)
-        warnings.append(f"the views fall into {len(members)} models ({sizes} views); the largest is used")
+        warnings.append(f"the views form {len(members)} separate models ({sizes} views); the largest is used")
     if errors and points_per_view < WEAK_POINTS_PER_VIEW:
         warnings.append(
             f"only {points_per_view} points per registered view (good runs: {WEAK_POINTS_PER_VIEW} or more): "
@@ -268,7 +268,7 @@ def _why_not(view: str, entry: Mapping[str, Any], members: Sequence[set[str]]) -
     if entry["features"] == 0:
         return "no features: the image is flat, dark or out of focus"
     if entry["matched_views"] == 0:
-        return f"too few matches: no other view shares {MIN_INLIERS} verified ones"
+        return f"too few matches: no other view shares {MIN_INLIERS} verified matches with it"
     for number, names in enumerate(members[1:], start=2):
         if view in names:
             return f"in model {number} ({len(names)} views), not in the largest model"
@@ -287,7 +287,7 @@ def check_registration(images: Path, name: str, report: Mapping[str, Any], setti
     )
     if not report["models"]:
         raise RegistrationError(
-            f"no camera pose could be found for {name} from {images}",
+            f"no camera poses could be found for {name} in {images}",
             expected=f"a model of at least {MIN_PHOTOS} of the {total} photographs",
             found=f"none{listing}",
             fix=advice,
@@ -351,6 +351,6 @@ def plot_lost(path: Path, images: Path, report: Mapping[str, Any]) -> bool:
         for axes in row:
             axes.set_axis_off()
         if not near:
-            row[1].text(0, 0.5, "shares no verified match with a registered photograph", fontsize=8)
+            row[1].text(0, 0.5, "no verified match with a registered photograph", fontsize=8)
     figure.savefig(path, format="png", dpi=100, metadata={"Software": None})
     return True

@@ -47,7 +47,7 @@ class Scene:
         expected = self.cameras[view].size_hw
         if pixels.shape[:2] != expected:
             raise SceneError(
-                f"image of view {view} of {self.name} does not fit its camera",
+                f"the image of view {view} in {self.name} does not match its camera",
                 expected=f"{expected[0]} x {expected[1]} (height x width)",
                 found=f"{pixels.shape[0]} x {pixels.shape[1]}",
                 fix="run the poses stage again",

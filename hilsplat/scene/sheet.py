@@ -162,7 +162,7 @@ def choose_scenes(
         found = found or [row.name for row in rows if name in (row.scene, row.name)]
         if not found:
             raise SceneError(
-                f"the setting only contains {name!r}, but no scene has that name",
+                f"setting `only`: no scene is named {name!r}",
                 expected=", ".join(row.name for row in in_groups or rows),
                 fix="correct the name, or add a row to the scene sheet",
             )
@@ -197,8 +197,8 @@ def _check_header(path: Path, line: int, header: list[str]) -> None:
     problems = [f"{what}: {', '.join(map(repr, columns))}" for what, columns in kinds if columns]
     if problems:
         raise SceneError(
-            f"{path}, line {line}: the header cannot be used",
-            expected=f"the columns {' '.join(COLUMNS)}, separated by tabs; also {' '.join(OPTIONAL_COLUMNS)}",
+            f"{path}, line {line}: the header is not valid",
+            expected=f"tab-separated columns {' '.join(COLUMNS)}; optional: {' '.join(OPTIONAL_COLUMNS)}",
             found="; ".join(problems),
             fix="correct the header line, and separate columns with tabs, not spaces or commas",
         )
@@ -231,7 +231,7 @@ def _row(
         if not WORLD_SOURCE.fullmatch(source):
             raise fault(
                 "source",
-                f"{source!r} is not the name of a synthetic world",
+                f"{source!r} does not name a synthetic scene",
                 expected="world:<kind>:<seed>, as in world:tabletop:201",
                 fix="correct the source",
             )
@@ -251,7 +251,7 @@ def _row(
             "gaussians",
             f"file {gaussians} {problem}",
             expected="a 3DGS PLY; relative paths start from the project folder",
-            fix='correct the path, or write "-" to have the Gaussians fitted',
+            fix='correct the path, or enter "-" to fit the Gaussians',
         )
     if gaussians is None and folder is not None and cells.get("gaussians", "") not in NOTHING:
         raise fault(
@@ -264,14 +264,14 @@ def _row(
             "features",
             f"folder {features} contains no LangSplat masks",
             expected="<image>_s.npy and <image>_f.npy for each image",
-            fix='correct the path, or write "-" to have the masks computed',
+            fix='correct the path, or enter "-" to compute the masks',
         )
     if poses not in (None, NO_POSES) and not poses.exists():
         raise fault(
             "poses",
             f"{poses} is missing",
             expected=f"a COLMAP model, a transforms.json, or {NO_POSES}",
-            fix='correct the path, or write "-" to use the poses in the folder',
+            fix='correct the path, or enter "-" to use the poses in the folder',
         )
     return row
 
@@ -307,7 +307,7 @@ def _check_source(where: str, folder: Path) -> None:
         found = ", ".join(f"{count} files ({kind})" for kind, count in sorted(kinds.items()))
         below = sorted(sub.name for sub in folder.iterdir() if sub.is_dir() and list_images(sub))
         if below and not found:
-            found = f"folders with images below it: {', '.join(below[:5])}"
+            found = f"subfolders with images: {', '.join(below[:5])}"
         raise SceneError(
             f"{where}: folder {folder} has no images",
             expected=f"files with suffix {', '.join(sorted(IMAGE_SUFFIXES))} in it or in its images/ folder",

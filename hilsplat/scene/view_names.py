@@ -47,7 +47,7 @@ def view_names(sources: Sequence[Path]) -> list[str]:
     for name, files in owners.items():
         if len(files) > 1:
             raise SceneError(
-                f"{len(files)} images would become the same view {name}",
+                f"{len(files)} images have the same view name {name}",
                 found=", ".join(str(file) for file in files),
                 fix="rename or remove all but one: views are named after the file without its suffix",
             )

@@ -51,8 +51,8 @@ def mask_evidence(
     smaller (shares of 0.3 give 0.18).
 
     Two masks of one view show different objects, so they are evidence against a link (intersection 0, union:
-    both full sizes). Masks that share Gaussians are no evidence if each view sees less than `min_covisible`
-    of the other mask. If they share none, a mask counts if the other view sees at least that share of it.
+    both full sizes). Masks that share Gaussians are ignored if each view shows less than `min_covisible` of
+    the other mask. If they share none, a mask counts if the other view shows at least that share of it.
 
     `shares` has one row per mask of a level, and zeros for Gaussians not visible in the mask's view.
     The result does not depend on the number of threads.
@@ -78,7 +78,7 @@ def mask_evidence(
 
 @compiled
 def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
-    """Write to `out` the size of each mask on the Gaussians that each view sees."""
+    """Write to `out` the size of each mask on the Gaussians visible in each view."""
     for a in range(begin, end):
         for k in range(indptr[a], indptr[a + 1]):
             g = indices[k]

@@ -16,7 +16,7 @@ MIN_VISIBLE_PX = 0.3
 """A Gaussian counts as visible in a view if its mass there exceeds this."""
 
 MIN_COVISIBLE = 0.2
-"""Pairs of masks are no evidence if each mask's view sees less than this share of the other mask."""
+"""A pair of masks is not used as evidence if each view shows less than this share of the other's mask."""
 
 MIN_MEMBER_SHARE = 0.05
 """A Gaussian joins its best node if that node contains more than this share of its weight."""

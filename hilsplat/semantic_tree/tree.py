@@ -114,7 +114,7 @@ class SemanticTree:
                 )
         child = self.parent != NONE
         if (self.level[self.parent[child]] >= self.level[child]).any():
-            raise ArtifactError(f"{path}: a node's parent is not coarser than it", fix=remake(path))
+            raise ArtifactError(f"{path}: a node's parent is not at a coarser level", fix=remake(path))
 
     def nodes_of(self, level: Level) -> Int64[np.ndarray, " t"]:
         """Return the nodes of a level, in order."""

@@ -145,7 +145,7 @@ def read_source_from_scene(ply: Path) -> Float64[np.ndarray, "4 4"] | None:
         return None
     if content.get("ply_sha256") != (found := sha256_of_file(ply)):
         raise ArtifactError(
-            f"{path} belongs to a PLY other than {ply.name}",
+            f"{path} was written for a different {ply.name}",
             expected=f"sha256 {content.get('ply_sha256')}",
             found=f"sha256 {found}",
             fix="move it next to the PLY that it was written for, or remove it if the PLY is in the "
@@ -188,8 +188,8 @@ def import_gaussians(
         moved = "in the coordinates that the JSON file beside it describes"
     elif dataparser is not None:
         transform = transform @ source_from_dataparser(dataparser, transforms)
-        moved = f"in nerfstudio's training coordinates, by {dataparser.name}"
-    logger.info("%s: %d Gaussians of %s, %s", scene.name, len(gaussians), ply, moved)
+        moved = f"in nerfstudio's training coordinates, from {dataparser.name}"
+    logger.info("%s: %d Gaussians from %s, %s", scene.name, len(gaussians), ply, moved)
     origin = {
         "kind": "imported",
         "file": ply.name,  # its folder is in the provenance record

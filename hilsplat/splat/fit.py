@@ -102,10 +102,10 @@ class FitState:
         try:
             arrays = read_npz(path)
         except ArtifactError as error:
-            logger.warning("ignoring the checkpoint, the fit starts over: %s", error)
+            logger.warning("ignoring the checkpoint and restarting the fit: %s", error)
             return None
         if arrays["key"].item() != key:
-            logger.info("checkpoint %s was written for different inputs; the fit starts over", path)
+            logger.info("checkpoint %s was written for different inputs; restarting the fit", path)
             return None
         parameters, first, second = ({name: arrays[f"{table}_{name}"] for name in FIELDS} for table in TABLES)
         generator = np.random.default_rng()
@@ -303,8 +303,8 @@ def write_report(
     }
     if report["psnr_db"] <= np.mean(flat):
         report["warnings"].append(
-            f"the {split} views score {report['psnr_db']:.1f} dB, no more than one flat colour does: look at "
-            "test_views.png; the Gaussians may be in other coordinates than the cameras, or the poses "
+            f"the {split} views score {report['psnr_db']:.1f} dB, no better than a single flat colour: check "
+            "test_views.png; the Gaussians and the cameras may use different coordinates, or the poses "
             "may be wrong"
         )
     with atomic_folder(folder) as temporary:

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 SH_0 = 0.28209479177387814
 FIRST_OPACITY = 0.1  # 3DGS
 MIN_POINTS = 200
-"""If there are fewer sparse points than this, random points in front of cameras are added."""
+"""If there are fewer sparse points than this, random points in front of the cameras are added."""
 ADDED_POINTS = 2_000
 """Number of random points added if there are too few sparse points."""
 RANDOM_POINTS = 10_000
@@ -85,7 +85,7 @@ def first_gaussians(
         xyz, rgb = xyz[rows], rgb[rows]
     if is_random or (len(xyz) < MIN_POINTS and not is_frozen):
         if not is_random:
-            logger.warning("%s has %d sparse points; random points are added", scene.name, len(xyz))
+            logger.warning("%s has only %d sparse points; adding random points", scene.name, len(xyz))
         number = min(RANDOM_POINTS if is_random else ADDED_POINTS, settings.max_gaussians - len(xyz))
         more = _random_points(cameras, known, number, generator)
         xyz, rgb = np.concatenate([xyz, more]), np.concatenate([rgb, np.full((number, 3), 0.5, np.float32)])

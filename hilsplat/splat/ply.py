@@ -87,7 +87,7 @@ def load_ply(path: Path, fix: str = "") -> Gaussians:
         raise ArtifactError(
             f"{path} is not a 3DGS PLY",
             expected="x y z, f_dc_0..2, 0, 9, 24 or 45 f_rest_*, opacity, scale_0..2, rot_0..3",
-            found=f"{num_rest} f_rest columns" + (f"; without {', '.join(missing[:5])}" if missing else ""),
+            found=f"{num_rest} f_rest columns" + (f"; missing: {', '.join(missing[:5])}" if missing else ""),
             fix=fix,
         )
 

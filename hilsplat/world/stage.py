@@ -69,7 +69,7 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
     with stage_log("world", source) as counts:
         scene = _scene(kind, seed, settings.objects)
         if not scene.placed:
-            raise SceneError(f"no object fits into {source}", fix="use another seed")
+            raise SceneError(f"no object fits in {source}", fix="use another seed")
         cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
         require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
         smallest = smallest_areas(settings.image_px, settings.min_area_px)

@@ -78,17 +78,17 @@ def run_truth_masks(
     draws = Draws(settings.seed, scene.name)
     label = faults_label(settings)
     with stage_log("masks", scene.name) as counts:
-        logger.warning("masks %s: %s, from the ground truth: a diagnostic, not a result", scene.name, label)
+        logger.warning("%s: masks from the ground truth (%s): for diagnosis, not results", scene.name, label)
 
         def segment(view: str) -> tuple[HierarchicalMasks, dict[str, int]]:
             labels = true_labels(annotations, view)
             expected = scene.cameras[view].size_hw
             if labels.shape[1:] != expected:
                 raise MisalignedArtifactError(
-                    f"label image of view {view} does not match its camera",
+                    f"the label image of view {view} does not match its camera",
                     expected=f"{expected[0]} x {expected[1]} (height x width)",
                     found=f"{labels.shape[1]} x {labels.shape[2]}",
-                    fix="run poses without shrinking the images (poses.max_side_px)",
+                    fix="rerun poses without shrinking the images (poses.max_side_px)",
                 )
             return faulty_masks(labels, nodes, view, draws, settings, min_area_px)
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from hilsplat.scene.cameras import Camera, Cameras
 
 Sight = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
-"""Position of a camera, and the point at which it looks."""
+"""Position of a camera, and the point that it looks at."""
 
 
 def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:

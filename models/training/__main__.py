@@ -15,10 +15,10 @@ from models.training.train import require_own_models, train_models
 
 def main(
     out: Annotated[Path, typer.Option(help="folder for sam-tiny and clip-tiny")] = Path("results/models"),
-    cache: Annotated[Path, typer.Option(help="folder for rendered views and training states")] = Path(
+    cache: Annotated[Path, typer.Option(help="folder for rendered views and checkpoints")] = Path(
         "results/.cache/models"
     ),
-    settings: Annotated[str, typer.Option(help="settings as JSON: see models/training/settings.py")] = "{}",
+    settings: Annotated[str, typer.Option(help="settings as JSON (models/training/settings.py)")] = "{}",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     threads: Annotated[int, typer.Option(min=1)] = 2,
     stage: Annotated[

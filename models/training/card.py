@@ -128,10 +128,10 @@ def write_sam_card(
 A promptable segmenter of {parameters / 1e6:.1f} million parameters in the layout of the Hugging Face ONNX
 exports of SAM. Its inputs are an image of {FRAME_PX} x {FRAME_PX} and points; its outputs are three masks
 (subpart, part, whole) of {mask_px} x {mask_px} and their predicted IoU. Where the world has no subpart at a
-point, the first mask is the part; where it has no part, the whole. Weights are stored as float16 and computed
+point, the first mask is the part or, without a part, the whole. Weights are stored as float16 and computed
 in float32.
 
-## How good it is
+## Quality
 Measured on {recipe["validation_scenes"]} held-out scenes from the training range, for regions of at least
 {MIN_PX} px in views of {FRAME_PX} x {FRAME_PX}.
 
@@ -181,13 +181,13 @@ def write_clip_card(
 
 {WARNING.format(real="CLIP")}
 
-It embeds crops of {CROP_PX} x {CROP_PX} pixels and short English phrases in one space of {DIMENSIONS}
+It embeds crops of {CROP_PX} x {CROP_PX} pixels and short English phrases in a shared space of {DIMENSIONS}
 dimensions, in the layout of the Hugging Face ONNX exports of CLIP. Its vocabulary is limited to the words of
 the world's texts. Pixels outside a mask are black in most training crops (setting `clip.background: black`)
 and kept in the others (`keep`). "object", "things", "stuff" and "texture" were captions of random crops, so
 they have no specific meaning. Weights are stored as float16 and computed in float32.
 
-## How good it is
+## Quality
 Measured on crops of held-out scenes from the training range. "Exact": ground-truth masks of at least 24 px;
 "rough": masks from `sam-tiny` whose IoU with a node is above 0.5. The candidates are all
 {recipe["texts_competing"]} texts of those scenes (all levels), the texts of the mask's own level, or the
@@ -229,15 +229,15 @@ def _write_card(
     ending = f"""
 ## Recipe
 `python -m models.training` repeats this training: the same steps give the same weights on the same machine
-with the same number of threads. On other machines, the last digits of sums differ, and so do the weights.
+with the same number of threads. On other machines, rounding differs, and so do the weights.
 
-- generator of the world: version and digest of its output {recipe["generator"]}
+- world generator: version and digest of its output {recipe["generator"]}
 - training scenes: seeds {first} to {last} ({kinds}), {recipe["views"]} views each, {FRAME_PX} x {FRAME_PX}
-- measured on: seeds {lowest} to {highest}. Benchmark and development scenes come from other ranges of
-  seeds, and the code rejects them here.
+- measured on: seeds {lowest} to {highest}. Benchmark and development scenes use other seed ranges,
+  which training rejects.
 - {recipe["steps"]} steps of AdamW with averaged weights; the learning rate is constant, then decays to zero
   over the last quarter; seed {recipe["seed"]}, recipe {recipe["version"]}
-- {recipe["minutes"]:.0f} minutes with {recipe["threads"]} threads of a shared machine ({recipe["device"]}),
+- {recipe["minutes"]:.0f} minutes with {recipe["threads"]} threads on a shared machine ({recipe["device"]}),
   torch {recipe["torch"]}
 
 {_table(columns, rows)}

@@ -48,7 +48,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         if self.minutes <= 0 and self.steps <= 0:
-            raise ValueError("a training needs minutes or steps")
+            raise ValueError("training needs a limit: minutes or steps")
 
     def is_time_to_decay(self, step: int, minutes: float) -> bool:
         """Return whether the learning rate decay should begin."""
@@ -239,12 +239,12 @@ class Training:
             if self.progress.decay_from >= 0 and self.progress.budget != planned:
                 if not self.constant.is_file():
                     raise ArtifactError(
-                        f"{self.now} cannot be trained with another budget: {self.constant.name} is missing",
+                        f"{self.now} cannot resume with another budget: {self.constant.name} is missing",
                         fix="use the previous budget, or start again with another --cache folder",
                     )
                 finished = self.progress.step
                 self._load(self.constant)
-                logger.info("another budget: resuming from step %d of %d", self.progress.step, finished)
+                logger.info("different budget: resuming from step %d of %d", self.progress.step, finished)
             logger.info("resuming at step %d, after %.1f minutes", self.progress.step, self.progress.minutes)
         self.progress.budget = planned
 

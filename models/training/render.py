@@ -139,7 +139,7 @@ def render_training_views(cache: Path, seeds: Sequence[int], views: int, workers
     for row, path in enumerate(paths):
         arrays = read_npz(path)
         if arrays["images"].shape[0] != views:
-            raise ArtifactError(f"{path} is damaged", fix="run with another --cache folder")
+            raise ArtifactError(f"{path} is damaged", fix="rerun with another --cache folder")
         at = slice(row * views, (row + 1) * views)
         images[at], labels[at] = arrays["images"], arrays["labels"]
         rows = json.loads(arrays["nodes"].tobytes())
@@ -164,7 +164,7 @@ def world_vocabulary() -> str:
             for node in world.nodes:
                 (things if node.level == int(Level.WHOLE) else parts).add(node.text)
     sections = {"things": things - SURFACES, "parts": parts, "surfaces": things & SURFACES}
-    lines = ["# What clip-tiny was taught, by `python -m models.training`."]
+    lines = ["# Texts that clip-tiny was trained on, written by `python -m models.training`."]
     for section, texts in sections.items():
         lines += ["", f"[{section}]", *sorted(texts)]
     return "\n".join(lines) + "\n"

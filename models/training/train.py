@@ -94,7 +94,7 @@ def train_models(
     stages = STAGES if stages is None else tuple(stages)
     if not set(stages) <= set(STAGES):
         raise SettingsError(
-            "unknown stage of training", expected=f"some of {', '.join(STAGES)}", found=str(stages)
+            "unknown training step", expected=f"one or more of {', '.join(STAGES)}", found=str(stages)
         )
     recipe = render_views(Path(cache), settings, seed, threads)
     threads_before = torch.get_num_threads()
@@ -114,7 +114,7 @@ def require_own_models(out: Path) -> None:
         folder = Path(out) / name
         if folder.exists() and any(folder.iterdir()) and not (folder / RECORD).is_file():
             raise ModelError(
-                f"{folder} exists and contains no model trained by this package",
+                f"{folder} exists, but contains no model trained by this package",
                 fix="choose another --out folder, or remove it first",
             )
 

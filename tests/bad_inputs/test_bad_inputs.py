@@ -217,12 +217,12 @@ ROWS = {
     "cameras of another scene beside a tree": row(
         lambda: move_cameras(SCENE / "scene"),
         ASK,
-        "the semantic tree of photos/desk was made for another cameras.npz",
+        "the semantic tree of photos/desk was made for a different cameras.npz",
     ),
     "Gaussians of another scene beside a tree": row(
         lambda: GAUSSIANS.write_bytes(GAUSSIANS.read_bytes()[:-4] + b"\0\0\x80?"),
         ASK,
-        "of photos/desk was made for another gaussians.ply",
+        "of photos/desk was made for a different gaussians.ply",
     ),
     "provenance whose outputs are a list": row(
         lambda: write_record(FIELD, outputs=[]), ASK, "field.safetensors.provenance.json is damaged: outputs"
@@ -238,7 +238,7 @@ ROWS = {
         "hilsplat run",
     ),
     "a query that is not UTF-8": row(nothing, ("query", "photos/desk", "mug \udcff"), "is not UTF-8"),
-    "a query of nothing": row(nothing, ("query", "photos/desk", " > "), "is empty"),
+    "a query of nothing": row(nothing, ("query", "photos/desk", " > "), "an empty text"),
     "an unknown view": row(nothing, (*ASK, "--view", "x"), "x"),
     "an unknown variant": row(nothing, (*ASK, "--variant", "x"), "no variant 'x'", "default"),
     # ---- photographs and imports
@@ -254,7 +254,7 @@ ROWS = {
         with_photographs("transforms.json", "[]"), POSES, "transforms.json is not a JSON object"
     ),
     "frames that are numbers": row(
-        with_photographs("transforms.json", '{"frames": [1, 2, 3]}'), POSES, "no `frames` list of objects"
+        with_photographs("transforms.json", '{"frames": [1, 2, 3]}'), POSES, "`frames` is missing"
     ),
     "LLFF poses that are text": row(
         lambda: [photographs()(), np.save("photos/poses_bounds.npy", np.array([["a"] * 17] * 3))],
@@ -272,7 +272,7 @@ ROWS = {
     "labels of 10^9 px": row(
         write("label.json", '{"info": {"height": 1000000000, "width": 1000000000}, "objects": []}'),
         lambda: read_isat(Path("label.json")),
-        "label.json does not state the size",
+        "label.json does not state a valid image size",
         "at most 20000",
         "1000000000",
     ),

@@ -74,7 +74,7 @@ def regions_of(labels: IsatFile, warnings: list[str]) -> tuple[LabelledRegion, .
     """Return one region per object of a file, except for unaccepted proposals; extend `warnings`."""
     waiting = [thing for thing in labels.objects if thing.keys.get("origin") == PROPOSED]
     if waiting:
-        warnings.append(f"{labels.path.name}: unaccepted proposals, ignored: {len(waiting)}")
+        warnings.append(f"{labels.path.name}: ignored {len(waiting)} unaccepted proposal(s)")
         accepted = tuple(thing for thing in labels.objects if thing not in waiting)
         labels = replace(labels, objects=accepted)
     objects = by_id(labels)
@@ -105,17 +105,17 @@ def by_id(labels: IsatFile) -> dict[int, IsatObject]:
         is_piece = same is not None and is_group and same.category == thing.category
         if type(number) is not int or (same is not None and not is_piece):
             raise SceneError(
-                f"{where}: id cannot be used",
-                expected="a whole number, unique in the file",
+                f"{where}: invalid id",
+                expected="an integer, unique in the file",
                 found=repr(number),
-                fix="number the objects in the file",
+                fix="give each object in the file its own id",
             )
         if type(level) is not int or level not in list(Level):
             raise SceneError(
-                f"{where}: level cannot be used",
+                f"{where}: invalid level",
                 expected="1 (whole), 2 (part) or 3 (subpart)",
                 found=repr(level),
-                fix="correct it; plain LERF-OVS labels have no levels and belong below lerf_ovs/label",
+                fix="correct it; plain LERF-OVS labels have no levels and belong in lerf_ovs/label",
             )
         if same is not None:
             low = np.minimum(same.box_xyxy[:2], thing.box_xyxy[:2])
@@ -138,10 +138,10 @@ def parents_of(
             continue
         where = f"{labels.path.name}, id {number} ({thing.category})"
         if not isinstance(parent, int) or parent not in objects:
-            warnings.append(f"{where}: its parent {parent!r} does not exist")
+            warnings.append(f"{where}: parent {parent!r} does not exist")
         elif objects[parent].keys["level"] != level - 1:
             found = objects[parent].keys["level"]
-            warnings.append(f"{where}, level {level}: its parent {parent} has level {found}")
+            warnings.append(f"{where}, level {level}: parent {parent} has level {found}")
         else:
             parents[number] = parent
     return parents
@@ -167,7 +167,7 @@ def _nesting_violations(
 
 
 def _dataset(name: str, title: str, frame: str) -> Dataset:
-    """Return one of the two data sets, which differ in names only."""
+    """Return one of the two data sets, which differ only in their names."""
     images = IMAGES_OF[name]
     return Dataset(
         name=name,
@@ -175,7 +175,7 @@ def _dataset(name: str, title: str, frame: str) -> Dataset:
         labels="images",
         folder=name,
         scenes=tuple(FRAMES[name]),
-        licence="labels unpublished; images under the licence of their data set",
+        licence="labels unpublished; images under their data set's licence",
         terms="Write your own labels in our format; the terms of the images apply.",
         citation="Hi-LSplat (frames and levels)",
         layout=f"""{name}/
@@ -204,15 +204,15 @@ class Annotated(Dataset):
 
 ANNOTATED = Annotated(
     name="annotated",
-    title="Own annotations",
+    title="your annotations",
     labels="images",
     folder="annotated",
     scenes=(),
-    licence="yours; the photographs keep theirs",
+    licence="yours; the photographs keep their own",
     terms="Draw them with: hilsplat annotate SCENE",
     citation="none",
     layout="""annotated/
-  <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), a file per annotated photograph""",
+  <dataset>/<scene>/DSC_0001.json ...   our format (docs/datasets.md), one file per photograph""",
     required=lambda scene: (scene,),
     open=open_annotated,
     label_places=lambda scene: (f"{scene}/*.json",),

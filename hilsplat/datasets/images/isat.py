@@ -112,9 +112,9 @@ def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
     if not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no `objects` list",
-            expected="an ISAT file: info, objects",
+            expected="an ISAT file with the keys info and objects",
             found=f"keys {', '.join(content)}",
-            fix="convert labels from other tools (labelme, COCO)",
+            fix="convert labels from other tools (labelme, COCO) to ISAT",
         )
     info: Any = content.get("info")
     if not isinstance(info, dict):
@@ -122,8 +122,8 @@ def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
     size_hw = height, width = info.get("height"), info.get("width")
     if not all(isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX for side in size_hw):
         raise SceneError(
-            f"label file {path} does not state the size of its image",
-            expected=f"info.width and info.height, px, at most {LARGEST_SIDE_PX}",
+            f"label file {path} does not state a valid image size",
+            expected=f"info.width and info.height in pixels, at most {LARGEST_SIDE_PX}",
             found=f"height {height!r}, width {width!r}",
             fix="export the labels again",
         )
@@ -149,7 +149,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
     where = f"{where} ({category})"
     if not isinstance(entry.get("iscrowd", 0), int):  # 0 in some files, false in others
         raise SceneError(
-            f"{where}: iscrowd is not a number", found=repr(entry["iscrowd"]), fix="write 0 or 1"
+            f"{where}: iscrowd is not a number", found=repr(entry["iscrowd"]), fix="set it to 0 or 1"
         )
     polygons = _polygons(where, entry.get("segmentation"))
     height, width = size_hw
@@ -157,7 +157,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
         low, high = polygon.min(axis=0), polygon.max(axis=0)
         if high[0] < 0 or high[1] < 0 or low[0] >= width or low[1] >= height:
             raise SceneError(
-                f"{where}: a polygon is outside the image",
+                f"{where}: a polygon is entirely outside the image",
                 expected=f"x below {width}, y below {height}",
                 found=f"x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}",
                 fix="use labels and images of the same size and release",
@@ -167,7 +167,7 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
     points = np.concatenate(polygons)
     reach = float(max((-points).max(), (points - [width, height]).max()))
     if reach > SLACK_PX:
-        warnings.append(f"{where}: a polygon reaches {reach:g} px outside the image; clipped")
+        warnings.append(f"{where}: a polygon extends {reach:g} px beyond the image; clipped")
     return IsatObject(category, polygons, _box(where, entry.get("bbox"), points, warnings), entry)
 
 
@@ -184,7 +184,7 @@ def _polygons(where: str, value: Any) -> tuple[Float[np.ndarray, "_ 2"], ...]:
             f"{where}: segmentation is not a polygon",
             expected="a list of [x, y] pairs, or a list of such lists",
             found=repr(value)[:80],
-            fix="export the labels again; flat COCO lists x1, y1, x2, ... are a different format",
+            fix="export the labels again; flat COCO lists (x1, y1, x2, ...) are not supported",
         )
     return polygons
 
@@ -201,7 +201,7 @@ def _box(
         usable = False
     if not usable:
         raise SceneError(
-            f"{where}: bbox cannot be used", expected="[x1, y1, x2, y2]", found=repr(value), fix="correct it"
+            f"{where}: invalid bbox", expected="[x1, y1, x2, y2]", found=repr(value), fix="correct it"
         )
     if np.abs(box - extent).max() > SLACK_PX:
         as_sizes = np.concatenate([box[:2], box[:2] + box[2:]])
@@ -209,7 +209,7 @@ def _box(
             raise SceneError(
                 f"{where}: bbox is not [x1, y1, x2, y2]",
                 expected=f"{extent.tolist()}, the polygon's extent",
-                found=f"{box.tolist()}, as if it were [x, y, width, height]",
+                found=f"{box.tolist()}, probably [x, y, width, height]",
                 fix="convert the boxes, or remove bbox to use the polygon's extent",
             )
         warnings.append(f"{where}: bbox {box.tolist()} differs from the polygon's extent {extent.tolist()}")

@@ -34,10 +34,10 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     test = tuple(view for view in posed if view not in train)
     if not test:
         raise SceneError(
-            f"{folder} has no test view",
+            f"{folder} has no test views",
             expected="posed images that are not in images_train",
-            found=f"{len(posed)} posed images, all of them in images_train",
-            fix="unpack images_train again; it is not a copy of images",
+            found=f"{len(posed)} posed images, all in images_train",
+            fix="unpack images_train again; it must not be a copy of images",
         )
     masks = _mask_folders(folder / "test_mask", test)
     require_images(masks, images)
@@ -56,7 +56,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
                 )
             regions.append(mask_region(path, FOREGROUND, image_hw, warnings))
         if not regions:
-            raise SceneError(f"{place} has no mask", expected="<prompt>.png", fix="unpack test_mask again")
+            raise SceneError(f"{place} has no masks", expected="<prompt>.png", fix="unpack test_mask again")
         views[view] = tuple(regions)
     read = LabelledScene("lerf_mask", scene, images, folder, views)
     warnings += differences("lerf_mask", scene, {}, read.prompts)
@@ -70,9 +70,9 @@ def _mask_folders(folder: Path, test: tuple[str, ...]) -> dict[str, Path]:
     strange = sorted(place.name for place in places if not place.name.isdecimal())
     if strange or [number for number, _ in numbers] != list(range(len(test))):
         raise SceneError(
-            f"the folders of {folder} do not match the test views",
+            f"the folders in {folder} do not match the test views",
             expected=f"0 to {len(test) - 1}, for {', '.join(test[:10])}{', ...' if len(test) > 10 else ''}",
-            found=", ".join([place.name for _, place in numbers] + strange) or "no folder",
+            found=", ".join([place.name for _, place in numbers] + strange) or "no folders",
             fix="unpack test_mask, images_train and sparse again, from the same release",
         )
     return {view: place for view, (_, place) in zip(test, numbers, strict=True)}
@@ -90,7 +90,7 @@ DATASET = Dataset(
     layout="""lerf_mask/
   figurines/  ramen/  teatime/
     images/             all images
-    images_train/       training images; a posed image that is not here is a test view
+    images_train/       training images; posed images missing here are test views
     sparse/0/*.bin      undistorted
     test_mask/0/green apple.png ...     one folder per test view, one mask per prompt
     object_mask/        tracked masks for training, not read""",

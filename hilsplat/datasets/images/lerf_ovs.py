@@ -48,8 +48,8 @@ def label_files(folder: Path) -> dict[str, Path]:
     files = {view_name(path.stem): path for path in paths}
     if not files:
         raise SceneError(
-            f"{folder} has no label file",
-            expected="one .json per labelled frame",
+            f"{folder} has no label files",
+            expected="one .json file per labelled frame",
             found=", ".join(sorted(path.name for path in folder.glob("*"))[:5]) or "nothing",
             fix="unpack the labels again, or move them up if they are in a subfolder",
         )

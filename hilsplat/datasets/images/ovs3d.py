@@ -46,7 +46,7 @@ def open_scene(root: Path, scene: str) -> LabelledScene:
     )
     if not places:
         raise SceneError(
-            f"{folder / 'segmentations'} has no segmented view",
+            f"{folder / 'segmentations'} has no segmented views",
             expected="00/, 04/, ...",
             fix="unpack segmentations again",
         )
@@ -69,9 +69,9 @@ def read_classes(path: Path) -> tuple[str, ...]:
     twice = sorted({prompt for prompt in prompts if prompts.count(prompt) > 1})
     if not prompts or twice:
         raise SceneError(
-            f"{path} cannot be used",
+            f"{path} is not a valid list of classes",
             expected="one class per line, without duplicates",
-            found=f"duplicates: {', '.join(twice)}" if twice else "no class",
+            found=f"duplicates: {', '.join(twice)}" if twice else "no classes",
             fix="unpack segmentations again",
         )
     return tuple(prompts)

@@ -71,10 +71,10 @@ class LabelledPoints:
         fitting = LABELLINGS[self.labelling]
         if classes not in fitting:
             raise MisalignedArtifactError(
-                f"classes {classes.name} are not defined on {self.labelling} labels",
+                f"class set {classes.name} is not defined for {self.labelling} labels",
                 expected=" or ".join(each.name for each in fitting),
                 found=classes.name,
-                fix="use a protocol of this data set",
+                fix="use one of this data set's protocols",
             )
         return classes.labels(self.class_id)
 
@@ -120,7 +120,7 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
     if not content.keys() >= set(keys):
         raise SceneError(
             f"{path} does not have the expected content",
-            expected=f"an object with {', '.join(keys)}",
+            expected=f"an object with the keys {', '.join(keys)}",
             found=", ".join(sorted(content)[:12]) or "an empty object",
             fix=UNPACK_AGAIN,
         )
@@ -169,7 +169,7 @@ class PlyMesh:
         except (PlyParseError, KeyError, ValueError, OSError) as error:
             raise SceneError(
                 f"{path} cannot be read: {error}",
-                expected=f"a PLY mesh with faces of {corners} corners",
+                expected=f"a PLY mesh with {corners} corners per face",
                 found=f"a file of {path.stat().st_size} bytes",
                 fix=UNPACK_AGAIN,
             ) from error
@@ -182,7 +182,7 @@ class PlyMesh:
                 f"the {element} element of {self.path} has no property {name}",
                 expected=name,
                 found=", ".join(data.dtype.names),
-                fix="use the labelled file that the data set distributes",
+                fix="use the labelled file distributed with the data set",
             )
         return np.asarray(data[name])
 
@@ -198,7 +198,7 @@ class PlyMesh:
         count = len(self._content["vertex"].data)
         if faces.size and (faces.min() < 0 or faces.max() >= count):
             raise SceneError(
-                f"{self.path}: a face has a corner that is not a vertex",
+                f"{self.path}: a face has an invalid vertex index",
                 expected=f"0 to {count - 1}",
                 found=f"{faces.min()} to {faces.max()}",
                 fix=UNPACK_AGAIN,
@@ -213,9 +213,9 @@ def by_number(paths: Sequence[Path], prefix: str = "") -> list[tuple[int, Path]]
         stem = path.stem.removeprefix(prefix)
         if not (stem.isascii() and stem.isdecimal()):
             raise SceneError(
-                f"{path} is not named like a frame",
+                f"{path} does not have a frame's file name",
                 expected=f"{prefix}<number>{path.suffix}",
-                fix="move other images out of this folder",
+                fix="move images that are not frames to another folder",
             )
         numbered.append((int(stem), path))
     return sorted(numbered)

@@ -89,7 +89,7 @@ def read_images(folder: Path) -> tuple[tuple[PosedImage, ...], tuple[str, ...]]:
     frames = by_number(named, prefix)
     beyond = [number for number, _ in frames if number >= len(poses)]
     if beyond or not frames:
-        missing = f", the first without a line is frame {beyond[0]}" if beyond else ""
+        missing = f"; the first frame without a line is {beyond[0]}" if beyond else ""
         raise SceneError(
             f"{path} does not match the images in {folder / image_folder}",
             expected="at least one line per frame",
@@ -187,7 +187,7 @@ def read_semantic_mesh(habitat: Path) -> LabelledPoints:
             f"{path} and info_semantic.json do not match",
             expected=f"object ids 0 to {len(classes) - 1}",
             found=f"{of_face.min()} to {of_face.max()}",
-            fix="use both files of the same scene",
+            fix="use both files from the same scene",
         )
     owner = object_of_vertices(quads, of_face, len(mesh.xyz))
     class_id = np.where(owner >= 0, classes[owner], 0).astype(np.int32)
@@ -201,13 +201,13 @@ def read_vertex_labels(path: Path, num_vertices: int) -> Int32[np.ndarray, " P"]
     try:
         labels = np.array(path.read_text(encoding="utf-8").split(), dtype=np.int32)
     except ValueError as error:
-        raise SceneError(f"{path} does not contain whole numbers: {error}", fix=UNPACK_AGAIN) from error
+        raise SceneError(f"{path} does not contain only integers: {error}", fix=UNPACK_AGAIN) from error
     if len(labels) != num_vertices:
         raise SceneError(
             f"{path} does not match the vertices of its mesh",
             expected=f"{num_vertices} lines",
             found=f"{len(labels)}",
-            fix="use the mesh and the labels of the same scene and release",
+            fix="use a mesh and labels from the same scene and release",
         )
     unknown = Counter(labels[~np.isin(labels, [*REPLICA_NAMES, 0, -1, -2])].tolist())
     if unknown:
@@ -241,7 +241,7 @@ def read_labelled_mesh(mesh_path: Path, labels: Path, instances: Path | None = N
                 f"{instances} does not match the vertices of {mesh_path}",
                 expected=f"{len(xyz)} lines",
                 found=len(values),
-                fix="use files of the same scene",
+                fix="use both files from the same scene",
             )
         # Values are class * 1000 + instance; values below 1000 are not objects.
         instance = np.where(values >= 1000, values, 0).astype(np.int32)
@@ -260,7 +260,7 @@ def open_scene(root: Path, scene: str) -> PointScene:
         truth = read_labelled_mesh(mesh, text, instances if instances.is_file() else None)
     else:
         raise SceneError(
-            f"{scene} of Replica has no labels in {root}",
+            f"Replica scene {scene} has no labels in {root}",
             expected=f"{scene}/habitat/mesh_semantic.ply, or {text.name} with {short}_mesh.ply",
             found=listing(root),
             fix="unpack the original release there",
@@ -278,14 +278,14 @@ DATASET = Dataset(
     folder="replica",
     scenes=(*(f"office_{number}" for number in range(5)), *(f"room_{number}" for number in range(3))),
     licence="Replica Research Terms",
-    terms="Non-commercial research and education only; do not pass the data on.",
+    terms="Non-commercial research and education only; do not redistribute the data.",
     citation="Straub et al., The Replica Dataset: A Digital Replica of Indoor Spaces, arXiv 1906.05797, 2019",
     layout="""replica/
   room_0/                        the original release
     habitat/mesh_semantic.ply
     habitat/info_semantic.json
-  cam_params.json                lens of the renderings, optional
-  room0/                         the renderings of NICE-SLAM, or room_0/imap/00 (vMAP), room_0/Sequence_1
+  cam_params.json                optional: intrinsics of the renderings
+  room0/                         NICE-SLAM's renderings; or room_0/imap/00 (vMAP), room_0/Sequence_1
     traj.txt
     results/frame000000.jpg depth000000.png ...""",
     required=lambda scene: (f"{scene}/habitat/mesh_semantic.ply", f"{scene}/habitat/info_semantic.json"),

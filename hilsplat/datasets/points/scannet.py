@@ -57,7 +57,7 @@ def scan_folder(root: Path, scan: str) -> Path:
 
 def read_label_table(path: Path) -> dict[str, int]:
     """Return each raw category's id in `scannetv2-labels.combined.tsv`; 0 if not one of the 200 classes."""
-    require_file(path, f"download {LABEL_TABLE} of ScanNet's release into the data set's folder")
+    require_file(path, f"download {LABEL_TABLE} from ScanNet's release to the data set's folder")
     found = {}
     with path.open(encoding="utf-8", newline="") as stream:
         rows = csv.DictReader(stream, delimiter="\t")
@@ -67,7 +67,7 @@ def read_label_table(path: Path) -> dict[str, int]:
                 f"{path} is not ScanNet's label table",
                 expected="tab-separated columns id, raw_category",
                 found=", ".join(rows.fieldnames or ())[:120] or "an empty file",
-                fix="download the latest table of the release again",
+                fix="download the table again, from the latest release",
             )
         for row in rows:
             try:
@@ -95,7 +95,7 @@ def axis_alignment(folder: Path, scan: str) -> Float[np.ndarray, "4 4"]:
             f"{scan} has no usable axisAlignment",
             expected="16 numbers",
             found=f"{len(words)} words",
-            fix="leave mesh and poses as they are (aligned=False)",
+            fix="do not align the mesh and poses (aligned=False)",
         ) from error
 
 
@@ -129,14 +129,14 @@ def read_images(folder: Path, scan: str) -> tuple[tuple[PosedImage, ...], tuple[
         images.append(PosedImage(path.name, path, cam_from_world, K, size_hw))
     if not images:
         raise SceneError(
-            f"no frame of {scan} can be used",
+            f"{scan} has no usable frames",
             expected="images in color/, each with a finite matrix in pose/",
-            found=f"{len(frames)} images; {len(without)} without a pose, {len(lost)} lost by tracking",
+            found=f"{len(frames)} images; {len(without)} without a pose, {len(lost)} with failed tracking",
             fix="export poses and images again",
         )
     warnings = []
     if lost:
-        warnings.append(f"{len(lost)} frames were lost by tracking (infinite poses) and are skipped")
+        warnings.append(f"{len(lost)} frames are skipped because tracking failed (infinite poses)")
     if without:
         warnings.append(f"{len(without)} images (first: {without[0]}) have no file in pose/ and are skipped")
     return tuple(images), tuple(warnings)
@@ -159,7 +159,7 @@ def read_truth(
         raise SceneError(
             f"{label_path.name} does not match {mesh_path.name} of {scan}",
             expected=f"the same {len(xyz)} vertices in the same order",
-            found=f"{len(nyu40)} vertices" if len(nyu40) != len(xyz) else "vertices in other positions",
+            found=f"{len(nyu40)} vertices" if len(nyu40) != len(xyz) else "vertices at other positions",
             fix="use both files from the same release",
         )
     if nyu40.size and nyu40.max() > 40:
@@ -187,7 +187,7 @@ def _from_aggregation(
             f"{segments_path} does not match the mesh of {scan}",
             expected=f"an integer for each of {num_points} vertices",
             found=f"{segments.size} values of type {segments.dtype}",
-            fix="use the file of the decimated mesh (vh_clean_2)",
+            fix="use the file for the decimated mesh (vh_clean_2)",
         )
     path = folder / f"{scan}.aggregation.json"
     fine, instance = np.zeros((2, num_points), dtype=np.int32)
@@ -206,7 +206,7 @@ def _from_aggregation(
         if not rows.any():
             raise SceneError(
                 f"{path}, group {row} ({category}): none of its segments is in {segments_path.name}",
-                fix="use the aggregation of the decimated mesh, not that of the full mesh",
+                fix="use the aggregation for the decimated mesh, not the one for the full mesh",
             )
         if category not in table:
             unknown[category] += 1
@@ -248,7 +248,7 @@ DATASET = Dataset(
     folder="scannet",
     scenes=OPENGAUSSIAN_SCENES,
     licence="code MIT; data under the ScanNet Terms of Use",
-    terms="A signed agreement, research use only; never pass on scans or label files made from them.",
+    terms="Research use only, with a signed agreement; never redistribute scans or labels made from them.",
     citation="Dai et al., ScanNet: Richly-annotated 3D Reconstructions of Indoor Scenes, CVPR 2017; "
     "ScanNet200: Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation, ECCV 2022",
     layout="""scannet/
@@ -262,7 +262,7 @@ DATASET = Dataset(
       scene0000_00_vh_clean_2.labels.ply
       scene0000_00_vh_clean_2.0.010000.segs.json
       scene0000_00.aggregation.json
-      scene0000_00.txt                 optional: size of the images, axisAlignment""",
+      scene0000_00.txt                 optional: image size, axisAlignment""",
     required=lambda scan: (
         *(f"scans/{scan}/{name}" for name in ("color", "pose", "intrinsic/intrinsic_color.txt")),
         f"scans/{scan}/{scan}_vh_clean_2.ply",

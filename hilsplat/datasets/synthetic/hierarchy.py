@@ -89,11 +89,11 @@ class HierarchyAnnotations:
 
     @staticmethod
     def load(folder: Path) -> "HierarchyAnnotations":
-        """Read the folder; raise ArtifactError if annotations.json is missing or in a different format."""
+        """Read the folder; raise ArtifactError if annotations.json is missing or has another format."""
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(
-                f"{folder}/annotations.json has a different format",
+                f"{folder}/annotations.json has an unsupported format",
                 expected=FORMAT,
                 found=record.get("format"),
             )

@@ -96,7 +96,7 @@ def labelled_points(world: Path, kind: str) -> dict[str, LabelledPoints]:
         return {"waymo": LabelledPoints(scan["points"].astype(np.float64), classes, instance, "waymo")}
     if kind != "room":
         raise SceneError(
-            f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="omit them"
+            f"a world of kind {kind!r} has no labelled points", expected="room or street", fix="score images"
         )
     mesh = PlyMesh(world / "truth" / "mesh.ply", 3)
     seen = mesh.column("vertex", "views") > 0

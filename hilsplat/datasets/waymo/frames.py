@@ -193,10 +193,10 @@ def frame_points(frame: LidarFrame, segment_from_world: Float[np.ndarray, "4 4"]
     classes = points.class_id
     if classes.size and (classes.min() < 0 or classes.max() > max(WAYMO_22.ids)):
         raise SceneError(
-            f"labels of the top lidar at {frame.timestamp_micros} have an unknown class",
+            f"the top lidar's labels at {frame.timestamp_micros} contain an unknown class",
             expected=f"0 to {max(WAYMO_22.ids)}",
             found=f"{classes.min()} to {classes.max()}",
-            fix="use the 3D semantic segmentation of release 1.4.3 or 2.0.1",
+            fix="use the 3D semantic segmentation from release 1.4.3 or 2.0.1",
         )
     return points
 

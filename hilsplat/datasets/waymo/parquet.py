@@ -59,15 +59,15 @@ def read_component(
             f"component {tag} of segment {segment} is missing",
             expected=path,
             found=listing(path.parent),
-            fix=f"download {tag}/{segment}.parquet of the same release",
+            fix=f"download {tag}/{segment}.parquet from the same release",
         )
     try:
         known = parquet.read_schema(path).names
         lacking = [name for name in (*columns, *(only or {})) if name not in known]
         if lacking:
             raise SceneError(
-                f"{path} is not the component {tag} of release 2",
-                expected=", ".join(lacking),
+                f"{path} is not component {tag} of release 2",
+                expected=f"columns {', '.join(lacking)}",
                 found=", ".join(known[:12]),
                 fix="download the component again",
             )
@@ -139,7 +139,7 @@ def _range_images(
         raise SceneError(
             f"component {tag} of segment {segment} does not match lidar_segmentation",
             expected=f"one row for the top lidar at {time}",
-            found=f"{len(rows)}",
+            found=f"{len(rows)} rows",
             fix="download all components of the segment from the same release",
         )
     images: list[np.ndarray | None] = []
@@ -185,7 +185,7 @@ def camera_shots(split: Path, segment: str, every: int = 1) -> Iterator[CameraSh
     strange = sorted({row[CAMERA] for row in rows} - set(known))
     if strange:
         raise SceneError(
-            f"segment {segment} has images of cameras without a calibration",
+            f"segment {segment} has images from cameras without a calibration",
             expected=", ".join(map(str, sorted(known))),
             found=", ".join(map(str, strange)),
             fix="download camera_image and camera_calibration from the same release",

@@ -82,7 +82,7 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     points = [frame_points(frame, segment_from_world) for frame in frames]
     if not points:
         raise SceneError(
-            f"segment {segment} has no frame with labels of the top lidar",
+            f"segment {segment} has no frames with labels for the top lidar",
             fix="use a segment with 3D semantic segmentation labels, from release 1.3.2 or later",
         )
     images = tuple(shot_image(shot, segment_from_world) for shot in shots)
@@ -93,9 +93,9 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
     )  # fmt: skip
     warnings = []
     if any(image.distortion[4] for image in images):
-        warnings.append("the lenses have a k3 coefficient, which poses cannot import: undistort the images")
+        warnings.append("the lenses have a k3 coefficient, which poses cannot import; undistort the images")
     if truth.visible is None:
-        warnings.append("lidar_camera_projection is missing: the points visible to a camera are unknown")
+        warnings.append("lidar_camera_projection is missing, so the points' visibility is unknown")
     return PointScene(segment, images, {"waymo": truth}, tuple(warnings))
 
 
@@ -130,7 +130,7 @@ DATASET = Segments(
     folder="waymo",
     scenes=(),
     licence="code Apache-2.0; data under the Waymo Dataset License Agreement for Non-Commercial Use",
-    terms="Non-commercial use after registering; do not pass the data on.",
+    terms="Non-commercial use after registration; do not redistribute the data.",
     citation="Sun et al., Scalability in Perception for Autonomous Driving: Waymo Open Dataset, CVPR 2020",
     layout="""waymo/
   validation/                          release 2.0.1, one parquet file per component and segment

@@ -121,7 +121,7 @@ def first_pose(path: Path) -> Float[np.ndarray, "4 4"]:
     """Return the vehicle's pose in the world at the first frame."""
     for where, frame in frames(path):
         return _transform(frame.pose, where)
-    raise SceneError(f"{path} has no frame", fix=UNPACK_AGAIN)
+    raise SceneError(f"{path} contains no frames", fix=UNPACK_AGAIN)
 
 
 def _transform(message: Any, where: str) -> np.ndarray:
@@ -173,7 +173,7 @@ def _named(messages: Iterable[Any], name: int) -> Any:
     for message in messages:
         if message.name == name:
             return message
-    raise ValueError(f"it has no data from sensor {name}")
+    raise ValueError(f"no data from sensor {name}")
 
 
 def camera_shots(path: Path, every: int = 1) -> Iterator[CameraShot]:

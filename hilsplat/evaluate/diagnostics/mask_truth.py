@@ -50,10 +50,10 @@ def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str
         labels = truth.label_image(view, level)
         if labels.shape != tuple(masks.size_hw):
             raise MisalignedArtifactError(
-                f"masks of view {view} do not have the size of its label images",
+                f"the masks of view {view} do not match the size of its label images",
                 expected=f"{labels.shape[0]} x {labels.shape[1]} (height x width)",
                 found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                fix="run poses without shrinking the images (poses.max_side_px), then masks again",
+                fix="rerun poses without shrinking the images (poses.max_side_px), then rerun masks",
             )
         rows = masks.rows_of(level)
         ids, areas, ious = region_ious(labels, masks.dense(rows))
@@ -133,7 +133,7 @@ def draw_fits(
         scale = below[0].inset_axes((0.1, 0.5, 0.8, 0.05))
         bar = figure.colorbar(ScalarMappable(cmap=COLOURS), cax=scale, orientation="horizontal")
         bar.ax.tick_params(labelsize=7)
-        bar.set_label("IoU of a true region with\nthe mask that fits it best", fontsize=8)
+        bar.set_label("IoU of each true region\nwith its best mask", fontsize=8)
     return figure
 
 

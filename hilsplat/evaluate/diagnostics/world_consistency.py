@@ -216,7 +216,7 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     index = read_index(masks_folder)
     views = list(index["views"])
     if len(views) < 2:
-        raise ArtifactError(f"{masks_folder} has masks of {len(views)} view(s)", expected="at least two")
+        raise ArtifactError(f"{masks_folder} has masks for {len(views)} view(s)", expected="at least two")
     cameras = Cameras.load(Path(truth) / "cameras.npz")
     mesh = TrueMesh.load(Path(truth) / "mesh.ply")
     annotations = HierarchyAnnotations.load(truth)
@@ -232,10 +232,10 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         expected = cameras[view].size_hw
         if masks.size_hw != expected:
             raise MisalignedArtifactError(
-                f"masks of view {view} do not have the size of its ground-truth camera",
+                f"the masks of view {view} do not match the size of its ground-truth camera",
                 expected=f"{expected[0]} x {expected[1]} (height x width)",
                 found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                fix="run poses without shrinking the images (poses.max_side_px), then masks again",
+                fix="rerun poses without shrinking the images (poses.max_side_px), then rerun masks",
             )
         return masks
 

@@ -174,7 +174,7 @@ def draw_views(methods: Sequence[Answerer], rows: Sequence[Shown], evaluate: Eva
     """Draw one row per method, one column per view, to compare a method's answers across views."""
     first = methods[0].scene
     scene = first.scene
-    query = f"“{rows[0].text}” over {len(rows)} views" if rows else "no query"
+    query = f"“{rows[0].text}” in {len(rows)} views" if rows else "no query"
     figure, grid = _grid(scene, len(methods) + 1, max(len(rows), 1), f"{scene.name}: {query}")
     answers = [method.masks(rows, evaluate) for method in methods]
     for column, row in enumerate(rows):

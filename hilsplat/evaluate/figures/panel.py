@@ -164,7 +164,7 @@ def draw_panel(
     queries_in = len(rows) * row_in + (0.2 if rows else 0)
     figure = Figure(figsize=(WIDTH_IN, overview_in + queries_in + 0.45), layout="constrained")
     label = masks_label(masks_folder)
-    warning = ": a diagnostic, masks made from the true labels" if made_from_truth(label) else ""
+    warning = " (diagnostic: masks made from the true labels)" if made_from_truth(label) else ""
     title = [scene.name + warning, *textwrap.wrap(answers.caution, TITLE_LETTERS)]
     figure.suptitle("\n".join(title), fontsize=12, fontweight="bold", parse_math=False)
     parts: list[FigureBase] = [figure]

@@ -60,7 +60,7 @@ def match_instances(
     """
     if masks.shape[1] != len(truth):
         raise MisalignedArtifactError(
-            "predicted instances do not fit the scan's points",
+            "predicted instances do not match the scan's points",
             expected=f"{len(truth)} points",
             found=masks.shape[1],
             fix="predict on the vertices of the evaluated mesh",

@@ -32,9 +32,9 @@ def relevancy_of(
     found = np.asarray(render(tuple(texts), view), dtype=np.float32)
     if np.isnan(found).any():
         raise ArtifactError(
-            f"the relevancy of view {view} is not a number at {np.isnan(found).sum()} pixels",
+            f"the relevancy of view {view} is NaN at {np.isnan(found).sum()} pixels",
             expected="a finite relevancy everywhere",
-            fix="check the field and the vectors of the scene for NaN",
+            fix="check the scene's field and CLIP vectors for NaN",
         )
     return found
 

@@ -91,7 +91,7 @@ LERF_LANGSPLAT = ProtocolCard(
     "pairs",
     "min-max relevancy above 0.7 after a mean filter of 30 px at a height of 730, scaled; level of the "
     "highest value",
-    "LangSplat; departs: its filter of 30 px is scaled with the height of the image",
+    "LangSplat, except that its 30 px filter is scaled with the image height",
     RelevancyRule(),
     public="minghanqin/LangSplat@26ed214 eval/evaluate_iou_loc.py:activate_stream",
 )
@@ -166,13 +166,13 @@ LERF_MASK = ProtocolCard(
     MASK,
     "classes",
     "the method's own masks, one per prompt",
-    "Gaussian Grouping; departs: a missing prediction and two empty masks (there, NaN) count as 0",
+    "Gaussian Grouping, except that a missing prediction and two empty masks count as 0 (there, NaN)",
     public=GAUSSIAN_GROUPING,
 )
 LERF_MASK_SKIPPING = replace(
     LERF_MASK,
     name="lerf-mask/gaussian-grouping-skipping",
-    source="Gaussian Grouping, skipping missing predictions; departs: two empty masks count as 0 "
+    source="Gaussian Grouping, except that missing predictions are skipped and two empty masks count as 0 "
     "(there, NaN)",
     missing="left out",
 )
@@ -190,7 +190,7 @@ OVS_ARGMAX = ProtocolCard(
     ("iou", "pixel_accuracy"),
     "pairs",
     f"{ARGMAX} and over the levels, at an eighth of the image's size",
-    "3D-OVS; departs: the highest cosine of three levels (there, one); a pixel without a cosine is a miss. "
+    "3D-OVS, except that three levels compete (there, one) and a pixel without a cosine is a miss. "
     "Up to version 2, texts not visible in the view did not compete",
     public="Kunhao-Liu/3D-OVS@80e512c renderer.py:evaluation_segmentation_test",
 )
@@ -200,8 +200,8 @@ INSTANCES = ProtocolCard(
     ("ap", "ap50", "ap25", "ap_head", "ap_common", "ap_tail"),
     "pooled",
     "predicted instances with class and confidence; those with fewer than 100 points are ignored",
-    "OpenMask3D's copy of ScanNet's script; departs: confidence is the cosine (there, 1 for all). "
-    "Predictions are matched in the order given; ScanNet's own script uses a dict's order, so undefined",
+    "OpenMask3D's copy of ScanNet's script, except that confidence is the cosine (there, 1). Predictions "
+    "are matched in the order given; ScanNet's own script uses a dict's order, which is undefined",
     classes="scannet200-instances",
     public="OpenMask3D/openmask3d@6488748 openmask3d/evaluation/eval_semantic_instance.py:evaluate_matches",
 )
@@ -212,8 +212,8 @@ OVS_LANGSPLAT_V2 = ProtocolCard(
     "pairs",
     "min-max of the smoothed relevancy above 0.625, 7 x 7 majority; whole or part, by the highest mean in "
     "its mask, an empty mask first; ground truth: any non-zero grey; wood wall includes wood table's mask",
-    f"{LANGSPLAT_V2}, with its shell script's threshold; departs: a text without ground-truth pixels is not "
-    "queried. Up to version 2, a mask with only greys of 1 to 127 was empty",
+    f"{LANGSPLAT_V2}, with its shell script's threshold, except that a text without ground-truth pixels is "
+    "not queried. Up to version 2, a mask with only greys of 1 to 127 was empty",
     RelevancyRule(
         filter_px=29,
         threshold=0.25,
@@ -319,9 +319,7 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points("scannet/opengaussian-19", "scannet-19", "OpenGaussian", public=OPENGAUSSIAN),
     _points("scannet/opengaussian-15", "scannet-15", "OpenGaussian", public=OPENGAUSSIAN),
     _points("scannet/opengaussian-10", "scannet-10", "OpenGaussian", public=OPENGAUSSIAN),
-    _points(
-        "scannet200/opengaussian", "scannet200", "OpenGaussian; departs: 200 classes", public=OPENGAUSSIAN
-    ),
+    _points("scannet200/opengaussian", "scannet200", "OpenGaussian, with 200 classes", public=OPENGAUSSIAN),
     _points(
         "scannet200/benchmark",
         "scannet200",
@@ -335,8 +333,8 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points(
         "replica/opennerf",
         "replica-51",
-        "OpenNeRF; departs: a class without ground-truth points counts as 0 (there, NaN if it is predicted; "
-        "otherwise, the script stops)",
+        "OpenNeRF, except that a class without ground-truth points counts as 0 (there, NaN if it is "
+        "predicted; otherwise, the script stops)",
         (*PER_CLASS, "miou_all", "macc_all"),
         "pooled",
         public="opennerf/opennerf@343fa06 scripts/train_eval_replica_semantics.py:get_iou",
@@ -344,8 +342,8 @@ CARDS: tuple[ProtocolCard, ...] = (
     _points(
         "replica/conceptgraphs",
         "replica-51",
-        "ConceptGraphs' means; departs: scored on mesh vertices, and all 51 names compete (there, only the "
-        "classes in the scene)",
+        "ConceptGraphs' means, except that mesh vertices are scored and all 51 names compete (there, only "
+        "the classes in the scene)",
         (*PER_CLASS, "macc_present", "frequency_weighted_iou"),
         public="concept-graphs/concept-graphs@3f97d78 conceptgraph/utils/eval.py:compute_metrics",
     ),

@@ -92,7 +92,7 @@ def carried_to(
     if mode == "frozen":
         if len(opacities) != len(points):
             raise MisalignedArtifactError(
-                "the Gaussians do not correspond to the points of the ground truth",
+                "the Gaussians do not correspond to the ground-truth points",
                 expected=f"{len(points)} Gaussians, one per point",
                 found=len(opacities),
                 fix="fit with frozen points, or use mode nearest, vote or density",

@@ -69,10 +69,10 @@ class ViewTruth:
             labels = annotations.label_image(view, level)
             if labels.shape != tuple(size_hw):
                 raise MisalignedArtifactError(
-                    f"label image of view {view}, level {level.label}, does not fit its camera",
+                    f"the {level.label} label image of view {view} does not match its camera's size",
                     expected=f"{size_hw[0]} x {size_hw[1]} (height x width)",
                     found=f"{labels.shape[0]} x {labels.shape[1]}",
-                    fix="annotate the images of the scene folder, or run poses without shrinking them",
+                    fix="annotate the images in the scene folder, or run poses without shrinking them",
                 )
             for text, ids in texts.items():
                 for node in ids:

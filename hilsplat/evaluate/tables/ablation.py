@@ -25,10 +25,10 @@ COLUMNS = (
 )
 
 COLUMNS_NOTE = (
-    "All in %. Columns of measured rows are named after the paper's; on the stand-in, LERF and 3D-OVS are "
-    "their protocols (lerf/langsplat or lerf/tree-nodes, level chosen; 3d-ovs/langsplat), and Hi-LERF is "
-    "hierarchy/level-given: mIoU is the mean of L1 to L3, HC its containment reading. The level is given, "
-    "so a row measures the parts of the method, not how well levels are chosen. "
+    "All values in %. Measured columns have the paper's names; on the stand-in, LERF and 3D-OVS denote their "
+    "protocols (lerf/langsplat or lerf/tree-nodes, level chosen; 3d-ovs/langsplat), and Hi-LERF denotes "
+    "hierarchy/level-given: mIoU is the mean of L1 to L3, and HC uses the containment reading. The level is "
+    "given, so a row measures the components of the method, not how well levels are chosen. "
     f'"{AGAINST}": Hi-LERF mIoU minus that of the default field, paired by scene; mean and standard error '
     "over the scenes."
 )
@@ -37,24 +37,24 @@ COLUMNS_NOTE = (
 def ablation_table(sources: Sources) -> Table:
     """Build the paper's ablation: parts of its method enabled one after the other, in the paper's reading."""
     note = (
-        "Initial-2D: levels of the 2D masks by the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
-        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md says how each was read."
+        "Initial-2D: 2D mask levels from the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
+        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md describes how we read each."
     )
     return _table(sources, "ablation", "Ablation", "ablation", note)
 
 
 def component_table(sources: Sources) -> Table:
     """Build our own ablation: the contribution of each part of the default field and its code."""
-    note = "Rows name the losses that are switched on; d is the size of a latent."
+    note = "Rows name the enabled losses; d is the size of a latent."
     return _table(sources, "components", "Parts of the default field", "parts", note)
 
 
 def theta_table(sources: Sources) -> Table:
     """Build the sweep over the coverage threshold."""
     note = (
-        "theta decides which mask of a view lies inside which other. Rows in the paper's reading take levels "
-        "from this tree (masks.levels: tree), so theta moves masks between levels. With levels by SAM's head "
-        "it affects a field only through L_ins and L_part, and the linked semantic tree not at all."
+        "theta determines which masks of a view are nested. Rows in the paper's reading take levels from the "
+        "coverage tree (masks.levels: tree), so theta moves masks between levels. With levels from SAM's "
+        "heads, theta affects a field only through L_ins and L_part, and not the linked semantic tree."
     )
     title = "Influence of the coverage threshold theta"
     return _table(sources, "theta", title, "coverage threshold", note, ("field",))
@@ -63,8 +63,8 @@ def theta_table(sources: Sources) -> Table:
 def omega_table(sources: Sources) -> Table:
     """Build the sweep over the similarity degree."""
     note = (
-        "Omega appears in L_ins only. Rows in the paper's reading take lambda_1 = exp(-6) and "
-        "lambda_2 = exp(-5): with 1e-6 and 1e-5 all rows are equal."
+        "Omega appears only in L_ins. Rows in the paper's reading use lambda_1 = exp(-6) and "
+        "lambda_2 = exp(-5); with 1e-6 and 1e-5, all rows are equal."
     )
     title = "Influence of the similarity degree Omega"
     return _table(sources, "omega", title, "similarity degrees", note, ("field",))

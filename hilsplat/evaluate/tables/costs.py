@@ -30,10 +30,10 @@ SECONDS = "-seconds"
 """Name suffix of tables that are not reproducible byte for byte."""
 
 COST_NOTE = (
-    "Measured rows, on this machine, means over scenes: preparation is masks, trees of the views and CLIP; "
-    "training is contributions, semantic tree, autoencoder and field; neither includes the 3D Gaussians. "
-    "Memory is the peak of the training jobs, in main memory (the paper: GPU). A query is one text in one "
-    "view: text encoding, compositing weights of the view, relevancy and mask."
+    "Measured rows are means over scenes on this machine. Preparation: masks, coverage trees and CLIP. "
+    "Training: contributions, semantic tree, autoencoder and field. Neither includes the 3D Gaussians. "
+    "Memory is the peak main memory of the training jobs (in the paper, GPU memory). A query is one text "
+    "in one view: text encoding, the view's compositing weights, relevancy and mask."
 )
 
 
@@ -214,8 +214,8 @@ def pruning_table(sources: Sources, seconds: bool = False) -> Table:
     columns = ("Training (min)", "Memory (GB)", "Query (s)")
     blocks = [reported(sources, "sample pruning"), *quality_blocks(sources, columns, ("field",))]
     footnote = (
-        "The paper removes redundant pairs by similarity of features and gives no rule. What our variant "
-        "removes is set in config/config.yaml (variants)."
+        "The paper removes redundant pairs by feature similarity but gives no rule. config/config.yaml "
+        "(variants) sets which pairs our variant removes."
     )
     return finished(sources, "pruning", "Cost with pruned pairs", blocks, seconds, (footnote,))
 
@@ -240,7 +240,7 @@ def finished(
             block = replace(block, rows=tuple(rows), columns=columns)
         if block.columns:
             repeated.append(block)
-    elsewhere = f"What the jobs of this machine took, beside these numbers: table {name}{SECONDS}."
+    elsewhere = f"Table {name}{SECONDS} adds the times and memory measured on this machine."
     return sources.finished(name, title, repeated, (elsewhere, *footnotes))
 
 

@@ -53,16 +53,16 @@ def hierarchy_table(sources: Sources) -> Table:
         "HC containment: share of the child inside the parent (the paper's wording), mean over the children "
         "of a parent, then over parents: 100 for perfect nesting, 50 in a view without subparts. HC literal: "
         "share of the parent covered by the child (the printed formula; perfect masks "
-        "score low). HC anchored: share of the child inside the annotated parent. The row of the "
-        "annotations gives what perfect masks would score.",
-        "A path of texts asks for whole > part > subpart: more information than the paper's protocol gives.",
-        "The field and the tree answer each view by what that view shows: only nodes visible in it compete. "
-        "Scene-wide: all nodes of the scene compete, and one answer in 3D serves all views.",
-        "View consistency: of the surface points visible in two neighbouring views, IoU of those inside the "
-        "answer of one view and of the other, by exact geometry, level given; mean over the texts of a "
-        "level, then over levels. Texts that neither view answers there are left out. It measures "
-        "consistency, not correctness.",
-        "Avg, best threshold: the threshold of every map is chosen with the truth: a diagnostic.",
+        "score low). HC anchored: share of the child inside the annotated parent. The annotations' row "
+        "shows the score of perfect masks.",
+        "A path of texts queries whole > part > subpart, which uses more text than the paper's protocol.",
+        "In each view, the field and the tree rank only the Gaussians and nodes visible there. "
+        "Scene-wide: all nodes of the scene compete, and all views share one 3D answer.",
+        "View consistency: IoU of the answers in two neighbouring views, over the surface points visible in "
+        "both, with exact geometry and the level given; mean over the texts of a level, then over levels. "
+        "Texts without an answer in either view are omitted. The metric measures consistency, not "
+        "correctness.",
+        "Avg, best threshold: a diagnostic that chooses each map's threshold with the ground truth.",
     )
     return sources.finished("hierarchy", "Queries at three levels", blocks, footnotes)
 
@@ -91,7 +91,7 @@ def frames_table(sources: Sources, data: str) -> Table:
             cells = {scene: Cell(names[number]) for scene, names in of_scenes.items() if number < len(names)}
             rows.append(Row({"Frame": str(number + 1)}, cells, None))
         blocks.append(Block(*measured.kind_and_title(dataset), tuple(rows), tuple(sorted(of_scenes))))
-    footnotes = ("Measured rows: views that were scored, with the number of texts asked at levels.",)
+    footnotes = ("Measured rows: scored views, with the number of texts queried at levels.",)
     return sources.finished(f"frames-{data.lower()}", f"{data}: frames", blocks, footnotes)
 
 
@@ -114,14 +114,14 @@ def lerf_table(sources: Sources) -> Table:
             ranked_by_protocol=False,
         )
     footnotes = (
-        "All in %. mIoU and mBIoU are means over (view, text) pairs of a scene; Average is the mean of the "
-        "scenes. Localization: the point of highest smoothed relevancy lies in a box of the text.",
+        "All values in %. mIoU and mBIoU are means over (view, text) pairs of a scene; Average is the mean "
+        "over scenes. Localization: the point of highest smoothed relevancy is in a box of the text.",
         "lerf/langsplat: mean filter (30 px at a height of 730, scaled), min-max above 0.7, 7 x 7 majority, "
-        "level of the highest relevancy. lerf/tree-nodes: tree nodes that the view shows, level chosen by "
+        "level of the highest relevancy. lerf/tree-nodes: tree nodes visible in the view, level chosen by "
         "the tree.",
         "lerf-mask/gaussian-grouping: one mask per text and view, mean over the views of a text, then over "
-        "texts; a missing prediction counts 0. On the stand-in the texts are those of whole objects, and "
-        "the answers those of the row's method with the level chosen.",
+        "texts; a missing prediction counts as 0. On the stand-in, the texts are those of whole objects, "
+        "and the row's method chooses the level.",
         "*: reproduced by the paper's authors; other reported rows come from the methods' own papers.",
     )
     return sources.finished("lerf", "Segmentation and localization", blocks, footnotes)
@@ -147,16 +147,16 @@ def ovs_table(sources: Sources) -> Table:
     blocks = [sources.reported("3D-OVS")]
     blocks += measured.measured_blocks(sources, ("3d-ovs/",), cells_of, columns_of)
     footnotes = (
-        "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean of the scenes, on 3D-OVS of "
-        f"the five that the paper has ({', '.join(OVS_SCENES)}).",
+        "mIoU in %: mean over (view, text) pairs of a scene; Overall is the mean over scenes (3D-OVS: over "
+        f"the paper's five, {', '.join(OVS_SCENES)}).",
         "3d-ovs/langsplat: min-max relevancy above 0.7, unfiltered, level of the highest mean in its mask "
         "(LangSplat's supplement; its code is not released). 3d-ovs/langsplat-raw takes the printed 0.4 "
         "literally. 3d-ovs/langsplat-v2: LangSplatV2's code: smoothed relevancy above 0.625, whole or part. "
-        "These are rules for maps; 3d-ovs/tree-nodes scores the nodes that a tree answers with.",
+        "These are rules for maps; 3d-ovs/tree-nodes scores the nodes selected by the tree.",
         "3d-ovs/argmax: every pixel gets the text of the highest cosine, at an eighth of the image's size; "
-        "accuracy is the share of pixels with the right text. Brackets name the level it is read from.",
-        "On the stand-in the texts are those of whole objects in view; what surrounds them has no text, and "
-        "the argmax protocol is scored on the pixels that have one.",
+        "accuracy is the share of pixels with the right text. The level used is in brackets.",
+        "On the stand-in, the texts are those of whole objects in view. Their surroundings have no text, so "
+        "the argmax protocol scores only pixels with a text.",
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("3dovs", "3D-OVS: segmentation", blocks, footnotes)

@@ -36,9 +36,9 @@ PROTOCOLS = {
 """Protocol -> its name in tables; other protocols keep their own."""
 
 STAND_INS = {
-    "synthetic": "tables of the synthetic world",
-    "synthetic-rooms": "rooms of the synthetic world",
-    "synthetic-streets": "streets of the synthetic world",
+    "synthetic": "generated tabletops",
+    "synthetic-rooms": "generated rooms",
+    "synthetic-streets": "generated streets",
 }
 """Synthetic data set -> its description in headings."""
 

@@ -39,15 +39,15 @@ DRAWS = 1000
 PERCENTILES = (2.5, 97.5)
 
 MODE_NOTE = (
-    "Points get their class from the Gaussians by the mode named after 'points:' (nearest: the nearest "
-    "Gaussian of opacity 0.1 or more; frozen: the Gaussian that the point became). Classes are queried by "
-    "their names alone; the highest cosine wins. A name outside the CLIP model's vocabulary "
-    "still competes."
+    "Classes are transferred from Gaussians to points by the mode named after 'points:' (nearest: the "
+    "nearest Gaussian with an opacity of at least 0.1; frozen: the Gaussian initialised at the point). "
+    "Classes are queried by their names alone; the highest cosine wins. Names outside the CLIP model's "
+    "vocabulary also compete."
 )
 
 INTERVAL_NOTE = (
-    "95 %: bootstrap interval of the mIoU over scenes and the names in them. Names: true names, and the "
-    "number of scenes. Rows with overlapping intervals cannot be ranked by these scenes."
+    "95 %: bootstrap interval of the mIoU, resampling scenes and their class names. Names: number of "
+    "ground-truth names, and of scenes. Rows with overlapping intervals cannot be ranked by these scenes."
 )
 
 
@@ -69,8 +69,8 @@ def replica_table(sources: Sources) -> Table:
     blocks = [sources.reported("Replica")]
     blocks += measured_blocks(sources, ("replica/per-scene",), cells_of, columns_of)
     footnotes = (
-        "All in %. Mean over the classes present in a scene, vertices of other classes ignored. The paper "
-        "speaks of 48 classes and names no code: this is our reading.",
+        "All values in %. Mean over the classes present in a scene; vertices of other classes are ignored. "
+        "The paper states 48 classes but names no code, so this is our reading.",
         MODE_NOTE,
         INTERVAL_NOTE,
         "*: reproduced by the paper's authors.",
@@ -94,15 +94,15 @@ def scannet_table(sources: Sources) -> Table:
         label_of=lambda protocol: protocol.partition("(")[2].rstrip(")"),  # how points were classified
     )
     footnotes = (
-        "All in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the classes "
-        "present in a scene, then over scenes; vertices of other classes are ignored.",
+        "All values in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the "
+        "classes present in a scene, then over scenes; vertices of other classes are ignored.",
         MODE_NOTE,
         INTERVAL_NOTE,
         "Head, common, tail: the benchmark's splits; mIoU with the counts of all scenes pooled, over the "
-        "classes that occur in truth or prediction.",
-        "AP, AP@25, AP@50: OpenMask3D's copy of ScanNet's script, over all scans together; an instance is a "
-        "node of the tree at level whole, its class the best of 198, its confidence that cosine. A field has "
-        "no instances.",
+        "classes that occur in the ground truth or the prediction.",
+        "AP, AP@25, AP@50: OpenMask3D's copy of ScanNet's script, over all scans together. An instance is a "
+        "tree node at level whole; its class has the highest cosine of 198, and its confidence is that "
+        "cosine. A field has no instances.",
         "*: reproduced by the paper's authors.",
     )
     return sources.finished("scannet", "ScanNet and ScanNet200: segmentation of points", blocks, footnotes)
@@ -164,8 +164,8 @@ def waymo_table(sources: Sources) -> Table:
         unranked=frozenset({"Classes present"}),
     )
     footnotes = (
-        "All in %. mIoU: Waymo's official metric over 22 classes, in which a class without a point counts "
-        "100; present classes leaves those out. Counts of all scenes are pooled.",
+        "All values in %. mIoU: Waymo's official metric over 22 classes, in which a class without points "
+        "counts as 100; 'present classes' omits such classes. Counts of all scenes are pooled.",
         MODE_NOTE,
         INTERVAL_NOTE,
         "*: reproduced by the paper's authors.",

@@ -19,17 +19,16 @@ PUBLISHED_COLUMNS = ("method", "family", "column", "value", "note")
 
 STAND_IN_NOTE = (
     "Rows of a synthetic stand-in are measured on generated scenes with the models named under Masks. "
-    "They show how the parts of the method compare with each other and are not comparable with reported "
-    "rows."
+    "They compare components of the method with each other and are not comparable with reported rows."
 )
 
 TRUE_MASKS_NOTE = (
-    "Rows that begin with 'diagnostic, true masks' were given masks made from the true labels, with the "
+    "Rows that begin with 'diagnostic, true masks' use masks made from the true labels, with the "
     "faults named under Masks. They are not results and are not ranked; they separate errors of the "
     "method from errors of the segmenter."
 )
 
-SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; nothing is random in rows without ±."
+SEEDS_NOTE = "Values with ± are mean and standard deviation over seeds; rows without ± are deterministic."
 
 
 @dataclass(frozen=True)

@@ -189,8 +189,8 @@ def thresholds_of(settings: MethodSettings, own: tuple[float, float, float]) -> 
     grow = own[0] < own[-1]
     if list(settings.thresholds) != sorted(set(settings.thresholds), reverse=not grow):
         raise SettingsError(
-            f"method.thresholds: {settings.name} cannot nest its levels",
-            expected=f"numbers that {'grow' if grow else 'fall'} from whole to subpart, such as {list(own)}",
+            f"method.thresholds: {settings.name} cannot nest levels with these thresholds",
+            expected=f"numbers that {'rise' if grow else 'fall'} from whole to subpart, such as {list(own)}",
             found=str(list(settings.thresholds)),
             fix="reorder the numbers",
         )

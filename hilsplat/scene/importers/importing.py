@@ -33,7 +33,7 @@ MIN_TRIANGULATED = 100
 NUM_RANDOM_POINTS = 20_000
 
 TRAIN_FOLDER = "images_train"
-"""Folder beside `images` with the training views of Gaussian Grouping's data (LERF-Mask)."""
+"""Folder of training views, beside `images`, in Gaussian Grouping's data (LERF-Mask)."""
 
 
 def import_poses(
@@ -68,7 +68,7 @@ def import_poses(
             f"too few posed views of {name} have an image in {known.root}",
             expected=f"at least {least:.0%} of {total} (poses.min_registered_share)",
             found=f"{len(present)}; missing: {listed}",
-            fix="put the images where the model expects them: in images/ or beside it",
+            fix="put the images where the pose file expects them: in images/ or beside it",
         )
     named = list(zip(present, files, view_names(files), strict=True))
     views = [
@@ -92,7 +92,7 @@ def import_poses(
     others = list_images(beside) if known.kind == "colmap" and beside.is_dir() else []
     unposed = [path for path in others if path not in used]
     if unposed:
-        warnings.append(f"{len(unposed)} images have no pose and are left out")
+        warnings.append(f"{len(unposed)} images have no pose and are skipped")
     for warning in warnings:
         logger.warning("%s: %s", name, warning)
     entries: dict[str, Any] = {}
@@ -175,7 +175,7 @@ def _read_as_described(path: Path, camera: pycolmap.Camera) -> UInt8[np.ndarray,
         if abs(ratio - 1) <= ASPECT_TOLERANCE:
             return pixels
     raise ImageError(
-        f"image {path} does not have the shape that its camera describes",
+        f"image {path} does not match the size of its camera",
         expected=f"{camera.width} x {camera.height} px (width x height), or a scaled copy",
         found=f"{upright.shape[1]} x {upright.shape[0]} px",
         fix="use the images that the poses were computed from",

@@ -94,7 +94,7 @@ def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
         else:
             continue
         raise SceneError(
-            f"the {fault} of {view.name} is not valid for a camera",
+            f"the camera {fault} of view {view.name} is not valid",
             expected=expected,
             found=found,
             fix=f"export the poses again: {known.files[0]}",
@@ -146,8 +146,8 @@ def _check_inside(root: Path, name: str) -> None:
     """Refuse names of files outside the source's folder, which downloaded data could otherwise access."""
     if Path(name).is_absolute() or Path(os.path.normpath(name)).parts[:1] == ("..",):
         raise SceneError(
-            f"the poses in {root} name a file outside it: {name}",
-            expected="names below the folder",
+            f"the poses in {root} refer to a file outside it: {name}",
+            expected="paths inside the folder",
             fix="put the images into the folder, and correct the names in the pose file",
         )
 
@@ -163,7 +163,7 @@ def read_transforms(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
         content = read_json_object(file, AGAIN)
         frames = content.get("frames")
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise SceneError(f"{file} has no `frames` list of objects", fix=AGAIN)
+            raise SceneError(f"{file}: `frames` is missing, or is not a list of objects", fix=AGAIN)
         for number, frame in enumerate(frames):
             views.append(_read_frame(known, file, number, {**content, **frame}))
         if points is None and isinstance(content.get("ply_file_path"), str):
@@ -180,7 +180,7 @@ def _read_frame(known: KnownPoses, file: Path, number: int, frame: Mapping[str, 
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
     except (KeyError, ValueError, TypeError) as error:
         raise SceneError(
-            f"{where}: file_path or transform_matrix cannot be used: {error!r}", fix=AGAIN
+            f"{where}: file_path or transform_matrix is not valid: {error!r}", fix=AGAIN
         ) from error
     if matrix.shape == (4, 4):
         matrix = matrix[:3]  # the last row may be omitted
@@ -212,7 +212,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
         expected = "fl_x (px) or camera_angle_x (radians)"
         raise SceneError(f"{where} has no focal length", expected=expected, fix=AGAIN) from error
     except (TypeError, ValueError, OverflowError, OSError) as error:
-        raise SceneError(f"{where}: intrinsics cannot be used: {error}", fix=AGAIN) from error
+        raise SceneError(f"{where}: the intrinsics are not valid: {error}", fix=AGAIN) from error
     model = str(frame.get("camera_model", "OPENCV"))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or any(further):
         raise SceneError(
@@ -222,7 +222,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
         )
     if not (focal_x > 0 and focal_y > 0 and 0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
         raise SceneError(
-            f"{where}: focal length and size are not valid for a photograph",
+            f"{where}: the focal length or image size is not valid",
             expected=f"a focal length above 0, sides of 1 to {MAX_SIDE_PX} px",
             found=f"{focal_x:g} and {focal_y:g}, {width:g} x {height:g} px",
             fix=AGAIN,
@@ -281,7 +281,7 @@ def read_llff(known: KnownPoses) -> list[KnownView]:
         raise SceneError(
             f"{path}, row {int(np.argmin(proper))}: not a rigid pose with size and focal length",
             expected="rotation columns down, right, back, then translation, then height, width, focal",
-            fix="write it again with LLFF's axes",
+            fix="export it again with LLFF's axes",
         )
     images = sorted(list_images(folder if folder.is_dir() else known.root), key=lambda image: image.stem)
     if len(images) != len(rows):
@@ -323,7 +323,7 @@ def read_polycam(known: KnownPoses) -> list[KnownView]:
             camera = pycolmap.Camera(model="PINHOLE", params=params, **size)
         except (KeyError, TypeError, ValueError) as error:
             raise SceneError(
-                f"{file} is not a Polycam camera: {error!r}",
+                f"{file} is not a Polycam camera file: {error!r}",
                 expected="fx, fy, cx, cy, width, height and t_00 to t_23",
                 fix="export the raw data again (developer mode)",
             ) from error

@@ -97,11 +97,11 @@ def _require_whole(path: Path, record: Callable[[mmap.mmap], None]) -> None:
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         count = _number(data, "Q")
         if count > len(data):
-            raise ValueError(f"it states {count} records in {len(data)} bytes")
+            raise ValueError(f"it declares {count} records but has only {len(data)} bytes")
         for number in range(count):
             try:
                 record(data)
             except struct.error as error:
-                raise ValueError(f"it ends in record {number + 1} of {count}") from error
+                raise ValueError(f"it ends within record {number + 1} of {count}") from error
         if rest := len(data) - data.tell():
             raise ValueError(f"{rest} bytes follow its {count} records")

@@ -46,7 +46,7 @@ def _matrix(path: Path, key: str, content: dict[str, Any]) -> Float64[np.ndarray
         usable = False
     if not usable:
         raise SceneError(
-            f"{path}: {key} cannot be used",
+            f"{path}: {key} is not valid",
             expected="an invertible 3 x 4 matrix",
             found=repr(content.get(key))[:80],
             fix=FIX,

@@ -80,7 +80,7 @@ def draw(
     """
     if features is not None and len(features) != len(gaussians):
         raise HilsplatError(
-            "features do not match the Gaussians",
+            "the features do not match the Gaussians",
             expected=f"{len(gaussians)} rows",
             found=f"{len(features)} rows",
         )

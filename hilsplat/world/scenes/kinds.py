@@ -47,7 +47,7 @@ def build_scene(kind: str, seed: int, objects: int) -> WorldScene:
         raise SceneError(
             f"unknown kind of synthetic scene {kind!r}",
             expected=f"one of: {', '.join(KINDS)}",
-            fix="name a known kind in the scene sheet, as in world:tabletop:201",
+            fix="use a known kind in the scene sheet, as in world:tabletop:201",
         )
     if seed < 0 or objects < 1:
         raise SceneError(

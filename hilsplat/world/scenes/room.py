@@ -163,7 +163,7 @@ def build_room(seed: int, objects: int) -> WorldScene:
     names = [str(name) for _ in range(1 + count // len(ROOM_THINGS)) for name in rng.permutation(ROOM_THINGS)]
     things = sum(_add_thing(work, name) for name in names[:count])
     logger.info(
-        "scene room:%d: %d pieces of furniture, %d things of %d objects asked, %d fixtures: %s",
+        "scene room:%d: %d pieces of furniture and %d things (%d objects requested), %d fixtures: %s",
         seed, furniture, things, objects, 3 + pictures, ", ".join(thing.name for thing in work.placed),
     )  # fmt: skip
     _add_shell(work.assembly, room, np.random.default_rng([seed, 23]))
@@ -224,7 +224,7 @@ def _furnish(work: _Furnishing, count: int) -> int:
                 done += _put_partner(work, owner, name, where)
     if done < count:
         logger.warning(
-            "scene room:%d: no place left for %d pieces of furniture", work.assembly.seed, count - done
+            "scene room:%d: no space left for %d pieces of furniture", work.assembly.seed, count - done
         )
     return done
 
@@ -312,7 +312,7 @@ def _add_thing(work: _Furnishing, name: str) -> bool:
     model = replace(model, materials=pattern)
     found = _thing_spot(work, radius, height * scale)
     if found is None:
-        logger.warning("scene room:%d: no place left for the %s", work.assembly.seed, name)
+        logger.warning("scene room:%d: no space left for the %s", work.assembly.seed, name)
         return False
     spot, base_z = found
     yaw = float(np.degrees(np.arctan2(-spot[1], -spot[0])) + work.rng.uniform(-50, 50))

@@ -177,7 +177,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
         spots = {"pedestrian": street.pedestrian_spot, "cyclist": street.cyclist_spot}
         thing = street.try_spots(name, spots.get(name, street.vehicle_spot))
         if thing is None:
-            logger.warning("scene street:%d: no place left for the %s", seed, name)
+            logger.warning("scene street:%d: no space left for the %s", seed, name)
         else:
             placed.append(thing)
     furniture = 0
@@ -185,7 +185,7 @@ def build_street(seed: int, objects: int) -> WorldScene:
         side = -1 if i <= 1 or rng.random() < 0.5 else 1
         thing = street.try_spots(name, partial(street.furniture_spot, side))
         if thing is None:
-            logger.info("scene street:%d: no place left for the %s", seed, name)
+            logger.info("scene street:%d: no space left for the %s", seed, name)
         else:
             furniture += 1
     _add_ground(street.assembly, np.random.default_rng([seed, 23]))

@@ -33,7 +33,7 @@ DISTANCE = 2.15 * TABLE_RADIUS
 LOOK_AT_Z = 0.16
 TRIES = 150
 LAYOUTS = 25
-"""Maximum number of layouts tried; the first layout that fits all objects is used, else the fullest."""
+"""Maximum number of layouts tried; the first layout that fits all objects is used, or else the fullest."""
 
 
 def build_tabletop(seed: int, objects: int) -> WorldScene:
@@ -59,7 +59,7 @@ def build_tabletop(seed: int, objects: int) -> WorldScene:
     placed: list[PlacedObject] = []
     for (model, centre, radius, height, scale), spot in zip(drawn, spots, strict=True):
         if spot is None:
-            logger.warning("scene tabletop:%d: no place left for the %s", seed, model.name)
+            logger.warning("scene tabletop:%d: no space left for the %s", seed, model.name)
             continue
         yaw = float(rng.uniform(-110, 110))
         xy = spot - rotation_about("z", yaw)[:2, :2] @ centre

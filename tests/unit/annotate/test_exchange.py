@@ -118,7 +118,7 @@ def shapes(shape: str) -> str:
     [
         ("{", "cannot be read"),
         ("[]", "has an unknown format"),
-        ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "names no photograph"),
+        ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "not match a photograph"),
         ('{"shapes": [], "imagePath": "DSC_1.jpg", "imageHeight": 60, "imageWidth": 80}', "80 x 60 px"),
         (shapes('{"label": "a", "points": [[1, 1]], "shape_type": "circle"}'), "circle"),
         (shapes('{"label": "", "points": [[1, 1], [5, 5]]}'), "text: "),
@@ -129,11 +129,11 @@ def shapes(shape: str) -> str:
         (shapes('{"label": "a", "points": [[1, NaN], [5, 5]]}'), "read"),
         (shapes('{"label": "a", "points": [[1, 1]], "group_id": [1]}'), "read"),
         (shapes("7"), "read"),
-        ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "not have the size"),
+        ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "not match the size"),
         ('{"annotations": [7], "images": [], "categories": []}', "COCO"),
         ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
         ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', "file.json, object 0"),
-        ('{"objects": [], "info": 7}', "size of its image"),
+        ('{"objects": [], "info": 7}', "valid image size"),
         ('{"annotations": [{}], "images": []}', "'categories'"),
     ],
 )

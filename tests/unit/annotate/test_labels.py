@@ -61,9 +61,9 @@ def test_a_child_around_a_hole_of_its_parent_is_cut_exactly():
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 2, 1, box(6, 6, 9, 9))], "entirely outside 'thing 1'"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 3, 1, box(0, 0, 4, 4))], "expected  a part"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(2, 1, 1, box(0, 0, 4, 4))], "none: it is a whole"),
-        ([label(2, 2, 7, box(0, 0, 4, 4))], "no thing in this photograph"),
+        ([label(2, 2, 7, box(0, 0, 4, 4))], "no such thing in this photograph"),
         ([label(1, 1, None, box(0, 0, 4, 4)), label(1, 1, None, box(0, 0, 4, 4))], "id 1 occurs twice"),
-        ([label(1, 1, None, box(50, 50, 60, 60))], "no pixel inside the photograph"),
+        ([label(1, 1, None, box(50, 50, 60, 60))], "no pixels inside the photograph"),
     ],
 )
 def test_invalid_labels_are_refused(labels, message):
@@ -83,7 +83,7 @@ def test_a_written_file_is_read_back_and_scored_without_proposals(tmp_path):
     warnings: list[str] = []
     regions = regions_of(read_isat(path), warnings)
     assert [region.path for region in regions] == [("mug",), ("mug", "Henkel „links“")]
-    assert warnings == ["DSC_1.json: unaccepted proposals, ignored: 1"]
+    assert warnings == ["DSC_1.json: ignored 1 unaccepted proposal(s)"]
     first = path.read_bytes()
     write_labels(path, "DSC_1.png", SIZE, given[::-1], version)
     assert path.read_bytes() == first  # the order of drawing does not matter

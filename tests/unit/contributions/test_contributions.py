@@ -267,5 +267,5 @@ def test_masks_of_another_size_are_refused(two_boxes):
     wrong.save(two_boxes.masks / f"{view}.npz")
     index = read_index(two_boxes.masks)["views"]
     write_index(two_boxes.masks, {**index, view: index_entry(wrong)}, segmenter="sam")
-    with pytest.raises(MisalignedArtifactError, match=r"masks of view 001.png do not match its camera"):
+    with pytest.raises(MisalignedArtifactError, match=r"masks of view 001.png do not match the size"):
         build_contributions(two_boxes)

@@ -104,7 +104,7 @@ def test_labelled_views_without_pose_are_named(block_world, rows):
 def test_labels_of_another_shape_than_the_view_are_refused(rows):
     wide = region_of(np.ones((64, 80), bool), "bear")
     scene = LabelledScene("lerf_ovs", "blocks", {}, None, {"001.png": (wide,)})
-    with pytest.raises(SceneError, match=r"label of view 001.png does not fit"):
+    with pytest.raises(SceneError, match=r"label of view 001.png does not match"):
         rows(scene)
 
 

@@ -326,7 +326,7 @@ def test_a_field_resumes_from_another_one(flat_boxes):
     assert begun.pop("ridge") == 0  # which pulls towards the start
     assert begun == pytest.approx({name: trained[name] for name in begun}, rel=1e-4)
     LanguageField(LanguageField.load(first).features, "other", "code").save(first)
-    with pytest.raises(MisalignedArtifactError, match="from other Gaussians or another code"):
+    with pytest.raises(MisalignedArtifactError, match="from different Gaussians or a different code"):
         solved_field(flat_boxes, "second", onward, start=first)
 
 
@@ -354,9 +354,9 @@ def test_the_literal_trainer_and_baselines_refuse_other_gaussians_and_masks_in_a
     other = world.folder / "other.ply"
     other.write_bytes(b"other")
     rendered = world.scene, other, world.masks
-    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+    with pytest.raises(MisalignedArtifactError, match=r"made for a different other\.ply"):
         solved_field(flat_boxes, "literal", LITERAL, rendered=rendered)
-    with pytest.raises(MisalignedArtifactError, match=r"made for another other\.ply"):
+    with pytest.raises(MisalignedArtifactError, match=r"made for a different other\.ply"):
         MethodInputs(*rendered, *own).view_weights(world.views[0])
     reverse_masks(world, "001.png")
     with pytest.raises(MisalignedArtifactError, match=r"contains different masks \(view 001\.png\)"):

@@ -29,7 +29,7 @@ RNG = np.random.default_rng(0)
 
 
 @pytest.mark.parametrize(
-    ("method", "wrong", "direction"), [(omniseg3d, (0.9, 0.7, 0.5), "grow"), (vch, (0.1, 0.2, 0.2), "fall")]
+    ("method", "wrong", "direction"), [(omniseg3d, (0.9, 0.7, 0.5), "rise"), (vch, (0.1, 0.2, 0.2), "fall")]
 )
 def test_thresholds_out_of_order_are_refused(method, wrong, direction):
     settings = MethodSettings(name=method.__name__.rpartition(".")[2], thresholds=wrong)

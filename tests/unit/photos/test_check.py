@@ -50,7 +50,7 @@ def test_a_moving_camera_raises_no_doubt_unless_photographs_are_few(moving):
 
 def test_a_camera_that_turns_in_place_is_reported_with_its_evidence(moving):
     (doubt,) = doubts_of(turning(moving[0], np.linspace(-8, 8, 10)))
-    assert "turn in place: a rotation explains 9 of the 9 pairs" in doubt
+    assert "turn in place: rotation alone explains 9 of the 9 pairs" in doubt
     assert "walk around the scene" in doubt
     assert doubts_of(turning(moving[0], np.linspace(-8, 8, 10)), have_poses=True) == []
     assert doubts_of([*turning(moving[0], np.linspace(-4, 4, 5)), *moving]) == []
@@ -73,15 +73,15 @@ def test_photographs_from_one_place_are_named(moving):
     pictures = [picture for pair in zip(moving, shifted, strict=True) for picture in pair]
     (doubt,) = doubts_of(pictures)
     listed = "1.jpg, 3.jpg, 5.jpg, 7.jpg, 9.jpg, ..."
-    assert doubt.startswith(f"12 of 24 photographs ({listed}) are nearly the same")
+    assert doubt.startswith(f"12 of 24 photographs ({listed}) are nearly identical")
 
 
 def test_different_sizes_and_lenses_are_reported_but_not_a_turned_camera(moving):
     assert doubts_of(moving, sizes=[(480, 640)] * 6 + [(640, 480)] * 6) == []
     (sizes,) = doubts_of(moving, sizes=[(480, 640)] * 6 + [(600, 800)] * 6)
-    assert sizes.startswith("2 sizes of photographs (800 x 600, 640 x 480)")
+    assert sizes.startswith("the photographs have 2 sizes (800 x 600, 640 x 480)")
     (lenses,) = doubts_of(moving, focals=[500.0] * 8 + [900.0] * 4)
-    assert lenses.startswith("focal lengths from 500 to 900 px")
+    assert lenses.startswith("the focal lengths range from 500 to 900 px")
     assert doubts_of(moving, focals=[500.0] * 8 + [510.0] * 4) == []
 
 

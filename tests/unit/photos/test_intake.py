@@ -145,7 +145,7 @@ def test_the_intact_part_of_a_truncated_video_is_used_and_reported(tmp_path):
     cut.write_bytes(content[: len(content) // 2])
     _, notes, origin = extracted([cut], tmp_path, 8)
     assert 1 < origin["videos"][0]["seconds"] < 3
-    assert any(note.startswith("cut.mp4 breaks off after") and "of 4.0 s" in note for note in notes)
+    assert any(note.startswith("cut.mp4 ends after") and "of 4.0 s" in note for note in notes)
     assert len(origin["frames"]) == 8
 
 
@@ -159,7 +159,7 @@ def test_damaged_packets_are_left_out_and_counted(tmp_path):
     damaged, sound = origin["videos"][0]["damaged"], origin["videos"][0]["frames"]
     assert 0 < damaged < 5
     assert sound == 61 - damaged
-    assert notes[0] == f"hurt.mp4: {damaged} damaged packets or frames were left out"
+    assert notes[0] == f"hurt.mp4: {damaged} damaged packets or frames were skipped"
 
 
 def test_unreadable_videos_are_refused(tmp_path):
@@ -271,7 +271,7 @@ def test_a_folder_of_videos_is_one_capture_and_a_static_one_leaves_no_files(tmp_
         write_video(tmp_path / "clips" / f"{number}.mp4", pan([left] + [6] * 20))
     assert add_scene(sheet, "desk", tmp_path / "clips", frames=10).num_readable == 10
     video = write_video(tmp_path / "still.mp4", pan([0] * 20))
-    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*1 different(.|\n)*a longer video"):
+    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*1 distinct(.|\n)*a longer video"):
         add_scene(sheet, "still", video)
     assert sources(sheet) == {"desk": "photos/desk"}
     assert not (tmp_path / "project/photos/still").exists()
@@ -284,7 +284,7 @@ def test_an_existing_folder_is_kept_and_other_files_are_refused(tmp_path, sheet)
         add_scene(sheet, "desk", archive)
     assert len(list(mine.iterdir())) == 1
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(SceneError, match=r"notes\.txt is a file of an unsupported kind(.|\n)*a \.zip"):
+    with pytest.raises(SceneError, match=r"notes\.txt has an unsupported file type(.|\n)*a \.zip"):
         add_scene(sheet, "desk", tmp_path / "notes.txt")
 
 
@@ -293,7 +293,7 @@ def test_a_command_that_was_killed_after_it_unpacked_resumes(tmp_path, sheet):
     with prepared_photographs(video, made, 10):
         before = sorted(path.stat().st_mtime_ns for path in made.glob("*.*"))
     report = add_scene(sheet, "desk", video, frames=10)  # no frame is extracted again
-    assert report.num_readable == 10 and "already exists, from the same files" in str(report)
+    assert report.num_readable == 10 and "already exists, made from the same files" in str(report)
     assert sorted(path.stat().st_mtime_ns for path in made.glob("*.*")) == before
 
 
@@ -326,7 +326,7 @@ def link(name):
     return entry
 
 
-OUTSIDE = [(name, "is outside") for name in ("../evil.jpg", "a/../../evil.jpg", "/evil.jpg", "..\\evil.jpg")]
+OUTSIDE = [(name, "would be") for name in ("../evil.jpg", "a/../../evil.jpg", "/evil.jpg", "..\\evil.jpg")]
 
 
 @pytest.mark.parametrize(

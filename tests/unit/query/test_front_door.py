@@ -154,10 +154,10 @@ def test_a_copy_without_recorded_settings_warns(desk, elsewhere, caplog):
     shutil.copytree(desk / SCENE, elsewhere / "desk")
     shutil.copytree(desk / "models", elsewhere / "models")
     hilsplat.open("desk")
-    assert "using the default settings" not in caplog.text
+    assert "using the defaults" not in caplog.text
     (elsewhere / "desk/default/scores.csv.provenance.json").unlink()
     hilsplat.open("desk")
-    assert "using the default settings" in caplog.text
+    assert "using the defaults" in caplog.text
 
 
 def test_the_example_of_the_docs_runs(desk, project, monkeypatch, capsys):
@@ -283,4 +283,4 @@ def test_key_views_are_queried_until_the_vectors_of_all_views_exist(desk, tmp_pa
     parts = FinishedScene.locate(growing).parts
     expected = [key / name for name in ("clip", "semantic_tree", "masks")]
     assert [parts.clip, parts.semantic_tree, parts.masks] == expected and parts.field is None
-    assert re.search(r"photos/desk answers from \d+ of \d+ photographs until the run ends", caplog.text)
+    assert re.search(r"photos/desk uses \d+ of \d+ photographs until the run ends", caplog.text)

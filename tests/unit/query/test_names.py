@@ -100,7 +100,7 @@ def test_names_of_another_tree_are_kept_but_not_used(desk, tmp_path):
 
 @pytest.mark.parametrize(
     ("node", "name", "message"),
-    [*((0, name, "be a name") for name in ("a > b", "x" * 81, "\x07")), (99, "mug", "no node 99")],
+    [*((0, name, "valid name") for name in ("a > b", "x" * 81, "\x07")), (99, "mug", "node 99 does")],
 )
 def test_a_name_that_cannot_be_requested_is_refused(desk, node, name, message):
     with pytest.raises(SettingsError, match=message):
@@ -146,5 +146,5 @@ def test_nodes_similar_to_a_node_or_a_picture_are_ranked_by_cosine(desk):
     blue = np.zeros((7, 3, 3), np.uint8)
     blue[..., 2] = 250
     assert scene.like_picture(blue, limit=1)[0].node == found["book"]
-    with pytest.raises(SettingsError, match="no node 99"):
+    with pytest.raises(SettingsError, match="node 99 does not exist"):
         scene.like_node(99)

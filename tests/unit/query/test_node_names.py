@@ -44,7 +44,7 @@ def test_sections_comments_and_repeated_texts_of_a_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b"[colours]\nred", "line 1 .* unknown section"), (b"# nothing", "names nothing"), (b"\xff", "read")],
+    [(b"[colours]\nred", "line 1 .* unknown section"), (b"# nothing", "no texts"), (b"\xff", "read")],
 )
 def test_invalid_vocabularies_are_refused(tmp_path, content, message):
     (tmp_path / "words.txt").write_bytes(content)

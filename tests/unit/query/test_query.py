@@ -387,7 +387,7 @@ def test_query_parses_paths_and_describes_hits(scene):
     [
         ("a > b > c > d", {}, "1 to 3 texts"),
         ("a > b > c", {"level": "part"}, "cannot be searched at level part"),
-        (" ", {}, "is empty"),
+        (" ", {}, "an empty text"),
         ("A", {"level": "hole"}, "unknown"),
         ("A > A top", {"level": "hole"}, "unknown"),
         ("A", {"answerer": "tre"}, "answerer 'tre' is unknown"),

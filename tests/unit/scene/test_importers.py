@@ -181,8 +181,8 @@ FRAME = r"frame 1 \(images/b\), transform_matrix: the pose is not a rotation"
         ({"fl_x": 40, "camera_model": "OPENCV_FISHEYE"}, {}, "OPENCV_FISHEYE .* is not supported"),
         ({"fl_x": 40, "ply_file_path": "gone.ply"}, {}, r"the points of .*gone\.ply cannot be read"),
         *(({"fl_x": 40}, {"transform_matrix": pose}, FRAME) for pose in NOT_RIGID),
-        *(({"fl_x": 40}, {"file_path": name}, f"name a file outside it: {name}") for name in OUTSIDE),
-        *(({"fl_x": 40, "ply_file_path": name}, {}, f"name a file outside it: {name}") for name in OUTSIDE),
+        *(({"fl_x": 40}, {"file_path": name}, f"a file outside it: {name}") for name in OUTSIDE),
+        *(({"fl_x": 40, "ply_file_path": name}, {}, f"a file outside it: {name}") for name in OUTSIDE),
     ],
 )
 def test_unusable_transforms_are_refused(tmp_path, more, frame, message):
@@ -345,7 +345,7 @@ FAULTY_LENSES += [lens(50, 50, np.nan, 15), lens(50, 50, 20, 15, width=0)]
     ],
 )
 def test_impossible_lenses_and_poses_are_refused(changes, fault):
-    with pytest.raises(SceneError, match=rf"the {fault} of b\.png"):
+    with pytest.raises(SceneError, match=rf"the camera {fault} of view b\.png"):
         checked([VIEW, replace(VIEW, name="b.png", **changes)], KNOWN)
 
 

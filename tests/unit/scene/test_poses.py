@@ -152,7 +152,7 @@ def test_views_are_named_after_files_and_collisions_are_refused(tmp_path):
     assert view_names([tmp_path / "DSC_1.jpg", tmp_path / "a.b.PNG"]) == ["DSC_1.png", "a.b.png"]
     twice = [tmp_path / "train" / "r_0.png", tmp_path / "test" / "r_0.png"]
     assert view_names(twice) == ["train_r_0.png", "test_r_0.png"]
-    with pytest.raises(SceneError, match=r"same view 1\.png"):
+    with pytest.raises(SceneError, match=r"same view name 1\.png"):
         view_names([tmp_path / "1.jpg", tmp_path / "1.png"])
     with pytest.raises(SceneError, match="brace"):
         view_names([tmp_path / "a{1}.png"])
@@ -187,7 +187,7 @@ def found(registered, models):
             r"at least 70% of 10.*6 \(60\.0%\); models of 6, 4 .*9\.jpg: no features.*0\.60",
         ),
         (found(8, [8]), found(8, [8, 3]), {"several_models": "stop"}, r"2 separate models.*8\.jpg"),
-        (found(8, [8, 3]), found(0, []), {}, r"no camera pose could be found.*0\.jpg: no features"),
+        (found(8, [8, 3]), found(0, []), {}, r"no camera poses could be found.*0\.jpg: no features"),
     ],
 )
 def test_too_few_views_and_separate_models_are_refused_as_configured(accepted, refused, settings, message):

@@ -45,7 +45,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
     assert chosen("two") == ["a/two"]  # in the groups
     assert chosen("b/two") == ["b/two"]
     assert chosen("three", "a/one") == ["a/one", "a/three"]
-    with pytest.raises(SceneError, match=r"only contains 'tow'(.|\n)*a/one, a/two"):
+    with pytest.raises(SceneError, match=r"no scene is named 'tow'(.|\n)*a/one, a/two"):
         chosen("tow")
 
 
@@ -59,7 +59,7 @@ def test_named_scenes_are_chosen_alone_and_from_any_group(tmp_path):
         ("scene", "x" * 101, "longer than 100"),
         ("group", "paper", "'paper' is unknown"),
         ("unit", "cm", "'cm' is unknown"),
-        ("source", "world:tabletop", "is not the name of a synthetic world"),
+        ("source", "world:tabletop", "does not name a synthetic scene"),
         ("source", "gone", "gone is missing"),
         ("source", "", "it is empty"),
         ("source", "phone", r"has no images(.|\n)*1 files \(\.dng"),
@@ -150,8 +150,8 @@ def test_files_of_3dgs_and_langsplat_are_found_reported_and_recorded(tmp_path):
     sheet = write_sheet(tmp_path, WORLD)
     report = str(add_scene(sheet, "desk", folder))
     assert "iteration_30000/point_cloud.ply" in report and "language_features" in report
-    assert "not read, because a pickle can run code: chkpnt30000.pth" in report
-    assert "labels of 1 photographs" in report
+    assert "skipped, because pickle files can run code: chkpnt30000.pth" in report
+    assert "labels for 1 photographs" in report
     assert (tmp_path / "annotated/photos/desk/0.json").is_file()
     old, new = read_sheet(sheet)
     assert (old.gaussians, old.features) == (None, None)
@@ -244,7 +244,7 @@ def test_adding_a_scene_appends_one_row_with_a_relative_source(tmp_path, columns
 def test_adding_unusable_photographs_leaves_the_sheet_alone(tmp_path):
     sheet, folder = tmp_path / "scenes.tsv", write_noise(tmp_path / "desk", 2)
     shutil.copy(folder / "1.png", folder / "copy.png")
-    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*2 different"):
+    with pytest.raises(SceneError, match=r"too few photographs(.|\n)*2 distinct"):
         add_scene(sheet, "desk", folder)
     (folder / "empty.jpg").touch()
     with pytest.raises(SceneError, match=r"empty\.jpg: the file is empty"):

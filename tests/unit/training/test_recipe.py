@@ -41,7 +41,7 @@ def test_kinds_of_scenes_have_their_shares():
 
 
 def test_an_unknown_stage_of_training_is_refused(tmp_path):
-    with pytest.raises(SettingsError, match="unknown stage of training"):
+    with pytest.raises(SettingsError, match="unknown training step"):
         train_models(tmp_path, tmp_path, TrainingSettings(), stages=["sams"])
 
 

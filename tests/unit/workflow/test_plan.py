@@ -71,7 +71,7 @@ def test_a_run_without_scenes_lists_the_known_scenes(tmp_path):
 @pytest.mark.parametrize("name", ["lifted", "in-no-table"])
 def test_an_unknown_method_stops_at_once(tmp_path, name):
     variants = {**VARIANTS, name: {"method": {"name": "magic"}}}
-    with pytest.raises(HilsplatError, match="there is no method 'magic'"):
+    with pytest.raises(HilsplatError, match="method 'magic' is unknown"):
         plan(tmp_path, main_variants=list(VARIANTS), variants=variants)
 
 

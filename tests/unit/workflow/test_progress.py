@@ -127,7 +127,7 @@ def test_queries_of_key_views_are_announced_before_those_of_all_views(screen, tm
     lines = screen.text.splitlines()
     assert lines[1:5] == [
         "photos/desk is ready to query:",
-        "photos/desk answers from 1 of 2 photographs until the run ends",
+        "photos/desk uses 1 of 2 photographs until the run ends",
         '  hilsplat query photos/desk "..."',
         "  hilsplat view photos/desk",
     ]

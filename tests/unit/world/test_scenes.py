@@ -96,7 +96,7 @@ def test_objects_that_do_not_fit_are_omitted_and_logged(monkeypatch, caplog):
     monkeypatch.setattr(tabletop, "GAP", 5.0)  # wider than the table: a second object has no place
     scene = build_scene("tabletop", 104, 3)
     assert (scene.asked, len(scene.placed)) == (3, 1)
-    assert len([record for record in caplog.records if "no place left" in record.message]) == 2
+    assert len([record for record in caplog.records if "no space left" in record.message]) == 2
 
 
 def test_unknown_kinds_and_invalid_numbers_are_refused():

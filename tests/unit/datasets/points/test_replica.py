@@ -143,14 +143,14 @@ def sequence_with(folder: Path, poses: str) -> Path:
             lambda at: read_semantic_mesh(habitat_with(at, classes=SOFA, id_to_label=[0, 1, 2, 3])),
             "found     20 sofa",
         ),
-        (lambda at: read_semantic_mesh(habitat_with(at)), "expected  an object with classes, id_to_label"),
+        (lambda at: read_semantic_mesh(habitat_with(at)), "expected  an object with the keys classes, id"),
         (
             lambda at: (make_habitat(at) / "info_semantic.json").unlink() or read_semantic_mesh(at),
             r"info_semantic\.json is missing\n  found     mesh_semantic\.ply",
         ),
         (
             lambda at: read_images(make_semantic_nerf(at, 3, lines=1)),
-            "1 lines, 3 images, the first without a line is frame 1",
+            "1 lines, 3 images; the first frame without a line is 1",
         ),
         (
             lambda at: read_images(make_semantic_nerf(at / "room0", 1).parent),
@@ -162,7 +162,7 @@ def sequence_with(folder: Path, poses: str) -> Path:
         ),
         (
             lambda at: open_scene(at, "room_1"),
-            r"room_1 of Replica has no labels.*mesh_semantic\.ply, or semantic_labels_room1\.txt",
+            r"Replica scene room_1 has no labels.*mesh_semantic\.ply, or semantic_labels_room1\.txt",
         ),
     ],
 )

@@ -71,7 +71,7 @@ def test_labels_are_rows_of_the_evaluated_set(root):
     truth = open_scan(root, SCAN).truth
     assert truth["nyu40"].labels(SCANNET_10).tolist() == [1, 1, 3, 4, 0]  # wall, bed and chair are 1, 3 and 4
     assert truth["scannet200"].labels(SCANNET200_INSTANCES).tolist() == [0, 0, 198, 1, 0]  # it lacks walls
-    with pytest.raises(MisalignedArtifactError, match=r"replica-48 are not defined on nyu40 labels"):
+    with pytest.raises(MisalignedArtifactError, match=r"replica-48 is not defined for nyu40 labels"):
         truth["nyu40"].labels(REPLICA_48)
 
 
@@ -92,12 +92,12 @@ def test_frames_without_a_pose_are_skipped_and_reported(tmp_path):
     (folder / "pose" / "4.txt").unlink()
     scene = open_scan(tmp_path / "scannet", SCAN)
     assert [image.name for image in scene.images] == ["0.jpg", "2.jpg"]
-    assert scene.warnings[0].startswith("2 frames were lost by tracking")
+    assert scene.warnings[0].startswith("2 frames are skipped because tracking failed")
     assert scene.warnings[1] == "1 images (first: 4) have no file in pose/ and are skipped"
     for number in (0, 2):
         (folder / "pose" / f"{number}.txt").unlink()
     with pytest.raises(
-        SceneError, match=r"no frame of scene0000_00 can be used\n.*\n.*5 images; 3 .* 2 lost"
+        SceneError, match=r"scene0000_00 has no usable frames\n.*\n.*5 images; 3 .* 2 with failed tracking"
     ):
         open_scan(tmp_path / "scannet", SCAN)
 
@@ -178,7 +178,7 @@ OTHER_TABLE = text_in(f"../../{LABEL_TABLE}", "id,raw_category,nyu40id\n")
             mesh_of(np.tile(XYZ, (2, 1))),
             "does not match.*the same 10 vertices.*found     5 vertices",
         ),
-        (mesh_of(XYZ + np.float32([0.5, 0, 0])), "does not match.*found     vertices in other positions"),
+        (mesh_of(XYZ + np.float32([0.5, 0, 0])), "does not match.*found     vertices at other positions"),
         (truncate_labels, r"labels\.ply cannot be read.*found     a file of \d+ bytes.*fix "),
         (
             lambda folder: (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink(),
@@ -186,7 +186,7 @@ OTHER_TABLE = text_in(f"../../{LABEL_TABLE}", "id,raw_category,nyu40id\n")
         ),
         (
             lambda folder: (folder / "color/0.jpg").rename(folder / "color/first.jpg"),
-            r"first\.jpg is not named like a frame\n  expected  <number>\.jpg",
+            r"first\.jpg does not have a frame's file name\n  expected  <number>\.jpg",
         ),
         (nest, "wrong place.*fix       move .*scene0000_00/scene0000_00 to"),
         (

@@ -181,7 +181,7 @@ def test_damaged_components_are_refused_with_a_fix(root):
     poses.write_bytes(poses.read_bytes()[:200])
     refused("cannot be read.*found     a file of 200 bytes.*fix ")
     poses.write_bytes(ranges.read_bytes())
-    refused("is not the component lidar_pose of release 2")
+    refused("is not component lidar_pose of release 2")
     poses.unlink()
     refused("component lidar_pose of segment .* is missing.*fix       download")
     (root / "all").mkdir()
@@ -278,11 +278,11 @@ def test_a_record_that_is_cut_off_or_unlabelled_is_refused(tmp_path):
     path = write_records(tmp_path / RECORD.format(split="validation", segment=SEGMENT), [record])
     whole, damaged = path.read_bytes(), write_records(tmp_path / "damaged", [b"\x0b"]).read_bytes()
     for content, message in (
-        (whole, "no frame with labels of the top lidar"),
+        (whole, "no frames with labels for the top lidar"),
         (whole[:-30], "record 0 is damaged or truncated.*expected  a TFRecord file"),
         (b"no record at all", "record 0 is damaged"),
         (damaged, "frame 0 cannot be read: Error parsing message"),
-        (b"", "has no frame"),
+        (b"", "contains no frames"),
     ):
         path.write_bytes(content)
         with pytest.raises(SceneError, match=f"(?s){message}"):

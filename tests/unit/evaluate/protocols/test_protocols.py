@@ -195,7 +195,7 @@ def test_a_relevancy_that_is_not_a_number_is_an_error():
     relevancy = np.full((3, *SIZE), 0.1, np.float32)
     relevancy[1, 2, 3] = np.nan
     truth = ViewTruth.of_regions([region_of(box((2, 6), (2, 6)), "cup")], SIZE)
-    with pytest.raises(ArtifactError, match=r"relevancy of view v\.png is not a number at 1 pixels"):
+    with pytest.raises(ArtifactError, match=r"relevancy of view v\.png is NaN at 1 pixels"):
         measured(HandMade([], {}, {"cup": relevancy}), truth, methods=("field",))
 
 

@@ -91,7 +91,7 @@ def test_hierarchy_means_go_over_pairs_then_scenes_then_levels(tmp_path):
     assert headings == [
         "## Reported in the paper: Hi-LERF",
         "## Reported in the paper: Hi-3DOVS",
-        "## Measured on a synthetic stand-in (tables of the synthetic world); not comparable",
+        "## Measured on a synthetic stand-in (generated tabletops); not comparable",
     ]
     assert "not comparable with reported" in forms[".md"]
 
@@ -350,7 +350,7 @@ def test_a_row_with_true_masks_is_marked_and_not_ranked(tmp_path):
         ("diagnostic, true masks: hilsplat, tree", TRUE_MASKS),
     ]
     assert "They are not results" in forms[".md"]
-    stand_in = forms[".md"].split("synthetic stand-in (tables")[1]
+    stand_in = forms[".md"].split("synthetic stand-in (generated")[1]
     assert "**50.0**" in stand_in
     assert " 90.0 " in stand_in and "**90.0**" not in stand_in
 
