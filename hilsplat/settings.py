@@ -154,7 +154,7 @@ class MasksSettings(Section):
 
     segmenter: Literal["auto", "sam", "graph", "truth-perturbed"] = knob(
         "sam",
-        "sam: the SAM model in `model`; graph: OpenCV's graph segmentation, without weights; auto: sam if "
+        "sam: the SAM model in `model`; graph: OpenCV's graph segmentation (no weights); auto: sam if "
         "pretrained, else graph; truth-perturbed: a diagnostic, ground-truth masks of a synthetic scene with "
         "the faults in perturb",
     )
@@ -189,7 +189,7 @@ class MasksSettings(Section):
         "theta",
         origin="paper: three levels by theta; LangSplat: head",
     )
-    theta: float | None = knob(None, "threshold for levels: tree; unset: coverage_tree.theta", gt=0.5, lt=1)
+    theta: float | None = knob(None, "for levels = tree; default: coverage_tree.theta", gt=0.5, lt=1)
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
@@ -509,7 +509,7 @@ class EvaluateSettings(Section):
     relevancy_scale: float = knob(10.0, "scale of the cosines in the relevancy", gt=0, origin="LangSplat")
     filter_px: int = knob(
         0,
-        "side of the mean filter on relevancy maps; 0: by image height, 30 px at 730 px",
+        "side of the mean filter on relevancy maps; 0: scaled with the image height (30 px at 730)",
         unit="px",
         ge=0,
         origin="LangSplat: 30, paper: 20",

@@ -50,7 +50,7 @@ class Stroke(Message):
 
 
 class Shape(Message):
-    """A region: the union of polygons, plus or minus a stroke, cut to `inside`."""
+    """A region: the union of polygons, with a stroke added or removed, clipped to `inside`."""
 
     view: int
     add: Rings
@@ -210,7 +210,7 @@ def _all_labels(opened: OpenedScene, of: Mapping[str, Any]) -> list[dict[str, An
 
 
 def _shape(opened: OpenedScene, asked: Shape) -> dict[str, Any]:
-    """Return a region's polygons and area: given polygons, plus or minus a stroke, cut to `inside`."""
+    """Return polygons and area of a region: polygons with a stroke added or removed, clipped to `inside`."""
     size_hw = opened.scene.cameras[view_name(opened.scene, asked.view)].size_hw
     mask = drawn = fill_polygons(asked.add, size_hw)
     if asked.stroke is not None:

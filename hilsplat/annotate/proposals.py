@@ -268,7 +268,7 @@ class Clicks:
         inside = np.array([each for *_, each in clicks], np.bool_)
         corners = np.array(box if box else (0, 0, 0, 0))
         if not (inside.any() or box) or (points < 0).any() or (points > (width, height)).any():
-            raise SettingsError("no click marks the thing", expected="a click inside the photograph")
+            raise SettingsError("no click or box selects anything", expected="a click inside the photograph")
         encoded = self.encoded(view)
         asked = points[inside] if clicks else _grid(corners)
         iou, logits = self.model.decode(encoded, asked)

@@ -105,7 +105,7 @@ def lifted_median(
 
     LangSplat's L1 loss converges to it. Masks that merge or miss objects shift an average much more. Each
     Weiszfeld iteration, one pass over A, divides weights by the distance to the latest estimate; 15 of them
-    give about three correct digits. Gaussians that no mask shows keep `start`, the lifted average.
+    give about three correct digits. Gaussians outside all masks keep `start`, the lifted average.
     """
     features = np.array(start, np.float32, order="C")
     for _ in range(steps):

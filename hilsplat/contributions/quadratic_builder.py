@@ -32,7 +32,7 @@ BLOCKS = 64
 without Gaussians visible in a part are skipped; Morton order makes such blocks frequent."""
 
 MERGE_AT = 8
-"""Late pairs of a block are merged with its rows once there is more than one per this many row pairs."""
+"""A block's late pairs are merged with its rows once they exceed its row pairs divided by this number."""
 
 CHUNK_WEIGHTS = 2**25
 """Number of non-zeros of W collected before they are added to G; collecting and adding need 0.6 GiB."""

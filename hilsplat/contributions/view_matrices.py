@@ -1,4 +1,4 @@
-"""The matrices of one view: masks over Gaussians, and the rows of W that show a mask."""
+"""The matrices of one view: masks by Gaussians, and the rows of W for pixels inside a mask."""
 
 import hashlib
 from concurrent.futures import ThreadPoolExecutor

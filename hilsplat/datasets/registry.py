@@ -107,7 +107,7 @@ def _presence(dataset: Dataset, data_root: Path) -> list[str]:
 
 
 def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tuple[str, int]:
-    """Read whole scenes of a data set, by default all that are at least partly present.
+    """Read whole scenes of a data set (default: all that are at least partly present).
 
     Return a report of what was found, and the number of scenes that cannot be read. Raise SceneError if the
     data set's folder is missing.

@@ -51,8 +51,8 @@ def smoothing_loss(
 def contrast_loss(means: Float[Tensor, "m D"], done: float) -> Float[Tensor, ""]:
     """Return the mean of w / (squared distance + 1) over mask pairs, with w = 0.1 + 0.9 rank / (masks - 1).
 
-    For each mask, the other masks are ranked by distance, from 1 for the farthest mask to masks - 1 (w = 1)
-    for the closest. After half of the steps, weights below 0.9 become 0.1.
+    For each of the M masks, the others are ranked by distance: 1 for the farthest, M - 1 (w = 1) for the
+    closest. After half of the steps, weights below 0.9 become 0.1.
     """
     num = len(means)
     if num < 2:

@@ -14,7 +14,7 @@ Departs:
     - vectors of 16 numbers on frozen Gaussians, not an instant-NGP field of 128 with its own density;
     - unit length by division, without a penalty on the norm; depth is not smoothed;
     - parents are those in our coverage tree (0.9 inside), not 0.95 inside and IoU below 0.9;
-    - components of Gaussians, not of 0.002 voxels; Gaussians outside the 200 largest join the nearest one;
+    - components of Gaussians, not of 0.002 voxels; those not among the 200 largest join the nearest;
     - the authors don't support text.
 """
 
@@ -143,7 +143,7 @@ def components(
 ) -> Int64[np.ndarray, "N 3"]:
     """Return each Gaussian's component at every distance, numbered from the largest component.
 
-    Gaussians outside the 200 largest components join the component of the nearest Gaussian in one of these.
+    Gaussians in other components than the 200 largest join the component of the nearest Gaussian in these.
     """
     num = len(means)
     near = nearest(means, NEIGHBOURS + 1)

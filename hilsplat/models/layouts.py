@@ -110,7 +110,7 @@ MODEL_TYPES = {
 
 
 def layout_of(config: object) -> str | None:
-    """Return a model's layout from the content of its config.json, or None if it is not supported."""
+    """Return a model's layout from the contents of its config.json, or None if it is not supported."""
     if not isinstance(config, dict):
         return None
     if {"vision_cfg", "text_cfg"} <= config.keys():

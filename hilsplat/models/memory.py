@@ -19,7 +19,7 @@ ViT-B, whose patch features take 12 MiB."""
 PROMPT_MIB = 64
 """Memory per prompt in SAM's exported decoder, for a 1024 px image. Measured: 507 MiB for 8 (ViT-B)."""
 FACTORED_MIB = 250
-"""Memory of all prompts of a 1024 px image in the factored decoder. Measured: 104 MiB while 1024 prompts are
+"""Memory that the factored decoder needs for a 1024 px image. Measured: 104 MiB while 1024 prompts are
 previewed, plus the masks of the prompts that are kept."""
 CLIP_TOKEN_MIB = 0.03
 """Memory per patch of a crop in a CLIP model, besides two arrays of attention weights. Measured: 521 MiB for

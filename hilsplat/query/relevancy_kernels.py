@@ -109,7 +109,7 @@ def projected_relevancy(coordinates, generic, first, weights, scale, out):
 
 @compiled
 def fill_maps(found, least, pixels, level, maps):
-    """Write the values of a level's pixels to its maps (T, 3, P), and each text's `least` elsewhere.
+    """Fill a level's maps (T, 3, P): `pixels` get their values, all others the text's value in `least`.
 
     Runs of consecutive pixels are copied together.
     """

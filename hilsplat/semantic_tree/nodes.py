@@ -22,7 +22,7 @@ MIN_MEMBER_SHARE = 0.05
 """A Gaussian joins its best node if that node contains more than this share of its weight."""
 
 MIN_FIT = 0.25
-"""A mask shows its best-fitting node if the IoU of mask and node in the mask's view exceeds this."""
+"""A mask is assigned to its best-fitting node if their IoU in the mask's view exceeds this."""
 
 PRIOR_VIEWS = 3
 """Number of views without the node added to the views that show it, to limit a single view's influence."""

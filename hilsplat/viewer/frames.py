@@ -16,9 +16,9 @@ from hilsplat.viewer.wire import Style
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 TINT = np.float32(0.35)
-"""Factor on unselected Gaussians' luminance in mode `tint`. The page's shader has the same numbers."""
+"""Luminance factor of unselected Gaussians in `tint` mode. The page's shader has the same numbers."""
 GHOST = np.float32(0.08)
-"""Factor on unselected Gaussians' opacity in mode `ghost`."""
+"""Opacity factor of unselected Gaussians in `ghost` mode."""
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4

@@ -29,7 +29,7 @@ class WireCamera(Message):
     def _rotation(cls, value: tuple[Row4, ...]) -> tuple[Row4, ...]:
         rotation = np.array(value)[:3, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-            raise ValueError("the upper left of cam_from_world is not a rotation")
+            raise ValueError("the upper-left 3 x 3 block of cam_from_world is not a rotation")
         return value
 
     @field_validator("K")

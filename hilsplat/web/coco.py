@@ -13,7 +13,7 @@ from hilsplat.scene.cameras import Cameras
 def coco_content(
     description: str, views: Iterable[str], cameras: Cameras, categories: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the content of a file without annotations; views are numbered from 0, categories from 1."""
+    """Return a COCO file without annotations; views are numbered from 0, categories from 1."""
     images = []
     for number, view in enumerate(views):
         height, width = cameras[view].size_hw

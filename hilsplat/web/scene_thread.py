@@ -45,7 +45,7 @@ class ShownScene:
             self._seen.setdefault(part, _state_of(part))
 
     def changed(self, *parts: Path) -> list[str]:
-        """Return the names of recorded parts, by default all, that were rewritten or deleted.
+        """Return the names of the given parts (default: all) that were rewritten or deleted.
 
         The page still shows the parts as they were opened.
         """
@@ -53,7 +53,7 @@ class ShownScene:
 
     @contextmanager
     def unchanged(self, *parts: Path) -> Iterator[None]:
-        """Guard disk reads: fail if recorded parts, by default all, were rewritten.
+        """Guard disk reads: fail if one of the given parts (default: all) was rewritten.
 
         Raises:
             StaleSceneError: a part was rewritten before or during the read.

@@ -73,7 +73,7 @@ def libraries() -> Iterator[Finding]:
             wrong.append(f"{requirement.name} is missing")
             continue
         if not requirement.specifier.contains(found, prereleases=True):
-            wrong.append(f"{requirement.name} {found} is not {requirement.specifier}")
+            wrong.append(f"{requirement.name} {found} does not satisfy {requirement.specifier}")
     fix = f"pip install --upgrade {PACKAGE}, with the constraints.txt of the repository"
     yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
 

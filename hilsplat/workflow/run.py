@@ -249,7 +249,7 @@ def _all_cores() -> int:
 
 
 def _recover(command: Sequence[str], results: Path) -> None:
-    """Remove unfinished files of a killed run and, if no process is alive, Snakemake's locks."""
+    """Remove unfinished files left by a killed run and, if no process is alive, Snakemake's locks."""
     markers = sorted(STATE.glob("run-*"))
     if not markers:
         return

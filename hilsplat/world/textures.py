@@ -69,7 +69,7 @@ def fractal_noise(x: float, y: float, z: float, octaves: int, salt: int) -> floa
 
 @compiled
 def cell_noise(x: float, y: float, z: float, salt: int) -> tuple[float, float, float]:
-    """Find the two nearest points among one random point per cell (Worley noise).
+    """Find the two nearest of many random points, one per cell (Worley noise).
 
     Returns:
         Distances to these two points, in cells, and the nearest point's random number in [0, 1).

@@ -24,7 +24,7 @@ def looking_at(centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"])
 
 
 def pinhole(image_px: int, fov_deg: float | int) -> Float[np.ndarray, "3 3"]:
-    """Return the intrinsics of a square image with the given field of view, px."""
+    """Return the intrinsics (px) of a square image with the given field of view."""
     focal = image_px / (2 * np.tan(np.radians(fov_deg) / 2))
     return np.array([[focal, 0.0, image_px / 2], [0.0, focal, image_px / 2], [0.0, 0.0, 1.0]])
 

@@ -108,7 +108,7 @@ def read_isat(path: Path, image: Path | None = None) -> IsatFile:
 
 
 def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
-    """Check the content of a label file, like `read_isat`; `path` is used only in messages."""
+    """Check the contents of a label file, like `read_isat`; `path` is used only in messages."""
     if not isinstance(content.get("objects"), list):
         raise SceneError(
             f"label file {path} has no `objects` list",

@@ -29,7 +29,7 @@ class RelevancyRule:
     rules: `max` takes the level whose (mixed) map has the highest value, `mean_in_mask` the highest mean
     inside its own mask (LangSplat's text on 3D-OVS). The finest level wins ties, because LangSplat stacks
     levels from fine to coarse. At the border, `langsplat` reflects in the mean filter and omits the last row
-    and column in the majority filter; `inside` averages the window's part inside the image (LangSplatV2).
+    and column in the majority filter; `inside` omits pixels outside the image (LangSplatV2).
     """
 
     filter_px: int = 0  # side of the mean filter; 0 scales 30 with the height of the map

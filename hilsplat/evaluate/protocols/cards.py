@@ -20,14 +20,15 @@ RELEVANCY_SCALE = 10.0
 """Scale of the cosine in the relevancy (LERF, LangSplat)."""
 
 NODE_SELECT = 0.95
-"""A node answers a text if its cosine margin is at most (1 - NODE_SELECT) times its level's range of margins
-below the margin of the view's best node, or three times that if the two nodes' cosine is at least 0.9."""
+"""A node matches a text if its margin is close to that of the view's best node: the difference is at most
+(1 - NODE_SELECT) times the range of margins at its level, or three times as much if the cosine between the
+two nodes is at least 0.9."""
 
 ANCESTORS = 0.2
 """Fraction of the ancestors' mean margin that is added to a node's own margin, except on paths."""
 
 Averaging = Literal["pairs", "classes", "levels", "views", "scenes", "pooled"]
-"""How rows are averaged to one number in a table.
+"""How rows are averaged into one number of a table.
 
 pairs: mean over the (view, query) pairs of a scene, then over scenes.
 classes: mean over the views of a query, then over the queries of a scene, then over scenes.

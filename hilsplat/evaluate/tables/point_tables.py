@@ -94,8 +94,8 @@ def scannet_table(sources: Sources) -> Table:
         label_of=lambda protocol: protocol.partition("(")[2].rstrip(")"),  # how points were classified
     )
     footnotes = (
-        "All values in %. 19, 15 and 10 classes and ScanNet200 follow OpenGaussian's code: mean over the "
-        "classes present in a scene, then over scenes; vertices of other classes are ignored.",
+        "All values in %. Columns of 19, 15 and 10 classes and of ScanNet200 follow OpenGaussian's code: "
+        "mean over the classes present in a scene, then over scenes; vertices of other classes are ignored.",
         MODE_NOTE,
         INTERVAL_NOTE,
         "Head, common, tail: the benchmark's splits; mIoU with the counts of all scenes pooled, over the "

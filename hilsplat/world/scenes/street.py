@@ -1,6 +1,6 @@
 """Street scenes: a drive past houses, vehicles, people, trees and signs, as in Waymo. Lengths are metres.
 
-x points along the street, y to the left of a driver who heads for +x, and z up; the road is z = 0.
+x points along the street, y to the left of a driver facing +x, and z up; the road is at z = 0.
 """
 
 import logging
