@@ -22,8 +22,8 @@ def test_an_iou_may_differ_by_a_point_and_more_with_other_gaussians():
     assert len(changed(0.011)) == len(changed(-0.011)) == 1
     assert changed(float("nan")) != []
     assert changed(-0.1, gaussians_sha256="other") == []
-    [sentence] = changed(-0.13, gaussians_sha256="other")
-    assert sentence.startswith(f"{NAME} is ") and sentence.endswith("tolerance 0.12")
+    [sentence] = changed(-0.19, gaussians_sha256="other")
+    assert sentence.startswith(f"{NAME} is ") and sentence.endswith("tolerance 0.18")
 
 
 def test_every_recorded_number_has_a_tolerance():
