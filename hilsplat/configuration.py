@@ -114,7 +114,7 @@ def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -
             found = json.dumps(problem.get("input"), default=str)
             found = found if len(found) <= LONGEST_SHOWN else f"{found[:LONGEST_SHOWN]}..."
             lines.append(f"{place}: {problem['msg']}; found {found}")
-    return SettingsError("settings cannot be used:\n  " + "\n  ".join(lines))
+    return SettingsError("the settings are not valid:\n  " + "\n  ".join(lines))
 
 
 def _known_keys(model: Any, path: list[str]) -> list[str]:
@@ -156,7 +156,7 @@ class RunSettings(StageSettings):
     results: str = knob("results", "results folder, relative to the working folder", pattern="^[^{}<>]+$")
     groups: tuple[str, ...] = knob(("benchmark",), "groups of the scene sheet to run")
     only: tuple[str, ...] = knob(
-        (), "the only scenes to run, from any group: table-1, or synthetic/table-1; empty: all in the groups"
+        (), "scenes to run, from any group, such as table-1 or synthetic/table-1; empty: all in `groups`"
     )
     # The report shows the data root without escaping < and >, so these are not allowed.
     data_root: str = knob(
@@ -164,23 +164,23 @@ class RunSettings(StageSettings):
     )
     main_variants: tuple[str, ...] = knob(("default",), "variants in the main tables")
     ablation_variants: tuple[str, ...] = knob((), "variants in the paper's ablation table")
-    component_variants: tuple[str, ...] = knob((), "variants in the table of the default field's parts")
+    component_variants: tuple[str, ...] = knob((), "variants in the components table, our own ablation")
     theta_variants: tuple[str, ...] = knob((), "variants in the sweep over theta")
     omega_variants: tuple[str, ...] = knob((), "variants in the sweep over Omega")
-    pruning_variants: tuple[str, ...] = knob((), "variants in the table of pruned pairs")
+    pruning_variants: tuple[str, ...] = knob((), "variants in the pruning tables")
     sweep_scenes: tuple[str, ...] = knob(
-        (), "scenes for ablation, sweeps and pruning; empty: all tabletop and photographed scenes"
+        (), "scenes in ablation, sweep and pruning tables; empty: all tabletop and photographed scenes"
     )
-    seeds: int = knob(1, "seeds for random training; if several, tables report mean and spread", ge=1, le=10)
+    seeds: int = knob(1, "seeds of random variants; if several, tables report mean and spread", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> setting -> value; 'default' always exists"
     )
     labels: dict[str, str] = knob({}, "variant -> its name in tables")
     overrides: dict[str, dict[str, dict[str, Any]]] = knob(
-        {}, "settings of a group or of one scene: group or dataset/scene -> section -> setting -> value"
+        {}, "settings for a group or a scene: group or dataset/scene -> section -> setting -> value"
     )
     queries: dict[str, tuple[str, ...]] = knob(
-        {}, "panel queries of a scene without labels on its images, by dataset/scene or by data set"
+        {}, "panel queries for scenes without image labels, by dataset/scene or data set"
     )
 
     @field_validator("groups", "only", "sweep_scenes", mode="before")
@@ -241,7 +241,7 @@ class RunSettings(StageSettings):
                     )
                 if where.startswith("variants.") and section not in VARIANT_SECTIONS:
                     raise SettingsError(
-                        f"{where}.{section}: variants cannot change this section, which they share",
+                        f"{where}.{section}: variants cannot change this section, because they share it",
                         expected=f"one of {', '.join(VARIANT_SECTIONS)}",
                         fix="put it under overrides for a group or a scene, or in another configuration file",
                     )
@@ -263,7 +263,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
     """Validate a configuration with variants and overrides; raise SettingsError, which names each bad key."""
     if "\\u0000" in json.dumps(config, default=str):
         raise SettingsError(
-            "a text in the configuration contains a null byte", fix="remove it; commands do not accept it"
+            "a string in the configuration contains a null byte", fix="remove it; commands do not accept it"
         )
     try:
         run = RunSettings.model_validate(config)
@@ -285,7 +285,7 @@ def parse_run(config: dict[str, Any]) -> RunSettings:
             )
     for key, texts in run.queries.items():
         if any(not text.strip() for text in texts):
-            raise SettingsError(f"queries.{key}: a text is empty", fix="remove it, or write what to look for")
+            raise SettingsError(f"queries.{key}: a query is empty", fix="remove it, or enter some text")
     for variant in dict.fromkeys([*run.variant_names(), *run.variants]):
         run.stages(variant)
     for scope in run.overrides:
@@ -330,7 +330,7 @@ def read_config(path: Path) -> dict[str, Any]:
         fault = "cannot be used" if isinstance(error, yaml.constructor.ConstructorError) else "is not YAML"
         raise SettingsError(
             f"{path}{place} {fault}: {error.problem or error.context}",
-            fix="indent with spaces, close brackets and quotes, and quote texts with a colon or braces",
+            fix="indent with spaces, close brackets and quotes, and quote strings with a colon or braces",
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct the path") from error
@@ -338,11 +338,11 @@ def read_config(path: Path) -> dict[str, Any]:
         raise SettingsError(f"{path} cannot be read: {error}", fix="save it as YAML in UTF-8") from error
     if not isinstance(found, dict):
         kind = "nothing" if found is None else type(found).__name__
-        raise SettingsError(f"{path} does not contain settings", expected="lines of key: value", found=kind)
+        raise SettingsError(f"{path} does not contain settings", expected="lines like key: value", found=kind)
     try:
         json.dumps(found, default=str)
     except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key
-        raise SettingsError(f"{path} cannot be used: {error}", fix="write keys and values in full") from error
+        raise SettingsError(f"{path} cannot be used: {error}", fix="avoid aliases and complex keys") from error
     return found
 
 

@@ -57,33 +57,33 @@ class WorldSettings(Section):
 
     views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
     image_px: int = knob(256, "height and width of each view", unit="px", ge=32, le=4096)
-    arc_deg: float = knob(360.0, "azimuth covered by the cameras; 360: a ring", unit="degree", gt=0, le=360)
+    arc_deg: float = knob(360.0, "azimuth covered by the cameras; 360: a circle", unit="degree", gt=0, le=360)
     objects: int = knob(6, "objects to place; the log reports how many fit", unit="objects", ge=1, le=30)
     samples: int = knob(3, "samples per pixel along each side", ge=1, le=8)
-    min_area_px: int = knob(60, "wholes and parts with less visible area are not scored", unit="px", ge=1)
+    min_area_px: int = knob(60, "minimum visible area of scored wholes and parts", unit="px", ge=1)
 
 
 class PosesSettings(Section):
     """Camera poses, from structure from motion or imported."""
 
     max_side_px: int = knob(
-        1600, "longest side after shrinking images", unit="px", ge=64, origin="3DGS: 1600"
+        1600, "longest side of an image; larger images are shrunk", unit="px", ge=64, origin="3DGS: 1600"
     )
     camera_model: Literal["auto", "simple_pinhole", "simple_radial", "opencv"] = knob(
-        "auto", "lens model; auto: simple_radial, for renders simple_pinhole"
+        "auto", "lens model; auto: simple_radial, or simple_pinhole for renders"
     )
     single_camera: Literal["auto", "yes", "no"] = knob(
         "auto", "one camera for all photographs; auto: one per size and EXIF focal length", origin="COLMAP"
     )
     matcher: Literal["auto", "exhaustive", "sequential"] = knob(
-        "auto", "pairs of views to match; auto: exhaustive up to 200 views, then sequential", origin="COLMAP"
+        "auto", "pairs of views to match; auto: exhaustive up to 200 views, else sequential", origin="COLMAP"
     )
     mapper: Literal["incremental", "global"] = knob(
         "incremental", "structure-from-motion algorithm", origin="COLMAP"
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     min_registered_share: float = knob(
-        0.7, "poses fail if the largest model contains a smaller share of the views", unit="share", gt=0, le=1
+        0.7, "minimum share of the views in the largest model; below, poses fail", unit="share", gt=0, le=1
     )
     several_models: Literal["largest", "stop"] = knob(
         "largest", "if the photographs form several models: use the largest, or stop"
@@ -95,25 +95,25 @@ class GaussiansSettings(Section):
     """Fit of the 3D Gaussians."""
 
     iterations: int = knob(3000, "maximum number of steps, each on one view", ge=1, origin="3DGS: 30000")
-    steps_per_view: int = knob(60, "steps per training view, if fewer than `iterations` in total", ge=1)
+    steps_per_view: int = knob(60, "steps per training view, up to `iterations` in total", ge=1)
     max_gaussians: int = knob(50_000, "maximum number of Gaussians at any step", ge=100)
-    image_scale: float = knob(1.0, "scale of the fit's images; 0.5 halves their sides", gt=0, le=1)
-    quarter_until: Share = knob(0.15, "share of the iterations at quarter size", origin="3DGS: 0")
-    half_until: Share = knob(0.75, "share of the iterations before full size", origin="3DGS: 0")
+    image_scale: float = knob(1.0, "scale of the images in the fit; 0.5 halves their sides", gt=0, le=1)
+    quarter_until: Share = knob(0.15, "share of the iterations with quarter-size images", origin="3DGS: 0")
+    half_until: Share = knob(0.75, "share of the iterations below full size", origin="3DGS: 0")
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: Share = knob(0.2, "D-SSIM's share of the loss; the rest is L1", origin="3DGS")
     # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
     # config/paper.yaml uses the published number and sizes of steps.
     means_rate: float = knob(
-        1.5e-3, "initial step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-4"
+        1.5e-3, "initial step size of the means", unit="camera extent", gt=0, origin="3DGS: 1.6e-4"
     )
     means_rate_last: float = knob(
-        1.5e-5, "final step size of the means", unit="extent of the cameras", gt=0, origin="3DGS: 1.6e-6"
+        1.5e-5, "final step size of the means", unit="camera extent", gt=0, origin="3DGS: 1.6e-6"
     )
     scales_rate: float = knob(0.01, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
     quats_rate: float = knob(0.004, "step size of the quaternions", gt=0, origin="3DGS: 1e-3")
     sh_rate: float = knob(
-        4e-3, "step size of constant harmonics; others: 1/20 of it", gt=0, origin="3DGS: 2.5e-3"
+        4e-3, "step size of the constant harmonics; others: 1/20 of it", gt=0, origin="3DGS: 2.5e-3"
     )
     densify_from: Share = knob(
         0.06, "start of densification, as a share of iterations", origin="3DGS: 500 / 30000"
@@ -135,12 +135,12 @@ class GaussiansSettings(Section):
     mcmc_noise: float = knob(5e5, "mcmc: weight of the noise on the means", ge=0, origin="MCMC")
     mcmc_opacity_weight: float = knob(0.01, "mcmc: weight of the mean opacity", ge=0, origin="MCMC")
     mcmc_scale_weight: float = knob(
-        0.01, "mcmc: weight of the mean scale, in units of the extent of the cameras", ge=0, origin="MCMC"
+        0.01, "mcmc: weight of the mean scale, in units of the camera extent", ge=0, origin="MCMC"
     )
     initial: Literal["points", "random", "frozen"] = knob(
         "points",
-        "initial Gaussians; points: at the sparse points; random: at random points that cameras see; "
-        "frozen: one fixed at each sparse point and no others (for evaluate.points: frozen)",
+        "initial Gaussians; points: at the sparse points; random: at random points visible to cameras; "
+        "frozen: exactly one per sparse point, in a fixed position (for evaluate.points: frozen)",
         origin="OpenGaussian on ScanNet: frozen",
     )
     checkpoint_every: int = knob(1000, "steps between checkpoints", ge=1)
@@ -164,23 +164,23 @@ class MasksSettings(Section):
     )
     variant: str = knob(
         "",
-        "suffix of the networks' names, such as fp16 for vision_encoder_fp16.onnx",
+        "suffix of the network files, such as fp16 for vision_encoder_fp16.onnx",
         pattern=r"^[A-Za-z0-9_.-]*$",
     )
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "encoder arithmetic; auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32",
+        "encoder precision; auto: int8 on a CPU if it agrees with fp32 on the scene; embedded models: fp32",
     )
     key_views: float = knob(
         1.0,
-        "share of the training views to segment; below 1: views that together see most Gaussians",
+        "share of the training views to segment; below 1: those that together show the most Gaussians",
         gt=0,
         le=1,
     )
     prompts: Literal["grid", "guided"] = knob(
         "grid",
-        "prompts in views after the key views; guided: nodes of the key views, and grid points that no node "
-        "explains",
+        "prompts in views after the key views; guided: nodes of the key views, and grid points that no "
+        "node covers",
         origin="SAM, LangSplat: grid",
     )
     levels: Literal["head", "tree"] = knob(
@@ -193,24 +193,24 @@ class MasksSettings(Section):
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
-        "prompts per decoder call; auto: the model folder's number, else 8 (full-size SAM: 60 MB each)",
+        "prompts per decoder call; auto: the model folder's value, else 8 (full-size SAM: 60 MB each)",
         origin="LangSplat: 64",
     )
     crop_layers: int = knob(0, "layers of crops to segment", ge=0, le=2, origin="LangSplat: 1")
     predicted_iou_min: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "masks need a predicted IoU above this, which may exceed 1; 0: keep all; auto: the model folder's "
-        "number, else 0.7",
+        "predicted IoU that a mask must exceed (may be above 1); 0: keep all; auto: the model folder's "
+        "value, else 0.7",
         origin="SAM: 0.88, LangSplat: 0.7",
     )
     stability_min: Share | Auto = knob(
         "auto",
-        "minimum stability of a mask; auto: the model folder's number, else 0.85",
+        "minimum stability of a mask; auto: the model folder's value, else 0.85",
         origin="SAM: 0.95, LangSplat: 0.85",
     )
     stability: Literal["estimate", "full"] = knob(
         "estimate",
-        "masks in which stability counts pixels; estimate: the network's small masks; full: full size",
+        "masks used to measure stability; estimate: the network's small masks; full: full size",
         origin="SAM: full",
     )
     generator: Literal["hilsplat", "official"] = knob(
@@ -230,7 +230,7 @@ class MasksSettings(Section):
     nms_iou: float = knob(0.8, "IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat")
     nms_score: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "predicted IoU x stability must exceed this; 0: keep all; auto: the model folder's number, else 0.7",
+        "product of predicted IoU and stability to exceed; 0: keep all; auto: the model folder's value, else 0.7",
         origin="LangSplat: 0.7",
     )
     nms_inner: Share = knob(0.5, "threshold for suppressing inner masks", origin="LangSplat")
@@ -256,7 +256,7 @@ class PerturbSettings(Section):
     boundary_smooth_px: float = knob(
         6.0, "length along the boundary over which the displacement changes", unit="px", ge=1, le=256
     )
-    merge: Share = knob(0.02, "probability per node and view of merging with a sibling in contact")
+    merge: Share = knob(0.02, "probability per node and view of merging with a touching sibling")
     split: Share = knob(0.02, "probability per mask of being cut in two")
     missing: tuple[Share, Share, Share] = knob(
         (0.01, 0.04, 0.1), "probability that a mask is missing: whole, part, subpart"
@@ -296,11 +296,11 @@ class ClipSettings(Section):
 
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "image network; auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32",
+        "image network's precision; auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32",
     )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
-        "masks to embed; nodes: those showing each node best; masks: all; auto: as autoencoder.targets says",
+        "masks to embed; nodes: those showing each node best; masks: all; auto: by autoencoder.targets",
         origin="paper, LangSplat: masks",
     )
     crops_per_node: int = knob(5, "nodes: maximum number of crops averaged per node", ge=1, le=32)
@@ -311,18 +311,18 @@ class ClipSettings(Section):
     )
     variant: str = knob(
         "",
-        "suffix of the networks' names, such as fp16 for vision_model_fp16.onnx",
+        "suffix of the network files, such as fp16 for vision_model_fp16.onnx",
         pattern=r"^[A-Za-z0-9_.-]*$",
     )
     crop: Literal["box", "langsplat"] = knob(
         "box",
-        "box: a mask's whole box, area filter; langsplat: without its last row and column, bilinear",
+        "box: a mask's entire box, area filter; langsplat: without last row and column, bilinear filter",
         origin="LangSplat",
     )
     background: Literal["black", "keep"] = knob(
         "black", "pixels of a crop outside its mask: painted black, or kept", origin="LangSplat: black"
     )
-    batch: int = knob(1, "crops per network call; more are faster only on a GPU", ge=1, le=4096)
+    batch: int = knob(1, "crops per network call; above 1 is faster only on a GPU", ge=1, le=4096)
 
 
 class ContributionsSettings(Section):
@@ -332,7 +332,7 @@ class ContributionsSettings(Section):
     keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
         "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer "
-        "non-zeros; none: neither, sufficient for a semantic tree without a field",
+        "non-zeros; none: neither, which suffices for a semantic tree without a field",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
         "auto", "rasteriser; auto: cuda if torch finds a device and gsplat is installed, else cpu"
@@ -344,18 +344,18 @@ class SemanticTreeSettings(Section):
 
     evidence: Literal["masks", "features"] = knob(
         "masks",
-        "masks: linked across views; features: Gaussians clustered by features trained by L alone, with "
+        "masks: linked across views; features: Gaussians clustered by features trained with L alone, with "
         "the weights and readings of section field",
         origin="paper: features",
     )
-    feature_size: int = knob(6, "features: their dimension", ge=2, le=64, origin="OpenGaussian: 6")
+    feature_size: int = knob(6, "features: number of dimensions", ge=2, le=64, origin="OpenGaussian: 6")
     link_threshold: float = knob(0.3, "minimum pooled IoU to join mask clusters", gt=0, lt=1)
-    min_views: int = knob(3, "nodes with masks in fewer views are dropped", ge=1)
+    min_views: int = knob(3, "minimum number of views with masks of a node", ge=1)
     parent_coverage: float = knob(
         0.5, "a node is the child of a coarser node that contains more than this share of it", gt=0, lt=1
     )
     whole_side: float = knob(
-        0.35, "graph: regions that touch in 3D form wholes up to about this share of a view's side", gt=0
+        0.35, "graph: regions that touch in 3D are merged up to about this share of a view's side", gt=0
     )
 
     @property
@@ -373,7 +373,7 @@ class AutoencoderSettings(Section):
     latent: int = knob(16, "size d of a latent", ge=1, le=64, origin="paper, LangSplat: 3")
     targets: Literal["node", "mask"] = knob(
         "node",
-        "vector that represents a mask; node: its best-fitting node's; mask: its own",
+        "vector that represents a mask; node: that of its best-fitting node; mask: its own",
         origin="paper: mask",
     )
     epochs: int = knob(100, "network: passes over all vectors", ge=1, origin="LangSplat: 100")
@@ -406,10 +406,10 @@ class FieldSettings(Section):
     )
     part_mode: Literal["literal", "disentangle"] = knob(
         "disentangle",
-        "literal: Eq. 5 as printed; disentangle: parts repel each other, as its prose says",
+        "literal: Eq. 5 as printed; disentangle: parts repel each other, as the paper's text says",
         origin="paper: literal",
     )
-    omega: float = knob(10.0, "similarity degree Omega: base of L_ins's distances", gt=1, origin="paper: 10")
+    omega: float = knob(10.0, "similarity degree Omega: base of distances in L_ins", gt=1, origin="paper: 10")
     tau: float = knob(0.1, "temperature of L_part", gt=0, origin="paper: not given; VCH: 0.1")
     start: Literal["average", "median", "random", "langsplat"] = knob(
         "average",
@@ -428,7 +428,7 @@ class FieldSettings(Section):
     rate: float = knob(0.0025, "Adam step size of the literal trainer", gt=0, origin="LangSplat")
     language: Literal["squared", "l1"] = knob(
         "squared",
-        "regression to the latents; l1 (LangSplat's) needs the literal trainer",
+        "loss of the latent regression; l1 (LangSplat's) needs the literal trainer",
         origin="LangSplat: l1",
     )
     min_labelled_share: float = knob(
@@ -440,12 +440,12 @@ class FieldSettings(Section):
     )
     cg_steps: int = knob(6, "conjugate-gradient steps on the quadratic losses", ge=0)
     lbfgs_steps: int = knob(6, "L-BFGS steps, if L_ins or L_part has a weight", ge=0)
-    min_mask_px: int = knob(50, "L_ins and L_part ignore smaller masks", unit="px", ge=1)
+    min_mask_px: int = knob(50, "minimum area of masks in L_ins and L_part", unit="px", ge=1)
     prune_cosine: Share = knob(
         1.0,
-        "L_ins and L_part omit a mask if the cosine of its mean feature with that of a larger, unrelated "
-        "mask of the same view and level is higher; 1: keep all",
-        origin="paper: pruning, no number",
+        "L_ins and L_part omit a mask if the cosine between its mean feature and that of a larger, "
+        "unrelated mask of the same view and level exceeds this; 1: keep all",
+        origin="paper: pruning, no value given",
     )
 
     @property
@@ -456,7 +456,9 @@ class FieldSettings(Section):
     @model_validator(mode="after")
     def _l1_is_literal(self) -> "FieldSettings":
         if self.language == "l1" and self.trainer != "literal":
-            raise ValueError("language l1 needs trainer literal: the fast trainer solves only for squares")
+            raise ValueError(
+                "language: l1 needs trainer: literal; the fast trainer handles only squared losses"
+            )
         return self
 
 
@@ -502,7 +504,7 @@ class EvaluateSettings(Section):
     )
     template: str = knob(
         "{}",
-        "prompt template for texts and canonical phrases, such as 'a photo of a {}'",
+        "prompt template for queries and canonical phrases, such as 'a photo of a {}'",
         origin="LERF, LangSplat: {}",
         pattern=r"^[^{}]*\{\}[^{}]*$",
     )
@@ -514,39 +516,39 @@ class EvaluateSettings(Section):
         ge=0,
         origin="LangSplat: 30, paper: 20",
     )
-    mix: bool = knob(True, "average the filtered relevancy with the unfiltered one", origin="LangSplat")
+    mix: bool = knob(True, "average filtered and unfiltered relevancy", origin="LangSplat")
     relevancy_threshold: float = knob(0.4, "map threshold for masks", ge=0, lt=1, origin="LangSplat, paper")
     threshold_on: Literal["normalised_pm1", "raw"] = knob(
         "normalised_pm1",
         "scale of the threshold; normalised_pm1: maps stretched to [-1, 1], so 0.4 is 70 % of the range",
         origin="LangSplat's code",
     )
-    majority: bool = knob(True, "smooth a map's mask by 7 x 7 px majority", origin="LangSplat's code")
+    majority: bool = knob(True, "smooth a map's mask by 7 x 7 px majority vote", origin="LangSplat's code")
     level_rule: Literal["max", "mean_in_mask"] = knob(
         "max",
-        "level if none is given: that of the highest value, or of the highest mean in its mask",
+        "level if none is given; max: with the highest value; mean_in_mask: with the highest mean in its mask",
         origin="LangSplat: max",
     )
     node_select: float = knob(
         0.95,
-        "nodes selected with the best: their cosine margin may be lower by 1 - node_select times the level's "
-        "range of margins, or by three times that if they look like the best",
+        "a node is selected with the best if its cosine margin is lower by at most (1 - node_select) times the "
+        "level's range of margins, or three times that if it looks like the best",
         ge=0,
         le=1,
     )
     ancestors: float = knob(
         0.2, "share of the ancestors' mean margin added to a node's own for ranking", ge=0
     )
-    min_region_px: int = knob(60, "smaller ground-truth regions are not scored", unit="px", ge=1)
+    min_region_px: int = knob(60, "minimum area of scored regions", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
-        ("tree", "tree-path", "field"), "methods that answer; each has its own rows in the tables"
+        ("tree", "tree-path", "field"), "methods that answer queries; each has its own table rows"
     )
     view_consistency: bool = knob(
         True, "score whether answers agree in neighbouring views (synthetic scenes)"
     )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
-        "Gaussians that answer for a labelled point; nearest: the nearest opaque one; vote: 5 within "
+        "Gaussians used for a labelled point; nearest: the nearest opaque one; vote: 5 within "
         "10 cm; density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or your own "
         "PLY with one Gaussian per point)",
         origin="OpenGaussian: frozen",

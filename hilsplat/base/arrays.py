@@ -39,7 +39,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
             fits: bool = isinstance(array, declared)
             if not fits:
                 raise ArtifactError(
-                    f"{path}: array {name} cannot be used",
+                    f"{path}: array {name} has the wrong type or shape",
                     expected=described(declared),
                     found=f"{array.dtype} of shape {array.shape}",
                     fix=remake(path),
@@ -50,7 +50,7 @@ def require_types(maker: type, arrays: Mapping[str, Any], path: Path, limits: Li
             least, most = array.min(), array.max()  # NaN if any value is NaN
             if not (low <= least and most <= high and np.isfinite(least) and np.isfinite(most)):
                 raise ArtifactError(
-                    f"{path}: a value of array {name} cannot be right",
+                    f"{path}: array {name} contains an impossible value",
                     expected="finite numbers" if np.isinf(low) and np.isinf(high) else f"{low:g} to {high:g}",
                     found=f"{least} to {most}",
                     fix=remake(path),
@@ -83,7 +83,7 @@ def made(
     expected = {field.name for field in fields(maker) if field.init}  # type: ignore[arg-type]
     if {*arrays, *more} != expected:
         raise ArtifactError(
-            f"{path} was written by another version",
+            f"{path} was written by another version of hilsplat",
             expected=", ".join(sorted(expected - set(more))),
             found=", ".join(sorted(arrays)) or "no arrays",
             fix=remake(path),

@@ -176,7 +176,7 @@ def explain_full_disk(path: Path) -> Iterator[None]:
             raise DiskSpaceError(
                 f"no space left while writing {path.name} in {folder}",
                 found=f"{usage.free / 2**20:.1f} MiB free of {usage.total / 2**20:.0f} MiB on that disk",
-                fix=f"free space on the disk of {folder}, then run again; finished work is kept",
+                fix=f"free up space on the disk of {folder}, then run again; finished work is kept",
             ) from error
         if isinstance(error, OSError) and is_unfinished(Path(str(error.filename))):
             error.filename = str(path)  # a temporary name means nothing to a user
@@ -194,10 +194,10 @@ def require_free_space(folder: Path, needed_mib: float) -> None:
     free_mib = shutil.disk_usage(folder).free / 2**20
     if free_mib < needed_mib:
         raise DiskSpaceError(
-            f"too little space on the disk of {folder}",
+            f"not enough space on the disk of {folder}",
             expected=f"at least {needed_mib:.0f} MiB free",
             found=f"{free_mib:.0f} MiB free",
-            fix="free space, or move this folder to another disk (a symbolic link suffices)",
+            fix="free up space, or move the folder to another disk and replace it with a symbolic link",
         )
 
 
@@ -347,7 +347,7 @@ def read_index(folder: Path, *entries: str) -> dict[str, Any]:
     index = copy.deepcopy(_index(Path(folder)))
     if missing := [entry for entry in entries if entry not in index]:
         raise ArtifactError(
-            f"{folder} was written by another version",
+            f"{folder} was written by another version of hilsplat",
             expected=f"{', '.join(missing)} in {INDEX}",
             fix=remake(Path(folder)),
         )
@@ -370,7 +370,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
         raise ArtifactError(
-            f"{path} is not an artifact index, or was written by another version", fix=remake(path)
+            f"{path} is not an artifact index of this version of hilsplat", fix=remake(path)
         )
     if index.pop("seal") != _seal(index):
         raise _changed(path)
@@ -391,7 +391,7 @@ def sealed(folder: Path, name: str) -> Path:
 def _changed(path: Path) -> ArtifactError:
     return ArtifactError(
         f"{path} was changed after it was written",
-        expected=f"the bytes whose checksum is in {INDEX}",
+        expected=f"a file that matches its checksum in {INDEX}",
         fix=remake(path),
     )
 
@@ -470,7 +470,7 @@ def output_lock(output: Path) -> Iterator[None]:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ArtifactError(
-                f"another process is writing {output}", fix="wait until it ends, or stop it, then run again"
+                f"another process is writing {output}", fix="let it finish or stop it, then run again"
             ) from error
         stream.truncate(0)
         stream.write("unfinished\n")

@@ -37,7 +37,7 @@ def system_error(error: BaseException) -> HilsplatError | None:
     if problem is None or not isinstance(error, OSError):
         return None
     return HilsplatError(
-        f"{error.filename or 'standard output, or an open file,'} {problem}",
+        f"{error.filename or 'standard output or an open file'} {problem}",
         found=error.strerror,
         fix="correct the problem, or choose another path",
     )
@@ -49,7 +49,7 @@ def require_working_directory() -> None:
         Path.cwd()
     except FileNotFoundError:
         raise HilsplatError(
-            "the working directory was deleted", fix="change to a folder that exists, and run again"
+            "the working directory was deleted", fix="change to an existing folder, then run again"
         ) from None
 
 
@@ -60,16 +60,16 @@ PLACES = {
     errno.EACCES: "cannot be read or written: permission denied",
     errno.EPERM: "cannot be read or written: permission denied",
     errno.EROFS: "is on a read-only disk",
-    errno.ENOENT: "is missing, or cannot be created",
+    errno.ENOENT: "is missing or cannot be created",
     errno.ENOTDIR: "cannot be opened or created: part of the path is a file",
     errno.EISDIR: "is a folder; a file is expected",
     errno.EEXIST: "already exists",
-    errno.ELOOP: "is a symbolic link that leads back to itself",
+    errno.ELOOP: "is a symbolic link that points back to itself",
     errno.EMFILE: "cannot be opened: too many files are open (ulimit -n)",
-    errno.ENAMETOOLONG: "is too long for this disk",
-    errno.EFBIG: "would be larger than the limit of this shell (ulimit -f) or disk",
-    errno.EIO: "cannot be read or written: the disk reports an error",
-    errno.ENOSPC: "does not fit on the disk, which is full",
+    errno.ENAMETOOLONG: "is too long for this file system",
+    errno.EFBIG: "would exceed the size limit of this shell (ulimit -f) or of the file system",
+    errno.EIO: "cannot be read or written: the disk reported an error",
+    errno.ENOSPC: "cannot be written: the disk is full",
     errno.EDQUOT: "exceeds your disk quota",
 }
 """System error number -> problem with the path."""

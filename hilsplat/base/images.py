@@ -61,14 +61,14 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     try:
         with open_image(path) as image:
             if (num_frames := _frames(image)) > 1:
-                raise ValueError(f"it contains {num_frames} frames of one size, like an animation")
+                raise ValueError(f"it contains {num_frames} frames of the same size, like an animation")
             image.load()
             upright = ImageOps.exif_transpose(image)
             if upright.mode.startswith("I"):  # Pillow would clip values above 255
                 values = np.asarray(upright).astype(np.int64)
                 if values.min() < 0 or values.max() > DEEP_MAX:
                     raise ValueError(
-                        f"its grey values, {values.min()} to {values.max()}, are not 16-bit values"
+                        f"its grey values, {values.min()} to {values.max()}, do not fit into 16 bits"
                     )
                 upright = Image.fromarray(((values + 128) // 257).astype(np.uint8))
             if upright.mode == "F":
@@ -107,7 +107,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
                 colours, io.BytesIO(profile), _srgb_profile(), outputMode="RGB"
             )
         except ImageCms.PyCMSError as error:
-            logger.warning("%s: read as sRGB, because its colour profile is damaged: %s", path, error)
+            logger.warning("%s is read as sRGB, because its colour profile is damaged: %s", path, error)
         else:
             assert converted is not None  # only in-place conversion returns None
             return converted

@@ -223,15 +223,15 @@ def require_replaceable(outputs: Sequence[Path], stage: str, inputs: Iterable[Pa
         for each in read:
             if place == each or place in each.parents:
                 what = "is an input" if place == each else f"contains the input {each}"
-                raise ArtifactError(f"output {out} {what} of {stage}", fix="name another output")
+                raise ArtifactError(f"output {out} {what} of {stage}", fix="choose another output")
         for name, folder in (("working", Path.cwd()), ("home", Path.home())):
             if place == folder.resolve() or place in folder.resolve().parents:
                 raise ArtifactError(
-                    f"output {out} is the {name} folder, or contains it", fix="name a new file or folder"
+                    f"output {out} is or contains the {name} folder", fix="choose a new file or folder"
                 )
         if not _is_something(out) or place in own or was_interrupted(out):
             continue
-        raise _foreign(out, stage, f"nothing there, or an earlier output of {stage} with its provenance")
+        raise _foreign(out, stage, f"a new path, or an earlier output of {stage} with its provenance")
 
 
 def require_own_picture(path: Path, beside: Path | None = None) -> None:
@@ -271,10 +271,10 @@ def require_beginning(path: Path, line: str) -> None:
 
 def _foreign(path: Path, writer: str = "hilsplat", expected: str | None = None) -> ArtifactError:
     return ArtifactError(
-        f"output {path} exists, and {writer} did not write it",
+        f"output {path} exists, but {writer} did not write it",
         expected=expected,
         found=_described(path),
-        fix="name another output, or remove this one first",
+        fix="choose another output, or remove this one first",
     )
 
 
@@ -304,5 +304,5 @@ def _visible(folder: Path) -> list[str]:
 def _described(path: Path) -> str:
     if path.is_dir():
         names = sorted(_visible(path))
-        return f"a folder of {len(names)} entries: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        return f"a folder with {len(names)} files: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
     return f"a file of {path.stat().st_size} bytes" if path.is_file() else "neither a file nor a folder"

@@ -95,7 +95,7 @@ def world_masks(
     variant: MeasuredMasks = "default",
     results: Results = Path("results"),
     out: Annotated[
-        Path | None, typer.Option(help="PNG, with a CSV and a PDF beside it; default: beside the masks")
+        Path | None, typer.Option(help="PNG, with CSV and PDF beside it; default: in the folder of the masks")
     ] = None,
 ) -> None:
     """Compare masks with the ground-truth regions by level, and draw the errors."""
@@ -134,12 +134,12 @@ def models_get(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            help="names from `hilsplat models list`, or owner/name on the hub; default: recommended"
+            help="names from `hilsplat models list`, or owner/name on the hub; default: the recommended pair"
         ),
     ] = None,
     revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
     variant: Annotated[
-        str, typer.Option(help="networks of another precision: quantized, fp16, int8, ...; default: full")
+        str, typer.Option(help="precision of the networks: quantized, fp16, int8, ...; default: full")
     ] = "",
     out: Annotated[
         Path | None, typer.Option(help="models folder; default: HILSPLAT_MODELS, or the user's data folder")
@@ -166,7 +166,7 @@ def models_list() -> None:
 @models_app.command("check")
 def models_check(
     folder: Annotated[Path | None, typer.Argument(help="model folder; default: all installed")] = None,
-    variant: Annotated[str, typer.Option(help="ending of the networks' names, such as fp16")] = "",
+    variant: Annotated[str, typer.Option(help="suffix of the network files, such as fp16")] = "",
 ) -> None:
     """Describe a model folder, or all installed ones, and time one image."""
     from hilsplat.embed.model_check import check_model, check_models
@@ -203,13 +203,13 @@ def cache_prune(
     context: typer.Context,
     days: Annotated[float | None, typer.Option(min=0, help="delete entries unused for N days")] = None,
     max_mib: Annotated[
-        float | None, typer.Option(min=0, help="delete the least recently used until this much is left")
+        float | None, typer.Option(min=0, help="delete least recently used entries until N MiB are left")
     ] = None,
     stage: Annotated[
         list[str] | None,
         typer.Option(
-            help="cache to prune: masks, clip, contributions or gaussians (checkpoints of fits, kept for a "
-            "day); default: all, but gaussians only with --days"
+            help="cache to prune: masks, clip, contributions or gaussians (fit checkpoints, kept for at "
+            "least a day); default: all, but gaussians only with --days"
         ),
     ] = None,
 ) -> None:
@@ -265,9 +265,9 @@ def datasets_fits(
     scene: Annotated[str, typer.Argument(help="dataset/scene in the results folder that has a tree")],
     labels: Annotated[
         str | None,
-        typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own of this scene"),
+        typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own for this scene"),
     ] = None,
-    variant: Annotated[str, typer.Option(help="variant whose masks and tree are measured")] = "default",
+    variant: Annotated[str, typer.Option(help="variant whose masks and tree to measure")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     threads: Threads = 2,

@@ -8,7 +8,7 @@ import typer
 
 from hilsplat.cli.stage import app
 
-POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute poses; default: those found"
+POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute poses; default: use any found"
 
 
 @app.command()
@@ -54,16 +54,16 @@ def new(
     frames: Annotated[int, typer.Option(min=3, max=1000, help="maximum number of video frames")] = 60,
     poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     gaussians: Annotated[
-        Path | None, typer.Option(help="3DGS PLY; none: fit Gaussians; default: 3DGS output in the folder")
+        Path | None, typer.Option(help="3DGS PLY; none: fit Gaussians; default: use any 3DGS output found")
     ] = None,
     features: Annotated[
         Path | None,
         typer.Option(
-            help="LangSplat's features; none: use SAM and CLIP; default: use features if any are found"
+            help="LangSplat's features; none: use SAM and CLIP; default: use any features found"
         ),
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(help="LERF-OVS labels, for scores; none: no labels; default: those found")
+        Path | None, typer.Option(help="LERF-OVS labels for scores; none: no labels; default: use any found")
     ] = None,
 ) -> None:
     """Add photographs, a video, or a scene from COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.

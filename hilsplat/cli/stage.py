@@ -35,14 +35,14 @@ app.add_typer(cache_app, name="cache")
 PathIn = Annotated[Path, typer.Option(help="input artifact", show_default=False)]
 PathOut = Annotated[Path, typer.Option(help="output; written atomically", show_default=False)]
 Settings = Annotated[
-    str, typer.Option(help="settings of the stage as JSON; missing keys take their defaults")
+    str, typer.Option(help="settings of the stage, as JSON; omitted keys keep their defaults")
 ]
 Threads = Annotated[
     int,
     typer.Option(
         min=1,
         callback=lambda number: min(number, MOST_THREADS),
-        help="number of threads; results do not depend on it",
+        help="number of threads; does not affect results",
     ),
 ]
 MOST_THREADS = max(16, os.cpu_count() or 1)
@@ -51,11 +51,11 @@ MOST_THREADS = max(16, os.cpu_count() or 1)
 Memory = Annotated[
     float | None,
     typer.Option(
-        min=1, help="memory for concurrent views, MiB; default: all that is free; results do not depend on it"
+        min=1, help="memory for concurrent views, in MiB; default: all free memory; does not affect results"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
-Cache = Annotated[Path, typer.Option(help="folder of the caches of finished views, for resuming")]
+Cache = Annotated[Path, typer.Option(help="cache folder for finished views, to resume from")]
 Results = Annotated[Path, typer.Option(help="results folder")]
 DataRoot = Annotated[Path, typer.Option(help="folder of the data sets")]
 
@@ -142,7 +142,7 @@ def stage(
             raise problem from error
         if sys.gettrace() is not None:  # for post-mortem debugging
             raise
-        logging.getLogger("hilsplat").exception("%s failed on %s", name, out)
+        logging.getLogger("hilsplat").exception("stage %s failed; output: %s", name, out)
         sys.exit(1)
 
 
@@ -179,5 +179,5 @@ def json_option(option: str, text: str, kind: type) -> Any:
         raise SettingsError(f"{option} is not JSON: {error}", found=text[:80]) from error
     texts = value.values() if isinstance(value, dict) else value
     if not isinstance(value, kind) or not all(isinstance(each, str) for each in texts):
-        raise SettingsError(f"{option} is not a JSON {kind.__name__} of texts", found=text[:80])
+        raise SettingsError(f"{option} is not a JSON {kind.__name__} of strings", found=text[:80])
     return value

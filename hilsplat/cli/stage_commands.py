@@ -27,10 +27,10 @@ from hilsplat.cli.stage import (
 )
 from hilsplat.models.store import AUTO
 
-Features = Annotated[Path | None, typer.Option(help="folder of LangSplat's _s.npy and _f.npy, to import")]
+Features = Annotated[Path | None, typer.Option(help="folder of LangSplat's _s.npy and _f.npy files")]
 Truth = Annotated[Path | None, typer.Option(help="annotations of a synthetic scene")]
-LabelledScene = Annotated[str, typer.Option(help="or a labelled scene, such as lerf_ovs/figurines")]
-EvaluateSection = Annotated[str, typer.Option(help="settings of evaluate, as JSON")]
+LabelledScene = Annotated[str, typer.Option(help="labelled scene, such as lerf_ovs/figurines")]
+EvaluateSection = Annotated[str, typer.Option(help="evaluate settings as JSON")]
 Kind = Annotated[str, typer.Option(help="kind of a synthetic scene: tabletop, room or street")]
 Queries = Annotated[str, typer.Option(help="JSON list of queries, for a scene without labels")]
 
@@ -230,8 +230,8 @@ def semantic_tree(
     masks: PathIn,
     out: PathOut,
     settings: Settings = "{}",
-    coverage_tree: Annotated[Path | None, typer.Option(help="with evidence: features")] = None,
-    field_settings: Annotated[str, typer.Option(help="settings of field, with evidence: features")] = "{}",
+    coverage_tree: Annotated[Path | None, typer.Option(help="coverage trees, for evidence: features")] = None,
+    field_settings: Annotated[str, typer.Option(help="field settings, for evidence: features")] = "{}",
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
@@ -241,7 +241,7 @@ def semantic_tree(
     if (section.evidence == "features") != (coverage_tree is not None):
         raise SettingsError(
             "semantic_tree.evidence and the options do not match",
-            expected="--coverage-tree only with evidence: features",
+            expected="--coverage-tree with evidence: features, and only then",
         )
     if coverage_tree is None:
         with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs) as run:
@@ -344,15 +344,15 @@ def evaluate(
     clip: PathIn,
     masks: PathIn,
     out: PathOut,
-    dataset: Annotated[str, typer.Option(help="data set named in the scores")],
-    name: Annotated[str, typer.Option(help="scene named in the scores")],
+    dataset: Annotated[str, typer.Option(help="data set to record in the scores")],
+    name: Annotated[str, typer.Option(help="scene to record in the scores")],
     truth: Truth = None,
     labels: Annotated[
-        list[str] | None, typer.Option(help="or labels of published data sets, such as lerf_ovs/figurines")
+        list[str] | None, typer.Option(help="labels of published data sets, such as lerf_ovs/figurines")
     ] = None,
     data_root: DataRoot = Path(),
     kind: Kind = "",
-    variant: Annotated[str, typer.Option(help="variant named in the scores")] = "default",
+    variant: Annotated[str, typer.Option(help="variant to record in the scores")] = "default",
     settings: Settings = "{}",
     threads: Threads = 1,
 ) -> None:
@@ -376,18 +376,18 @@ def evaluate(
 def evaluate_files(
     predictions: Annotated[Path, typer.Argument(help="folder of masks or point labels from any program")],
     out: PathOut,
-    method: Annotated[str, typer.Option(help="name of the program in the tables")],
+    method: Annotated[str, typer.Option(help="name of the program, for the tables")],
     labels: Annotated[str, typer.Option(help="labels of a data set, such as lerf_ovs/figurines")] = "",
     data_root: DataRoot = Path(),
     truth: Truth = None,
     scene: Annotated[
-        Path | None, typer.Option(help="posed scene of a synthetic scene, which lists the test views")
+        Path | None, typer.Option(help="posed scene that lists the test views, for a synthetic scene")
     ] = None,
     kind: Kind = "",
-    dataset: Annotated[str, typer.Option(help="data set of a synthetic scene in the scores")] = "synthetic",
-    name: Annotated[str, typer.Option(help="name of a synthetic scene in the scores")] = "",
+    dataset: Annotated[str, typer.Option(help="data set to record for a synthetic scene")] = "synthetic",
+    name: Annotated[str, typer.Option(help="name to record for a synthetic scene")] = "",
     min_region_px: Annotated[
-        int | None, typer.Option(min=1, help="smaller regions of a synthetic scene are not scored")
+        int | None, typer.Option(min=1, help="minimum area of a scored region in a synthetic scene")
     ] = None,
 ) -> None:
     """Score masks or point labels written by any program, under the same protocols."""
@@ -482,7 +482,7 @@ def comparison(
 @app.command()
 def sweep(
     name: Annotated[str, typer.Argument(help="theta or omega")],
-    table: Annotated[Path, typer.Option(help="finished CSV of that table")],
+    table: Annotated[Path, typer.Option(help="CSV of the table")],
     out: Annotated[Path, typer.Option(help="PNG to write, with a PDF beside it")],
 ) -> None:
     """Plot a sweep from its table: the paper's curves and ours."""

@@ -22,18 +22,18 @@ SceneName = Annotated[
 def query(
     scene: SceneName,
     text: Annotated[
-        str, typer.Argument(help="what to look for; 'bear > head > nose' finds noses on heads of bears")
+        str, typer.Argument(help="what to look for; 'bear > head > nose' finds the noses on bears' heads")
     ],
     level: Annotated[
-        str, typer.Option(help="level of answers (or of a path's last text): auto, whole, part, subpart")
+        str, typer.Option(help="level of the answers, or of a path's last text: auto, whole, part, subpart")
     ] = "auto",
     variant: Annotated[str, typer.Option(help="variant to query")] = "default",
     results: Results = Path("results"),
-    views: Annotated[int, typer.Option(min=1, max=8, help="views in the panel")] = 3,
+    views: Annotated[int, typer.Option(min=1, max=8, help="number of views in the panel")] = 3,
     answerer: Annotated[
         str, typer.Option(help="tree: nodes of the semantic tree; field: the paper's language field")
     ] = "tree",
-    view: Annotated[str | None, typer.Option(help="search what this view shows, such as 000.png")] = None,
+    view: Annotated[str | None, typer.Option(help="search only in this view, such as 000.png")] = None,
     threshold: Annotated[
         float | None, typer.Option(help="minimum score of an answer, 0 to 1; default: near the best score")
     ] = None,
@@ -153,7 +153,7 @@ def export(
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     out: Annotated[
-        Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder, replaced")
+        Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder (replaced)")
     ] = None,
     threads: Threads = 2,
 ) -> None:
@@ -163,7 +163,7 @@ def export(
     """
     folder = scene_folder(scene, results)
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ArtifactError(f"--out {out} exists", fix="name a new folder, or remove this one first")
+        raise ArtifactError(f"--out {out} exists", fix="choose a new folder, or remove this one first")
     name = form.value if variant == "default" else f"{form.value}-{variant}"
     typer.echo(_write(form, folder, out or folder / "export" / name, variant, data_root, threads))
 

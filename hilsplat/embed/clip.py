@@ -116,8 +116,8 @@ class ClipModel:
         if self.width != numbers:
             raise MisalignedArtifactError(
                 f"{what} does not match the CLIP model in {self.model.folder}",
-                expected=f"vectors of {self.width} numbers, as from this model",
-                found=f"{numbers} numbers",
+                expected=f"vectors with {self.width} dimensions, as computed by this model",
+                found=f"{numbers} dimensions",
                 fix="set clip.model to the model it was made with, or rerun the clip stage and later stages",
             )
 
@@ -234,7 +234,7 @@ def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
         seen[place] = model.digest
     raise ModelError(
         f"the CLIP model that embedded the masks in {clip_folder} was not found",
-        expected=f"a model folder with digest {expected[:12]}, such as {recorded} at that time",
+        expected=f"a model folder with digest {expected[:12]}, originally {recorded}",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
         or f"no CLIP model at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
         fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "

@@ -87,10 +87,10 @@ def read_view(
     if (height, width) != size_hw:
         if abs(height * size_hw[1] / (width * size_hw[0]) - 1) > SHAPE_TOLERANCE:
             raise MisalignedArtifactError(
-                f"{maps_path} and view {view} differ in shape",
-                expected=f"the shape of {size_hw} (height, width)",
+                f"{maps_path} and view {view} differ in aspect ratio",
+                expected=f"{size_hw} (height, width), or the same aspect ratio",
                 found=f"{(height, width)}",
-                fix="create the map from the view's image; undistortion changes an image's shape",
+                fix="create the map from the view's image; undistortion changes an image's size",
             )
         rows = ((np.arange(size_hw[0]) + 0.5) * height / size_hw[0]).astype(int)
         columns = ((np.arange(size_hw[1]) + 0.5) * width / size_hw[1]).astype(int)
@@ -122,7 +122,7 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
             lacking,
             expected=", ".join(missing[:5]),
             found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
-            fix="pass the folder language_features that LangSplat made from the same images",
+            fix="pass the language_features folder that LangSplat made from the same images",
         )
     if missing:
         logger.warning("%s: %s", lacking, ", ".join(missing[:5]))

@@ -54,7 +54,7 @@ def check_model(folder: Path, variant: str = "") -> str:
     else:
         vectors = opened.embed_crops(np.zeros((1, side, side, 3), np.uint8))
         require_one_space(model.folder, vectors.shape[1], opened.embed_texts(["object"]).shape[1])
-        lines += [f"vectors    {vectors.shape[1]} numbers"]
+        lines += [f"vectors    {vectors.shape[1]} dimensions"]
         providers = opened.vision.providers
     _remember(folder, variant, seconds, CACHE)
     lines += [f"time       {times}", f"runs on    {', '.join(providers)}", f"digest     {model.digest}"]

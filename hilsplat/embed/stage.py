@@ -107,7 +107,7 @@ def run_clip(
         )
         if masks.size_hw != scene.cameras[view].size_hw:
             raise MisalignedArtifactError(
-                f"masks of view {view} of {scene.name} do not match its camera's size",
+                f"masks of view {view} of {scene.name} do not match the size of its camera",
                 expected=f"{scene.cameras[view].size_hw} (height, width)",
                 found=f"{masks.size_hw}",
                 fix=RERUN_MASKS,

@@ -34,7 +34,7 @@ def mask_embeddings(clip_folder: Path, folder: Path) -> Float32[np.ndarray, "M C
         wrong = ~((lengths == 0) | (np.abs(lengths - 1) < UNIT_TOLERANCE))  # also NaN
         if wrong.any():
             raise ArtifactError(
-                f"{np.count_nonzero(wrong)} CLIP vectors of {view} in {clip_folder} cannot be used",
+                f"{np.count_nonzero(wrong)} CLIP vectors of {view} in {clip_folder} are invalid",
                 expected="vectors of length 1, or 0 for crops that were not embedded",
                 found=f"length {lengths[wrong][0]}",
                 fix=remake(Path(clip_folder)),

@@ -169,7 +169,7 @@ def _prepare(requested: ModelRequest, listing: Listing, target: Path, variant: s
     licence = requested.release.licence if requested.release else "not stated by the hub"
     source = f"{requested.name}: {requested.repository} at {listing.revision[:12]}"
     size = f"{found.num_bytes() / 1e6:.1f} MB in {len(choice.files)} files"
-    left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB of which still to download"
+    left = f"{found.num_bytes(missing=True) / 1e6:.1f} MB still to download"
     logger.info("%s, %s, %s; licence: %s", source, size, left, listing.licence or licence)
     if choice.exported:
         require_exporter(requested.repository)
@@ -242,7 +242,7 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
         except CUT as error:
             if wait_s is None:
                 raise
-            logger.info("%s: the connection was lost (%s); trying again", file.path, type(error).__name__)
+            logger.info("%s: the connection was lost (%s); retrying", file.path, type(error).__name__)
             time.sleep(wait_s)
         else:
             return
@@ -288,7 +288,7 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
             f"{requested.repository} cannot be downloaded: {type(error).__name__}, {place} is unreachable",
             found="HF_HUB_OFFLINE is set" if constants.HF_HUB_OFFLINE else _innermost(error),
             fix=f"run the command again when the hub is reachable ({KEPT}; HF_ENDPOINT sets a mirror, "
-            f"HTTPS_PROXY a proxy), or put these files into {models / requested.name} by hand, from {place}: "
+            f"HTTPS_PROXY a proxy), or download these files from {place} into {models / requested.name}: "
             f"{', '.join(file for family in families for file in usual_files(family))}",
         ) from error
     except OSError as error:
@@ -311,7 +311,7 @@ def _refused(
         problem = f"the hub has no repository {repository}, or it is private {status}"
         fix = f"correct the name (hilsplat models list), or log in (`hf auth login`, HF_TOKEN) to use {place}"
     elif response.status_code == requests.codes.too_many_requests:
-        problem = f"the hub received too many requests to serve {repository} {status}"
+        problem = f"the hub refused {repository}: too many requests {status}"
         found = f"Retry-After: {response.headers.get('Retry-After', 'not stated')}"
         fix = f"run the command again later ({KEPT}); `hf auth login` or HF_TOKEN raises the limit"
     elif response.status_code in (requests.codes.unauthorized, requests.codes.forbidden):
@@ -321,7 +321,7 @@ def _refused(
         problem = f"the hub does not have this revision or file of {repository} {status}"
         fix = f"correct the name or --revision; {place} lists what exists"
     else:
-        problem = f"the hub does not serve {repository} {status}"
+        problem = f"the hub failed to serve {repository} {status}"
         fix = f"run the command again later: {KEPT}"
     return DownloadError(problem, found=found, fix=fix)
 
@@ -356,7 +356,7 @@ def export_networks(weights: Path, out: Path) -> dict[str, str]:
 
     If the exporter fails, the error contains its last lines of output.
     """
-    logger.info("exporting to ONNX; this takes minutes, and about three times the weights' size in memory")
+    logger.info("exporting to ONNX; this takes minutes and memory of about three times the weights' size")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
     done = subprocess.run(
         [sys.executable, "-m", "optimum.commands.optimum_cli", *words],

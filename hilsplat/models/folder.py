@@ -128,12 +128,12 @@ def _incomplete(folder: Path, name: str, missing: list[str], variant: str, alter
     variants = variants_of(folder, name)
     if any(file.endswith(".onnx") for file in missing) and variants:
         listed = ", ".join(repr(each) for each in variants)
-        remedy = f"its networks exist in variants: set {SECTIONS[layout.kind]}.variant to one of {listed}"
+        remedy = f"its networks have suffixes: set {SECTIONS[layout.kind]}.variant to one of {listed}"
     elif layout.kind == "clip" and whole_clip(folder):
-        remedy = f"split its single network into the two that are needed: hilsplat models split {folder}"
+        remedy = f"split its single network into the required two: hilsplat models split {folder}"
     elif any(file.endswith(TORCH_SUFFIXES) for file in found) and not any(folder.rglob("*.onnx")):
         remedy = (
-            "these are PyTorch weights, and hilsplat reads ONNX networks: fetch an ONNX export of the model "
+            "these are PyTorch weights, but hilsplat reads ONNX networks: fetch an ONNX export of the model "
             "(hilsplat models get), or export it (docs/models.md)"
         )
     else:
@@ -184,7 +184,7 @@ def _preprocessing_of(path: Path) -> dict[str, Any]:
         are_numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
         if not are_numbers or not all(least < value < math.inf for value in values):
             expected = "finite numbers" + (" above 0" if least == 0 else "")
-            problem = f"{path}: {key} cannot be used"
+            problem = f"{path}: {key} is invalid"
             raise ModelError(problem, expected=expected, found=str(values)[:80], fix=WHOLE_COPY)
     return found
 

@@ -43,7 +43,7 @@ def considers_int8(precision: str, model: ModelFolder) -> bool:
     """Return whether to compare int8 with float32; log a warning if int8 is required but unavailable."""
     possible = may_be_int8(model)
     if precision == "int8" and not possible:
-        logger.warning("%s runs in float32: int8 needs a pretrained model on a CPU", model.folder)
+        logger.warning("%s runs in float32: int8 requires a pretrained model on a CPU", model.folder)
     return possible and precision != "fp32"
 
 
@@ -64,7 +64,7 @@ def int8_network(
     folder = beside if os.access(beside, os.W_OK) else Path(cache)
     path = folder / ".int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
     if not path.is_file():
-        logger.info("quantising %s of %s, which takes seconds; the result is kept", name, model.folder)
+        logger.info("quantising %s of %s, which takes a few seconds; the result is kept", name, model.folder)
         _quantise(model.networks[name] if graph is None else graph, path, exact)
     return model.network(name, graph=path.read_bytes())
 
@@ -117,7 +117,7 @@ def use_int8(
     found = {name: float(value[0]) for name, value in kept.items()}
     use = precision == "int8" or all(value >= LEAST[name] for name, value in found.items())
     measured = ", ".join(f"{name} {value:.4f} (minimum: {LEAST[name]})" for name, value in found.items())
-    logger.info("%s runs in %s. int8 and float32: %s", what, "int8" if use else "float32", measured)
+    logger.info("%s runs in %s. int8 against float32: %s", what, "int8" if use else "float32", measured)
     return use
 
 

@@ -163,7 +163,7 @@ def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int
     if None not in (image_numbers, text_numbers) and image_numbers != text_numbers:
         raise ModelError(
             f"the two networks of {folder} do not belong together",
-            expected=f"text vectors of {image_numbers} numbers, like the image vectors",
-            found=f"{text_numbers} numbers",
+            expected=f"text vectors with {image_numbers} dimensions, like the image vectors",
+            found=f"{text_numbers} dimensions",
             fix="export both networks, with their projections, from one model",
         )

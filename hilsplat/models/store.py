@@ -40,8 +40,8 @@ class Release:
 
 
 RELEASES = (
-    Release("sam-vit-huge", "Xenova/sam-vit-huge", 2570, "the paper's masks; a GPU"),
-    Release("sam-vit-large", "Xenova/sam-vit-large", 1250, "between huge and base; a GPU"),
+    Release("sam-vit-huge", "Xenova/sam-vit-huge", 2570, "masks as in the paper; needs a GPU"),
+    Release("sam-vit-large", "Xenova/sam-vit-large", 1250, "between huge and base; needs a GPU"),
     Release("sam-vit-base", "Xenova/sam-vit-base", 376, "the smallest original SAM"),
     Release(
         "sam2.1-hiera-small", "onnx-community/sam2.1-hiera-small-ONNX", 184, "masks of photographs, on a CPU"
@@ -50,7 +50,7 @@ RELEASES = (
         "sam2.1-hiera-base-plus", "onnx-community/sam2.1-hiera-base-plus-ONNX", 328, "between small and ViT-B"
     ),
     Release("edgetam", "onnx-community/EdgeTAM-ONNX", 37, "the fastest encoder"),
-    Release("slimsam-77", "Xenova/slimsam-77-uniform", 40, "little memory or time"),
+    Release("slimsam-77", "Xenova/slimsam-77-uniform", 40, "low memory and time"),
     Release(
         "clip-vit-b-16-laion2b",
         "laion/CLIP-ViT-B-16-laion2B-s34B-b88K",

@@ -219,13 +219,13 @@ class HierarchicalMasks:
         """Check that offsets, runs, areas and boxes are consistent."""
         lengths, ends = np.diff(self.offsets), self.offsets[[0, -1]].tolist() if len(self.offsets) else []
         if len(self.offsets) != len(self) + 1 or ends != [0, len(self.runs)] or (lengths <= 0).any():
-            found = f"{len(self.offsets)} from {ends}, the smallest step {lengths.min(initial=0)}"
+            found = f"{len(self.offsets)} from {ends}, smallest step {lengths.min(initial=0)}"
             raise _damaged(path, "offsets", f"{len(self) + 1} ascending from 0 to {len(self.runs)}", found)
         height, width = self.size_hw
         if len(self):
             pixels = np.add.reduceat(self.runs.astype(np.int64), self.offsets[:-1])
             if (pixels != height * width).any():
-                found = f"{pixels[pixels != height * width][0]} in one"
+                found = f"{pixels[pixels != height * width][0]} in one mask"
                 raise _damaged(path, "runs", f"{height * width} pixels per mask", found)
         area_px, boxes = areas_and_boxes(self.runs, self.offsets, width)
         if not (area_px > 0).all() or not np.array_equal(area_px, self.area_px):
@@ -235,7 +235,7 @@ class HierarchicalMasks:
 
 
 def _damaged(path: Path, name: str, expected: str, found: str | None = None) -> ArtifactError:
-    problem = f"{path}: array {name} cannot be right"
+    problem = f"{path}: array {name} contains an impossible value"
     return ArtifactError(problem, expected=expected, found=found, fix=remake(path))
 
 

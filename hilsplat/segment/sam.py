@@ -193,7 +193,7 @@ class SamModel:
             logger.info("%s: %s", on_runtime, error)
             return None
         if difference > AGREEMENT:
-            logger.warning("%s, slower: the factored decoder differs by %.2g", on_runtime, difference)
+            logger.warning("%s (slower): the factored decoder differs by %.2g", on_runtime, difference)
             return None
         return factored
 
@@ -354,7 +354,7 @@ def own_thresholds(model: ModelFolder) -> Thresholds:
         return replace(REAL_SAM, **{name: getattr(read, name) for name in own})
     except ValueError as error:  # includes pydantic's ValidationError
         raise ModelError(
-            f"{model.folder / 'config.json'}: {OWN} cannot be used: {error}", fix="correct or remove it"
+            f"{model.folder / 'config.json'}: {OWN} is invalid: {error}", fix="correct or remove it"
         ) from error
 
 

@@ -91,7 +91,7 @@ def run_masks(
             threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
         else:
-            logger.info("masks %s: graph segmenter, without a model; levels are three scales", scene.name)
+            logger.info("masks %s: graph segmenter, without a model; the levels are three scales", scene.name)
         index: dict[str, Any] = {}
         with atomic_folder(out) as folder:
             found = in_order(segment, views, threads)

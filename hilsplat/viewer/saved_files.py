@@ -84,7 +84,7 @@ class SavedFiles:
             try:
                 found = await self.thread.run(partial(_step, steps), worker)
             except (HilsplatError, OSError) as error:  # such as a full disk
-                yield _line(error=f"the file could not be made: {error}")
+                yield _line(error=f"the file could not be created: {error}")
                 return
         yield _line(bytes=len(found))
         yield found

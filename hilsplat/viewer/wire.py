@@ -65,7 +65,7 @@ class Style(Message):
     @model_validator(mode="after")
     def _ramp_has_text(self) -> "Style":
         if self.ramp and not self.text:
-            raise ValueError("a ramp shows the relevancy to a text, but the text is empty")
+            raise ValueError("colouring by relevancy needs a text, but the text is empty")
         return self
 
     def rgba(self, num_nodes: int) -> UInt8[np.ndarray, "T1 4"]:
@@ -84,7 +84,7 @@ def _rows(text: str, width: int, count: int) -> np.ndarray:
         return np.frombuffer(base64.b64decode(text, validate=True), np.uint8).reshape(count, width)
     except ValueError as error:
         raise SettingsError(
-            "the style cannot be painted",
+            "the style is invalid",
             expected=f"base64 of {count} rows of {width} bytes",
             found=str(error),
             fix="reload the page",

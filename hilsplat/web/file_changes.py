@@ -35,6 +35,6 @@ def replacing(path: Path, version: str, what: str) -> Iterator[None]:
     with output_lock(path):
         if version_of(path) != version:
             raise StaleFileError(
-                f"{what} have changed since they were read", fix="reload the page, then change them"
+                f"{what} have changed since they were read", fix="reload the page, and repeat the change"
             )
         yield

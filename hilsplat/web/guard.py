@@ -63,7 +63,7 @@ class Guard:
         is_opening = scope["path"] == "/" and has_token and not self.embedded
         if self.embedded:
             is_known = has_token or scope["path"].startswith("/static/")
-            refused = self._sent_as_json(scope["method"], headers) if is_known else "the token is wrong"
+            refused = self._sent_as_json(scope["method"], headers) if is_known else "the token is invalid"
         else:
             refused = self._refusal(scope["method"], headers, is_opening)
         if refused:

@@ -131,7 +131,7 @@ def listening_at(port: int) -> socket.socket:
         made.bind(("127.0.0.1", port))
     except OSError as error:
         made.close()
-        fix = "choose another port, or omit it"
+        fix = "choose another port, or omit --port"
         raise SettingsError(f"port {port} cannot be used: {error}", fix=fix) from error
     made.listen()  # before the address is printed, so that early connections wait instead of failing
     return made

@@ -74,7 +74,7 @@ def libraries() -> Iterator[Finding]:
             continue
         if not requirement.specifier.contains(found, prereleases=True):
             wrong.append(f"{requirement.name} {found} does not satisfy {requirement.specifier}")
-    fix = f"pip install --upgrade {PACKAGE}, with the constraints.txt of the repository"
+    fix = f"pip install --upgrade {PACKAGE}, with the repository's constraints.txt"
     yield verdict("libraries", "; ".join(wrong), f"{number} libraries in the required versions", fix)
 
 
@@ -164,7 +164,7 @@ def space() -> Iterator[Finding]:
     free, needed = shutil.disk_usage(folder).free / 2**30, disk_mb * 1e6 / 2**30
     text = f"{free:.1f} GiB free in {folder}; results of {len(plan.scenes)} scenes need about {needed:.1f}"
     problem = "" if free > needed else text
-    yield verdict("disk", problem, text, "free space, or set results to a folder on another disk")
+    yield verdict("disk", problem, text, "free up space, or set results to a folder on another disk")
     most, rule, scene = memory
     text = (
         f"{machine_mib() / 1024:.1f} GiB; the largest job, {rule} of {scene}, needs about {most / 1024:.1f}"

@@ -22,8 +22,8 @@ Gaussians (docs/benchmarks.md), with loss and Adam on the CPU. The others are fr
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
-    "Hours can be wrong by a factor of two on another machine. Memory is that of the largest job.",
-    "GPU: published times of a 24 GB card for fits, SAM and CLIP; the rest runs on the cores.",
+    "On another machine, hours can be off by a factor of two. Memory is that of the largest job.",
+    "GPU: published times of a 24 GB card for fits, SAM and CLIP; other jobs run on the CPU.",
 )
 
 KEPT_PROMPTS = 0.3  # share of the previewed prompts whose masks are decoded
@@ -65,7 +65,7 @@ class RunEstimate:
         names = sorted(self._jobs, key=lambda name: (name == OTHERS, name))
         rows = [_row(name, self._jobs[name], cores) for name in names]
         total = _row("all", [job for name in names for job in self._jobs[name]], cores)
-        return ["This run would take about:", *_aligned([head, *rows, total]), *NOTES]
+        return ["Estimate for this run:", *_aligned([head, *rows, total]), *NOTES]
 
 
 def _row(name: str, jobs: Sequence[JobEstimate], cores: int) -> tuple[str, ...]:

@@ -78,7 +78,7 @@ class Plan:
                         *(f"{name} is skipped: {reason}" for name, reason in self.absent.items()),
                     ]
                 ),
-                fix="name a scene (hilsplat run photos/desk) or other groups, or set data_root",
+                fix="select a scene (hilsplat run photos/desk) or other groups, or set data_root",
             )
         # A thousand scenes have tens of thousands of jobs, so settings are resolved and folders read once.
         self.stages_of = functools.cache(lambda *which: run.stages(*which).with_models())
@@ -92,7 +92,7 @@ class Plan:
         """Check that the models exist and, with `devices`, that this machine has the configured devices."""
         if self.results.exists() and not self.results.is_dir():
             raise SettingsError(
-                f"results: {self.results} is not a folder", fix="move that file away, or name another folder"
+                f"results: {self.results} is not a folder", fix="move that file, or choose another folder"
             )
         where: dict[StageSettings, str] = {}
         for row in self.scenes:
@@ -318,7 +318,7 @@ class Plan:
         raise SettingsError(
             f"{job.dataset}/{job.scene}, variant {job.variant}: field.start is langsplat, but no variant has "
             "method.name langsplat with the same masks and autoencoder",
-            fix="add such a variant, or start from another field",
+            fix="add such a variant, or change field.start",
         )
 
     def field_option(self, job: VariantJob, input: Any) -> str:
@@ -367,7 +367,7 @@ def require_known_scenes(run: RunSettings, rows: Iterable[SceneRow]) -> None:
         near = difflib.get_close_matches(key, names, n=1, cutoff=0.85)
         if key not in names and near:
             raise SettingsError(
-                f"{where} in the configuration names the scene {key!r}, which is not in {run.scenes}",
+                f"the configuration ({where}) names the scene {key!r}, which is not in {run.scenes}",
                 expected=f"did you mean {near[0]!r}?",
                 fix="correct or remove the name",
             )

@@ -128,7 +128,7 @@ def verify(results: Path) -> tuple[str, bool]:
     paths = sorted(path for path in results.rglob("*.provenance.json") if ".cache" not in path.parts)
     if not paths:
         raise ArtifactError(
-            f"{results} contains no artifacts", expected="a results folder, with *.provenance.json in it"
+            f"{results} contains no artifacts", expected="a results folder with *.provenance.json files"
         )
     counts, lines, again, records = Counter[str](), [], [], Records(results, every_byte=True)
     for path in track(paths, "artifacts read"):
@@ -184,7 +184,7 @@ class Records:
                 return f"{path.name} is missing"
             found = sizes_of(path)
             if gone := sorted(sizes.keys() - found.keys()):
-                return f"{gone[0]} is missing in {path.name}"
+                return f"{gone[0]} is missing from {path.name}"
             if wrong := sorted(file for file in found if sizes.get(file) != found[file]):
                 return f"{path.name if wrong[0] == '.' else wrong[0]} was changed after it was written"
             if not self.every_byte and not was_interrupted(artifact):
@@ -198,7 +198,7 @@ class Records:
         stage, plugins = record.stage, record.plugins
         if expected is not None and stage != IMPORTED:
             if stage != expected.stage:
-                yield f"stage {stage} made it, not {expected.stage}"
+                yield f"it was made by stage {stage}, not {expected.stage}"
             then, now = record.settings, expected.settings
             for name in sorted(then.keys() | now.keys()):
                 made, configured = then.get(name), now.get(name)
@@ -212,7 +212,7 @@ class Records:
         except HilsplatError:  # this version does not have the stage or reader
             code = ""
         if code != record.code:
-            yield "other code made it"
+            yield "it was made by different code"
         for name, read in record.inputs.items():
             files = {read.path: read.sha256} if read.files is None else read.files
             for file, digest in files.items():

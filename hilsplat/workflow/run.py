@@ -106,7 +106,7 @@ def start_project(folder: Path) -> list[Path]:
     written = [Path(folder) / path for path in (CONFIG, DEFAULT_SHEET)]
     for path in written:
         if path.exists():
-            raise HilsplatError(f"{path} already exists", fix="edit it, or name another folder")
+            raise HilsplatError(f"{path} already exists", fix="edit it, or choose another folder")
     for path, installed in zip(written, (CONFIG, DEFAULT_SHEET), strict=True):
         write_text(path, (INSTALLED / installed).read_text(encoding="utf-8"))
     return written
@@ -137,7 +137,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         }
     except yaml.YAMLError as error:
         raise SettingsError(
-            f"--config is not YAML: {error}", expected="key=value", found=" ".join(given.config)
+            f"--config is not valid YAML: {error}", expected="key=value", found=" ".join(given.config)
         ) from error
     settings = merged_config(configs, overrides)
     try:
@@ -165,7 +165,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
         lock = _locked("run.lock", fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise HilsplatError(
-            f"another hilsplat run holds the lock of {Path.cwd()}", fix="wait until it ends, or stop it"
+            f"another hilsplat run has locked {Path.cwd()}", fix="let it finish, or stop it"
         ) from error
     with lock:
         _recover(command, plan.results)
@@ -187,7 +187,7 @@ def _require_known(targets: Sequence[str], rows: Sequence[SceneRow], sheet: str)
         near = difflib.get_close_matches(target, known, n=1)
         if target not in TARGET_RULES and (near or "/" not in target):
             raise HilsplatError(
-                f"there is no scene, rule or file {target!r}",
+                f"no scene, rule or file is named {target!r}",
                 expected=f"did you mean {near[0]!r}?" if near else f"a scene of {sheet}, or a file",
             )
 
@@ -202,7 +202,7 @@ def _start(command: list[str], plan: Plan, targets: Sequence[str], scenes: Seque
         needed = {line.split("\t")[0] for line in summary.stdout.splitlines()}
         wrong = {output: reason for output, reason in wrong.items() if output in needed}
     for output, reason in wrong.items():
-        logger.warning("%s is rebuilt: %s", output, reason)
+        logger.warning("rebuilding %s: %s", output, reason)
     logging.getLogger().handlers.clear()  # otherwise Snakemake's records would be printed twice
     sys.argv = [*command, *(["--forcerun", *wrong] if wrong else []), *ending]
     try:
@@ -258,7 +258,7 @@ def _recover(command: Sequence[str], results: Path) -> None:
             _locked(marker.name, fcntl.LOCK_EX | fcntl.LOCK_NB).close()
         except BlockingIOError as error:  # at its end, this run would remove the other run's locks
             raise HilsplatError(
-                f"another Snakemake process is running in {Path.cwd()}", fix="wait until it ends, or stop it"
+                f"another Snakemake process is running in {Path.cwd()}", fix="let it finish, or stop it"
             ) from error
     remove_leftovers(results)
     if any(marker.read_text(encoding="utf-8") != socket.gethostname() for marker in markers):

@@ -103,8 +103,8 @@ class SceneData:
         for path in [*files, *self.existing_gaussians(row), *self.features(row)]:
             if "{" in path or "}" in path:
                 raise SettingsError(
-                    f"{path} of {row.name} cannot be read by the workflow: its name contains braces",
-                    fix="rename it, or its folder",
+                    f"the workflow cannot read {path} of {row.name}: its name contains braces",
+                    fix="rename the file or its folder",
                 )
 
     def source_files(self, job: Job) -> list[str]:

@@ -34,13 +34,13 @@ def absent_options(plan: Plan, table: str) -> str:
         if place and place[0] in TABLES[table].data and reason is not None:
             by_dataset.setdefault(row.dataset, []).append((row.scene, reason))
     sentences = [
-        f"{name}: no labelled segment is below {plan.run.data_root or 'data_root, which is not set'}."
+        f"{name}: no labelled segment was found in {plan.run.data_root or 'data_root, which is not set'}."
         for name in TABLES[table].data
         if name in plan.run.groups and name in DATASETS and not any(data_of(row) == name for row in plan.rows)
     ]
     for dataset, scenes in by_dataset.items():
         reasons = {reason for _, reason in scenes}
-        others = "" if len(reasons) == 1 else " The others cannot be read either."
+        others = "" if len(reasons) == 1 else " The other scenes cannot be read either."
         listed = some([scene for scene, _ in scenes])
         sentences.append(f"{dataset} ({listed}): {scenes[0][1]}.{others}")
     return " ".join(f"--absent {shlex.quote(sentence)}" for sentence in sentences)

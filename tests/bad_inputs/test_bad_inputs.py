@@ -186,14 +186,14 @@ ROWS = {
     "a field of another type": row(
         lambda: resave_field(lambda features: features.astype(np.float64)),
         ASK,
-        "array features cannot be used",
+        "array features has the wrong type or shape",
         "Float32",
         "float64",
     ),
     "a field of nan": row(
         lambda: resave_field(lambda features: features * np.nan),
         ASK,
-        "array features cannot be right",
+        "array features contains an impossible value",
         "finite",
     ),
     "a number in an index as text": row(

@@ -188,14 +188,14 @@ def test_damaged_cameras(damage, tmp_path):
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
-        ("level", lambda values: values + 8, "level cannot be right"),
-        ("offsets", lambda values: values[::-1].copy(), "offsets cannot be right"),
-        ("offsets", lambda values: values + 2**40, "offsets cannot be right"),
-        ("runs", lambda values: values * 1000, "runs cannot be right"),
-        ("runs", lambda values: values[:, None], "runs cannot be used"),
-        ("area_px", lambda values: values + 1, "area_px cannot be right"),
-        ("box_xyxy", lambda values: values + 1, "box_xyxy cannot be right"),
-        ("predicted_iou", lambda values: values * np.nan, "predicted_iou cannot be right"),
+        ("level", lambda values: values + 8, "level contains an impossible value"),
+        ("offsets", lambda values: values[::-1].copy(), "offsets contains an impossible value"),
+        ("offsets", lambda values: values + 2**40, "offsets contains an impossible value"),
+        ("runs", lambda values: values * 1000, "runs contains an impossible value"),
+        ("runs", lambda values: values[:, None], "runs has the wrong type or shape"),
+        ("area_px", lambda values: values + 1, "area_px contains an impossible value"),
+        ("box_xyxy", lambda values: values + 1, "box_xyxy contains an impossible value"),
+        ("predicted_iou", lambda values: values * np.nan, "predicted_iou contains an impossible value"),
     ],
 )
 def test_each_array_of_masks_is_checked(tmp_path: Path, name, change, words):

@@ -42,7 +42,7 @@ def test_shipped_configurations_are_valid(project: Path, name: str) -> None:
             r"variants\.x\.poses: variants cannot change this section",
         ),
         ({"main_variants": ["nope"]}, "variant 'nope' is not defined"),
-        ({"queries": {"synthetic": ["mug", " "]}}, r"queries\.synthetic: a text is empty"),
+        ({"queries": {"synthetic": ["mug", " "]}}, r"queries\.synthetic: a query is empty"),
         ({"data_root": "</script>"}, "data_root: String should match pattern"),
         ({"gaussians": {"iterations": True}}, "YAML reads yes, no, on and off"),
         ({"masks": {"predicted_iou_min": float("inf")}}, r"masks\.predicted_iou_min"),

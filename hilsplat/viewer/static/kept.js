@@ -64,9 +64,9 @@ export function showKept() {
     const swatch = make("button", { type: "button", class: `swatch kept-${query.colour}`, "aria-pressed": String(query.shown), "aria-label": `Show ${text}`, title: query.shown ? "Hide" : "Show",
       onclick: () => { query.shown = !query.shown; showKept(); } });
     return make("li", {}, swatch,
-      make("button", { type: "button", class: "words", title: "Change it", disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
-        text, make("small", {}, [at === "auto" ? query.answers[0].level : at, counted(count, "answer"), ...(least ? [`from ${least.toFixed(2)}`] : [])].join(", "))),
-      api.offline ? null : make("button", { type: "button", class: "drop", "aria-label": `Drop ${text}`, title: "Drop", onclick: () => drop(query) }, "×"));
+      make("button", { type: "button", class: "words", title: "Edit", disabled: api.offline, onclick: () => { drop(query); reopen(query.asked); } },
+        text, make("small", {}, [at === "auto" ? query.answers[0].level : at, counted(count, "answer"), ...(least ? [`score at least ${least.toFixed(2)}`] : [])].join(", "))),
+      api.offline ? null : make("button", { type: "button", class: "drop", "aria-label": `Remove ${text}`, title: "Remove", onclick: () => drop(query) }, "×"));
   }));
   $("overlaps").textContent = overlaps();
   restyle();

@@ -44,7 +44,7 @@ async function begin() {
     try { await made.load(page.scene, api.splats, arriving); } catch (error) {
       if (api.offline) throw error;
       made.canvas.remove();
-      console.warn(error); tell(`${error.message}: the server renders instead.`);
+      console.warn(error); tell(`${error.message}, so the server renders the scene.`);
       made = serverPainter();
     }
   }
@@ -52,11 +52,11 @@ async function begin() {
   redraw();
   if (api.offline) onlyWhatIsHere();
   if (page.scene.variants.length) {
-    try { await useVariants(); } catch (error) { tell(`Queries are not possible: ${error.message}`, true); }   // the Gaussians can still be viewed
+    try { await useVariants(); } catch (error) { tell(`Queries are not available: ${error.message}`, true); }   // the Gaussians can still be viewed
   } else {
     fillVariants();
     $("about").textContent = `${page.scene.name}: ${counted(page.scene.gaussians, "Gaussian")}.`;
-    tell("The run is not finished: queries are possible once the semantic tree exists.");
+    tell("The run is not finished. You can query the scene once the semantic tree exists.");
   }
   if (!api.offline) watch();
   await page.painter.loaded;

@@ -34,7 +34,7 @@ export class Renderer {
   // Gaussians arrive in chunks of whole texel rows; each chunk is drawn as soon as it arrives.
   async load({ gaussians, chunk }, chunkOf, told) {
     const gl = this.gl, first = await readChunk(await chunkOf(0)), { bases, texels } = first;
-    if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians exceed the texture size of this browser`);
+    if (Math.ceil(gaussians * texels / WIDTH) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`${gaussians} Gaussians exceed this browser's maximum texture size`);
     this.count = gaussians;
     this.here = 0;
     this.program = this.link(vertex(bases, texels), fragment);

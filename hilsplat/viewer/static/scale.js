@@ -21,7 +21,7 @@ export function showScale(style) {
   context.putImageData(pixels, 0, 0);
   $("scale-low").textContent = style.low.toFixed(2);
   $("scale-high").textContent = style.high.toFixed(2);
-  $("scale-told").textContent = least === null ? "" : `${counted(above(style, least), "Gaussian")} from ${least.toFixed(2)}`;
+  $("scale-told").textContent = least === null ? "" : `${counted(above(style, least), "Gaussian")} at or above ${least.toFixed(2)}`;
 }
 
 function above(style, least) {

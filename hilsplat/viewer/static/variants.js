@@ -75,6 +75,6 @@ async function moreAnswer(variants) {
   const first = !page.scene.variants.length;
   page.scene.variants = variants;
   if (!first) { fillVariants(); return; }
-  tell("Queries are possible now.");
+  tell("You can now query the scene.");
   await useVariants();
 }

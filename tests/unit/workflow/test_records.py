@@ -60,7 +60,7 @@ def problems(expected: dict[Path, Expected] | None = None) -> dict[str, str]:
         ({"settings": {"theta": 0.6}}, "made with theta 0.9, but the configuration has 0.6"),
         ({"settings": {"theta": 0.9, "new": 1}}, "made with new None"),
         ({"seed": 8}, "made with seed 7, but the configuration has 8"),
-        ({"stage": "clip"}, "stage coverage_tree made it, not clip"),
+        ({"stage": "clip"}, "it was made by stage coverage_tree, not clip"),
     ],
 )
 def test_other_settings_are_found(results, change, reason):
@@ -83,7 +83,7 @@ def test_missing_and_cut_files_are_found(results):
 def test_other_code_and_damaged_provenance_are_found(results):
     path = provenance_path(TREE)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"code": "0" * 64}))
-    assert problems() == {"coverage_tree": "other code made it"}
+    assert problems() == {"coverage_tree": "it was made by different code"}
     for text in ("", "{", "[]", '{"stage": 3}', "[" * 100_000):
         path.write_text(text)
         assert problems() == {"coverage_tree": "its provenance is damaged"}

@@ -88,7 +88,7 @@ def test_scenes_become_a_configuration_and_other_targets_stay(folder, started):
 def test_a_misspelt_scene_is_refused(folder, started):
     with pytest.raises(HilsplatError, match="did you mean 'two'"):
         runs.run(["twoo"], [], [])
-    with pytest.raises(HilsplatError, match="there is no scene, rule or file 'desk'"):
+    with pytest.raises(HilsplatError, match="no scene, rule or file is named 'desk'"):
         runs.run(["desk"], [], [])
     assert started == []
 
