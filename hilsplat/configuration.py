@@ -171,7 +171,7 @@ class RunSettings(StageSettings):
     sweep_scenes: tuple[str, ...] = knob(
         (), "scenes in ablation, sweep and pruning tables; empty: all tabletop and photographed scenes"
     )
-    seeds: int = knob(1, "seeds of random variants; if several, tables report mean and spread", ge=1, le=10)
+    seeds: int = knob(1, "seeds for random training; if several, tables report mean and spread", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> setting -> value; 'default' always exists"
     )
@@ -342,7 +342,7 @@ def read_config(path: Path) -> dict[str, Any]:
     try:
         json.dumps(found, default=str)
     except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key
-        raise SettingsError(f"{path} cannot be used: {error}", fix="avoid aliases and complex keys") from error
+        raise SettingsError(f"{path} cannot be used: {error}", fix="avoid aliases and list keys") from error
     return found
 
 

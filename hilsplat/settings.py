@@ -83,7 +83,7 @@ class PosesSettings(Section):
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     min_registered_share: float = knob(
-        0.7, "minimum share of the views in the largest model; below, poses fail", unit="share", gt=0, le=1
+        0.7, "minimum share of the views in the largest model, or poses fail", unit="share", gt=0, le=1
     )
     several_models: Literal["largest", "stop"] = knob(
         "largest", "if the photographs form several models: use the largest, or stop"
@@ -230,7 +230,7 @@ class MasksSettings(Section):
     nms_iou: float = knob(0.8, "IoU above which the worse mask is dropped", gt=0, le=1, origin="LangSplat")
     nms_score: Annotated[float, Field(ge=0, le=2)] | Auto = knob(
         "auto",
-        "product of predicted IoU and stability to exceed; 0: keep all; auto: the model folder's value, else 0.7",
+        "minimum of predicted IoU x stability; 0: keep all; auto: the model folder's value, else 0.7",
         origin="LangSplat: 0.7",
     )
     nms_inner: Share = knob(0.5, "threshold for suppressing inner masks", origin="LangSplat")
@@ -296,7 +296,7 @@ class ClipSettings(Section):
 
     precision: Literal["auto", "fp32", "int8"] = knob(
         "auto",
-        "image network's precision; auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32",
+        "encoder precision; auto: int8 on a CPU if it agrees with fp32 on crops; embedded models: fp32",
     )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
@@ -456,9 +456,7 @@ class FieldSettings(Section):
     @model_validator(mode="after")
     def _l1_is_literal(self) -> "FieldSettings":
         if self.language == "l1" and self.trainer != "literal":
-            raise ValueError(
-                "language: l1 needs trainer: literal; the fast trainer handles only squared losses"
-            )
+            raise ValueError("language: l1 needs trainer: literal; the fast trainer needs a squared loss")
         return self
 
 
@@ -526,13 +524,13 @@ class EvaluateSettings(Section):
     majority: bool = knob(True, "smooth a map's mask by 7 x 7 px majority vote", origin="LangSplat's code")
     level_rule: Literal["max", "mean_in_mask"] = knob(
         "max",
-        "level if none is given; max: with the highest value; mean_in_mask: with the highest mean in its mask",
+        "level if none is given; max: that of the highest value; mean_in_mask: highest mean in its mask",
         origin="LangSplat: max",
     )
     node_select: float = knob(
         0.95,
-        "a node is selected with the best if its cosine margin is lower by at most (1 - node_select) times the "
-        "level's range of margins, or three times that if it looks like the best",
+        "a node is selected with the best if its cosine margin is lower by at most (1 - node_select) times "
+        "the level's range of margins, or three times that if it looks like the best",
         ge=0,
         le=1,
     )

@@ -369,9 +369,7 @@ def _unsealed(path: Path, *_: int) -> dict[str, Any]:
     """Read an index and compare it with its seal; the result is cached until the file changes."""
     index = read_json(path)
     if not isinstance(index, dict) or not isinstance(index.get("views"), dict) or "seal" not in index:
-        raise ArtifactError(
-            f"{path} is not an artifact index of this version of hilsplat", fix=remake(path)
-        )
+        raise ArtifactError(f"{path} is not an artifact index of this version of hilsplat", fix=remake(path))
     if index.pop("seal") != _seal(index):
         raise _changed(path)
     return index

@@ -304,5 +304,5 @@ def _visible(folder: Path) -> list[str]:
 def _described(path: Path) -> str:
     if path.is_dir():
         names = sorted(_visible(path))
-        return f"a folder with {len(names)} files: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+        return f"a folder of {len(names)} entries: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
     return f"a file of {path.stat().st_size} bytes" if path.is_file() else "neither a file nor a folder"

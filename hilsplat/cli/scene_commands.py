@@ -58,9 +58,7 @@ def new(
     ] = None,
     features: Annotated[
         Path | None,
-        typer.Option(
-            help="LangSplat's features; none: use SAM and CLIP; default: use any features found"
-        ),
+        typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: use any features found"),
     ] = None,
     labels: Annotated[
         Path | None, typer.Option(help="LERF-OVS labels for scores; none: no labels; default: use any found")

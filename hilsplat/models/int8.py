@@ -117,7 +117,7 @@ def use_int8(
     found = {name: float(value[0]) for name, value in kept.items()}
     use = precision == "int8" or all(value >= LEAST[name] for name, value in found.items())
     measured = ", ".join(f"{name} {value:.4f} (minimum: {LEAST[name]})" for name, value in found.items())
-    logger.info("%s runs in %s. int8 against float32: %s", what, "int8" if use else "float32", measured)
+    logger.info("%s runs in %s. int8 vs. float32: %s", what, "int8" if use else "float32", measured)
     return use
 
 

@@ -16,7 +16,7 @@ SENT: tuple[tuple[str, str, str, type[BaseModel] | None, str], ...] = (
     ("get", "/api/scene", "Views with their cameras, number of Gaussians, queryable variants", None, JSON),
     ("get", "/api/variant/{variant}", "The nodes of a variant's semantic tree, in row order", None, JSON),
     ("get", "/api/photo/{number}", "An undistorted photograph", None, IMAGE),
-    ("get", "/api/crop/{variant}/{node}", "A node in the photograph that shows it largest", None, IMAGE),
+    ("get", "/api/crop/{variant}/{node}", "A node in the photograph in which it is largest", None, IMAGE),
     ("post", "/api/query", "Answers to a text or a path", wire.Query, JSON),
     ("post", "/api/like", "Nodes similar to a node or a picture", wire.Like, JSON),
     ("post", "/api/pick", "The nodes at a pixel of a camera, with their shares", wire.Pick, JSON),

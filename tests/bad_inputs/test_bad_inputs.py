@@ -288,10 +288,10 @@ ROWS = {
     "an output on a disk without room": row(
         nothing,
         ("coverage-tree", "--masks", str(MASKS), "--out", "/proc/none/new"),
-        "too little space on the disk of /proc",
+        "not enough space on the disk of /proc",
     ),
     "a name that no disk takes": row(
-        nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "too long for this disk"
+        nothing, ("coverage-tree", "--masks", str(MASKS), "--out", "n" * 260), "too long for this file system"
     ),
     # ---- numbers and JSON on the command line
     "a seed beyond 64 bits": row(nothing, (*POSES, "--seed", str(10**30)), "--seed"),

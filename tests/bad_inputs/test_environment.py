@@ -15,17 +15,17 @@ STAGE = " ".join(CONTRIBUTE)
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        (f"{QUERY} > /dev/full", "standard output, or an open file, does not fit on the disk, which is full"),
+        (f"{QUERY} > /dev/full", "standard output or an open file cannot be written: the disk is full"),
         ("--help > /dev/full", "standard output"),
-        (f"ulimit -f 1; {QUERY}", "larger than the limit of this shell (ulimit -f)"),
-        (f"ulimit -f 1; {STAGE}", "larger than the limit of this shell (ulimit -f)"),
+        (f"ulimit -f 1; {QUERY}", "exceed the size limit of this shell (ulimit -f)"),
+        (f"ulimit -f 1; {STAGE}", "exceed the size limit of this shell (ulimit -f)"),
         (f"ulimit -v 300000; {QUERY}", "not enough memory"),
         (f"mkdir gone; cd gone; rmdir ../gone; {QUERY}", "the working directory was deleted"),
-        ("query photos/desk mug --out /proc/x", "/proc/x is missing, or cannot be created"),
-        ("export photos/desk --out /proc/x", "/proc/x is missing, or cannot be created"),
+        ("query photos/desk mug --out /proc/x", "/proc/x is missing or cannot be created"),
+        ("export photos/desk --out /proc/x", "/proc/x is missing or cannot be created"),
         (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not a .log file"),
         ("run -- --cores 0", "with --cores 0, no job can start"),
-        ("run -- --config 'only=[1'", "--config is not YAML"),
+        ("run -- --config 'only=[1'", "--config is not valid YAML"),
     ],
 )
 def test_what_surrounds_a_command(line: str, words: str, project: Path):

@@ -84,10 +84,10 @@ def test_a_full_disk_is_reported_and_costs_nothing(case: str, disk: Path, told: 
     text = told((*command, "--out", str(out)))
     assert "Traceback" not in text
     # `world` checks the space that it needs before it begins.
-    words = ("too little space on the disk of disk/world", "at least 5 MiB free", "0 MiB free")
+    words = ("not enough space on the disk of disk/world", "at least 5 MiB free", "0 MiB free")
     if case != "world":
         words = ("no space left while writing", f"of {SIZE_KIB // 1024} MiB on that disk")
-        words = (*words, "free space on the disk of disk")
+        words = (*words, "free up space on the disk of disk")
     for each in words:
         assert each in text
     assert snapshot(disk) == before

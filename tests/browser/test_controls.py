@@ -88,7 +88,7 @@ def test_a_threshold_cuts_the_colours_and_counts_the_gaussians_above(opened, des
         "[hilsplat.painted()[0].style.low, hilsplat.painted()[0].style.high].map((value) => value.toFixed(2))"
     )
     counts = []
-    page.get_by_label("scores from").check()
+    page.get_by_label("score at least").check()
     for least in ("0.5", "0.9"):
         page.get_by_role("slider", name="Minimum score").fill(least)
         page.wait_for_timeout(800)

@@ -28,7 +28,7 @@ def test_kept_queries_have_colours_and_can_be_hidden_and_dropped(opened, desk_ad
     drawn(page, page.get_by_role("button", name="Show book").click)
     assert page.get_by_role("button", name="Show book").get_attribute("aria-pressed") == "false"
     assert greenish(page) < 0.005
-    page.get_by_role("button", name="Drop book").click()
+    page.get_by_role("button", name="Remove book").click()
     assert chips(page).count() == 1
 
 
@@ -45,19 +45,19 @@ def test_the_overlap_of_two_queries_is_reported(opened, desk_address):
 def test_a_kept_query_is_edited_with_its_threshold_at_its_photograph(opened, desk_address):
     page = opened(desk_address)
     options = [
-        page.get_by_role("checkbox", name=name) for name in ("scores from", "only what this photograph")
+        page.get_by_role("checkbox", name=name) for name in ("score at least", "only what this photograph")
     ]
     for option in options:
         option.check()
     page.get_by_label("Minimum score").fill("0.3")
     view = page.evaluate("hilsplat.camera.view")
     keep(page, "book")
-    assert "from 0.30" in chips(page).first.inner_text()
+    assert "score at least 0.30" in chips(page).first.inner_text()
     for option in options:
         option.uncheck()
     page.locator("#view").focus()
     drawn(page, lambda: page.keyboard.press("ArrowLeft"))
-    chips(page).first.get_by_title("Change it").click()
+    chips(page).first.get_by_title("Edit").click()
     answers(page).first.wait_for()
     assert page.locator("#text").input_value() == "book" and not chips(page).count()
     assert all(option.is_checked() for option in options)

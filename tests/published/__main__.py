@@ -126,7 +126,7 @@ def rehearse(work: Path, cores: int) -> int:
     command = [sys.executable, "-m", "hilsplat", "run"]
     command += ["--config", "config/paper.yaml", "--config", "reduced.yaml"]
     planned = project.run(*command, "--", "--cores", str(cores), "--dry-run").stdout
-    estimate = planned[planned.index("This run would take") :]
+    estimate = planned[planned.index("Estimate for this run") :]
     print(estimate, flush=True)
     hours = float(re.findall(r"^all .* ([\d.]+) +[\d.]+$", estimate, re.MULTILINE)[0])
     start = time.monotonic()

@@ -84,7 +84,7 @@ def test_every_stage_and_table_is_planned(planned):
 
 
 def test_a_dry_run_ends_with_the_estimate_table(planned):
-    table = planned.partition("This run would take about:\n")[2].splitlines()
+    table = planned.partition("Estimate for this run:\n")[2].splitlines()
     assert table[0].split() == ["scenes", "jobs", "disk", "memory", "hours,", "2", "cores", "hours,", "GPU"]
     assert [row.split()[0] for row in table[1:6]] == ["3d_ovs", "lerf", "scannet", "tables", "all"]
     counted = re.search(r"^total +(\d+)$", planned, re.M)

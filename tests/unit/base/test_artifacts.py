@@ -118,7 +118,7 @@ def test_errors_on_a_full_disk_name_the_disk_and_the_fix(
         place, found, fix = str(raised.value).splitlines()
         assert place == f"no space left while writing a.txt in {tmp_path / 'new'}"
         assert f"{free:.1f} MiB free of 8 MiB on that disk" in found
-        assert f"free space on the disk of {tmp_path / 'new'}" in fix
+        assert f"free up space on the disk of {tmp_path / 'new'}" in fix
     else:
         assert raised.value is error
     assert list((tmp_path / "new").iterdir()) == []

@@ -86,7 +86,7 @@ def test_an_input_is_never_an_output(photographs, tmp_path):
 def test_the_working_and_the_home_folder_are_never_outputs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for out, name in ((Path(), "working"), (tmp_path.parent, "working"), (Path.home(), "home")):
-        with pytest.raises(ArtifactError, match=f"is the {name} folder"):
+        with pytest.raises(ArtifactError, match=f"is or contains the {name} folder"):
             require_replaceable([out], "masks", [])
 
 

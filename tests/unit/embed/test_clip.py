@@ -91,7 +91,7 @@ def test_vectors_of_another_width_are_refused(colour_clip):
     model = ClipModel.load(colour_clip)
     model.require_width(3, "autoencoder a")
     with pytest.raises(
-        MisalignedArtifactError, match=r"autoencoder a does not match the CLIP(.|\n)*3 numbers(.|\n)*512"
+        MisalignedArtifactError, match=r"autoencoder a does not match the CLIP(.|\n)*3 dimensions(.|\n)*512"
     ):
         model.require_width(512, "autoencoder a")
 
@@ -197,7 +197,7 @@ def test_an_embedded_model_runs_in_float32_with_a_warning_if_int8_is_required(pr
     embedded = open_model_folder(project / "models/clip-tiny")
     assert not considers_int8("auto", embedded) and not caplog.text
     assert not considers_int8("int8", embedded)
-    assert "clip-tiny runs in float32: int8 needs a pretrained model" in caplog.text
+    assert "clip-tiny runs in float32: int8 requires a pretrained model" in caplog.text
 
 
 def test_masks_of_another_scene_are_refused(red_scene, colour_clip, tmp_path):

@@ -100,7 +100,7 @@ def test_levels_have_the_reverse_order_in_the_files(tmp_path):
 
 def test_maps_of_another_size_are_resized_and_of_another_shape_refused(ours, tmp_path):
     write_langsplat(*ours, tmp_path / "files")
-    with pytest.raises(MisalignedArtifactError, match=r"differ in shape(.|\n)*\(12, 12\)(.|\n)*\(6, 8\)"):
+    with pytest.raises(MisalignedArtifactError, match=r"in aspect ratio(.|\n)*\(12, 12\)(.|\n)*\(6, 8\)"):
         read_view(tmp_path / "files", "a.png", (12, 12))
     masks, _ = read_view(tmp_path / "files", "a.png", (12, 16))
     np.testing.assert_array_equal(masks.area_px, 4 * nested().area_px)

@@ -177,7 +177,7 @@ GATED, NO_FILE = Refusal(401, {"X-Error-Code": "GatedRepo"}), Refusal(404, {"X-E
     [
         ("/api/", BUSY, r"too many requests(.|\n)*Retry-After: 7200(.|\n)*HF_TOKEN"),
         ("/resolve/", BUSY, r"too many requests(.|\n)*Retry-After: 7200(.|\n)*HF_TOKEN"),
-        ("/api/", Refusal(503), r"does not serve Xenova/sam-vit-base \(503"),
+        ("/api/", Refusal(503), r"failed to serve Xenova/sam-vit-base \(503"),
         ("/api/", GATED, r"requires you to accept(.|\n)*accept them at http"),
         ("/api/", Refusal(403), r"denies access to Xenova/sam-vit-base \(403"),
         ("/api/", Refusal(401), r"denies access to Xenova/sam-vit-base \(401"),
@@ -290,7 +290,7 @@ def test_offline_the_error_lists_the_files_to_copy(hub, monkeypatch):
         get_models(["clip-vit-base-patch16"])
     message = str(error.value)
     assert "HF_HUB_OFFLINE is set" in message
-    assert "put these files into models/clip-vit-base-patch16 by hand" in message
+    assert "into models/clip-vit-base-patch16: config.json, " in message
     assert "config.json, preprocessor_config.json, tokenizer.json, onnx/vision_model.onnx" in message
     assert hub.asked == []
 

@@ -62,7 +62,7 @@ def test_a_variant_is_chosen_by_its_ending(sam):
     plain = open_model_folder(sam).digest
     for path in (sam / "onnx").glob("*.onnx"):
         path.rename(path.with_name(f"{path.stem}_fp16.onnx"))
-    with pytest.raises(ModelError, match=r"exist in variants: set masks.variant to one of 'fp16'"):
+    with pytest.raises(ModelError, match=r"have suffixes: set masks.variant to one of 'fp16'"):
         SamModel.load(sam)
     model = SamModel.load(sam, "fp16")
     assert model.encoder.path.name == "vision_encoder_fp16.onnx"

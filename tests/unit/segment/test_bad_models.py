@@ -43,13 +43,13 @@ def test_damaged_or_unsupported_files_are_refused(own_sam, name, content, words)
     ("name", "entry", "words"),
     [
         (PREPROCESSOR, {"do_normalize": False}, "disables do_normalize"),
-        (PREPROCESSOR, {"image_std": [0, 1, 1]}, "image_std cannot be used"),
-        (PREPROCESSOR, {"image_std": [-1, 1, 1]}, "image_std cannot be used"),
-        (PREPROCESSOR, {"image_std": "x"}, "image_std cannot be used"),
-        (PREPROCESSOR, {"image_mean": [1e999, 0, 0]}, "image_mean cannot be used"),
-        (CONFIG, {"mask_generation": {"stability_min": 3}}, "config.json: mask_generation cannot be used"),
-        (CONFIG, {"mask_generation": {"segmenter": "graph"}}, "config.json: mask_generation cannot be used"),
-        (CONFIG, {"mask_generation": [1]}, "config.json: mask_generation cannot be used"),
+        (PREPROCESSOR, {"image_std": [0, 1, 1]}, "image_std is invalid"),
+        (PREPROCESSOR, {"image_std": [-1, 1, 1]}, "image_std is invalid"),
+        (PREPROCESSOR, {"image_std": "x"}, "image_std is invalid"),
+        (PREPROCESSOR, {"image_mean": [1e999, 0, 0]}, "image_mean is invalid"),
+        (CONFIG, {"mask_generation": {"stability_min": 3}}, "config.json: mask_generation is invalid"),
+        (CONFIG, {"mask_generation": {"segmenter": "graph"}}, "config.json: mask_generation is invalid"),
+        (CONFIG, {"mask_generation": [1]}, "config.json: mask_generation is invalid"),
     ],
 )
 def test_configuration_that_cannot_be_used_is_refused(own_sam, name, entry, words):

@@ -53,7 +53,7 @@ def test_scenes_of_the_groups_are_run_and_missing_data_is_named(tmp_path):
 def test_segments_of_waymo_are_run_without_a_row(tmp_path):
     groups = ["benchmark", "waymo"]
     none = plan(tmp_path, groups=groups, data_root=str(tmp_path))
-    assert f"waymo: no labelled segment is below {tmp_path}." in targets.absent_options(none, "waymo")
+    assert f"waymo: no labelled segment was found in {tmp_path}." in targets.absent_options(none, "waymo")
     file = tmp_path / "waymo/validation/lidar_segmentation/one.parquet"
     file.parent.mkdir(parents=True)
     file.touch()

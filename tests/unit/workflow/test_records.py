@@ -74,7 +74,7 @@ def test_missing_and_cut_files_are_found(results):
     (TREE / "a.npz").unlink()
     assert problems() == {
         "masks": "b.npz was changed after it was written",
-        "coverage_tree": "a.npz is missing in coverage_tree",
+        "coverage_tree": "a.npz is missing from coverage_tree",
     }
     shutil.rmtree(MASKS)
     assert problems()["masks"] == "masks is missing"
@@ -113,7 +113,7 @@ def test_imported_artifacts_are_not_compared_with_settings(results):
     write(TREE, masks=MASKS)
     assert problems({MASKS: replace(EXPECTED[MASKS], settings={"model": "x"}), TREE: EXPECTED[TREE]}) == {}
     (MASKS / "a.npz").unlink()
-    assert problems() == {"masks": "a.npz is missing in masks"}
+    assert problems() == {"masks": "a.npz is missing from masks"}
 
 
 def test_lists_of_input_files_may_be_empty_and_are_compared_file_by_file(results):
