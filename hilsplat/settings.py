@@ -355,7 +355,7 @@ class SemanticTreeSettings(Section):
         0.5, "a node is the child of a coarser node that contains more than this share of it", gt=0, lt=1
     )
     whole_side: float = knob(
-        0.35, "graph: regions that touch in 3D are merged up to about this share of a view's side", gt=0
+        0.35, "graph: regions that touch in 3D form wholes of up to about this share of a view's side", gt=0
     )
 
     @property

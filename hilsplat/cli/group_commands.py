@@ -95,7 +95,7 @@ def world_masks(
     variant: MeasuredMasks = "default",
     results: Results = Path("results"),
     out: Annotated[
-        Path | None, typer.Option(help="PNG, with CSV and PDF beside it; default: in the folder of the masks")
+        Path | None, typer.Option(help="PNG to write, with CSV and PDF beside it; default: beside the masks")
     ] = None,
 ) -> None:
     """Compare masks with the ground-truth regions by level, and draw the errors."""
