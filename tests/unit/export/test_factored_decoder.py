@@ -66,7 +66,7 @@ def test_a_decoder_that_differs_runs_in_onnxruntime(sam_parts, monkeypatch, capl
     )
     model = SamModel.load(sam_parts[-1])
     assert model.factored is None
-    assert "runs in onnxruntime, slower: the factored decoder differs by" in caplog.text
+    assert "runs in onnxruntime (slower): the factored decoder differs by" in caplog.text
 
 
 @pytest.mark.parametrize("change", ["names", "half"])
