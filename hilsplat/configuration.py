@@ -342,7 +342,7 @@ def read_config(path: Path) -> dict[str, Any]:
     try:
         json.dumps(found, default=str)
     except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key
-        raise SettingsError(f"{path} cannot be used: {error}", fix="avoid aliases and list keys") from error
+        raise SettingsError(f"{path} cannot be used: {error}", fix="no aliases, no lists as keys") from error
     return found
 
 

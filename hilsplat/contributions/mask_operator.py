@@ -22,7 +22,7 @@ BLOCK = 2**15
 """Number of Gaussians per pass of a wide product with A: their features fit into the processor's cache."""
 
 SPREAD_PARTS = 4
-"""Gaussian ranges per thread; several balance the load, because Gaussians occur in few or many masks."""
+"""Gaussian ranges per thread; several balance the load, as the masks per Gaussian vary."""
 
 
 @dataclass(frozen=True)

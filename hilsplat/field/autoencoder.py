@@ -148,7 +148,7 @@ def torch_order(count: int, twister: np.random.RandomState) -> Int64[np.ndarray,
 
 @compiled
 def _swap(order, drawn):
-    """Swap each element with itself or a later element, as drawn."""
+    """Swap each element with itself or a later element, chosen by random draws."""
     for place in range(len(drawn)):
         other = place + np.int64(drawn[place]) % (len(order) - place)
         order[place], order[other] = order[other], order[place]

@@ -344,7 +344,7 @@ class LanguageScene(FieldScene):
     def node_margins(self, texts: Sequence[str], answerer: str = "tree") -> Float32[np.ndarray, "T n"]:
         """Return each node's cosine margin for each text, relative to this scene's canonical phrases.
 
-        A node has the margin `NAMED` for its user-given name.
+        A node's margin for the name that the user gave it is `NAMED`.
         """
         if not len(texts):
             return np.zeros((0, len(self.tree)), np.float32)

@@ -102,7 +102,7 @@ def box(size: Point, centre: Point = (0.0, 0.0, 0.0), bevel: Number = 0.0) -> Me
 
 @cache
 def _box_corners(bevelled: bool) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 3"]]:
-    """Return each triangle corner's side on each axis (-1 or 1), and 1 where a bevel insets it, else 0.
+    """Return two values per triangle corner and axis: its side (-1 or 1), and whether a bevel insets it.
 
     A bevel insets a corner along the two axes other than its face's normal.
     """
