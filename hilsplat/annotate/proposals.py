@@ -268,7 +268,10 @@ class Clicks:
         inside = np.array([each for *_, each in clicks], np.bool_)
         corners = np.array(box if box else (0, 0, 0, 0))
         if not (inside.any() or box) or (points < 0).any() or (points > (width, height)).any():
-            raise SettingsError("no click or box selects anything", expected="a click inside the photograph")
+            raise SettingsError(
+                "no click is on the object, or one is outside the photograph",
+                expected=f"a click or box on the object, x <= {width}, y <= {height}",
+            )
         encoded = self.encoded(view)
         asked = points[inside] if clicks else _grid(corners)
         iou, logits = self.model.decode(encoded, asked)

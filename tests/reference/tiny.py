@@ -7,9 +7,10 @@ python -m tests.reference.tiny results/synthetic/tiny > tests/reference/tiny.jso
 import hashlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 
 import pandas as pd
 
@@ -17,11 +18,11 @@ METRICS = ("iou", "localization_box", "hc_containment", "view_consistency")
 SAME_FIT = {"iou": 0.01, "localization_box": 0.03, "hc_containment": 0.01, "view_consistency": 0.01}
 """Tolerances if the Gaussians equal the recorded ones byte for byte, as on all processors of the same kind.
 A difference above 0.01, or more than one of 32 localization hits, is then caused by a change of code."""
-OTHER_FIT = {"iou": 0.18, "localization_box": 0.2, "hc_containment": 0.15, "view_consistency": 0.15}
-"""Tolerances for other Gaussians. A fit of 600 steps amplifies differences in the last bits between
-processors. Measured: float64 scales in the fit changed mIoU by up to 0.06, localization by 0.14, HC and
-consistency by 0.06 and the fit by 0.73 dB; SSE4 in all libraries by 0.09, 0.12, 0.08, 0.10 and 0.14 dB; an
-Intel processor with AVX-512 by 0.14 (one of nine wholes, at theta 0.6), 0.09, 0.08, 0.08 and 0.05 dB."""
+OTHER_FIT = {"iou": 0.12, "localization_box": 0.2, "hc_containment": 0.15, "view_consistency": 0.15}
+"""Tolerances for other Gaussians, after `without_levels`. A fit of 600 steps amplifies differences in the
+last bits between processors. Measured: float64 scales in the fit changed mIoU by up to 0.06, localization by
+0.14, HC and consistency by 0.06 and the fit by 0.73 dB; SSE4 in all libraries by 0.09, 0.12, 0.08, 0.10 and
+0.14 dB; an Intel processor with AVX-512 by 0.06, 0.09, 0.08, 0.08 and 0.05 dB."""
 COUNTS = {
     "poses/registered views": 0,
     "poses/points": 5,
@@ -74,15 +75,28 @@ def recorded() -> Reached:
     return Reached(**json.loads(Path(__file__).with_suffix(".json").read_text()))
 
 
+def without_levels(numbers: Mapping[str, float]) -> dict[str, float]:
+    """Average the levels of each variant but the default; one of nine wholes changes a level by 0.14."""
+    groups: dict[str, list[float]] = {}
+    for name, value in numbers.items():
+        metric, variant, *_ = name.split("/")
+        is_level = metric in METRICS and variant != "default"
+        groups.setdefault(name.rpartition("/")[0] if is_level else name, []).append(value)
+    return {name: fmean(values) for name, values in groups.items()}
+
+
 def differences(found: Reached, expected: Reached) -> Iterator[str]:
     """Yield a sentence for each number that is missing, new, or outside its tolerance."""
     for name in sorted(found.numbers.keys() ^ expected.numbers.keys()):
         yield f"{name} is {'new' if name in found.numbers else 'missing'}"
     same_fit = found.gaussians_sha256 == expected.gaussians_sha256
     tolerances = {**COUNTS, **(SAME_FIT if same_fit else OTHER_FIT)}
-    for name in sorted(found.numbers.keys() & expected.numbers.keys()):
+    found_numbers, expected_numbers = found.numbers, expected.numbers
+    if not same_fit:
+        found_numbers, expected_numbers = without_levels(found_numbers), without_levels(expected_numbers)
+    for name in sorted(found_numbers.keys() & expected_numbers.keys()):
         [tolerance] = [allowed for start, allowed in tolerances.items() if f"{name}/".startswith(f"{start}/")]
-        value, reference = found.numbers[name], expected.numbers[name]
+        value, reference = found_numbers[name], expected_numbers[name]
         if not abs(value - reference) <= tolerance:
             yield f"{name} is {value:.6g}, recorded {reference:.6g}, tolerance {tolerance:g}"
 

@@ -22,8 +22,16 @@ def test_an_iou_may_differ_by_a_point_and_more_with_other_gaussians():
     assert len(changed(0.011)) == len(changed(-0.011)) == 1
     assert changed(float("nan")) != []
     assert changed(-0.1, gaussians_sha256="other") == []
-    [sentence] = changed(-0.19, gaussians_sha256="other")
-    assert sentence.startswith(f"{NAME} is ") and sentence.endswith("tolerance 0.18")
+    [sentence] = changed(-0.13, gaussians_sha256="other")
+    assert sentence.startswith(f"{NAME} is ") and sentence.endswith("tolerance 0.12")
+
+
+def test_levels_of_a_sweep_are_averaged_with_other_gaussians():
+    of_level = "iou/theta-0.6/field/hierarchy/level-given/whole"
+    assert changed(0.3, of_level, gaussians_sha256="other") == []
+    [sentence] = changed(0.37, of_level, gaussians_sha256="other")
+    assert sentence.startswith("iou/theta-0.6/field/hierarchy/level-given is ")
+    assert len(changed(0.011, of_level)) == 1
 
 
 def test_every_recorded_number_has_a_tolerance():

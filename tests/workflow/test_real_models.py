@@ -32,40 +32,39 @@ def serve(hub: LoopbackHub, project: Path, folder: Path) -> None:
 
 
 def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) -> None:
-    copy = plain
-    (copy.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
+    (plain.root / "config/small.yaml").write_text(json.dumps({"overrides": {"photos": SMALL}}))
     world = {"views": 12, "image_px": 128, "arc_deg": 100, "objects": 3, "samples": 2}
     source = ("--source", "world:tabletop:210", "--out", "drawn", "--settings", json.dumps(world))
-    copy.hilsplat("world", "make", *source)
-    (copy.root / "drawn/images").rename(copy.root / "photographs")
+    plain.hilsplat("world", "make", *source)
+    (plain.root / "drawn/images").rename(plain.root / "photographs")
 
-    without = copy.hilsplat("new", "before", "photographs")
+    without = plain.hilsplat("new", "before", "photographs")
     assert "text queries by clip-tiny" in without and "meaningless" in without
     with loopback_hub() as hub:
         serve(hub, project, tmp_path / "hub")
         where = {"HF_ENDPOINT": hub.endpoint, "HF_HOME": str(tmp_path / "home")}
         hub.cuts["vision_encoder.onnx"] = [2_000_000]
-        printed = copy.hilsplat("models", "get", HF_HUB_OFFLINE="0", **where)
+        printed = plain.hilsplat("models", "get", HF_HUB_OFFLINE="0", **where)
         assert len(hub.ranges("vision_encoder.onnx")) == 2
     assert "photographs use sam2.1-hiera-small and clip-vit-base-patch16" in printed
-    told = copy.hilsplat("new", "desk", "photographs")
+    told = plain.hilsplat("new", "desk", "photographs")
     assert "masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in told
     assert "meaningless" not in told
 
-    run = snakemake(copy)
+    run = snakemake(plain)
     assert "photos/desk: masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in run
     for stage, name in (("masks", "sam2.1-hiera-small"), ("clip", "clip-vit-base-patch16")):
-        index = json.loads((copy.root / DESK / "default" / stage / "index.json").read_text())
+        index = json.loads((plain.root / DESK / "default" / stage / "index.json").read_text())
         assert index["model"] == f"models/{name}"
-        record = json.loads((copy.root / DESK / f"default/{stage}.provenance.json").read_text())
+        record = json.loads((plain.root / DESK / f"default/{stage}.provenance.json").read_text())
         assert record["settings"]["model"] == f"models/{name}"
-    answer = copy.hilsplat("query", "photos/desk", "mug")
+    answer = plain.hilsplat("query", "photos/desk", "mug")
     assert "to 'mug' in photos/desk" in answer and "meaningless" not in answer
 
     # without these models, the others would recompute masks and vectors; poses and Gaussians are kept
-    shutil.rmtree(copy.root / "models/sam2.1-hiera-small")
-    shutil.rmtree(copy.root / "models/clip-vit-base-patch16")
-    planned = snakemake(copy, "-n")
+    shutil.rmtree(plain.root / "models/sam2.1-hiera-small")
+    shutil.rmtree(plain.root / "models/clip-vit-base-patch16")
+    planned = snakemake(plain, "-n")
     assert "rule masks:" in planned and "rule clip:" in planned
     assert "rule poses:" not in planned and "rule gaussians:" not in planned
 
