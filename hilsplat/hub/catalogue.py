@@ -14,7 +14,6 @@ from huggingface_hub.utils.sha import git_hash
 from hilsplat.base.artifacts import parse_json, sha256_of_file
 from hilsplat.base.errors import DownloadError
 from hilsplat.models.layouts import LAYOUTS, SUPPORTED, layout_of
-from hilsplat.models.onnx_graph import WHOLE
 from hilsplat.models.store import RELEASES, Release
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
@@ -24,7 +23,7 @@ SMALL_BYTES = 50_000_000
 """Text files of a PyTorch model above this size are not part of its tokenizer."""
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
 """Errors of the connection to the hub."""
-WHOLES = tuple(f"{place}{WHOLE.removesuffix('.onnx')}" for place in ("onnx/", ""))
+WHOLES = ("onnx/model", "model")
 """Possible paths, without `.onnx`, of a network that contains both halves of a CLIP model."""
 
 
@@ -109,7 +108,6 @@ class Choice:
 
     files: Mapping[str, str]  # path in the repository -> path in the model folder
     exported: bool = False  # they are PyTorch weights, to be exported as networks
-    split: bool = False  # they contain one CLIP network, to be split into its halves
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
@@ -173,8 +171,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             fix="choose a SAM or CLIP model (hilsplat models list)",
         )
     layout, ending = LAYOUTS[kind], f"_{variant}" if variant else ""
-    whole = [WHOLES if kind in ("clip", "siglip") else ()]
-    for networks, split in ((networks_of(kind), False), (whole, True)):
+    for networks in (networks_of(kind), [WHOLES if kind in ("clip", "siglip") else ()]):
         present = [[place for place in each if f"{place}{ending}.onnx" in listing.files] for each in networks]
         if all(present):
             places = [each[0] for each in present]
@@ -184,7 +181,7 @@ def choose_files(listing: Listing, config: bytes, variant: str = "") -> Choice:
             # external weights keep their names, because the networks refer to them by name
             prefixes = tuple(f"{network}{mark}data" for network in files for mark in "_.")
             weights = [path for path in listing.files if path.startswith(prefixes)]
-            return Choice({**{path: path for path in (*plain, *weights)}, **files}, split=split)
+            return Choice({**{path: path for path in (*plain, *weights)}, **files})
     weights = [name for name in WEIGHTS if name in listing.files][:1]
     if variant or not weights:
         listing.require(*(f"{places[0]}{ending}.onnx" for places in networks_of(kind)))

@@ -31,7 +31,7 @@ from hilsplat.base.artifacts import (
     work_folder,
     write_json,
 )
-from hilsplat.base.errors import DownloadError, HilsplatError, ModelError
+from hilsplat.base.errors import DownloadError, ModelError
 from hilsplat.base.progress import track
 from hilsplat.embed.model_check import check_model
 from hilsplat.hub.catalogue import (
@@ -109,9 +109,8 @@ def get_models(
         requested = ModelRequest.named(name, variant)
         target = models / requested.name
         with explain_refusals(requested, models):
-            _require_ours(requested, target)
             listing = _listing(requested, revision)
-            if _is_present(target, listing):
+            if _is_present(requested, target, listing):
                 texts.append(f"{target} already exists, from {listing.repository} at {listing.revision}")
             else:
                 prepared.append(_prepare(requested, listing, target, variant))
@@ -124,24 +123,18 @@ def get_models(
     return "\n\n".join([*texts, f"photographs use {' and '.join(used)}"])
 
 
-def _require_ours(requested: ModelRequest, target: Path) -> None:
-    """Refuse to replace a folder that was not downloaded from this repository."""
-    origin = _origin(target)
+def _is_present(requested: ModelRequest, target: Path, listing: Listing) -> bool:
+    """Return whether the target was downloaded at this commit and all its files have their original size.
+
+    A folder that was not downloaded from this repository is refused.
+    """
+    origin = read_json(target / ORIGIN) if (target / ORIGIN).is_file() else {}
     if target.exists() and origin.get("repository") != requested.repository:
         raise DownloadError(
             f"{target} already exists and was not downloaded from {requested.repository}",
             found=f"{ORIGIN} of {origin['repository']}" if origin else f"no {ORIGIN}",
             fix="rename or remove that folder, then run the command again",
         )
-
-
-def _origin(folder: Path) -> dict[str, Any]:
-    return read_json(folder / ORIGIN) if (folder / ORIGIN).is_file() else {}
-
-
-def _is_present(target: Path, listing: Listing) -> bool:
-    """Return whether the target was downloaded at this commit and all its files have their original size."""
-    origin = _origin(target)
     return origin.get("revision") == listing.revision and all(
         (target / path).is_file() and (target / path).stat().st_size == size
         for path, size in origin["holds"].items()
@@ -204,8 +197,6 @@ def _install(found: Prepared) -> str:
         if file.relative_to(found.staging).as_posix() not in choice.files.values():
             file.unlink()  # metadata of the download, and files of another revision
     shutil.rmtree(found.staging / ".cache", ignore_errors=True)
-    if choice.split:
-        split_whole(found.staging)
     return _place(found, found.staging)
 
 
@@ -249,7 +240,10 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
-    """Check a finished folder, write `origin.json` into it, and rename it to the target."""
+    """Check a folder with all files, write `origin.json` into it, and rename it to the target."""
+    if whole_clip(made) is not None:
+        with explain_full_disk(made):
+            split_whole(made)
     text = check_model(made).replace(str(made), str(found.target))
     files = [path for path in sorted(made.rglob("*")) if path.is_file() and path.name != ORIGIN]
     fetched = []
@@ -277,8 +271,6 @@ def explain_refusals(requested: ModelRequest, models: Path) -> Iterator[None]:
     place = f"{constants.ENDPOINT}/{requested.repository}"
     try:
         yield
-    except HilsplatError:
-        raise
     except (requests.RequestException, *OUT_OF_REACH) as error:
         answered = error.__cause__ if isinstance(error, LocalEntryNotFoundError) else error
         if isinstance(answered, requests.HTTPError) and answered.response is not None:
@@ -352,10 +344,7 @@ def _is_installed(module: str) -> bool:
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
-    """Export the networks of a SAM or CLIP model saved by transformers; return the versions of packages used.
-
-    If the exporter fails, the error contains its last lines of output.
-    """
+    """Export the networks of a SAM or CLIP model saved by transformers; return the versions of packages used."""
     logger.info("exporting to ONNX; this takes minutes and memory of about three times the weights' size")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
     done = subprocess.run(
@@ -372,6 +361,4 @@ def export_networks(weights: Path, out: Path) -> dict[str, str]:
             found="\n            ".join(lines) or "no output",
             fix=f"install the tested versions ({INSTALL}), then run the command again",
         )
-    if whole_clip(out) is not None:
-        split_whole(out)
     return {name: metadata.version(name) for name in ("optimum-onnx", "transformers", "torch")}
