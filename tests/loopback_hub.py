@@ -1,7 +1,7 @@
-"""A model hub on 127.0.0.1 that speaks what `huggingface_hub` asks of the real one, and misbehaves on demand.
+"""A model hub on 127.0.0.1 with the routes that `huggingface_hub` uses, and faults on demand.
 
-Small files are served from `/owner/name/resolve/revision/file`. Large ones are redirected to another address,
-as the hub does with those kept in Git LFS, and state their SHA-256 in the API.
+Small files are served from `/owner/name/resolve/revision/file`. Requests for large ones are redirected to
+another address, as for files in Git LFS, and the API lists their SHA-256.
 """
 
 import hashlib
@@ -16,17 +16,17 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 LFS_BYTES = 20_000
-"""Files from this size on are kept in Git LFS."""
+"""Minimum size of files in Git LFS."""
 
 
 def git_sha1(content: bytes) -> str:
-    """What git calls a file of this content; also the ETag of a small file."""
+    """Return git's digest of a file, which is also the ETag of a small file."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
 
 
 @dataclass
 class Refusal:
-    """An answer that is given instead of a file or a listing."""
+    """A response that replaces a file or a listing."""
 
     status: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -34,35 +34,24 @@ class Refusal:
 
 @dataclass
 class LoopbackHub:
-    """Repositories, faults, and the record of what was asked.
+    """Repositories, faults, and a record of the requests."""
 
-    Attributes:
-        endpoint: value for HF_ENDPOINT.
-        repositories: owner/name -> folder that is served.
-        cuts: file name -> numbers of bytes after which its next transfers break.
-        replaced: file name -> bytes that are sent in its place.
-        refusals: part of a path -> answers that its next requests get.
-        licences: owner/name -> licence in its card.
-        ranged: whether a part of a file can be asked for; some mirrors send the whole.
-        asked: (method, path, Range header) of each request, in order.
-    """
-
-    endpoint: str = ""
-    repositories: dict[str, Path] = field(default_factory=dict)
-    cuts: dict[str, list[int]] = field(default_factory=dict)
-    replaced: dict[str, bytes] = field(default_factory=dict)
-    refusals: dict[str, list[Refusal]] = field(default_factory=dict)
-    licences: dict[str, str] = field(default_factory=dict)
-    ranged: bool = True
-    asked: list[tuple[str, str, str]] = field(default_factory=list)
+    endpoint: str = ""  # value for HF_ENDPOINT
+    repositories: dict[str, Path] = field(default_factory=dict)  # owner/name -> folder
+    cuts: dict[str, list[int]] = field(default_factory=dict)  # file name -> bytes before its transfers break
+    replaced: dict[str, bytes] = field(default_factory=dict)  # file name -> bytes that are sent instead
+    refusals: dict[str, list[Refusal]] = field(default_factory=dict)  # part of a path -> next responses
+    licences: dict[str, str] = field(default_factory=dict)  # owner/name -> licence in its card
+    ranged: bool = True  # False: ignore Range headers and send whole files, as some mirrors do
+    asked: list[tuple[str, str, str]] = field(default_factory=list)  # method, path and Range header
 
     def commit(self, repository: str) -> str:
-        """A commit that changes with the files."""
+        """Return a commit that depends on the files."""
         names = [f"{file}{file.stat().st_size}" for file in sorted(self.repositories[repository].rglob("*"))]
         return hashlib.sha1("".join(names).encode()).hexdigest()
 
     def info(self, repository: str) -> dict[str, object]:
-        """What the API says about a repository with ?blobs=true."""
+        """Return the API's description of a repository with ?blobs=true."""
         folder, siblings = self.repositories[repository], []
         for file in sorted(path for path in folder.rglob("*") if path.is_file()):
             content = file.read_bytes()
@@ -76,26 +65,14 @@ class LoopbackHub:
                 entry["lfs"] = {"size": len(content), "sha256": sha256, "pointerSize": 134}
             siblings.append(entry)
         card = {"license": self.licences[repository]} if repository in self.licences else {}
-        return {
-            "id": repository,
-            "sha": self.commit(repository),
-            "siblings": siblings,
-            "cardData": card,
-            "tags": [],
-            "private": False,
-            "downloads": 0,
-        }
+        return {"id": repository, "sha": self.commit(repository), "siblings": siblings, "cardData": card}
 
     def ranges(self, name: str) -> list[str]:
-        """Range headers of the transfers of a file's bytes, in order."""
-        return [
-            given for method, path, given in self.asked if path.startswith("/lfs/") and path.endswith(name)
-        ]
+        """Return the Range headers of a large file's transfers, in order."""
+        return [given for _, path, given in self.asked if path.startswith("/lfs/") and path.endswith(name)]
 
 
 def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
-    """The handler of a hub's requests."""
-
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
@@ -130,18 +107,14 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
                 self.answer(404, b"", **{"X-Error-Code": "EntryNotFound"})
                 return
             content = path.read_bytes()
-            headers = {
-                "X-Repo-Commit": hub.commit(repository),
-                "ETag": f'"{git_sha1(content)}"',
-            }
+            headers = {"X-Repo-Commit": hub.commit(repository), "ETag": f'"{git_sha1(content)}"'}
             if len(content) >= LFS_BYTES and not is_lfs:
                 headers["X-Linked-Etag"] = f'"{hashlib.sha256(content).hexdigest()}"'
                 headers["X-Linked-Size"] = str(len(content))
-                # another host name, so that a token must not go along
+                # another host name, which must not receive the token
                 there = hub.endpoint.replace("127.0.0.1", "localhost")
-                self.answer(
-                    302, b"", Location=f"{there}/lfs/{repository}/resolve/{revision}/{name}", **headers
-                )
+                headers["Location"] = f"{there}/lfs/{repository}/resolve/{revision}/{name}"
+                self.answer(302, b"", **headers)
                 return
             if is_lfs and "authorization" in self.headers:
                 self.answer(400, b"a token reached the store of large files")
@@ -175,7 +148,7 @@ def handler_of(hub: LoopbackHub) -> type[BaseHTTPRequestHandler]:
 
 @contextmanager
 def loopback_hub() -> Iterator[LoopbackHub]:
-    """A hub that runs until the block ends."""
+    """Run a hub until the block ends."""
     hub = LoopbackHub()
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler_of(hub))
     hub.endpoint = f"http://127.0.0.1:{server.server_address[1]}"

@@ -2,42 +2,19 @@
 
 import numpy as np
 import pytest
-import torch
 
 from hilsplat.embed.model_check import check_model
 from hilsplat.segment.generate import positive_boxes
-from hilsplat.segment.sam import (
-    REAL_SAM,
-    Frame,
-    SamModel,
-    Thresholds,
-    point_grid,
-    read_logits,
-    resized_size,
-    taps,
-)
+from hilsplat.segment.sam import REAL_SAM, Frame, SamModel, Thresholds, read_logits, resized_size
 from hilsplat.settings import MasksSettings
 from models.training.export import OWN_THRESHOLDS
 
 SQUARE = Frame((4, 4), (4, 4), (4, 4))
 
 
-@pytest.mark.parametrize(
-    ("original", "resized"),
-    [
-        ((256, 256), (1024, 1024)),
-        ((600, 800), (768, 1024)),
-        ((1080, 1920), (576, 1024)),
-        ((3, 2048), (2, 1024)),
-        ((1, 5000), (1, 1024)),
-    ],
-)
-def test_longest_edge_is_kept_and_halves_round_up(original, resized):
-    assert resized_size(original, 1024) == resized
-
-
-def test_grid_points_are_the_centres_of_squares():
-    assert point_grid(2).tolist() == [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
+def test_longest_edge_is_kept_and_halves_round_up():
+    originals = (600, 800), (3, 2048), (1, 5000)
+    assert [resized_size(size, 1024) for size in originals] == [(768, 1024), (2, 1024), (1, 1024)]
 
 
 @pytest.mark.parametrize(
@@ -85,20 +62,6 @@ def test_thresholds_are_the_settings_else_the_models_else_langsplats(own_sam, pr
     assert SamModel.load(own_sam).thresholds(chosen) == Thresholds(0.35, 0.9, 0.0, 3)
     (own_sam / "config.json").write_text('{"model_type": "sam"}')
     assert SamModel.load(own_sam).thresholds(MasksSettings()) == REAL_SAM == Thresholds(0.7, 0.85, 0.7, 8)
-
-
-@pytest.mark.parametrize("length", [1, 7, 48, 90, 500])
-def test_taps_equal_two_bilinear_steps_of_torch(length):
-    resized = min(64, max(1, round(length * 0.6)))
-    first, weights = taps(16, 64, resized, length)
-    whole = np.zeros((length, 16))
-    for row in range(length):
-        whole[row, first[row] : first[row] + weights.shape[1]] = weights[row]
-    eye = torch.eye(16)[None]
-    padded = torch.nn.functional.interpolate(eye, 64, mode="linear", align_corners=False)[..., :resized]
-    if resized != length:
-        padded = torch.nn.functional.interpolate(padded, length, mode="linear", align_corners=False)
-    np.testing.assert_allclose(whole, padded[0].numpy().T, atol=1e-5)  # torch places pixels in float32
 
 
 @pytest.mark.parametrize(
