@@ -250,22 +250,6 @@ class Plan:
             return []
         return [self.shared("clip", "clip")(of_variant(job, KEY_VIEWS))]
 
-    def earlier(self, job: VariantJob) -> list[str]:
-        """Return inputs of `masks` that only order jobs: the first answer, and masks from the same candidates.
-
-        Variants that differ only in `masks.levels` use the same cached candidates. Run side by side, each
-        would compute them.
-        """
-        own, scopes = self.stages(job).masks, self.scopes(self.row(job))
-
-        def has_same_candidates(variant: str) -> bool:
-            other = self.stages_of(variant, scopes).masks
-            return other.model_copy(update={"levels": own.levels, "theta": own.theta}) == own
-
-        first = next(filter(has_same_candidates, self.run.every_variant()), job.variant)
-        is_reused = first != job.variant and self.masks_stage(job) == "masks"
-        return [*self.first_answer(job), *([self.path(job, first, "masks")] if is_reused else [])]
-
     def masks_truth(self, job: VariantJob) -> list[str]:
         """Return the input of `masks`: the diagnostic's ground-truth labels; SettingsError if none exist."""
         if self.masks_stage(job) != "truth_masks":

@@ -217,16 +217,6 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert plan(tmp_path, **(config | {"variants": {}})).first_answer(desk) == []
 
 
-def test_masks_wait_for_those_from_the_same_candidates(tmp_path):
-    tree = {"levels": "tree"}
-    variants = {"tree": {"masks": tree}, "own": {"masks": {**tree, "points_per_side": 8}}}
-    variants["theta"] = {"masks": tree, "coverage_tree": {"theta": 0.6}}
-    found = plan(tmp_path, variants=variants, main_variants=["default", *variants])
-    waits = {name: found.earlier(Job(variant=name)) for name in ("default", *variants)}
-    default = ["results/synthetic/one/default/masks"]
-    assert waits == {"default": [], "tree": default, "own": [], "theta": default}
-
-
 def test_a_vector_per_mask_is_made_only_for_variants_whose_targets_are_masks(tmp_path):
     found = plan(tmp_path)
     assert found.crops_tree(Job()) == ["results/synthetic/one/default/semantic_tree"]
