@@ -10,7 +10,6 @@ from hypothesis.extra import numpy as hnp
 
 from benchmarks.canned_sam import CannedSam, NetworkClock
 from hilsplat.base.levels import Level
-from hilsplat.models.folder import open_model_folder
 from hilsplat.segment.coverage import coverage_tree
 from hilsplat.segment.generate import (
     Candidates,
@@ -22,7 +21,16 @@ from hilsplat.segment.generate import (
     keep_candidates,
     masks_from_candidates,
 )
-from hilsplat.segment.sam import Encoded, Frame, Prompts, SamModel, Thresholds, enlarged, resized_size
+from hilsplat.segment.sam import (
+    Encoded,
+    Frame,
+    Prompts,
+    SamModel,
+    Thresholds,
+    enlarged,
+    point_grid,
+    resized_size,
+)
 from hilsplat.settings import MasksSettings
 from tests.unit.segment import official
 from tests.unit.segment.handmade import assert_equal_masks, generate, pack
@@ -46,8 +54,9 @@ def model(disc_sam) -> SamModel:
     return SamModel.load(disc_sam)
 
 
-def test_every_prompt_produces_a_disc_at_every_level(model):
-    masks = generate(model, SETTINGS, IMAGE)
+@pytest.mark.parametrize("batch", [1, 3, 64])
+def test_every_prompt_produces_a_disc_at_every_level_whatever_the_batch(model, batch):
+    masks = generate(model, changed(points_per_batch=batch), IMAGE)
     for level, radius, score in ((Level.WHOLE, 10, 0.7), (Level.PART, 6, 0.8), (Level.SUBPART, 3, 0.9)):
         rows = masks.rows_of(level)
         assert len(rows) == 4
@@ -59,28 +68,12 @@ def test_every_prompt_produces_a_disc_at_every_level(model):
             assert sorted(centres) == [[1, 1], [1, 3], [3, 1], [3, 3]]  # prompts at 8 and 24 px
 
 
-@pytest.mark.parametrize("batch", [1, 3, 64])
-def test_masks_do_not_depend_on_the_batch(model, batch):
-    masks = generate(model, changed(points_per_batch=batch), IMAGE)
-    np.testing.assert_array_equal(masks.runs, generate(model, SETTINGS, IMAGE).runs)
-
-
-def one_row(candidates: Candidates, row: int) -> Candidates:
-    low, high = candidates.offsets[row : row + 2]
-    arrays = vars(candidates) | {"logits": candidates.logits[low:high]}
-    arrays["offsets"] = np.array([0, high - low])
-    for name in ("window_xyxy", "head", "predicted_iou", "stability", "crop"):
-        arrays[name] = arrays[name][row : row + 1]
-    return Candidates(**arrays)
-
-
-def test_masks_do_not_depend_on_the_order_of_candidates(model):
+def test_masks_do_not_depend_on_the_order_of_prompts(model):
     settings = changed(points_per_side=6, box_nms_iou=0.5)
-    candidates = decode_candidates(IMAGE, model, settings)
-    shuffle = np.random.default_rng(0).permutation(len(candidates.head))
-    shuffled = Candidates.concatenate([one_row(candidates, row) for row in shuffle])
-    first = masks_from_candidates(candidates, (32, 32), model, settings)
-    assert_equal_masks(masks_from_candidates(shuffled, (32, 32), model, settings), first)
+    points = np.random.default_rng(0).permutation(point_grid(6) * 32)
+    candidates = decode_candidates(IMAGE, model, settings, points)
+    expected = generate(model, settings, IMAGE)
+    assert_equal_masks(masks_from_candidates(candidates, (32, 32), model, settings), expected)
 
 
 def test_crops_by_hand():
@@ -142,9 +135,7 @@ def test_an_image_of_one_pixel_width_has_masks_of_its_size(model, size_hw, crop_
     image = np.full((*size_hw, 3), 90, np.uint8)
     masks = generate(model, changed(points_per_side=3, crop_layers=crop_layers), image)
     assert masks.size_hw == size_hw
-    assert len(masks) > 0
-    parent, _ = coverage_tree(masks, theta=0.9)
-    assert len(parent) == len(masks)
+    assert len(masks) == len(coverage_tree(masks, theta=0.9)[0]) > 0
 
 
 def test_a_view_may_have_no_masks(model):
@@ -153,19 +144,13 @@ def test_a_view_may_have_no_masks(model):
     assert [len(each) for each in coverage_tree(none, theta=0.9)] == [0, 0]
 
 
-def test_of_two_predicted_ious_above_1_the_higher_wins(disc_sam):
-    """The smaller disc has the higher predicted IoU, 1.06 and 1.02. Clipped to 1, the larger would win."""
-
-    class Sure(SamModel):
-        def decode(self, encoded: Encoded, points_xy: np.ndarray):
-            y, x = np.mgrid[:16, :16]
-            is_first = np.arange(len(points_xy)) == 0
-            radii = np.where(is_first, 5.2, 4.8)
-            discs = (radii[:, None, None] - np.hypot(x - 7.5, y - 7.5)[None]).astype(np.float32)
-            scores = np.where(is_first, 1.02, 1.06).astype(np.float32)
-            return np.repeat(scores[:, None], 3, axis=1), np.repeat(discs[:, None], 3, axis=1)
-
-    masks = generate(Sure(open_model_folder(disc_sam)), changed(points_per_batch="auto"), IMAGE)
+def test_of_two_predicted_ious_above_1_the_higher_wins(model):
+    y, x = np.mgrid[:16, :16]
+    radii = np.array([5.2, 4.8], np.float32)[:, None, None]  # clipped to 1, the larger disc would win
+    discs = np.repeat((radii - np.hypot(x - 7.5, y - 7.5))[:, None], 3, axis=1).astype(np.float32)
+    scores = np.repeat(np.array([[1.02], [1.06]], np.float32), 3, axis=1)
+    kept = keep_candidates(scores, discs, model.frame((32, 32)), 0, SETTINGS, NOTHING_DROPPED)
+    masks = masks_from_candidates(kept, (32, 32), model, SETTINGS)
     assert masks.predicted_iou.tolist() == [np.float32(1.06)] * 3
 
 

@@ -26,21 +26,17 @@ def ious(masks: HierarchicalMasks, first: int, last: int) -> np.ndarray:
     return (dense & square).sum(axis=(1, 2)) / (dense | square).sum(axis=(1, 2))
 
 
-@pytest.fixture(scope="module")
-def masks() -> HierarchicalMasks:
-    return segment_graph(mosaic(), SCALES, min_area_px=16)
-
-
-def test_clear_regions_are_found_to_the_pixel_or_two(masks):
-    wholes = masks.rows_of(Level.WHOLE)
+def test_clear_regions_are_wholes_and_fine_detail_appears_at_finer_levels_only():
+    masks = segment_graph(mosaic(), SCALES, min_area_px=16)
+    wholes, subparts = masks.rows_of(Level.WHOLE), masks.rows_of(Level.SUBPART)
     assert len(wholes) == 2
     assert ious(masks, 30, 110)[wholes].max() > 0.95
-
-
-def test_fine_detail_appears_at_the_finer_levels_only(masks):
-    found = ious(masks, 60, 72)
-    assert found[masks.rows_of(Level.WHOLE)].max() < 0.1
-    assert found[masks.rows_of(Level.SUBPART)].max() > 0.7
+    detail = ious(masks, 60, 72)
+    assert detail[wholes].max() < 0.1 and detail[subparts].max() > 0.7
+    for score in (masks.predicted_iou, masks.stability):
+        assert ((score >= 0) & (score <= 1)).all()
+    # a clear region has the better score
+    assert masks.predicted_iou[wholes].min() > masks.predicted_iou[detail.argmax()] > 0
 
 
 def test_every_level_covers_the_image_and_levels_nest():
@@ -55,13 +51,6 @@ def test_every_level_covers_the_image_and_levels_nest():
         for child in dense[masks.rows_of(fine)]:
             covers = [(child & parent).sum() / child.sum() for parent in dense[masks.rows_of(coarse)]]
             assert max(covers) == 1.0
-
-
-def test_scores_are_shares_and_a_clear_region_has_the_better_one(masks):
-    for score in (masks.predicted_iou, masks.stability):
-        assert ((score >= 0) & (score <= 1)).all()
-    faint = ious(masks, 60, 72).argmax()
-    assert masks.predicted_iou[masks.rows_of(Level.WHOLE)].min() > masks.predicted_iou[faint] > 0
 
 
 @pytest.mark.parametrize("size_hw", [(1, 1), (50, 1), (1, 700), (3, 5), (40, 60)])
