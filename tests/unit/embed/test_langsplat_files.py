@@ -66,8 +66,7 @@ def test_maps_by_hand():
 
 
 def test_exported_files_are_read_back(ours, scene, tmp_path):
-    masks_folder, clip_folder = ours
-    write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+    write_langsplat(*ours, tmp_path / "files")
     names = sorted(path.name for path in (tmp_path / "files").glob("*.npy"))
     assert names == ["a_f.npy", "a_s.npy", "b_f.npy", "b_s.npy"]
     maps, vectors = (np.load(tmp_path / "files" / f"a_{kind}.npy", allow_pickle=False) for kind in "sf")
@@ -145,22 +144,20 @@ def test_views_that_differ_only_after_a_dot_are_refused(ours, tmp_path):
 
 
 def test_vectors_of_other_masks_are_refused(ours, tmp_path):
-    masks_folder, clip_folder = ours
-    write_index(clip_folder, {"a.png": index_entry(nested())}, scene="set/scene")
+    write_index(ours[1], {"a.png": index_entry(nested())}, scene="set/scene")
     with pytest.raises(MisalignedArtifactError, match=r"clip .*different masks \(view b\.png\)"):
-        write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+        write_langsplat(*ours, tmp_path / "files")
 
 
 @pytest.fixture
 def embedded(ours, scene, tmp_path, project) -> ClipModel:
     """LangSplat's files of the scene, with vectors of clip-tiny."""
     model = ClipModel.load(project / "models/clip-tiny")
-    masks_folder, clip_folder = ours
     for name in ("a.png", "b.png"):
         image = read_image(scene / "images" / name)
         vectors = model.embed_masks(image, nested(), ClipSettings(crop="langsplat"))
-        np.save(clip_folder / f"{name}.npy", vectors)
-    write_langsplat(masks_folder, clip_folder, tmp_path / "files")
+        np.save(ours[1] / f"{name}.npy", vectors)
+    write_langsplat(*ours, tmp_path / "files")
     return model
 
 
@@ -168,14 +165,11 @@ def test_vectors_of_the_same_clip_are_accepted(embedded, scene, tmp_path):
     settings = ClipSettings(model=str(embedded.model.folder))
     read_clip(scene, tmp_path / "files", tmp_path / "out", settings)
     index = read_index(tmp_path / "out")
-    masks, _ = read_view(tmp_path / "files", "a.png", SIZE)
-    assert (index["dim"], index["model"], index["views"]["a.png"]) == (
-        embedded.width,
-        settings.model,
-        {"masks_sha256": digest_of(masks), "masks": 4},
-    )
-    lengths = np.linalg.norm(read_npy(tmp_path / "out" / "a.png.npy").astype(float), axis=1)
-    np.testing.assert_allclose(lengths, 1, atol=2e-3)
+    assert (index["dim"], index["model"]) == (embedded.width, settings.model)
+    masks, vectors = read_view(tmp_path / "files", "a.png", SIZE)
+    assert index["views"]["a.png"] == {"masks_sha256": digest_of(masks), "masks": 4}
+    np.testing.assert_array_equal(read_npy(tmp_path / "out" / "a.png.npy"), vectors)
+    np.testing.assert_allclose(np.linalg.norm(vectors.astype(float), axis=1), 1, atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -187,8 +181,7 @@ def test_vectors_of_the_same_clip_are_accepted(embedded, scene, tmp_path):
 )
 def test_vectors_of_another_clip_are_refused(embedded, scene, tmp_path, width, words):
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(embedded.width, embedded.width)))
-    for stem in "ab":
-        path = tmp_path / "files" / f"{stem}_f.npy"
+    for path in (tmp_path / "files").glob("*_f.npy"):
         np.save(path, (np.load(path) @ turn).astype(np.float32)[:, :width])
     with pytest.raises(MisalignedArtifactError, match=words):
         read_clip(scene, tmp_path / "files", tmp_path / "out", ClipSettings(model=str(embedded.model.folder)))
