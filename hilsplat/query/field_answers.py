@@ -13,12 +13,9 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import rendered_latents
 from hilsplat.field.code import Code, LanguageField
 from hilsplat.query.relevancy import LatentRelevancy
-from hilsplat.query.relevancy_kernels import fill_maps
 from hilsplat.query.scene_views import SceneViews
 from hilsplat.semantic_tree.nodes import node_means
 from hilsplat.settings import EvaluateSettings
-
-TextEncoder = Callable[[list[str]], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class FieldScene(SceneViews):
 
     language: LanguageField | None
     autoencoder: Code | None
-    encode_texts: TextEncoder
+    encode_texts: Callable[[list[str]], np.ndarray]
     settings: EvaluateSettings = field(default_factory=EvaluateSettings)
     threads: int = 1
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False, kw_only=True)
@@ -77,7 +74,9 @@ class FieldScene(SceneViews):
             if not len(pixels):
                 continue
             found = answer.exact(latents, vectors) if placed is None else answer.fast(placed[index], vectors)
-            fill_maps(found, found.min(axis=1), pixels, index, maps)
+            for text_map, values in zip(maps[:, index], found, strict=True):
+                text_map[:] = values.min()
+                text_map[pixels] = values
         return maps.reshape(len(texts), len(LEVELS), height, width)
 
     def field_cosine(
@@ -88,17 +87,12 @@ class FieldScene(SceneViews):
         Pixels (row * width + column) that show mostly Gaussians without a latent have -inf.
         """
         vectors = self.text_vectors(texts)
-        height, width = self.camera(view).size_hw
         found = np.full((len(texts), len(LEVELS), len(pixels)), -np.inf, np.float32)
         for index, (shown, latents) in enumerate(self.latents(view)):
-            row_of_pixel = np.full(height * width, -1)
-            row_of_pixel[shown] = np.arange(len(shown))
-            rows = row_of_pixel[pixels]
-            has_latent = np.flatnonzero(rows >= 0)
+            has_latent = np.flatnonzero(np.isin(pixels, shown))
             if len(has_latent):
-                decoded = self.trained()[1].decode_array(
-                    np.ascontiguousarray(latents[rows[has_latent]], np.float32)
-                )
+                rows = np.searchsorted(shown, pixels[has_latent])
+                decoded = self.trained()[1].decode_array(np.ascontiguousarray(latents[rows], np.float32))
                 found[:, index, has_latent] = vectors @ decoded.T
         return found
 
@@ -107,12 +101,11 @@ class FieldScene(SceneViews):
         features = self.trained()[0].features
         out = np.zeros(len(features), np.float32)
         vector = self.text_vectors([text])
-        for each in (each for each in LEVELS if level in ("auto", each.label)):
-            latents = np.ascontiguousarray(features[:, each.index], np.float32)
-            has = np.flatnonzero((latents != 0).any(axis=1))
-            if len(has):
-                own = self._latent_relevancy.exact(latents[has], vector)[0]
-                out[has] = np.maximum(out[has], own)
+        for each in LEVELS:
+            if level in ("auto", each.label):
+                latents = features[:, each.index]
+                has = (latents != 0).any(axis=1)
+                out[has] = np.maximum(out[has], self._latent_relevancy.exact(latents[has], vector)[0])
         return out
 
     def field_image(self, view: str, level: Level) -> UInt8[np.ndarray, "H W 3"]:

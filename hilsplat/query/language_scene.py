@@ -86,15 +86,11 @@ class LanguageScene(FieldScene):
     @staticmethod
     def of(found: FinishedScene, *, threads: int = 1, opened: Opened | None = None) -> "LanguageScene":
         """Open a located finished scene with its own settings and its nodes' names."""
-        scene = LanguageScene.from_parts(
-            found.parts,
-            found.evaluate_settings(),
-            threads=threads,
-            opened=opened,
-            names=read_names(found.folder, found.parts.semantic_tree),
-            naming=NodeNaming.load(found.naming, found.parts.semantic_tree, found.parts.clip),
-        )
-        return replace(scene, finished=found)
+        parts = found.parts
+        scene = LanguageScene.from_parts(parts, found.evaluate_settings(), threads=threads, opened=opened)
+        names = read_names(found.folder, parts.semantic_tree)
+        naming = NodeNaming.load(found.naming, parts.semantic_tree, parts.clip)
+        return replace(scene, names=names, naming=naming, finished=found)
 
     @staticmethod
     def from_parts(
@@ -103,14 +99,11 @@ class LanguageScene(FieldScene):
         *,
         threads: int = 1,
         opened: Opened | None = None,
-        names: NodeNames | None = None,
-        naming: NodeNaming | None = None,
     ) -> "LanguageScene":
-        """Read each of a scene's artifacts once, and check that they belong together.
+        """Read each of a scene's artifacts once, without names, and check that they belong together.
 
         Args:
             opened: artifacts that other variants of the scene have already opened.
-            names, naming: None in evaluation, which scores only the models and doesn't estimate chance.
 
         Raises:
             MisalignedArtifactError: the tree or field was made for other Gaussians or cameras, or the field
@@ -154,10 +147,8 @@ class LanguageScene(FieldScene):
             settings,
             threads,
             meaningless(clip.model.folder.name) if is_meaningless else "",
-            names or NodeNames(),
-            naming,
-            clip.unknown_words,
-            clip.embed_picture,
+            unknown_words=clip.unknown_words,
+            encode_picture=clip.embed_picture,
         )
 
     def show(self, text: str = "", *, height: int = 640, proxy: str = "") -> "EmbeddedViewer":
@@ -346,8 +337,6 @@ class LanguageScene(FieldScene):
 
         A node's margin for the name that the user gave it is `NAMED`.
         """
-        if not len(texts):
-            return np.zeros((0, len(self.tree)), np.float32)
         canonical = self.text_vectors(self.settings.canonical)
         found = margins(self.node_vectors(answerer), self.text_vectors(texts), canonical)
         for row, text in zip(found, texts, strict=True):

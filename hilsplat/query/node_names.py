@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from hilsplat.base.identity import code_digest
 from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.embed.clip import ClipModel, open_clip_of
+from hilsplat.models.store import AUTO
 from hilsplat.query.names import tree_digest
 from hilsplat.query.relevancy import margins
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -50,8 +50,7 @@ THINGS, PARTS, SURFACES = range(3)
 VOCABULARY = "vocabulary.txt"
 """Vocabulary file in a model's folder; models without this file use the one in this package."""
 
-COMMON = Path(str(files("hilsplat.query") / VOCABULARY))
-AUTO = "auto"
+COMMON = Path(__file__).with_name(VOCABULARY)
 SECTIONS = ("things", "parts", "surfaces", "absent")
 
 

@@ -101,7 +101,7 @@ def search(
         shown: which nodes are allowed as answers; None allows all.
 
     Raises:
-        SettingsError: the path is empty, or has more texts than there are levels down to its last text.
+        SettingsError: the path has more texts than there are levels down to its last text.
     """
     margin = margin.astype(np.float64)
     anywhere = (margin if shown is None else margin[:, shown]).max(axis=1, initial=-np.inf).tolist()
@@ -219,7 +219,7 @@ def _search_path(
     these, the largest sum of margins wins. Ancestors need not be shown; they compete with nodes that are
     shown or have a shown descendant.
     """
-    ways = [way for way in combinations(LEVELS, len(path)) if way and level in (None, way[-1])]
+    ways = [way for way in combinations(LEVELS, len(path)) if level in (None, way[-1])]
     if not ways:
         levels = LEVELS if level is None else LEVELS[: level.index + 1]
         raise SettingsError(

@@ -14,9 +14,15 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.query.hits import counted, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.node_search import NodeHits
-from hilsplat.query.pictures import TITLE_LETTERS, paint_answer, paint_relevancy, save_figure, show_from_above
+from hilsplat.query.pictures import (
+    DPI,
+    TITLE_LETTERS,
+    paint_answer,
+    paint_relevancy,
+    save_figure,
+    show_from_above,
+)
 
-DPI = 110
 COLUMNS = 5
 CELL_PX = 272
 GAP_PX = 8
@@ -79,7 +85,7 @@ def query_panel(
     below = (MAP_PX - TITLE_PX - GAP_PX) / page.height_px
     axes = page.figure.add_axes((0.02, GAP_PX / page.height_px, 0.96, below))
     show_from_above(axes, scene.gaussians, scene.scene.cameras, selected, title)
-    save_figure(page.figure, out_png, DPI)
+    save_figure(page.figure, out_png)
 
 
 class _Page:

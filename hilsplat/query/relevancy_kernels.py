@@ -8,22 +8,6 @@ BLOCK = 2048
 """Pixels to process at once: the pixels' sums fit in the L1 cache, and the block of each channel is long
 enough to be prefetched."""
 
-TRANSPOSED = 16
-"""Rows to transpose at once: one channel of these rows fills a cache line."""
-
-
-@compiled
-def by_channel(rows):
-    """Transpose latents (P, D) to (D, P), a few rows at a time; numpy reads all rows for every channel."""
-    count, channels = rows.shape
-    out = np.empty((channels, count), np.float32)
-    for begin in range(0, count, TRANSPOSED):
-        end = min(begin + TRANSPOSED, count)
-        for c in range(channels):
-            for p in range(begin, end):
-                out[c, p] = rows[p, c]
-    return out
-
 
 @compiled
 def _dots_of_block(channels, begin, end, offset, slope, out):
@@ -105,27 +89,6 @@ def projected_relevancy(coordinates, generic, first, weights, scale, out):
         for text in range(len(out)):
             _dots_of_block(coordinates, begin, end, np.float32(0), weights[text], dots)
             _write_relevancy(dots, generic[begin:end], scale, out[text, begin - first : end - first])
-
-
-@compiled
-def fill_maps(found, least, pixels, level, maps):
-    """Fill a level's maps (T, 3, P): `pixels` get their values, all others the text's value in `least`.
-
-    Runs of consecutive pixels are copied together.
-    """
-    starts = np.empty(len(pixels) + 1, np.int64)
-    runs = 0
-    for place in range(len(pixels)):
-        if place == 0 or pixels[place] != pixels[place - 1] + 1:
-            starts[runs] = place
-            runs += 1
-    starts[runs] = len(pixels)
-    for text in range(len(found)):
-        row = maps[text, level]
-        row[:] = least[text]
-        for run in range(runs):
-            begin, end = starts[run], starts[run + 1]
-            row[pixels[begin] : pixels[begin] + end - begin] = found[text, begin:end]
 
 
 @compiled

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.contributions.compositing import normalised_weights
-from hilsplat.scene.cameras import Camera
+from hilsplat.scene.cameras import Camera, Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
 from hilsplat.splat.gaussians import Gaussians
@@ -172,3 +172,10 @@ class SceneViews:
             for row, values in enumerate(scores):
                 shown.blend(values, float(values[nodes].min()), maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
+
+
+def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
+    """Return the mean up direction of the cameras (OpenCV: up is -y)."""
+    up = -cameras.cam_from_world[:, 1, :3].mean(axis=0)
+    length = np.linalg.norm(up)
+    return up / length if length > 1e-6 else -cameras.cam_from_world[0, 1, :3]

@@ -55,45 +55,44 @@ def tree_picture(scene: LanguageScene) -> UInt8[np.ndarray, "H W 3"]:
     it is largest, with the rest of that view dimmed; the node's name and number are below.
     """
     tree = scene.tree
-    roots = [node for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]
-    width_of = {int(root): _leaves(tree, int(root)) for root in roots}
+    children = [tree.children_of(np.array([node])).tolist() for node in range(len(tree))]
+
+    def columns(node: int) -> int:
+        """Return the number of leaves below a node, at least 1."""
+        return sum(map(columns, children[node])) or 1
+
     rows: list[list[int]] = [[]]
-    for root in map(int, roots):
-        if rows[-1] and sum(width_of[each] for each in rows[-1]) + width_of[root] > COLUMNS:
+    for root in [int(node) for level in LEVELS for node in tree.nodes_of(level) if tree.parent[node] == NONE]:
+        if rows[-1] and sum(map(columns, [*rows[-1], root])) > COLUMNS:
             rows.append([])
         rows[-1].append(root)
     step = CELL_PX + GAP_PX
     height = len(LEVELS) * ROW_PX + BLOCK_GAP_PX
-    width = max(sum(width_of[each] * step + BLOCK_GAP_PX for each in row) for row in rows)
+    width = max(sum(columns(root) * step + BLOCK_GAP_PX for root in row) for row in rows)
     canvas = np.full((len(rows) * height, MARGIN_PX + width, 3), BACKGROUND, np.uint8)
     placed: list[tuple[int, int, int]] = []
 
-    def place(node: int, left: int, top: int) -> tuple[int, int]:
-        """Place a node and its descendants, draw their lines, and return the node's centre and the width."""
-        index = Level(int(tree.level[node])).index
-        y = top + index * ROW_PX
-        kids, used, middles = tree.children_of(np.array([node])), 0, []
-        for child in map(int, kids):
-            middle, width = place(child, left + used, top)
-            depth = Level(int(tree.level[child])).index - index
-            middles.append((middle, y + depth * ROW_PX))
-            used += width
-        used = max(used, step)
-        x = left + (used - step) // 2
+    def place(node: int, left: int, top: int) -> int:
+        """Place a node and its descendants, draw their lines, and return the node's horizontal centre."""
+        x = left + (columns(node) - 1) * step // 2
+        y = top + Level(int(tree.level[node])).index * ROW_PX
+        centre = x + CELL_PX // 2
         bar = y + CELL_PX + LABEL_PX + GAP_PX  # below this line, children do not share columns
-        for middle, below in middles:
-            canvas[bar:below, middle] = LINE
-            canvas[bar, min(middle, x + CELL_PX // 2) : max(middle, x + CELL_PX // 2) + 1] = LINE
-        if middles:
-            canvas[bar - GAP_PX : bar, x + CELL_PX // 2] = LINE
+        for child in children[node]:
+            middle = place(child, left, top)
+            left += columns(child) * step
+            canvas[bar : top + Level(int(tree.level[child])).index * ROW_PX, middle] = LINE
+            canvas[bar, min(middle, centre) : max(middle, centre) + 1] = LINE
+            canvas[bar - GAP_PX : bar, centre] = LINE
         placed.append((node, x, y))
-        return x + CELL_PX // 2, used
+        return centre
 
     labels: list[tuple[str, int, int]] = []
     for number, row in enumerate(rows):
         left, top = MARGIN_PX, number * height + GAP_PX
         for root in row:
-            left += place(root, left, top)[1] + BLOCK_GAP_PX
+            place(root, left, top)
+            left += columns(root) * step + BLOCK_GAP_PX
         labels += [
             (level.label, MARGIN_PX // 2, top + level.index * ROW_PX + CELL_PX // 2) for level in LEVELS
         ]
@@ -119,11 +118,6 @@ def _labelled(
             shown = shown.rstrip("…")[:-1] + "…"
         draw.text((x, y), shown, TEXT, font, anchor="mm")
     return np.asarray(picture)
-
-
-def _leaves(tree, node: int) -> int:
-    kids = tree.children_of(np.array([node]))
-    return sum(_leaves(tree, int(child)) for child in kids) if len(kids) else 1
 
 
 def _crop(scene: LanguageScene, node: int) -> UInt8[np.ndarray, "84 84 3"]:

@@ -12,6 +12,7 @@ from typing_extensions import TypedDict  # pydantic needs this class before Pyth
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.query.hits import Hit, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
+from hilsplat.query.scene_views import upright
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import OrientedBox, SemanticTree
@@ -73,13 +74,6 @@ def described_scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
             for name in cameras.names
         ],
     }
-
-
-def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
-    """Return the mean up direction of the cameras."""
-    up = -cameras.cam_from_world[:, 1, :3].mean(axis=0)
-    length = np.linalg.norm(up)
-    return up / length if length > 1e-6 else -cameras.cam_from_world[0, 1, :3]
 
 
 def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:

@@ -12,7 +12,6 @@ from hilsplat.field.code import LanguageField, load_code
 from hilsplat.field.field import run_field
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.node_search import ancestor_margins, automatic_level, best_nodes, search
-from hilsplat.query.relevancy_kernels import fill_maps
 from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
@@ -475,18 +474,6 @@ def test_a_forgotten_view_is_computed_again_with_the_same_answers(scene):
     assert np.array_equal(own.field_relevancy(["cup"], "000.png"), first)
     own.nodes_shown("001.png")
     assert asked == ["000.png", "001.png", "000.png"]
-
-
-def test_pixels_of_a_map_without_a_latent_get_the_lowest_value_of_its_text():
-    maps = np.zeros((1, 1, 9), np.float32)
-    found = np.arange(1, 7, dtype=np.float32)[None]
-    fill_maps(found, np.float32([9]), np.array([0, 1, 3, 4, 5, 8]), 0, maps)
-    assert maps[0, 0].tolist() == [1, 2, 9, 3, 4, 5, 9, 9, 6]
-    maps = np.full((2, 3, 4), 7, np.float32)
-    found = np.array([[0.5, 0.25], [0.125, 1]], np.float32)
-    fill_maps(found, found.min(axis=1), np.array([3, 1]), 1, maps)
-    assert maps[:, 1].tolist() == [[0.25, 0.25, 0.25, 0.5], [0.125, 1, 0.125, 0.125]]
-    assert (maps[:, [0, 2]] == 7).all()
 
 
 def test_field_image_has_one_colour_per_region(scene):

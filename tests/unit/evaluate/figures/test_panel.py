@@ -60,7 +60,7 @@ def test_panel_without_annotations_shows_given_texts_below_the_overview(block_wo
     paths = [(("bear",), "000.png"), (("bear", "head"), "000.png")]
     assert [(row.path, row.view) for row in rows] == paths[: len(texts)]
     figure = draw_panel(block_world.answers, block_world.folder / "masks", rows, EVALUATE)
-    save_figure(figure, tmp_path / "panel.png", dpi=60)
+    save_figure(figure, tmp_path / "panel.png")
     assert (tmp_path / "panel.png").stat().st_size > 10_000
 
 
