@@ -8,15 +8,13 @@ import pytest
 import scipy.sparse as sp
 
 from hilsplat.base.artifacts import read_index, write_index, write_npy, write_npz
-from hilsplat.base.images import write_png
 from hilsplat.contributions import stage
 from hilsplat.contributions.stage import run_contributions
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ContributionsSettings
 from tests.unit.round_gaussians import round_gaussians
+from tests.unit.segment.handmade import pack, save_scene
 
 HEIGHT, WIDTH = 8, 12
 NUM_GAUSSIANS = HEIGHT * WIDTH
@@ -45,30 +43,15 @@ class TwoBoxes:
     folder: Path
     regions: dict[str, list[int]]
     region_vectors: np.ndarray
+    scene: Path
+    masks: Path
+    coverage_tree: Path
+    clip: Path
+    ply: Path
 
     @property
     def views(self) -> tuple[str, ...]:
         return tuple(self.regions)
-
-    @property
-    def scene(self) -> Path:
-        return self.folder / "scene"
-
-    @property
-    def masks(self) -> Path:
-        return self.folder / "masks"
-
-    @property
-    def coverage_tree(self) -> Path:
-        return self.folder / "coverage_tree"
-
-    @property
-    def clip(self) -> Path:
-        return self.folder / "clip"
-
-    @property
-    def ply(self) -> Path:
-        return self.folder / "gaussians.ply"
 
 
 def region_mask(row: int) -> np.ndarray:
@@ -112,33 +95,23 @@ def build_two_boxes(
     """A train view with masks of the given regions for each item, and a test view."""
     rng = np.random.default_rng(0)
     names = tuple(f"{view:03d}.png" for view in range(len(regions) + 1))
-    scene = tmp_path / "scene"
-    (scene / "images").mkdir(parents=True)
-    for name in names:
-        write_png(scene / "images" / name, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    cameras = Cameras(
-        names,
-        np.tile(np.eye(4), (len(names), 1, 1)),
-        np.tile(np.array([[10.0, 0, 6], [0, 10, 4], [0, 0, 1]]), (len(names), 1, 1)),
-        np.full((len(names), 2), (HEIGHT, WIDTH), np.int32),
-    )
-    split = {name: "test" if name == names[-1] else "train" for name in names}
-    points = np.zeros((0, 3), np.float32)
-    Scene(scene, "toy/boxes", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4)).save()
+    black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    K = np.array([[10.0, 0, 6], [0, 10, 4], [0, 0, 1]])
+    scene = save_scene(tmp_path / "scene", dict.fromkeys(names, black), names[-1:], K)
     own = {name: list(rows) for name, rows in zip(names, regions, strict=False)}
-    world = TwoBoxes(tmp_path, own, rng.normal(size=(len(REGIONS), CHANNELS)))
-    world.region_vectors[:] /= np.linalg.norm(world.region_vectors, axis=1, keepdims=True)
+    vectors = rng.normal(size=(len(REGIONS), CHANNELS))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    stages = (tmp_path / name for name in ("masks", "coverage_tree", "clip", "gaussians.ply"))
+    world = TwoBoxes(tmp_path, own, vectors, scene, *stages)
     entries = {}
     for shift, (view, rows) in enumerate(world.regions.items()):
         dense = np.stack([np.roll(region_mask(row), shift, axis=1) for row in rows])
-        level = np.array([REGIONS[row][1] for row in rows], np.uint8)
-        ones = np.ones(len(rows), np.float32)
-        masks = HierarchicalMasks.from_dense(dense, level, ones, ones)
+        masks = pack(dense, [REGIONS[row][1] for row in rows])
         masks.save(world.masks / f"{view}.npz")
         entries[view] = index_entry(masks)
         parent = [rows.index(REGIONS[row][4]) if REGIONS[row][4] in rows else -1 for row in rows]
         write_npz(world.coverage_tree / f"{view}.npz", parent=np.array(parent, np.int32))
-        noisy = world.region_vectors[rows] + 0.02 * rng.normal(size=(len(rows), CHANNELS))
+        noisy = vectors[rows] + 0.02 * rng.normal(size=(len(rows), CHANNELS))
         noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
         write_npy(world.clip / f"{view}.npy", noisy.astype(np.float16))
     for folder in (world.masks, world.coverage_tree, world.clip):
@@ -159,8 +132,7 @@ def build_two_boxes(
 
 def build_contributions(world: TwoBoxes) -> Path:
     """Run the contributions stage."""
-    out = world.folder / "contributions"
-    cache = world.folder / "cache"
+    out, cache = world.folder / "contributions", world.folder / "cache"
     run_contributions(world.scene, world.ply, world.masks, out, cache, ContributionsSettings(), 1)
     return out
 

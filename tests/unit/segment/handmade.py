@@ -46,13 +46,16 @@ def generate(model: SamModel, settings: MasksSettings, image: np.ndarray) -> Hie
     return masks_from_candidates(candidates, image.shape[:2], model, settings)
 
 
-def save_scene(folder: Path, images: Mapping[str, np.ndarray], test: Sequence[str] = ()) -> Path:
+def save_scene(
+    folder: Path, images: Mapping[str, np.ndarray], test: Sequence[str] = (), K: np.ndarray | None = None
+) -> Path:
     """A posed scene `set/scene` without points; views are training views unless named in `test`."""
     for name, image in images.items():
         write_png(folder / "images" / name, image)
     sizes = np.array([image.shape[:2] for image in images.values()], np.int32)
     eyes = np.tile(np.eye(4), (len(images), 1, 1))
-    cameras = Cameras(tuple(images), eyes, eyes[:, :3, :3], sizes)
+    intrinsics = eyes[:, :3, :3] if K is None else np.tile(K, (len(images), 1, 1))
+    cameras = Cameras(tuple(images), eyes, intrinsics, sizes)
     split = {name: "test" if name in test else "train" for name in images}
     none = np.zeros((0, 3), np.float32)
     Scene(folder, "set/scene", "metre", cameras, split, none, none.astype(np.uint8), np.eye(4)).save()

@@ -8,9 +8,17 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.world.objects.builder import NEIGHBOUR_CONTRAST, PARENT_CONTRAST, Builder
 from hilsplat.world.objects.catalogue import CLASSES, TABLETOP, build_object
-from hilsplat.world.paints import COLOURS, KINDS, TEXTURES, Paint, PaintBox, colour_word, lab_from_srgb
+from hilsplat.world.paints import (
+    COLOURS,
+    KINDS,
+    TEXTURES,
+    PaintBox,
+    colour_word,
+    lab_from_srgb,
+    srgb_from_linear,
+)
 from hilsplat.world.scenes.kinds import build_scene
-from hilsplat.world.shapes import Mesh, box, cylinder, disc, extrude, loft, ring, sphere, sweep
+from hilsplat.world.shapes import Mesh, box, cylinder, extrude, loft, ring, sphere, sweep
 from hilsplat.world.textures import pattern
 
 SIZES = {"tabletop": (0.0, np.inf), "room": (0.3, 2.7), "street": (0.5, 16)}
@@ -44,7 +52,6 @@ def square(half, z):
         (sphere(1.0, segments=64), 4 / 3 * np.pi),
         (extrude([(0, 0), (1, 0), (0, 1)], 2.0), 1.0),
         (extrude([(0, 0), (0, 1), (1, 0)], 2.0), 1.0),
-        (disc(1.0, 0.0, 1.0, segments=256), np.pi),
         (ring(1.0, 0.25, segments=128), 2 * np.pi**2 * 0.25**2),  # Pappus; its tube has 12 sides, see below
         (ring(1.0, 0.25, axis="x", segments=128), 2 * np.pi**2 * 0.25**2),
         # A frustum of squares with sides 2 and 1 and height 3: h / 3 * (A + B + sqrt(A * B)) = 7.
@@ -96,8 +103,7 @@ def test_no_text_names_two_kinds_of_node():
 def seen_lab(materials, rows):
     """L*a*b* from afar of materials, from the numbers that the shader gets."""
     share = np.array([[TEXTURES[KINDS[int(kind)]].second_share] for kind in materials[rows, 0]])
-    values = (1 - share) * materials[rows, 1:4] + share * materials[rows, 4:7]
-    return lab_from_srgb(np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055))
+    return lab_from_srgb(srgb_from_linear((1 - share) * materials[rows, 1:4] + share * materials[rows, 4:7]))
 
 
 def main_materials(model, chosen):
@@ -157,11 +163,7 @@ def test_colour_words_match_the_average_colour():
             paint = box_of_paints.draw(group)
             assert colour_word(paint.seen) == paint.colour
             assert colour_word(paint.paled(0.4).seen) == paint.paled(0.4).colour
-
-
-def test_shades_are_darker_below_1_and_lighter_above():
-    paint = Paint("red", "mottled", (0.7, 0.2, 0.2), (0.5, 0.1, 0.1), 9.0, 0.0, 1.0, 0.0, (0.0, 0.0, 0.0))
-    assert paint.shaded(0.5).seen.max() < paint.seen.max() < paint.shaded(1.5).seen.max() <= 0.95
+            assert paint.shaded(0.5).seen.max() < paint.seen.max() < paint.shaded(1.5).seen.max() <= 0.95
 
 
 def test_synonyms_contain_aliases_attributes_and_relations():
@@ -175,11 +177,9 @@ def test_synonyms_contain_aliases_attributes_and_relations():
 
 
 def test_synonyms_of_street_objects_include_the_waymo_class():
-    classes = dict.fromkeys(("car", "truck", "bus"), "vehicle") | dict.fromkeys(
-        ("tree", "bush"), "vegetation"
-    )
-    for name, waymo_class in (classes | {"traffic sign": "sign"}).items():
-        assert waymo_class in built(name, "street").nodes[0].synonyms
+    names = {"vehicle": ("car", "truck", "bus"), "vegetation": ("tree", "bush"), "sign": ("traffic sign",)}
+    for waymo_class, objects in names.items():
+        assert all(waymo_class in built(name, "street").nodes[0].synonyms for name in objects)
 
 
 def test_the_error_about_an_unknown_class_lists_the_known_ones():

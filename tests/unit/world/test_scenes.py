@@ -51,14 +51,11 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another(kind):
 def test_placed_objects_do_not_intersect_and_stand_on_the_table():
     for seed in range(100, 103):
         scene = build_scene("tabletop", seed, 7)
-        points = {
-            thing.node: scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
-            for thing in scene.placed
-        }
         for thing in scene.placed:
-            away = np.linalg.norm(points[thing.node][:, :2] - np.array(thing.centre_xy), axis=1)
+            points = scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
+            away = np.linalg.norm(points[:, :2] - np.array(thing.centre_xy), axis=1)
             assert away.max() == pytest.approx(thing.footprint, abs=1e-4)
-            assert points[thing.node][:, 2].min() == pytest.approx(0, abs=1e-6)
+            assert points[:, 2].min() == pytest.approx(0, abs=1e-6)
             assert np.linalg.norm(thing.centre_xy) < TABLE_RADIUS
         for a, b in itertools.combinations(scene.placed, 2):
             # Disjoint circles from above: whatever their shapes, the objects cannot meet.

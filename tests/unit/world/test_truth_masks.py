@@ -1,5 +1,4 @@
-"""Faults in true masks occur at their rates, systematic faults repeat across views, and the diagnostic
-segmenter that applies them is deterministic and runs only on request."""
+"""Faults in true masks occur at their rates, and the segmenter that applies them runs only on request."""
 
 import itertools
 
@@ -17,12 +16,9 @@ from hilsplat.base.artifacts import (
 from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
-from hilsplat.cli import stage as around
 from hilsplat.cli import stage_commands
 from hilsplat.configuration import parse_section
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
-from hilsplat.scene.cameras import Cameras
-from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import PerturbSettings
 from hilsplat.world.truth_masks import (
@@ -38,6 +34,7 @@ from hilsplat.world.truth_masks import (
     run_truth_masks,
     sibling_borders,
 )
+from tests.unit.segment.handmade import save_scene
 
 EXACT = PerturbSettings(
     **{fault: (0, 0, 0) if fault.startswith("missing") else 0 for fault in FAULTS}, score_noise=0
@@ -69,9 +66,9 @@ def row_of_objects(objects: int = OBJECTS) -> tuple[np.ndarray, TrueNodes]:
 LABELS, TRUTH = row_of_objects()
 
 
-def with_faults(view="000.png", seed=0, min_area_px=1, **faults):
+def with_faults(view="000.png", min_area_px=1, **faults):
     settings = EXACT.model_copy(update=faults)
-    return faulty_masks(LABELS, TRUTH, view, Draws(seed, "set/scene"), settings, min_area_px)
+    return faulty_masks(LABELS, TRUTH, view, Draws(0, "set/scene"), settings, min_area_px)
 
 
 def regions(masks, level) -> set[bytes]:
@@ -83,10 +80,10 @@ def true_regions(level, skip=(), labels=LABELS) -> set[bytes]:
     return {(of_level == node).tobytes() for node in np.unique(of_level) if node >= 0 and node not in skip}
 
 
-def within_binomial_bounds(successes: int, trials: int, probability: float) -> bool:
-    """Four standard deviations: wrong once in 16,000."""
+def binomial(trials: int, probability: float):
+    """The expected number, with four standard deviations: wrong once in 16,000."""
     sigma = np.sqrt(trials * probability * (1 - probability))
-    return abs(successes - trials * probability) <= 4 * sigma
+    return pytest.approx(trials * probability, abs=4 * sigma)
 
 
 def test_surroundings_can_be_omitted_and_small_regions_give_no_mask():
@@ -99,8 +96,7 @@ def test_surroundings_can_be_omitted_and_small_regions_give_no_mask():
 
 def test_only_siblings_have_common_borders():
     borders = sibling_borders(LABELS[1], TRUTH)
-    assert borders[1] == {2: 4}
-    assert borders[2] == {1: 4}
+    assert borders[1] == {2: 4} and borders[2] == {1: 4}
     assert sibling_borders(LABELS[0], TRUTH) == {}  # the floor touches every object
     assert TRUTH.partner == {node: node + (1 if node % 3 == 1 else -1) for node in borders}
     assert longest_border({7: 3, 5: 9, 4: 9}) == 4
@@ -119,7 +115,7 @@ def test_only_siblings_have_common_borders():
 def test_faults_occur_at_their_rates(fault, settings, trials, probability):
     views = [with_faults(f"{view:03d}.png", **settings) for view in range(12)]
     counts = sum(counts[fault] for _, counts in views)
-    assert within_binomial_bounds(counts, 12 * trials, probability)
+    assert counts == binomial(12 * trials, probability)
     if fault == "missing":
         assert sum(3 * OBJECTS + 1 - len(masks) for masks, _ in views) == counts
 
@@ -158,7 +154,7 @@ def test_a_wrong_level_is_one_step_away():
     masks, _ = with_faults(wrong_level=1)
     # Every whole becomes a part; about half of the parts become wholes, the others subparts.
     assert len(masks.rows_of(Level.PART)) == OBJECTS + 1
-    assert within_binomial_bounds(len(masks.rows_of(Level.WHOLE)), 2 * OBJECTS, 0.5)
+    assert len(masks.rows_of(Level.WHOLE)) == binomial(2 * OBJECTS, 0.5)
     assert len(masks.rows_of(Level.WHOLE)) + len(masks.rows_of(Level.SUBPART)) == 2 * OBJECTS
     assert [beside(Level.SUBPART, up) for up in (True, False)] == [Level.PART, Level.PART]
 
@@ -174,8 +170,8 @@ def test_views_and_levels_are_dropped_at_their_rates():
         without_parts += counts["missing_levels"]
         expected = 0 if counts["dropped"] else 2 if counts["missing_levels"] else 4
         assert len(masks) == expected
-    assert within_binomial_bounds(dropped, 150, 0.25)
-    assert within_binomial_bounds(without_parts, 150, 0.75 * 0.4)
+    assert dropped == binomial(150, 0.25)
+    assert without_parts == binomial(150, 0.75 * 0.4)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +190,7 @@ def test_a_systematic_fault_repeats_in_its_share_of_the_views(fault, level, rate
         found += [(of_level == node).tobytes() in parts for node in nodes]
     times = found if fault == "merge" else views - found
     assert 0 < (times > 0).sum() < len(nodes)
-    assert within_binomial_bounds(int((times > 0).sum()), len(nodes), rate)
+    assert (times > 0).sum() == binomial(len(nodes), rate)
     # A pair whose parts are both drawn merges more often, never less: four deviations below 0.9.
     assert (times[times > 0] >= 0.9 * views - 4 * np.sqrt(views * 0.09)).all()
 
@@ -226,7 +222,7 @@ def test_a_larger_amplitude_lowers_the_iou_and_changes_more_pixels(seed):
     rough = [displaced(mask, a, 6, np.random.default_rng(seed)) for a in (0, 0.5, 1, 2, 4, 8)]
     assert np.array_equal(rough[0], mask)
     ious = [(mask & each).sum() / (mask | each).sum() for each in rough]
-    assert all(more < less for less, more in itertools.pairwise(ious))
+    assert (np.diff(ious) < 0).all()
     for less, more in itertools.pairwise(rough):  # what a small amplitude changed, a large one does
         assert not ((less ^ mask) & ~(more ^ mask)).any()
 
@@ -262,14 +258,8 @@ def shifted(view: int) -> np.ndarray:
 @pytest.fixture
 def world(tmp_path):
     """A posed scene, its last view for testing, and its truth."""
-    size_hw = LABELS.shape[1:]
-    poses, K = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(3), (3, 1, 1))
-    cameras = Cameras(NAMES, poses, K, np.tile(np.int32(size_hw), (3, 1)))
-    for name in NAMES:
-        write_png(tmp_path / "scene" / "images" / name, np.zeros((*size_hw, 3), np.uint8))
-    split = dict.fromkeys(NAMES, "train") | {NAMES[-1]: "test"}
-    points, colours = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    Scene(tmp_path / "scene", "synthetic/cups", "metre", cameras, split, points, colours, np.eye(4)).save()
+    black = np.zeros((*LABELS.shape[1:], 3), np.uint8)
+    save_scene(tmp_path / "scene", dict.fromkeys(NAMES, black), test=NAMES[-1:])
     labels = {name: dict(zip(LEVELS, shifted(view), strict=True)) for view, name in enumerate(NAMES)}
     write_hierarchy(tmp_path / "truth", TRUTH.nodes, labels, dict.fromkeys(NAMES, range(len(TRUTH.nodes))))
     write_json(tmp_path / "truth" / "scene.json", {"background": sorted(TRUTH.background)})
@@ -277,8 +267,8 @@ def world(tmp_path):
     return tmp_path
 
 
-def make(world, out="masks", settings=EXACT, threads=1, min_area_px=1):
-    run_truth_masks(world / "scene", world / "truth", world / out, settings, min_area_px, threads)
+def make(world, out="masks", settings=EXACT, threads=1):
+    run_truth_masks(world / "scene", world / "truth", world / out, settings, 1, threads)
     return world / out
 
 
@@ -295,19 +285,16 @@ def test_without_faults_every_true_region_of_every_training_view_is_a_mask(world
         assert not any(index["views"][name]["faults"].values())
 
 
-def test_the_index_records_segmenter_and_faults(world):
-    index = read_index(make(world, settings=PerturbSettings(merge=0.5, seed=7)))
-    assert (index["segmenter"], index["model"]) == ("truth-perturbed", None)
-    assert index["label"] == "truth-perturbed (seed 7, merge 0.5)"
-    assert index["perturb"]["merge"] == 0.5
-
-
 def test_the_same_faults_give_the_same_bytes_on_any_number_of_threads(world):
     settings = PerturbSettings(merge=0.5, split=0.5, boundary_px=2.0)
-    digests = {sha256_of_path(make(world, f"masks-{run}", settings, run)) for run in (1, 3)}
-    assert len(digests) == 1
-    other = make(world, "masks-other", settings.model_copy(update={"seed": 1}))
-    assert sha256_of_path(other) not in digests
+    folders = [make(world, f"masks-{threads}", settings, threads) for threads in (1, 3)]
+    assert sha256_of_path(folders[0]) == sha256_of_path(folders[1])
+    other = make(world, "masks-other", settings.model_copy(update={"seed": 7}))
+    assert sha256_of_path(other) != sha256_of_path(folders[0])
+    index = read_index(other)
+    assert (index["segmenter"], index["model"]) == ("truth-perturbed", None)
+    assert index["label"] == "truth-perturbed (seed 7, boundary_px 2.0, merge 0.5, split 0.5)"
+    assert index["perturb"]["merge"] == 0.5
 
 
 def test_labels_list_non_default_settings():
@@ -335,18 +322,16 @@ def test_probabilities_above_1_are_refused():
         parse_section("perturb", '{"missing": [0, 0, 2]}')
 
 
-@pytest.fixture
-def command(world, monkeypatch):
-    """The subcommand `hilsplat masks` without its logging."""
-    monkeypatch.setattr(around, "start_logging", lambda *_, **__: None)
-    return lambda **options: stage_commands.masks(scene=world / "scene", out=world / "out", **options)
+def command(world, settings, **options):
+    """Run `hilsplat masks`."""
+    stage_commands.masks(scene=world / "scene", out=world / "out", settings=settings, **options)
 
 
-def test_the_command_requires_the_truth_and_records_it(world, command):
+def test_the_command_requires_the_truth_and_records_it(world):
     asked = '{"segmenter": "truth-perturbed", "min_area_px": 1}'
     with pytest.raises(HilsplatError, match=r"needs a synthetic scene(.|\n)*--truth results"):
-        command(settings=asked)
-    command(settings=asked, truth=world / "truth", perturb='{"seed": 3}')
+        command(world, asked)
+    command(world, asked, truth=world / "truth", perturb='{"seed": 3}')
     record = read_json(provenance_path(world / "out"))
     assert record["stage"] == "truth_masks"
     assert record["settings"]["perturb"]["seed"] == record["seed"] == 3
@@ -354,7 +339,7 @@ def test_the_command_requires_the_truth_and_records_it(world, command):
 
 
 @pytest.mark.parametrize("segmenter", ["sam", "graph"])
-def test_other_segmenters_refuse_the_truth(world, command, segmenter):
+def test_other_segmenters_refuse_the_truth(world, segmenter):
     with pytest.raises(HilsplatError, match=f"the segmenter {segmenter} must not use the ground truth"):
-        command(settings=f'{{"segmenter": "{segmenter}"}}', truth=world / "truth")
+        command(world, f'{{"segmenter": "{segmenter}"}}', truth=world / "truth")
     assert not (world / "out").exists()
