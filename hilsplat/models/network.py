@@ -93,16 +93,14 @@ class Network:
     ) -> None:
         wrong = [name for name in expected if name not in found]
         wrong += [name for name in found if name not in expected and name not in optional]
-        for name, axes in expected.items():
-            if name in found and not (_fits(found[name].shape, axes) and found[name].type in DTYPES):
+        for name in [name for name in expected if name in found]:
+            item = found[name]
+            if item.type not in DTYPES or (item.shape and not _fits(item.shape, expected[name])):
                 wrong.append(name)
         if wrong:
-            axes_of = {
-                name: ", ".join(str(axis or "any") for axis in axes) for name, axes in expected.items()
-            }
             raise ModelError(
                 f"network {self.path} has unexpected or missing {what}: {', '.join(wrong)}",
-                expected=", ".join(f"{name} ({axes})" for name, axes in axes_of.items()),
+                expected=", ".join(_described(name, axes) for name, axes in expected.items()),
                 found=", ".join(f"{name} {list(item.shape)} {item.type}" for name, item in found.items()),
                 fix=EXPORT_AGAIN,
             )
@@ -115,7 +113,7 @@ class Network:
     def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
         """Run the network once, and return the outputs in the order of the spec.
 
-        A ModelError is raised if the network rejects the inputs, or an output has the wrong number of axes.
+        A ModelError is raised if the network rejects the inputs, or an output has another shape.
         """
         known = {name: value for name, value in feeds.items() if name in self.inputs}
         cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in known.items()}
@@ -128,34 +126,22 @@ class Network:
                 fix="check that preprocessor_config.json belongs to this network",
             ) from error
         for (name, axes), output in zip(self.spec.outputs.items(), outputs, strict=True):
-            if output.ndim != len(axes):
-                raise ModelError(
-                    f"network {self.path} returned {name} of shape {output.shape}",
-                    expected=f"{len(axes)} axes",
-                    fix=EXPORT_AGAIN,
-                )
+            if not _fits(output.shape, axes):
+                problem = f"network {self.path} returned {name} of shape {output.shape}"
+                raise ModelError(problem, expected=_described(name, axes), fix=EXPORT_AGAIN)
         return [output.astype(np.float32, copy=False) for output in outputs]
 
 
 def _fits(shape: Sequence[Any], axes: Axes) -> bool:
-    """Return whether a declared shape, which may be empty or contain names, is compatible with these axes."""
-    if not shape:
-        return True
+    """Return whether a shape, which may contain names, is compatible with these axes."""
     return len(shape) == len(axes) and all(
         axis is None or not isinstance(length, int) or axis == length
         for length, axis in zip(shape, axes, strict=True)
     )
 
 
-def require_three_heads(path: Path, iou_scores: np.ndarray, pred_masks: np.ndarray) -> None:
-    """Raise a ModelError unless a decoder returned three masks per prompt."""
-    if iou_scores.shape[2] != 3 or pred_masks.shape[2] != 3:
-        raise ModelError(
-            f"decoder {path} does not return three masks per prompt",
-            expected="iou_scores (images, prompts, 3) and pred_masks (images, prompts, 3, h, w)",
-            found=f"{iou_scores.shape} and {pred_masks.shape}",
-            fix="export it with multimask output",
-        )
+def _described(name: str, axes: Axes) -> str:
+    return f"{name} ({', '.join(str(axis or 'any') for axis in axes)})"
 
 
 def require_one_space(folder: Path, image_numbers: int | None, text_numbers: int | None) -> None:

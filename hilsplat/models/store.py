@@ -19,8 +19,6 @@ from hilsplat.models.layouts import LAYOUTS, layout_of
 
 MODELS = Path("models")
 """Folder of a project's own models, relative to the working directory of a command or run."""
-FOLDER_VARIABLE = "HILSPLAT_MODELS"
-"""Environment variable with the path of `user_models`."""
 AUTO = "auto"
 """Setting value that selects a pretrained model if one is installed."""
 EMBEDDED = {"sam": "models/sam-tiny", "clip": "models/clip-tiny"}
@@ -95,8 +93,8 @@ def read_model(folder: Path) -> PresentModel | None:
 
 
 def user_models() -> Path:
-    """Return the folder of downloaded models, which all projects of a user share."""
-    named = os.environ.get(FOLDER_VARIABLE)
+    """Return the folder of downloaded models, shared by all projects of a user."""
+    named = os.environ.get("HILSPLAT_MODELS")
     return Path(named).expanduser() if named else platformdirs.user_data_path("hilsplat") / "models"
 
 

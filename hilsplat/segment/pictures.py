@@ -21,6 +21,8 @@ GOLDEN = 0.6180339887498949
 """Hue step between rows: the golden ratio gives consecutive rows clearly different colours."""
 UNCOVERED = 0.35  # brightness of pixels without a mask
 THUMB_PX = 56  # side of a mask's crop in the tree picture
+MAX_LEAVES = 12  # rows of crops in the tree picture
+MIN_SIDE_PX = 384  # smaller images are enlarged for the masks picture
 
 
 def row_colours(number: int) -> UInt8[np.ndarray, "n 3"]:
@@ -46,11 +48,9 @@ def paint_level(
     return painted.astype(np.uint8)
 
 
-def masks_picture(
-    image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, min_side_px: int = 384
-) -> UInt8[np.ndarray, "h w 3"]:
+def masks_picture(image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks) -> UInt8[np.ndarray, "h w 3"]:
     """Draw a view and its three levels side by side, with the number of masks of each level."""
-    factor = max(1, -(-min_side_px // max(image.shape[:2])))
+    factor = max(1, -(-MIN_SIDE_PX // max(image.shape[:2])))
     panels = {"photo": image}
     for level in LEVELS:
         panels[f"{level.label}: {len(masks.rows_of(level))}"] = paint_level(image, masks, level)
@@ -64,15 +64,12 @@ def masks_picture(
 
 
 def tree_picture(
-    image: UInt8[np.ndarray, "H W 3"],
-    masks: HierarchicalMasks,
-    parent: Int32[np.ndarray, " M"],
-    max_leaves: int = 12,
+    image: UInt8[np.ndarray, "H W 3"], masks: HierarchicalMasks, parent: Int32[np.ndarray, " M"]
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the largest coverage trees of a view: roots at the left, children to the right.
 
     Each mask is shown as a crop, dimmed outside the mask and framed in its `masks_picture` colour. Trees that
-    don't fit into `max_leaves` rows are omitted.
+    don't fit into `MAX_LEAVES` rows are omitted.
     """
     children: dict[int, list[int]] = {}
     for row, above in enumerate(parent.tolist()):
@@ -87,14 +84,14 @@ def tree_picture(
     def height(row: int) -> int:
         return 1 + max(map(height, children.get(row, [])), default=0)
 
-    shown, left = [], max_leaves
+    shown, left = [], MAX_LEAVES
     for root in sorted(children.get(NONE, []), key=lambda row: (-nodes(row), row)):
         if leaves(root) <= left:
             shown.append(root)
             left -= leaves(root)
     step_x, step_y = 2 * THUMB_PX, THUMB_PX + 6
     columns = max(map(height, shown), default=1)
-    canvas = np.full((max(1, max_leaves - left) * step_y + 6, columns * step_x, 3), 255, np.uint8)
+    canvas = np.full((max(1, MAX_LEAVES - left) * step_y + 6, columns * step_x, 3), 255, np.uint8)
     palette = row_colours(len(masks))
 
     def draw(row: int, depth: int, top: int) -> int:

@@ -24,7 +24,7 @@ from hilsplat.base.processes import in_order
 from hilsplat.models.folder import ModelFolder, open_model_folder, side_px
 from hilsplat.models.int8 import CHECKED_GRID, agreement_of_masks, considers_int8, int8_network, use_int8
 from hilsplat.models.layouts import DECODER, PREVIEW
-from hilsplat.models.network import Network, execution_providers, require_three_heads
+from hilsplat.models.network import Network, execution_providers
 from hilsplat.models.onnx_graph import with_rowwise_attention
 from hilsplat.segment.decoder_weights import DecoderGraph
 from hilsplat.segment.factored_decoder import HEADS_PER_ATTENTION, PROMPTS, FactoredDecoder, ImageTerms
@@ -304,7 +304,6 @@ def ask_network(
         input_boxes=np.zeros((1, 0, 4)),
         **features,
     )
-    require_three_heads(decoder.path, scores, logits)
     return scores[0], logits[0]
 
 
@@ -329,10 +328,10 @@ def largest_difference(factored: FactoredDecoder, decoder: Network, side_px: int
     features = {}
     for name in decoder.spec.inputs:
         if name.startswith("image_"):
-            shape = [decoder.fixed_axis(name, axis) for axis in (1, 2, 3)]
-            if None in shape:
+            shape = [decoder.fixed_axis(name, axis) or 0 for axis in (1, 2, 3)]
+            if 0 in shape:
                 raise ModelError(f"{decoder.path.name} declares no shape for input {name}")
-            features[name] = rng.standard_normal((1, *shape), np.float32)  # type: ignore[arg-type]
+            features[name] = rng.standard_normal((1, *shape), np.float32)
     points = rng.uniform(0, side_px, (CHECKED_PROMPTS, 2))
     iou, logits = ask_network(decoder, features, points[:, None])
     own_iou, own_logits, _ = factored.decode(factored.image(features), points, fine=True)

@@ -11,7 +11,8 @@ import pytest
 from onnx import TensorProto, helper
 
 from hilsplat.base.errors import ModelError
-from hilsplat.models.network import require_one_space, require_three_heads
+from hilsplat.models.layouts import NetworkSpec
+from hilsplat.models.network import Network, require_one_space
 from hilsplat.segment.sam import SamModel
 from tests.unit.segment.handmade import save_network, tensor, write_disc_sam
 
@@ -101,8 +102,13 @@ def test_missing_and_unsuitable_networks_are_refused(own_sam, change: Callable[[
 
 
 def test_networks_with_undeclared_shapes_are_checked_when_they_run(tmp_path):
-    with pytest.raises(ModelError, match="three masks per prompt"):
-        require_three_heads(tmp_path, np.zeros((1, 1, 4)), np.zeros((1, 1, 4, 2, 2)))
+    path, either = tmp_path / "network.onnx", ["rows", "columns"]
+    same = helper.make_node("Identity", ["x"], ["y"])
+    save_network(path, [same], [tensor("x", either)], [tensor("y", either)], {})
+    network = Network(path, NetworkSpec({"x": (None, None)}, {"y": (None, 3)}))
+    network(x=np.zeros((1, 3)))
+    with pytest.raises(ModelError, match=r"returned y of shape \(1, 4\)\n  expected  y \(any, 3\)"):
+        network(x=np.zeros((1, 4)))
     require_one_space(tmp_path, 512, None)
     with pytest.raises(ModelError, match=r"do not belong together(.|\n)*512(.|\n)*768"):
         require_one_space(tmp_path, 512, 768)
