@@ -17,13 +17,13 @@ from jaxtyping import Bool
 from hilsplat.annotate.labels import Label, traced
 from hilsplat.base.artifacts import read_index
 from hilsplat.base.errors import SettingsError
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS, NONE, Level
 from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.query.names import read_names
-from hilsplat.query.scene_views import ViewStore
+from hilsplat.query.scene_views import ViewStore, heaviest_node
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks
-from hilsplat.segment.sam import HEADS, SamModel, enlarged
+from hilsplat.segment.sam import HEADS, SamModel, enlarged, point_grid
 from hilsplat.segment.suppression import box_iou
 from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.splat.gaussians import Gaussians
@@ -98,13 +98,10 @@ class Proposals:
         found = []
         for level in LEVELS:
             nodes = self.tree.node_of_gaussian[:, level.index]
-            share = np.bincount(nodes[row.indices] + 1, row.data, minlength=1)  # entry 0: without a node
-            share[0] = 0
-            node = int(share.argmax()) - 1
-            if node < 0:
-                continue
-            mask = weights @ (nodes == node).astype(np.float32) > 0.5
-            found.append((f"node {node}", self.names.get(node, ""), level, mask.reshape(size_hw)))
+            node, _ = heaviest_node(nodes[row.indices], row.data)
+            if node != NONE:
+                mask = weights @ (nodes == node).astype(np.float32) > 0.5
+                found.append((f"node {node}", self.names.get(node, ""), level, mask.reshape(size_hw)))
         return _proposals(found)
 
     def _masks_at(self, view: str, x: int, y: int) -> list[Proposal]:
@@ -144,12 +141,11 @@ class Proposals:
             )
         size_hw = self.scene.cameras[view].size_hw
         masks = {label.id: label.mask(size_hw) for label in known.get(view, ())}
-        evidence: dict[int, list[tuple[str, Label]]] = {number: [] for number in ids}
+        evidence: dict[int, list[tuple[str, Label]]] = {}
         for other, labels in known.items():
             for label in labels:
-                if other != view and label.id in evidence and label.origin != "proposed":
-                    evidence[label.id].append((other, label))
-        evidence = {number: shown for number, shown in evidence.items() if shown}
+                if other != view and label.id in ids and label.origin != "proposed":
+                    evidence.setdefault(label.id, []).append((other, label))
         weights, found = self._weights(view), []
         for number, shown in sorted(evidence.items(), key=lambda item: item[1][0][1].level):
             label = shown[0][1]
@@ -158,11 +154,9 @@ class Proposals:
             belongs, seen = self._members(shown)
             part, all_seen = weights @ belongs, weights @ seen
             mask = ((part > 0.5 * all_seen) & (all_seen > LEAST_SEEN)).reshape(size_hw)
-            if label.parent is not None:
-                mask &= masks[label.parent]
-            if (mask := cleaned(mask)).any():
-                if label.parent is not None:
-                    mask &= masks[label.parent]
+            inside = True if label.parent is None else masks[label.parent]
+            mask = cleaned(mask & inside) & inside
+            if mask.any():
                 masks[number] = mask
                 found.append((label, traced(mask)))
         return found
@@ -273,7 +267,8 @@ class Clicks:
                 expected=f"a click or box on the object, x <= {width}, y <= {height}",
             )
         encoded = self.encoded(view)
-        asked = points[inside] if clicks else _grid(corners)
+        sides = corners[2:] + 1 - corners[:2]
+        asked = points[inside] if clicks else corners[:2] + point_grid(BOX_GRID) * sides
         iou, logits = self.model.decode(encoded, asked)
         iou, logits = iou.reshape(-1), logits.reshape(-1, *logits.shape[2:])
         if len(clicks) > 1:  # decode all clicks as one prompt, too
@@ -300,13 +295,6 @@ class Clicks:
             for row, level in kept.items()
             if (mask := cleaned(masks[row])).any()
         ]
-
-
-def _grid(box: np.ndarray) -> np.ndarray:
-    """Return points inside a box, (BOX_GRID**2, 2)."""
-    steps = (np.arange(BOX_GRID) + 0.5) / BOX_GRID
-    x, y = np.meshgrid(box[0] + steps * (box[2] + 1 - box[0]), box[1] + steps * (box[3] + 1 - box[1]))
-    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _iou(one: Bool[np.ndarray, "H W"], other: Bool[np.ndarray, "H W"]) -> float:

@@ -207,9 +207,7 @@ class LanguageScene(FieldScene):
         Raises:
             SettingsError: there is no such node.
         """
-        if not 0 <= node < len(self.tree):
-            raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(self.tree) - 1}")
-        same = self.tree.nodes_of(Level(int(self.tree.level[node])))
+        same = self.tree.nodes_of(Level(int(self.tree.level[self.existing_node(node)])))
         return self._nearest(self.tree.clip[node], same[same != node], limit)
 
     def like_picture(self, picture: UInt8[np.ndarray, "H W 3"], *, limit: int = 10) -> list[Hit]:
@@ -221,6 +219,12 @@ class LanguageScene(FieldScene):
         if self.encode_picture is None:
             raise ModelError(f"{self.scene.name} was opened without a model that embeds images")
         return self._nearest(self.encode_picture(picture), np.arange(len(self.tree)), limit)
+
+    def existing_node(self, node: int) -> int:
+        """Return the node; raise SettingsError if it does not exist."""
+        if not 0 <= node < len(self.tree):
+            raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(self.tree) - 1}")
+        return node
 
     def _nearest(
         self, vector: Float32[np.ndarray, " C"], nodes: Int64[np.ndarray, " n"], limit: int

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, Level
@@ -172,6 +172,16 @@ class SceneViews:
             for row, values in enumerate(scores):
                 shown.blend(values, float(values[nodes].min()), maps[row, level.index])
         return maps.reshape(len(scores), len(LEVELS), height, width)
+
+
+def heaviest_node(
+    node_of_gaussian: Int32[np.ndarray, " g"], weights: Float[np.ndarray, " g"]
+) -> tuple[int, float]:
+    """Return the node with the largest total weight, and that weight; -1 and 0 if no Gaussian has a node."""
+    total = np.bincount(node_of_gaussian + 1, weights, minlength=1)
+    total[0] = 0  # Gaussians without a node
+    best = int(total.argmax())
+    return best - 1, float(total[best])
 
 
 def upright(cameras: Cameras) -> Float64[np.ndarray, " 3"]:

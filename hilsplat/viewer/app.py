@@ -21,7 +21,7 @@ from hilsplat.scene.finished import FinishedScene
 from hilsplat.viewer import exports, payload, wire
 from hilsplat.viewer.frames import painted, pick
 from hilsplat.viewer.openapi import description
-from hilsplat.viewer.saved_files import SavedFiles, node_of
+from hilsplat.viewer.saved_files import SavedFiles
 from hilsplat.viewer.viewer_scene import ViewerScene
 from hilsplat.web.guard import Guard
 from hilsplat.web.scene_thread import SceneThread
@@ -97,7 +97,7 @@ def _nodes(shown: ViewerScene, of: Mapping[str, Any]) -> bytes:
 
 def _crop(shown: ViewerScene, of: Mapping[str, Any]) -> Response:
     scene = shown.answering(of["variant"])
-    node = node_of(scene, of["node"])
+    node = scene.existing_node(of["node"])
     with shown.unchanged():
         return plain(encoded(exports.crop(scene, node, shown.threads)), "image/jpeg", cached=True)
 

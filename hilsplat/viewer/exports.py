@@ -181,12 +181,13 @@ def encoded_gif(path: Path, frames: Iterable[np.ndarray]) -> Iterator[None]:
     """
     kept = []
     for frame in frames:
-        kept.append(Image.fromarray(frame))
+        kept.append(frame)
         yield
-    sheet = Image.new("RGB", (kept[0].width, kept[0].height * min(len(kept), 8)))
-    for number in range(min(len(kept), 8)):
-        sheet.paste(kept[number * len(kept) // min(len(kept), 8)], (0, number * kept[0].height))
-    palette = sheet.quantize(256)
-    first, *others = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in kept]
+    some = min(len(kept), 8)
+    sheet = np.concatenate([kept[number * len(kept) // some] for number in range(some)])
+    palette = Image.fromarray(sheet).quantize(256)
+    first, *others = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept
+    ]
     duration_ms = round(1000 * STEP["gif"] / FRAMES_PER_S)
     first.save(path, save_all=True, append_images=others, duration=duration_ms, loop=0, optimize=False)

@@ -8,8 +8,10 @@ from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.query.scene_views import heaviest_node
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import Gaussians
+from hilsplat.splat.rasterise.blend import MAX_ALPHA, MIN_TRANSMITTANCE
 from hilsplat.splat.rasterise.cpu import blend_forward, project_gaussians
 from hilsplat.splat.rasterise.project import MIN_ALPHA
 from hilsplat.viewer.wire import Style
@@ -20,8 +22,6 @@ TINT = np.float32(0.35)
 GHOST = np.float32(0.08)
 """Opacity factor of unselected Gaussians in `ghost` mode."""
 
-MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4
 SEEN = 0.05
 """Minimum alpha of a pixel that can be picked."""
 
@@ -134,12 +134,8 @@ def pick(
         return None
     nodes = []
     for level in LEVELS:
-        if node_of_gaussian is None:
-            nodes.append((NONE, 0.0))
-            continue
-        own = node_of_gaussian[rows, level.index]
-        share = np.bincount(own + 1, weights)  # entry 0: without a node
-        share[0] = 0
-        best = int(share.argmax())
-        nodes.append((best - 1 if share[best] > 0 else NONE, float(share[best]) / alpha))
+        node, weight = NONE, 0.0
+        if node_of_gaussian is not None:
+            node, weight = heaviest_node(node_of_gaussian[rows, level.index], weights)
+        nodes.append((node, weight / alpha))
     return {"nodes": nodes, "alpha": alpha, "point": (weights @ gaussians.means[rows] / alpha).tolist()}

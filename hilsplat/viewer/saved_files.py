@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from hilsplat.base.errors import HilsplatError, SettingsError
+from hilsplat.base.errors import HilsplatError
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.splat.gaussians import morton_order
 from hilsplat.viewer import exports, payload, wire
@@ -110,7 +110,7 @@ def _selected(shown: ViewerScene, asked: wire.Selection) -> tuple[LanguageScene,
     scene = shown.answering(asked.variant)
     for group in asked.groups:
         for node in group.nodes:
-            node_of(scene, node)
+            scene.existing_node(node)
     return scene, asked.groups
 
 
@@ -125,10 +125,3 @@ def _step(steps: exports.Steps) -> tuple[int, int] | bytes:
 
 def _line(**values: int | str) -> bytes:
     return as_json(values) + b"\n"
-
-
-def node_of(scene: LanguageScene, node: int) -> int:
-    """Return the requested node; raise SettingsError if it does not exist."""
-    if node >= len(scene.tree):
-        raise SettingsError(f"node {node} does not exist", expected=f"0 to {len(scene.tree) - 1}")
-    return node

@@ -9,8 +9,8 @@ that no form can send.
 import hmac
 import secrets
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs
 
+from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -45,8 +45,7 @@ class Guard:
     def __init__(
         self, app: ASGIApp, token: str, max_body: int = MAX_BODY_BYTES, *, embedded: bool = False
     ) -> None:
-        self.app, self.max_body, self.embedded = app, max_body, embedded
-        self.token = token
+        self.app, self.token, self.max_body, self.embedded = app, token, max_body, embedded
         self.headers = dict(HEADERS)
         if embedded:
             self.headers["content-security-policy"] = CONTENT_POLICY + "frame-ancestors *"
@@ -57,8 +56,8 @@ class Guard:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        headers = Headers(scope=scope)
+        given = QueryParams(scope["query_string"]).get("token", "")
         has_token = hmac.compare_digest(given.encode(), self.token.encode())
         is_opening = scope["path"] == "/" and has_token and not self.embedded
         if self.embedded:
@@ -78,18 +77,15 @@ class Guard:
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                more = dict(self.headers)
+                sent = MutableHeaders(scope=message)
+                sent.update(self.headers)
                 if is_opening:
-                    more["set-cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-                message["headers"] = [
-                    *message["headers"],
-                    *((name.encode(), value.encode()) for name, value in more.items()),
-                ]
+                    sent["set-cookie"] = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             await send(message)
 
         await self.app(scope, receive, send_with_headers)
 
-    def _refusal(self, method: str, headers: dict[str, str], is_opening: bool) -> str:
+    def _refusal(self, method: str, headers: Headers, is_opening: bool) -> str:
         """Return the reason for refusing a request; empty if the request is accepted."""
         host = headers.get("host", "")
         name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
@@ -105,7 +101,7 @@ class Guard:
             return "only the page itself may send requests with a body"
         return self._sent_as_json(method, headers)
 
-    def _sent_as_json(self, method: str, headers: dict[str, str]) -> str:
+    def _sent_as_json(self, method: str, headers: Headers) -> str:
         is_json = headers.get("content-type", "").partition(";")[0].strip() == "application/json"
         return "" if method in ("GET", "HEAD") or is_json else "only JSON is accepted"
 
