@@ -13,23 +13,19 @@ class ClassSet:
 
     Attributes:
         name: name of the set, such as `scannet-19`.
-        source: origin of the list.
         ids: label of each class in the data set's own files.
         texts: query of each class.
     """
 
     name: str
-    source: str
     ids: tuple[int, ...]
     texts: tuple[str, ...]
 
     @staticmethod
-    def of(
-        name: str, source: str, query_of: Mapping[int, str], ids: Iterable[int] | None = None
-    ) -> "ClassSet":
+    def of(name: str, query_of: Mapping[int, str], ids: Iterable[int] | None = None) -> "ClassSet":
         """Return the set of classes with the given ids (default: all), from a data set's queries by id."""
         chosen = tuple(query_of if ids is None else ids)
-        return ClassSet(name, source, chosen, tuple(query_of[label] for label in chosen))
+        return ClassSet(name, chosen, tuple(query_of[label] for label in chosen))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -61,20 +57,10 @@ BENCHMARK_20 = (*range(1, 13), 14, 16, 24, 28, 33, 34, 36, 39)
 """Classes of ScanNet's own benchmark."""
 
 # The sets of 19, 15 and 10 classes are OpenGaussian's (yanmin-wu/OpenGaussian `scripts/eval_scannet.py`); the
-# paper also lists them.
-SCANNET_19 = ClassSet.of(
-    "scannet-19",
-    "OpenGaussian, paper: without otherfurniture",
-    NYU40,
-    [label for label in BENCHMARK_20 if label != 39],
-)
-SCANNET_15 = ClassSet.of(
-    "scannet-15",
-    "OpenGaussian, paper: without picture, refrigerator, shower curtain, bathtub too",
-    NYU40,
-    [label for label in BENCHMARK_20 if label not in (11, 24, 28, 36, 39)],
-)
-SCANNET_10 = ClassSet.of("scannet-10", "OpenGaussian, paper", NYU40, [1, 2, 4, 5, 6, 7, 8, 9, 10, 33])
+# paper also lists them. 19 lacks otherfurniture; 15 also picture, refrigerator, shower curtain and bathtub.
+SCANNET_19 = ClassSet.of("scannet-19", NYU40, [label for label in BENCHMARK_20 if label != 39])
+SCANNET_15 = ClassSet.of("scannet-15", NYU40, [n for n in SCANNET_19.ids if n not in (11, 24, 28, 36)])
+SCANNET_10 = ClassSet.of("scannet-10", NYU40, [1, 2, 4, 5, 6, 7, 8, 9, 10, 33])
 
 SPLITS: dict[str, str] = {
     "head": """
@@ -129,13 +115,9 @@ CLASSES: tuple[tuple[int, str, str], ...] = tuple(
 """Id, name and split of each class, in the benchmark's order (by id)."""
 _NAMES = {label: name for label, name, _ in CLASSES}
 
-SCANNET200 = ClassSet.of("scannet200", "ScanNet200 benchmark", _NAMES)
-SCANNET200_INSTANCES = ClassSet.of(
-    "scannet200-instances",
-    "ScanNet200 benchmark: the 198 without wall and floor",
-    _NAMES,
-    [label for label, name in _NAMES.items() if name not in ("wall", "floor")],
-)
+SCANNET200 = ClassSet.of("scannet200", _NAMES)
+_WITH_INSTANCES = [label for label, name in _NAMES.items() if name not in ("wall", "floor")]
+SCANNET200_INSTANCES = ClassSet.of("scannet200-instances", _NAMES, _WITH_INSTANCES)
 
 
 def splits_of(classes: ClassSet) -> dict[str, tuple[bool, ...]]:
@@ -175,23 +157,17 @@ REPLICA_EVALUATED_51: tuple[int, ...] = (
 _QUERIES = {label: name.replace("-", " ") for label, name in REPLICA_NAMES.items()}
 """Class id -> query: hyphens become spaces. OpenYOLO3D keeps hyphens."""
 
-REPLICA_51 = ClassSet.of("replica-51", "OpenNeRF", _QUERIES, REPLICA_EVALUATED_51)
-# The 48 classes are those of aminebdj/OpenYOLO3D; the paper states the same number.
-REPLICA_48 = ClassSet.of(
-    "replica-48",
-    "OpenYOLO3D, paper: without wall, floor, ceiling",
-    _QUERIES,
-    sorted(set(REPLICA_EVALUATED_51) - {93, 40, 31}),
-)
+REPLICA_51 = ClassSet.of("replica-51", _QUERIES, REPLICA_EVALUATED_51)
+# The 48 classes are those of aminebdj/OpenYOLO3D, without wall, floor and ceiling; the paper states the same
+# number.
+REPLICA_48 = ClassSet.of("replica-48", _QUERIES, sorted(set(REPLICA_EVALUATED_51) - {93, 40, 31}))
 
 _WAYMO = """
     car, truck, bus, other vehicle, motorcyclist, bicyclist, pedestrian, sign, traffic light, pole,
     construction cone, bicycle, motorcycle, building, vegetation, tree trunk, curb, road, lane marker,
     other ground, walkable ground, sidewalk
 """
-WAYMO_22 = ClassSet.of(
-    "waymo-22", "Waymo Open Dataset; queries ours", dict(enumerate(words_of(_WAYMO), start=1))
-)
+WAYMO_22 = ClassSet.of("waymo-22", dict(enumerate(words_of(_WAYMO), start=1)))
 """The 22 classes of Waymo's 3D semantic segmentation; 0 is undefined.
 
 Source: waymo-research/waymo-open-dataset `protos/segmentation.proto`. The benchmark has no text queries, so

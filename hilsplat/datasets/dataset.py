@@ -36,7 +36,6 @@ class Dataset:
         layout: the expected file tree, as user-facing text.
         required: paths that a scene needs.
         open: reads a scene from the data set's folder, as a `LabelledScene` or a `PointScene`.
-        open_part: like `open`, but reads only some of the images, for checks; None to use `open`.
         protocols: protocols of the data set (`evaluate.protocols.cards`), besides those for all image labels.
         label_places: glob patterns of a scene's files that only evaluation reads.
     """
@@ -52,13 +51,12 @@ class Dataset:
     layout: str
     required: Callable[[str], tuple[str, ...]]
     open: Callable[[Path, str], Any]
-    open_part: Callable[[Path, str], Any] | None = None
     protocols: tuple[str, ...] = ()
     label_places: Callable[[str], tuple[str, ...]] = lambda scene: ()
 
     def check(self, root: Path, scene: str) -> SceneReport:
         """Read a whole scene and report what was found."""
-        return (self.open_part or self.open)(root, scene).report()
+        return self.open(root, scene).report()
 
     def missing(self, root: Path, scene: str) -> tuple[str, ...]:
         """Return the required paths of a scene that are missing below the data set's folder `root`."""
@@ -74,28 +72,12 @@ class Dataset:
         root = data_root / self.folder
         if self._has_begun(root):
             return root
-        for deeper in _folders(root):
-            if self._has_begun(deeper):
-                raise SceneError(
-                    f"{self.title} is one level too deep in {root}",
-                    expected=f"scenes in {root}",
-                    found=f"scenes in {deeper}",
-                    fix=f"move the contents of {deeper} one level up",
-                )
-        if self._has_begun(data_root):
-            raise SceneError(
-                f"{data_root} is the folder of {self.title} itself",
-                expected=f"a folder that contains {self.folder}/",
-                fix=f"rename it to {self.folder} if necessary, and set data_root to its parent folder",
-            )
-        for deeper in _folders(data_root):
-            if self._has_begun(deeper / self.folder):
-                raise SceneError(
-                    f"{self.title} is one level too deep in {data_root}",
-                    expected=str(root),
-                    found=str(deeper / self.folder),
-                    fix=f"set data_root to {deeper}",
-                )
+        fixes = dict.fromkeys(_folders(root), f"move its contents to {root}")
+        fixes[data_root] = f"rename it to {self.folder} if necessary, and set data_root to its parent folder"
+        fixes |= {deeper / self.folder: f"set data_root to {deeper}" for deeper in _folders(data_root)}
+        for place, fix in fixes.items():
+            if self._has_begun(place):
+                raise SceneError(f"{self.title} is in the wrong place", expected=root, found=place, fix=fix)
         raise SceneError(
             f"{data_root} does not contain {self.title}",
             expected=f"{root}, containing at least one of: {', '.join(self.scenes[:8])}",

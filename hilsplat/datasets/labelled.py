@@ -213,8 +213,6 @@ def _opened(kind: str, path: Path) -> Iterator[Image.Image]:
     try:
         with open_image(path) as image:
             yield image
-    except FileNotFoundError as error:
-        raise ImageError(f"{kind} {path} is missing") from error
     except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for a damaged PNG
         raise ImageError(
             f"{kind} {path} cannot be read: {error}", fix="replace it with an intact copy"

@@ -3,7 +3,7 @@
 import shutil
 import stat
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -39,28 +39,13 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
         raise SceneError(
             f"{source} is missing", fix="pass a folder of photographs, a video, or a zip of photographs"
         )
-    make: Callable[[Path], list[str]]
-    if videos := _videos_of(source):
-
-        def make(folder: Path) -> list[str]:
-            from hilsplat.photos.video import extract_frames  # PyAV is slow to import
-
-            named = ", ".join(video.name for video in videos)
-            notes = extract_frames(videos, folder, frames)
-            return [f"{len(list_images(folder))} frames of {named} are in {target}", *notes]
-
-    elif source.is_dir():
+    videos = _videos_of(source)
+    if source.is_dir() and not videos:
         beside = list_files(photo_folder(source), VIDEO_SUFFIXES)
         note = f"{len(beside)} videos beside the photographs (Live Photos) are not used"
         yield source, [note] if beside else []
         return
-    elif source.suffix.lower() in (".zip", ".r3d"):
-
-        def make(folder: Path) -> list[str]:
-            unpack_photographs(source, folder)
-            return [f"{source.name} unpacked to {target}"]
-
-    else:
+    if not videos and source.suffix.lower() not in (".zip", ".r3d"):
         raise SceneError(
             f"{source} has an unsupported file type",
             expected=f"a folder of photographs, a video ({', '.join(sorted(VIDEO_SUFFIXES))}), or a .zip",
@@ -70,7 +55,15 @@ def prepared_photographs(source: Path, target: Path, frames: int) -> Iterator[tu
     mark = {"files": files, "frames": frames}
     if not target.exists():
         with atomic_folder(target) as folder:
-            notes = make(folder)
+            if videos:
+                from hilsplat.photos.video import extract_frames  # PyAV is slow to import
+
+                notes = extract_frames(videos, folder, frames)
+                named = ", ".join(video.name for video in videos)
+                notes.insert(0, f"{len(list_images(folder))} frames of {named} are in {target}")
+            else:
+                unpack_photographs(source, folder)
+                notes = [f"{source.name} unpacked to {target}"]
             write_json(folder / MARK, mark)
     elif (target / MARK).is_file() and read_json(target / MARK) == mark:
         notes = [f"{target} already exists, made from the same files"]  # left by a run that was killed

@@ -117,8 +117,7 @@ def parse_isat(path: Path, content: Mapping[str, Any]) -> IsatFile:
             fix="convert labels from other tools (labelme, COCO) to ISAT",
         )
     info: Any = content.get("info")
-    if not isinstance(info, dict):
-        info = {}
+    info = info if isinstance(info, dict) else {}
     size_hw = height, width = info.get("height"), info.get("width")
     if not all(isinstance(side, int) and 0 < side <= LARGEST_SIDE_PX for side in size_hw):
         raise SceneError(
@@ -147,10 +146,6 @@ def _read_object(where: str, entry: Any, size_hw: tuple[int, int], warnings: lis
             f"{where} has no category", found=repr(category), fix="set its category to the query"
         )
     where = f"{where} ({category})"
-    if not isinstance(entry.get("iscrowd", 0), int):  # 0 in some files, false in others
-        raise SceneError(
-            f"{where}: iscrowd is not a number", found=repr(entry["iscrowd"]), fix="set it to 0 or 1"
-        )
     polygons = _polygons(where, entry.get("segmentation"))
     height, width = size_hw
     for polygon in polygons:

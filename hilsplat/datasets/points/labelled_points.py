@@ -129,24 +129,14 @@ def read_json_object(path: Path, keys: tuple[str, ...]) -> dict:
 
 def read_numbers(path: Path, columns: int) -> np.ndarray:
     """Read a text file of numbers, `columns` per line (inf and nan are allowed)."""
-    require_file(path)
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        if not line.strip():
-            continue
-        try:
-            row = [float(word) for word in line.split()]
-        except ValueError:
-            row = []
-        if len(row) != columns:
-            raise SceneError(
-                f"{path}, line {number} cannot be read",
-                expected=f"{columns} numbers",
-                found=line[:80],
-                fix=UNPACK_AGAIN,
-            )
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+    try:
+        rows = np.loadtxt(require_file(path), comments=None, encoding="utf-8", ndmin=2)
+        if rows.shape[1] != columns:
+            raise ValueError(f"{rows.shape[1]} columns")
+    except ValueError as error:
+        expected = f"{columns} numbers per line"
+        raise SceneError(f"{path} cannot be read: {error}", expected=expected, fix=UNPACK_AGAIN) from error
+    return rows
 
 
 def read_matrix(path: Path) -> np.ndarray:

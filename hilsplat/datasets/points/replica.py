@@ -158,12 +158,11 @@ def object_of_vertices(
     """Return the most frequent object of each vertex's faces, -1 if it has none; the lowest id wins ties."""
     corners, owners = faces.reshape(-1).astype(np.int64), np.repeat(object_of_face, faces.shape[1])
     pairs, votes = np.unique(np.stack([corners, owners]), axis=1, return_counts=True)
-    # The last entry of each vertex has the most votes and, among ties, the smallest id.
-    order = np.lexsort((-pairs[1], votes, pairs[0]))
-    vertex, owner = pairs[0][order], pairs[1][order]
-    last = np.flatnonzero(np.append(vertex[1:] != vertex[:-1], True)) if len(vertex) else order
+    # The first pair of each vertex has the most votes and, among ties, the smallest id.
+    pairs = pairs[:, np.lexsort((pairs[1], -votes, pairs[0]))]
+    vertices, first = np.unique(pairs[0], return_index=True)
     result = np.full(num_vertices, -1, dtype=np.int32)
-    result[vertex[last]] = owner[last]
+    result[vertices] = pairs[1, first]
     return result
 
 

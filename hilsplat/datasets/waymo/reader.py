@@ -7,13 +7,12 @@ for float32.
 
 import logging
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hilsplat.base.errors import SceneError
-from hilsplat.datasets.dataset import Dataset, listing
+from hilsplat.datasets.dataset import Dataset, SceneReport, listing
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.waymo import parquet, records
 from hilsplat.datasets.waymo.frames import frame_points, joined_points, shot_image
@@ -103,6 +102,10 @@ def open_segment(root: Path, segment: str, every: int = 1) -> PointScene:
 class Segments(Dataset):
     """A data set for which the paper names no scenes; its scenes are the segments present."""
 
+    def check(self, root: Path, scene: str) -> SceneReport:
+        """Read a segment with only some of its images, and report what was found."""
+        return open_segment(root, scene, every=10).report()
+
     def found(self, root: Path) -> tuple[str, ...]:
         """Return the labelled segments below the folder."""
         found = set()
@@ -140,7 +143,6 @@ DATASET = Segments(
   individual_files_validation_segment-<segment>_with_camera_labels.tfrecord     or release 1.4.3""",
     required=lambda segment: tuple(f"{SPLITS[0]}/{tag}/{segment}.parquet" for tag in parquet.COMPONENTS),
     open=open_segment,
-    open_part=partial(open_segment, every=10),
     protocols=("waymo/segmentation",),
     label_places=lambda segment: (f"*/lidar_segmentation/{segment}.parquet",),
 )

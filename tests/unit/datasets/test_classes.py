@@ -31,7 +31,6 @@ SIZES = (
 def test_ids_and_texts_are_unique(classes, size):
     assert size == len(classes) == len(classes.texts) == len(set(classes.ids)) == len(set(classes.texts))
     assert min(classes.ids) > 0
-    assert classes.source
     assert all(text == text.strip() and "-" not in text for text in classes.texts)
 
 

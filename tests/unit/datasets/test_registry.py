@@ -1,6 +1,7 @@
 """The registry, the search for data sets, the workflow's queries at its start, and the `datasets` command."""
 
 import re
+import shutil
 import types
 from pathlib import Path
 
@@ -46,26 +47,21 @@ def test_published_lists_have_the_published_counts():
         assert set(frames) < set(FRAMES["hi_lerf"][scene])
 
 
-def test_a_folder_one_level_too_deep_is_detected(data_root):
-    moved = (data_root / "lerf_ovs").rename(data_root / "moved")
-    (data_root / "lerf_ovs").mkdir()
-    moved.rename(data_root / "lerf_ovs" / "LERF-OVS")
-    with pytest.raises(SceneError, match=r"one level too deep.*\n.*\n.*scenes in .*LERF-OVS\n.*move"):
-        DATASETS["lerf_ovs"].locate(data_root)
-
-
 @pytest.mark.parametrize(
     ("dataset", "place", "message"),
     [
-        ("lerf_ovs", "data/lerf_ovs", "is the folder of LERF-OVS itself"),
-        ("lerf_ovs", ".", "set data_root to .*/data$"),
+        ("lerf_ovs", "data/lerf_ovs", "wrong place.*fix       rename it to lerf_ovs if necessary, and set"),
+        ("lerf_ovs", ".", "wrong place.*set data_root to .*/data$"),
+        ("lerf_ovs", "deep", "wrong place.*found     .*deep/lerf_ovs/LERF-OVS\n.*move its contents to"),
         ("lerf_mask", "data", r"does not contain LERF-Mask\n.*\n.*lerf_ovs"),
         ("hi_lerf", "data", "does not contain Hi-LERF"),  # although its images, those of LERF-OVS, exist
     ],
 )
 def test_a_wrong_data_root_is_detected(data_root, dataset, place, message):
     (data_root / "hi_lerf").mkdir()
-    with pytest.raises(SceneError, match=message):
+    if place == "deep":
+        shutil.copytree(data_root / "lerf_ovs", data_root.parent / "deep/lerf_ovs/LERF-OVS")
+    with pytest.raises(SceneError, match=f"(?s){message}"):
         DATASETS[dataset].locate(data_root.parent / place)
 
 

@@ -158,7 +158,7 @@ def sequence_with(folder: Path, poses: str) -> Path:
         ),
         (
             lambda at: read_images(sequence_with(at, "1 0 0 0\n")),
-            "line 1 cannot be read\n  expected  16 numbers",
+            "cannot be read: 4 columns\n  expected  16 numbers per line",
         ),
         (
             lambda at: open_scene(at, "room_1"),

@@ -84,7 +84,7 @@ def test_scannet200_is_split_into_head_common_and_tail():
 
 
 def test_class_sets_turn_file_labels_into_rows():
-    classes = ClassSet("c", "here", (7, 3, 1191), ("a", "b", "c"))
+    classes = ClassSet("c", (7, 3, 1191), ("a", "b", "c"))
     found = classes.labels(np.array([3, 7, 1191, 5, 0, -2, 2000]))
     assert found.tolist() == [2, 1, 3, 0, 0, 0, 0]
 
@@ -107,7 +107,7 @@ def test_instance_rows_are_of_all_scans_together():
     assert list(measure_instances("tree", nothing, "nearest")) == []
 
 
-CLASSES = ClassSet("blocks", "drawn", (7, 9), ("chest", "bear"))
+CLASSES = ClassSet("blocks", (7, 9), ("chest", "bear"))
 
 
 def points_of(block_world, count=1):
