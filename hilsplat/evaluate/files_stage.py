@@ -68,7 +68,6 @@ def run_evaluate_files(
     counts as 0, except under the protocol that omits such texts.
 
     Args:
-        out: `scores.csv`; `instances.npz` is written beside it.
         method: name of the program, used as the variant in its rows.
         labels: labels of a published data set, such as "lerf_ovs/figurines".
         truth: alternatively, the ground truth of a synthetic scene, with its posed `scene` (which defines the
@@ -90,7 +89,7 @@ def run_evaluate_files(
         points: Mapping[str, LabelledPoints] = {}
         if truth is not None and scene is not None:
             extra = ExtraProtocols.of_world(kind)
-            if any((predictions / f"{each}.txt").is_file() for each in _files_of(extra.points)):
+            if any((predictions / file).is_file() for card in extra.points for file in _files_of(card)):
                 points = labelled_points(truth.parent, kind)
             else:
                 min_px = min_region_px or EvaluateSettings().min_region_px
@@ -105,19 +104,17 @@ def run_evaluate_files(
                     if regions:
                         image_hw = image_size_hw(known.images[view]) if view in known.images else None
                         views[view] = partial(ViewTruth.of_regions, regions, regions[0].size_hw, image_hw)
-        scores: list[Score] = []
+        rows = list(_mask_rows(predictions, views, extra)) if views else []
         matches: dict[tuple[str, ...], InstanceMatches] = {}
-
-        def keep(view: str, measured: Measured) -> None:
-            scores.append(Score(dataset, name, method, "-", view=view, **vars(measured)))
-
-        for view, row in _mask_rows(predictions, views, extra) if views else ():
-            keep(view, row)
         for each in _point_rows(predictions, points, extra) if points else ():
             if isinstance(each, Measured):
-                keep("", each)
+                rows.append(("", each))
             else:
                 matches[dataset, name, method, "-", METHOD] = each
+        scores = [
+            Score(dataset=dataset, scene=name, variant=method, masks="-", view=view, **vars(row))
+            for view, row in rows
+        ]
         counts["views"], counts["rows"] = len(views), len(scores)
         write_instances(out, matches)
         write_scores(out, scores)
@@ -180,13 +177,11 @@ def _flat_rows(masks: Masks, truth: ViewTruth, extra: ExtraProtocols) -> Iterato
     queries = [query for query in truth.queries if query.level is extra.level]
     flat = [*truth.categories, *truth.absent] if extra.level is None else queries
     for card in extra.flat:
-        if card is cards.OVS_NODES:  # masks from files are not nodes of a tree
-            continue
         if card is cards.OVS_ARGMAX:
             yield from argmax_rows(METHOD, flat, partial(_cosine, masks), words, extra.level is not None)
-            continue
-        for query in flat:
-            yield from _text_rows(card, replace(query, level=None), masks.get(("", query.text)), words)
+        elif card is not cards.OVS_NODES:  # masks from files are not nodes of a tree
+            for query in flat:
+                yield from _text_rows(card, replace(query, level=None), masks.get(("", query.text)), words)
 
 
 def _text_rows(
@@ -224,42 +219,37 @@ def _level_rows(masks: Masks, truth: ViewTruth) -> Iterator[Measured]:
     yield from consistency_rows(METHOD, protocol, truth, mask_of)
 
 
-def _files_of(protocols: Sequence[cards.ProtocolCard]) -> list[str]:
-    """Return the names, without suffix, of the files read under point protocols."""
-    names: list[str] = []
-    for card in protocols:
-        names += ["instances"] if card is cards.INSTANCES else [card.classes, class_set(card.classes)[0]]
-    return list(dict.fromkeys(names))
+def _files_of(card: cards.ProtocolCard) -> list[str]:
+    """Return the names of the files that a point protocol reads; the first that exists is read."""
+    if card is cards.INSTANCES:
+        return ["instances.txt"]
+    return [f"{card.classes}.txt", f"{class_set(card.classes)[0]}.txt"]
 
 
 def _point_rows(
     predictions: Path, truth: Mapping[str, LabelledPoints], extra: ExtraProtocols
 ) -> Iterator[Measured | InstanceMatches]:
     """Yield the rows of points under each protocol whose file exists, and the instance matches."""
-    scored = []
+    is_scored = False
     for card in extra.points:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:
             continue
-        points = truth[labelling]
+        found = [path for file in _files_of(card) if (path := predictions / file).is_file()]
+        if not found:
+            logger.info("%s: not scored: there is no %s", card.name, " or ".join(_files_of(card)))
+            continue
+        is_scored, points = True, truth[labelling]
         if card is cards.INSTANCES:
-            path = predictions / "instances.txt"
-            if path.is_file():
-                yield instance_scan(points, classes, *read_point_instances(path, len(points)))
-                scored.append(card.name)
-            continue
-        own, shared = (predictions / f"{each}.txt" for each in (card.classes, labelling))
-        path = own if own.is_file() else shared
-        if not path.is_file():
-            logger.info("%s: not scored: neither %s nor %s exists", card.name, own.name, shared.name)
-            continue
-        predicted = classes.labels(read_point_classes(path, len(points)))
-        yield from measure_points(card, METHOD, points.labels(classes), predicted, classes, "files")
-        scored.append(card.name)
-    if not scored:
+            yield instance_scan(points, classes, *read_point_instances(found[0], len(points)))
+        else:
+            predicted = classes.labels(read_point_classes(found[0], len(points)))
+            yield from measure_points(card, METHOD, points.labels(classes), predicted, classes, "files")
+    if not is_scored:
+        files = dict.fromkeys(file for card in extra.points for file in _files_of(card))
         raise ArtifactError(
             f"{predictions} has no point labels",
-            expected=" or ".join(f"{each}.txt" for each in _files_of(extra.points)),
+            expected=" or ".join(files),
             fix="write one class id per line, one line per point",
         )
 
@@ -275,7 +265,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
         ArtifactError: the view has neither folder nor file, or both, or a file cannot be used.
     """
     stem = Path(view).stem
-    place, packed = Path(folder) / stem, Path(folder) / f"{stem}.npz"
+    place, packed = folder / stem, folder / f"{stem}.npz"
     if packed.is_file() and place.is_dir():
         raise ArtifactError(
             f"view {stem} has two sets of predictions",
@@ -291,10 +281,8 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
             expected=f"{place}/<text>.png, or {packed.name}",
             fix="write them, or create an empty folder if nothing was found",
         )
-    masks = {}
-    for path in sorted(place.rglob("*.png")):
-        masks[_key(path.relative_to(place).with_suffix("").as_posix())] = _read_png(path)
-    return masks
+    files = sorted(place.rglob("*.png"))
+    return {_key(path.relative_to(place).with_suffix("").as_posix()): _read_png(path) for path in files}
 
 
 def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
@@ -334,7 +322,6 @@ def read_point_instances(
         ArtifactError: a file is missing or malformed.
         MisalignedArtifactError: the number of points in a mask differs.
     """
-    path = Path(path)
     masks, classes, confidences = [], [], []
     for number, line in enumerate(_text(path).splitlines(), 1):
         if not line.strip():
@@ -391,6 +378,6 @@ def _as_mask(array: np.ndarray, where: str) -> Bool[np.ndarray, "h w"]:
 
 def _text(path: Path) -> str:
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ArtifactError(f"{path} cannot be read: {error}", fix="write it as UTF-8 text") from error

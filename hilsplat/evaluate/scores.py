@@ -4,55 +4,49 @@ The official average precision pools the matches of all scans, so a number per s
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilsplat.base.artifacts import read_npz, remake, write_npz
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.tables import write_csv
+from hilsplat.evaluate.metrics.instances import InstanceMatches
 from hilsplat.evaluate.protocols.cards import card_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from hilsplat.evaluate.metrics.instances import InstanceMatches
-
 INSTANCES = "instances.npz"
+
+COLUMNS: tuple[str, ...] = (
+    *("dataset", "scene", "variant", "masks", "method", "view"),
+    *("query", "level", "metric", "protocol", "value", "n"),
+)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One number, without its scene and variant (see `Score`)."""
+    """One number, without its scene and variant."""
 
-    method: str
-    query: str
-    level: str
-    metric: str
-    protocol: str
-    value: float
-    n: int = 1
-
-
-@dataclass(frozen=True)
-class Score:
-    """One number."""
-
-    dataset: str
-    scene: str
-    variant: str
-    masks: str  # origin of the masks, such as `sam-tiny`; see `made_from_truth`
     method: str  # `tree`, `tree-path`, `field`, or `truth` for the annotations' own HC
-    view: str
     query: str  # empty if the number describes a whole view
     level: str  # of the annotation; empty if the protocol has no levels
     metric: str
     protocol: str  # full name, with non-default settings (`protocols.cards`)
     value: float
-    n: int  # number of items averaged
+    n: int = 1  # number of items averaged
 
 
-COLUMNS: tuple[str, ...] = tuple(field.name for field in fields(Score))
+@dataclass(frozen=True, kw_only=True)
+class Score(Measured):
+    """One row of a score file."""
+
+    dataset: str
+    scene: str
+    variant: str
+    masks: str  # origin of the masks, such as `sam-tiny`; see `made_from_truth`
+    view: str
 
 
 def write_scores(path: Path, scores: Iterable[Score]) -> None:
@@ -89,13 +83,11 @@ def read_scores(paths: Iterable[Path]) -> "pd.DataFrame":
                 fix=remake(path),
             )
         frames.append(frame)
-    if not frames:
-        frames.append(pd.DataFrame(columns=list(COLUMNS), dtype=str))
-    scores = pd.concat(frames, ignore_index=True)
+    scores = pd.concat([*frames, pd.DataFrame(columns=list(COLUMNS), dtype=str)], ignore_index=True)
     return scores.assign(value=scores["value"].astype(float), n=scores["n"].astype(int))
 
 
-def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMatches"]) -> None:
+def write_instances(scores: Path, matches: Mapping[tuple[str, ...], InstanceMatches]) -> None:
     """Write matches, keyed by (data set, scene, variant, masks, method), beside a score file."""
     arrays = {
         "/".join([*key, name]): array for key, found in matches.items() for name, array in vars(found).items()
@@ -103,10 +95,8 @@ def write_instances(scores: Path, matches: Mapping[tuple[str, ...], "InstanceMat
     write_npz(Path(scores).with_name(INSTANCES), **arrays)
 
 
-def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], "InstanceMatches"]:
+def read_instances(scores: Iterable[Path]) -> dict[tuple[str, ...], InstanceMatches]:
     """Read the matches beside score files, keyed by (data set, scene, variant, masks, method)."""
-    from hilsplat.evaluate.metrics.instances import InstanceMatches
-
     found: dict[tuple[str, ...], dict] = {}
     for path in scores:
         beside = Path(path).with_name(INSTANCES)

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import median_high
 
 import numpy as np
 from jaxtyping import Float64
@@ -37,9 +38,6 @@ MAX_CAMERA_ERROR_M = 0.1
 TIMED_TEXTS = 3
 """Number of timed queries, all in one view."""
 
-MIN_SHARED = 3
-"""Minimum number of shared cameras needed to align ground-truth and scene coordinates."""
-
 Annotations = LabelledScene | PointScene | Path
 """Labels of a published data set, or the ground-truth folder of a synthetic scene."""
 
@@ -65,10 +63,8 @@ def run_evaluate(
     written beside `scores.csv`, which contains only the header if there are neither truth nor labels.
 
     Args:
-        parts: the finished scene; its test views were held out from all earlier stages.
         dataset: data set recorded in every row, as are `scene` and `variant`.
-        truth: ground-truth folder of a synthetic scene.
-        kind: kind of synthetic scene, which determines its benchmarks (`ExtraProtocols.of_world`).
+        truth: ground-truth folder of a synthetic scene, whose `kind` determines its benchmarks.
         labels: labels of published data sets, such as "lerf_ovs/figurines", instead of `truth`.
 
     Raises:
@@ -82,7 +78,9 @@ def run_evaluate(
     label = masks_label(parts.masks)
 
     def keep(data: str, view: str, measured: Measured) -> None:
-        scores.append(Score(data, scene, variant, label, view=view, **vars(measured)))
+        scores.append(
+            Score(dataset=data, scene=scene, variant=variant, masks=label, view=view, **vars(measured))
+        )
 
     with stage_log("evaluate", f"{dataset}/{scene}/{variant}") as counts:
         scored: list[tuple[str, Annotations, ExtraProtocols]] = [
@@ -96,15 +94,16 @@ def run_evaluate(
             answers = LanguageScene.from_parts(parts, settings, threads=threads)
             posed, selections = answers.scene, Selections(answers)
             for data, known, protocols in scored:
-                min_px = settings.min_region_px
-                truths = {} if isinstance(known, PointScene) else truths_of(known, posed, min_px)
-                if not truths and not isinstance(known, PointScene):
-                    logger.warning("no view of %s is annotated: nothing to score", posed.name)
+                truths = {}
+                if not isinstance(known, PointScene):
+                    truths = truths_of(known, posed, settings.min_region_px)
+                    if not truths:
+                        logger.warning("no view of %s is annotated: nothing to score", posed.name)
                 counts[f"views of {data}"] = len(truths)
                 kept: dict[str, PackedMasks] = {}
                 for view in track(list(truths), "views scored"):
-                    of_view, size_hw = truths[view](), posed.cameras[view].size_hw
-                    kept[view] = PackedMasks(size_hw)
+                    of_view = truths[view]()
+                    kept[view] = PackedMasks(posed.cameras[view].size_hw)
                     for row in measure_view(selections, of_view, view, kept[view], settings, protocols):
                         keep(data, view, row)
                     if not seconds and of_view.categories:
@@ -163,15 +162,14 @@ def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, 
     ground-truth units.
 
     Raises:
-        MisalignedArtifactError: fewer than three cameras are shared, or all have the same position.
+        MisalignedArtifactError: fewer than 3 cameras are shared, or all have the same position.
     """
-    known = set(true.names)
-    shared = [name for name in found.names if name in known]
-    if len(shared) < MIN_SHARED:
+    shared = [name for name in found.names if name in true.names]
+    if len(shared) < 3:
         raise MisalignedArtifactError(
             "the ground-truth cameras and the scene's cameras belong to different images",
-            expected=f"at least {MIN_SHARED} shared view names",
-            found=f"{len(shared)}",
+            expected="at least 3 shared view names",
+            found=len(shared),
             fix="evaluate the scene with its own ground-truth folder",
         )
     turns = sum(found[name].cam_from_world[:3, :3].T @ true[name].cam_from_world[:3, :3] for name in shared)
@@ -228,5 +226,5 @@ def time_queries(
             start = time.perf_counter()
             query(text)
             taken.append(time.perf_counter() - start)
-        seconds[method] = shared_s + sorted(taken)[len(taken) // 2]
+        seconds[method] = shared_s + median_high(taken)
     return seconds

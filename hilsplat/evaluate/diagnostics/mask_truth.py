@@ -11,11 +11,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from hilsplat.base.artifacts import read_index
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import stage_log, track
 from hilsplat.base.tables import markdown_table, write_csv
 from hilsplat.datasets.synthetic.hierarchy import HierarchyAnnotations
+from hilsplat.evaluate.diagnostics.world_consistency import load_masks
 from hilsplat.query.pictures import grey, save_png_and_pdf, show
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.masks import HierarchicalMasks, region_ious
@@ -40,22 +40,10 @@ class ViewFit:
 
 
 def fit_of_view(masks: HierarchicalMasks, truth: HierarchyAnnotations, view: str) -> dict[Level, ViewFit]:
-    """Compare masks with the ground-truth regions, level by level.
-
-    Raises:
-        MisalignedArtifactError: masks and labels differ in size.
-    """
+    """Compare masks with the ground-truth regions, level by level."""
     found = {}
     for level in LEVELS:
-        labels = truth.label_image(view, level)
-        if labels.shape != tuple(masks.size_hw):
-            raise MisalignedArtifactError(
-                f"the masks of view {view} do not match the size of its label images",
-                expected=f"{labels.shape[0]} x {labels.shape[1]} (height x width)",
-                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                fix="rerun poses without shrinking the images (poses.max_side_px), then rerun masks",
-            )
-        rows = masks.rows_of(level)
+        labels, rows = truth.label_image(view, level), masks.rows_of(level)
         ids, areas, ious = region_ious(labels, masks.dense(rows))
         scored = areas >= MIN_PX
         best = ious[scored].max(axis=1, initial=0)
@@ -68,14 +56,16 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
     """Write a table of all views and a picture of the median and worst views; return a Markdown table.
 
     The PDF and the CSV table are written beside the PNG.
+
+    Raises:
+        MisalignedArtifactError: masks and labels differ in size.
     """
-    scene, index = Scene.load(scene_folder), read_index(masks_folder)
-    truth = HierarchyAnnotations.load(truth_folder)
+    scene, truth = Scene.load(scene_folder), HierarchyAnnotations.load(truth_folder)
     with stage_log("mask_truth", scene.name) as counts:
-        fits = {
-            view: fit_of_view(HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz"), truth, view)
-            for view in track(list(index["views"]), "views compared")
-        }
+        fits = {}
+        for view in track(list(read_index(masks_folder)["views"]), "views compared"):
+            masks = load_masks(masks_folder, view, truth.label_image(view, Level.WHOLE).shape)
+            fits[view] = fit_of_view(masks, truth, view)
         counts["views"] = len(fits)
         rows = []
         for level in LEVELS:  # means are over regions, not over views
@@ -87,8 +77,7 @@ def run_mask_truth(scene_folder: Path, truth_folder: Path, masks_folder: Path, o
             numbers = [str(len(own)), str(len(best)), f"{iou:.4f}", f"{recall:.4f}"]
             numbers += [f"{number / len(own):.1f}", f"{precision:.4f}"]
             rows.append([scene.name, masks_label(masks_folder), level.label, *numbers])
-        figure = draw_fits(scene, truth, Path(masks_folder), fits, median_and_worst(fits))
-        save_png_and_pdf(figure, out)
+        save_png_and_pdf(draw_fits(scene, truth, masks_folder, fits), out)
         write_csv(Path(out).with_suffix(".csv"), COLUMNS, rows)
     return markdown_table(COLUMNS, rows, 3)
 
@@ -105,20 +94,17 @@ def median_and_worst(fits: Mapping[str, dict[Level, ViewFit]]) -> list[str]:
 
 
 def draw_fits(
-    scene: Scene,
-    truth: HierarchyAnnotations,
-    masks_folder: Path,
-    fits: Mapping[str, dict[Level, ViewFit]],
-    views: list[str],
+    scene: Scene, truth: HierarchyAnnotations, masks_folder: Path, fits: Mapping[str, dict[Level, ViewFit]]
 ) -> Figure:
     """Draw two rows per view: masks by level, then ground-truth regions coloured by their best IoU."""
+    views = median_and_worst(fits)
     tall, wide = 2 * len(views), 1 + len(LEVELS)
     height, width = scene.cameras[views[0]].size_hw
     figure = Figure(figsize=(3.1 * wide, tall * (3.1 * height / width + 0.3)), layout="constrained")
     axes = figure.subplots(tall, wide, squeeze=False)
     for number, view in enumerate(views):
         image = scene.image(view)
-        masks = HierarchicalMasks.load(masks_folder / f"{view}.npz")
+        masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
         above, below = axes[2 * number], axes[2 * number + 1]
         show(above[0], image, f"{view}: {('median view', 'worst view')[number]}")
         for level in LEVELS:

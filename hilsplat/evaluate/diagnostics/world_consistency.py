@@ -1,5 +1,6 @@
 """View consistency of masks and answers on a synthetic scene, measured with the exact geometry."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -43,7 +44,6 @@ MIN_POINTS = 16
 MAX_POINTS = 50_000
 """Maximum number of shared points per pair of views; more are evenly subsampled."""
 
-METHODS = ("field", "tree")
 TEXTS_PER_LEVEL = 4
 """Number of texts per level and view; each is queried in two views."""
 
@@ -187,8 +187,8 @@ def mean_agreement(parts: Sequence[Agreement]) -> Agreement:
         values = [value for part in parts if (value := getattr(part, name)) == value]
         return sum(values) / len(values) if values else np.nan
 
-    shares = (mean(name) for name in ("best_iou", "disagreement", "joined_disagreement"))
-    return Agreement(sum(part.masks for part in parts), *shares)
+    masks = sum(part.masks for part in parts)
+    return Agreement(masks, mean("best_iou"), mean("disagreement"), mean("joined_disagreement"))
 
 
 def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple[str, str]]:
@@ -201,6 +201,19 @@ def neighbours(cameras: Cameras, views: Sequence[str], count: int) -> list[tuple
         nearest = np.argsort(apart, kind="stable")[: min(count, len(views) - 1)]
         pairs += [(view, views[other]) for other in nearest]
     return pairs
+
+
+def load_masks(folder: Path, view: str, size_hw: tuple[int, int]) -> HierarchicalMasks:
+    """Load the masks of a view; raise MisalignedArtifactError if they differ from its labels in size."""
+    masks = HierarchicalMasks.load(Path(folder) / f"{view}.npz")
+    if masks.size_hw != tuple(size_hw):
+        raise MisalignedArtifactError(
+            f"the masks of view {view} do not match the size of its ground truth",
+            expected=f"{size_hw[0]} x {size_hw[1]} (height x width)",
+            found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
+            fix="rerun poses without shrinking the images (poses.max_side_px), then rerun masks",
+        )
+    return masks
 
 
 def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> str:
@@ -222,22 +235,11 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
     annotations = HierarchyAnnotations.load(truth)
     pairs = neighbours(cameras, views, count)
 
-    @lru_cache(maxsize=2 * count + 2)
-    def depth_of(view: str) -> np.ndarray:
-        return mesh.depth(cameras[view])
+    depth_of = lru_cache(maxsize=2 * count + 2)(lambda view: mesh.depth(cameras[view]))
 
     @lru_cache(maxsize=2 * count + 2)
     def loaded(view: str) -> HierarchicalMasks:
-        masks = HierarchicalMasks.load(Path(masks_folder) / f"{view}.npz")
-        expected = cameras[view].size_hw
-        if masks.size_hw != expected:
-            raise MisalignedArtifactError(
-                f"the masks of view {view} do not match the size of its ground-truth camera",
-                expected=f"{expected[0]} x {expected[1]} (height x width)",
-                found=f"{masks.size_hw[0]} x {masks.size_hw[1]}",
-                fix="rerun poses without shrinking the images (poses.max_side_px), then rerun masks",
-            )
-        return masks
+        return load_masks(masks_folder, view, cameras[view].size_hw)
 
     def masks_of(view: str, level: Level) -> Bool[np.ndarray, "M H W"]:
         masks = loaded(view)
@@ -248,14 +250,13 @@ def run_consistency(truth: Path, masks_folder: Path, out: Path, count: int) -> s
         return labels[None] == np.unique(labels[labels >= 0])[:, None, None]
 
     sources = {masks_label(masks_folder): masks_of, TRUTH: regions_of}
-    found: dict[tuple[str, Level], list[Agreement]] = {
-        (name, level): [] for name in sources for level in LEVELS
-    }
+    found = defaultdict[tuple[str, Level], list[Agreement]](list)
     for a, b in pairs:
         pixel_a, pixel_b = shared_points(cameras[a], depth_of(a), cameras[b], depth_of(b))
-        for (name, level), parts in found.items():
-            of_level = sources[name]
-            parts.append(view_agreement(of_level(a, level), of_level(b, level), pixel_a, pixel_b))
+        for name, of_level in sources.items():
+            for level in LEVELS:
+                agreement = view_agreement(of_level(a, level), of_level(b, level), pixel_a, pixel_b)
+                found[name, level].append(agreement)
     rows = []
     for (name, level), parts in found.items():
         one = mean_agreement(parts)
@@ -281,20 +282,21 @@ def measure_world_consistency(
     if not (truth / "mesh.ply").is_file():
         return
     scene, true = selections.scene, Cameras.load(truth / "cameras.npz")
-    mesh = TrueMesh.load(truth / "mesh.ply")
-    known = set(true.names)
-    views = [view for view in scene.scene.cameras.names if view in known]
+    mesh, nothing = TrueMesh.load(truth / "mesh.ply"), PackedMasks((0, 0))
+    views = [view for view in scene.scene.cameras.names if view in true.names]
     nearest = dict(neighbours(true, views, 1))
     pairs = [(view, nearest[view]) for view in truths if view in nearest]
     for number, (a, b) in enumerate(pairs):
         pixel_a, pixel_b = shared_points(true[a], mesh.depth(true[a]), true[b], mesh.depth(true[b]))
         queries = spread(truths[a]().queries, TEXTS_PER_LEVEL)
-        for method in METHODS:
+        for method in ("field", "tree"):
             if method not in settings.methods:
                 continue
             protocol = label_of(VIEW_CONSISTENCY, method, settings)
-            masks_a = answers_in_view(selections, answered.get(a), method, a, queries, settings)
-            masks_b = answers_in_view(selections, answered.get(b), method, b, queries, settings)
+            masks_a, masks_b = (
+                answers_in_view(selections, answered.get(view, nothing), method, view, queries, settings)
+                for view in (a, b)
+            )
             for query, mask_a, mask_b in zip(queries, masks_a, masks_b, strict=True):
                 assert query.level is not None
                 seen_a, seen_b = mask_a.reshape(-1)[pixel_a], mask_b.reshape(-1)[pixel_b]
@@ -319,7 +321,7 @@ def spread(queries: Sequence[Query], per_level: int) -> list[Query]:
 
 def answers_in_view(
     selections: Selections,
-    stored: PackedMasks | None,
+    stored: PackedMasks,
     method: str,
     view: str,
     queries: Sequence[Query],
@@ -332,13 +334,12 @@ def answers_in_view(
         nodes = [selections.nodes((query.text,), query.level, view) for query in queries]
         return [selections.mask(view, ids, size_hw) for ids in nodes]
     keys = [given_key(method, query, settings) for query in queries]
-    known = [stored.get(key) if stored is not None and key in stored else None for key in keys]
-    texts = [query.text for query, mask in zip(queries, known, strict=True) if mask is None]
+    texts = [query.text for query, key in zip(queries, keys, strict=True) if key not in stored]
     missing, rule = list(dict.fromkeys(texts)), rule_of(settings)
     maps = dict(zip(missing, scene.field_relevancy(missing, view), strict=True)) if missing else {}
-    masks = []
-    for query, mask in zip(queries, known, strict=True):
-        if mask is None:
-            mask, _ = relevancy_mask(SmoothedRelevancy.of(maps[query.text], rule), query.level, rule)
-        masks.append(mask)
-    return masks
+    return [
+        stored.get(key)
+        if key in stored
+        else relevancy_mask(SmoothedRelevancy.of(maps[query.text], rule), query.level, rule)[0]
+        for query, key in zip(queries, keys, strict=True)
+    ]

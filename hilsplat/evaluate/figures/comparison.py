@@ -17,6 +17,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import rule_of
 from hilsplat.evaluate.tables.measured import row_name
+from hilsplat.query.field_answers import field_colours
 from hilsplat.query.language_scene import LanguageScene
 from hilsplat.query.pictures import label_left, paint_answer, save_png_and_pdf, show
 from hilsplat.query.scene_views import Opened
@@ -206,23 +207,13 @@ def draw_features(methods: Sequence[Answerer], view: str) -> Figure:
 
 
 def node_image(scene: LanguageScene, view: str, level: Level) -> np.ndarray:
-    """Colour each pixel by its node's CLIP vector, projected on the level's three principal directions."""
-    vectors = scene.tree.clip.astype(np.float64)
+    """Colour each pixel by its node's CLIP vector, as `field_colours` colours features."""
     nodes = scene.tree.nodes_of(level)
-    colours = np.zeros((len(vectors) + 1, 3))
-    if len(nodes):
-        centred = vectors[nodes] - vectors[nodes].mean(axis=0)
-        _, _, directions = np.linalg.svd(centred, full_matrices=False)
-        directions = directions[:3]
-        peak = np.abs(directions).argmax(axis=1)
-        directions = directions * np.sign(directions[np.arange(len(directions)), peak])[:, None]
-        values = centred @ directions.T
-        low, high = np.percentile(values, (2, 98), axis=0)
-        colours[nodes, : len(directions)] = np.clip((values - low) / np.maximum(high - low, 1e-9), 0, 1)
-    weights = scene.view_weights(view)
-    of_gaussian = colours[scene.tree.node_of_gaussian[:, level.index]].astype(np.float32)
+    colours = np.zeros((len(scene.tree) + 1, 3), np.float32)  # the last row is for Gaussians without a node
+    colours[nodes] = field_colours(scene.tree.clip[nodes].astype(np.float32))
+    pixels = scene.view_weights(view) @ colours[scene.tree.node_of_gaussian[:, level.index]]
     height, width = scene.scene.cameras[view].size_hw
-    return (255 * np.clip(weights @ of_gaussian, 0, 1)).astype(np.uint8).reshape(height, width, 3)
+    return (255 * np.clip(pixels, 0, 1)).astype(np.uint8).reshape(height, width, 3)
 
 
 def _grid(

@@ -73,14 +73,14 @@ def match_instances(
     common = np.array(
         [np.bincount(instance_of_point[masks[row]], minlength=len(ids)) for row in kept], dtype=np.int64
     ).reshape(len(kept), len(ids))
-    of_class = np.where(ids >= CLASS_STRIDE, ids // CLASS_STRIDE, 0)
-    void = ~np.isin(of_class, class_ids) | (ids < CLASS_STRIDE)
+    of_class = ids // CLASS_STRIDE
+    void = ~np.isin(of_class, class_ids)
 
     entries: list[tuple[int, int, float, bool]] = []
     misses = np.zeros((len(class_ids), len(OVERLAPS)), dtype=np.int64)
     has_truth = np.zeros(len(class_ids), dtype=bool)
     for class_index, class_id in enumerate(class_ids):
-        own = np.flatnonzero((of_class == class_id) & ~void)
+        own = np.flatnonzero(of_class == class_id)
         large = sizes[own] >= min_points
         predictions = np.flatnonzero(classes[kept] == class_id)
         has_truth[class_index] = large.any()

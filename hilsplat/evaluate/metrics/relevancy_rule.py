@@ -3,7 +3,6 @@
 Source: minghanqin/LangSplat `eval/evaluate_iou_loc.py`; every departure is a field of `RelevancyRule`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -134,14 +133,8 @@ class SmoothedRelevancy:
         """Filter all three levels."""
         side_px = filter_side_px(rule.filter_px, relevancy.shape[1])
         raw = np.asarray(relevancy, np.float32)
-        filtered = np.empty_like(raw)
-        for level in LEVELS:
-            filtered[level.index] = mean_filter(raw[level.index], side_px, rule.border)
-        if not rule.mix:
-            return SmoothedRelevancy(filtered, raw)
-        mixed = filtered + raw
-        mixed *= np.float32(0.5)
-        return SmoothedRelevancy(filtered, mixed)
+        filtered = np.stack([mean_filter(of_level, side_px, rule.border) for of_level in raw])
+        return SmoothedRelevancy(filtered, np.float32(0.5) * (filtered + raw) if rule.mix else raw)
 
 
 def relevancy_mask(
@@ -150,7 +143,7 @@ def relevancy_mask(
     rule: RelevancyRule,
     united: Float[np.ndarray, "3 H W"] | None = None,
 ) -> tuple[Bool[np.ndarray, "H W"], Level]:
-    """Return the mask of a level, or of the level that the rule chooses if `level` is None.
+    """Return the mask of a level, or of the level that the rule chooses if `level` is None; finer wins ties.
 
     `united` is the unfiltered relevancy of another text, whose mask is merged with the first text's mask
     before the majority filter; the level is chosen by the first text alone.
@@ -165,30 +158,14 @@ def relevancy_mask(
     if level is not None:
         return mask_of(level), level
     if rule.level_rule == "max":
-        chosen = _highest(rule.levels, [float(smoothed.mixed[each.index].max()) for each in rule.levels])
+        chosen = max(rule.levels, key=lambda each: (smoothed.mixed[each.index].max(), each))
         return mask_of(chosen), chosen
-    masks = np.zeros(smoothed.mixed.shape, dtype=bool)
-    for each in rule.levels:
-        masks[each.index] = mask_of(each)
-    chosen = level_by_mean_in_mask(smoothed.mixed, masks, rule.levels, rule.empty_wins)
-    return masks[chosen.index], chosen
+    masks = {each: mask_of(each) for each in rule.levels}
 
+    def mean_in_mask(level: Level) -> float:
+        if not masks[level].any():
+            return np.inf if rule.empty_wins else -np.inf
+        return float(smoothed.mixed[level.index][masks[level]].mean())
 
-def level_by_mean_in_mask(
-    relevancy: Float[np.ndarray, "3 H W"],
-    masks: Bool[np.ndarray, "3 H W"],
-    levels: tuple[Level, ...] = LEVELS,
-    empty_wins: bool = False,
-) -> Level:
-    """Return the level with the highest mean relevancy in its mask; empty masks lose unless `empty_wins`."""
-    empty = np.inf if empty_wins else -np.inf
-    means = [
-        float(relevancy[level.index][masks[level.index]].mean()) if masks[level.index].any() else empty
-        for level in levels
-    ]
-    return _highest(levels, means)
-
-
-def _highest(levels: Sequence[Level], scores: Sequence[float]) -> Level:
-    """Return the level with the highest score; the finest wins ties."""
-    return max(zip(scores, levels, strict=True), key=lambda each: (each[0], each[1].index))[1]
+    chosen = max(rule.levels, key=lambda each: (mean_in_mask(each), each))
+    return masks[chosen], chosen

@@ -98,8 +98,8 @@ def mask_rows(
     values = {
         "iou": lambda: masks.iou(mask, query.truth),
         "boundary_iou": lambda: masks.boundary_iou(mask, query.truth),
-        "acc_25": lambda: masks.exceeds(mask, query.truth, 0.25),
-        "acc_50": lambda: masks.exceeds(mask, query.truth, 0.5),
+        "acc_25": lambda: float(masks.iou(mask, query.truth) > 0.25),
+        "acc_50": lambda: float(masks.iou(mask, query.truth) > 0.5),
         "localization_box": lambda: float(masks.hits_a_box(points_xy, query.boxes_xyxy)),
         "localization_mask": lambda: float(masks.hits_the_mask(points_xy, query.truth)),
     }

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilsplat.base.artifacts import write_index
-from hilsplat.base.errors import MisalignedArtifactError
 from hilsplat.base.images import read_image
 from hilsplat.base.levels import Level
 from hilsplat.evaluate.diagnostics.mask_truth import fit_of_view, median_and_worst, run_mask_truth
@@ -66,9 +65,3 @@ def test_the_median_and_the_worst_view_are_drawn(block_world):
     bad = fit_of_view(masks_of([part((0, 4), (0, 4))], [1]), perfect, VIEW)
     assert median_and_worst({"a": good, "b": bad, "c": good}) == ["a", "b"]
     assert median_and_worst({"a": good}) == ["a"]
-
-
-def test_masks_of_another_size_are_refused(block_world):
-    small = HierarchicalMasks.concatenate([], (32, 32))
-    with pytest.raises(MisalignedArtifactError, match=r"64 x 64(.|\n)*32 x 32"):
-        fit_of_view(small, block_world.annotations, VIEW)

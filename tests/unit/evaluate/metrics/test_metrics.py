@@ -14,7 +14,6 @@ from hilsplat.evaluate.metrics.masks import (
     boundary,
     boundary_iou,
     boundary_width_px,
-    exceeds,
     hits_a_box,
     hits_the_mask,
     iou,
@@ -26,7 +25,6 @@ from hilsplat.evaluate.metrics.relevancy_rule import (
     RelevancyRule,
     SmoothedRelevancy,
     filter_side_px,
-    level_by_mean_in_mask,
     majority_smooth,
     mean_filter,
     relevancy_mask,
@@ -100,8 +98,9 @@ def test_mixing_halves_the_filtered_and_the_raw_map():
 def test_the_mean_in_the_mask_chooses_the_higher_mean_not_the_higher_value():
     relevancy = np.zeros((3, 1, 6), dtype=np.float32)
     relevancy[0, 0, :2] = 0.9, 0.5  # mean 0.7
-    relevancy[1, 0, :4] = 0.6, 0.6, 0.6, 0.9  # mean 0.675
-    assert level_by_mean_in_mask(relevancy, relevancy > 0) is Level.WHOLE
+    relevancy[1, 0, :4] = 0.6, 0.6, 0.6, 0.9  # mean 0.675; the mask of the subpart is empty
+    rule = RelevancyRule(1, threshold=0.0, threshold_on="raw", majority=False, level_rule="mean_in_mask")
+    assert relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)[1] is Level.WHOLE
 
 
 def test_rule_names_what_departs_from_langsplat():
@@ -197,12 +196,6 @@ def test_best_threshold_finds_the_best_cut_and_keeps_ties_together():
 def test_best_threshold_equals_trying_every_cut(score, truth):
     expected = max(iou(score >= cut, truth) for cut in np.unique(score))
     assert best_threshold_iou(score, truth) == pytest.approx(expected)
-
-
-def test_accuracy_of_a_pair_needs_more_than_the_threshold():
-    truth, quarter = box((0, 1), (0, 4)), box((0, 1), (0, 1))  # IoU 1/4
-    assert exceeds(quarter, truth, 0.25) == 0
-    assert exceeds(box((0, 1), (0, 2)), truth, 0.25) == 1
 
 
 # --- every pixel a class --------------------------------------------------------------------------

@@ -82,8 +82,8 @@ def first_class_occurring(counts):
 CASES = {
     "iou": of_masks(masks.iou),
     "boundary_iou": of_masks(masks.boundary_iou),
-    "acc_25": of_masks(partial(masks.exceeds, threshold=0.25)),
-    "acc_50": of_masks(partial(masks.exceeds, threshold=0.5)),
+    "acc_25": of_masks(lambda mask, truth: float(masks.iou(mask, truth) > 0.25)),
+    "acc_50": of_masks(lambda mask, truth: float(masks.iou(mask, truth) > 0.5)),
     "best_threshold_iou": of_masks(lambda mask, truth: masks.best_threshold_iou(mask / 1.0, truth)),
     "localization_box": of_points(
         lambda points, truth: masks.hits_a_box(points, region_of(truth, "").boxes())
