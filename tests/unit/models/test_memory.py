@@ -47,53 +47,49 @@ def test_free_memory_is_part_of_the_machine():
 
 
 GIB, UNLIMITED = 2**30, 9223372036854771712
-V1_FILES = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
-V2_FILES = ("memory.max", "memory.current", "inactive_file")
+V1, V2 = "9:cpuset:/\n4:cpu,memory:/a/b\n0::/\n", "0::/a/b\n"
 
 
-def system(folder: Path, membership: str, mount: str, names: tuple[str, ...], groups: dict) -> Path:
+def system(folder: Path, membership: str, groups: dict) -> Path:
     """A folder with `proc` and `sys` of a process: limit, use and reclaimable pages by control group."""
+    mount, limit_file, use_file, pages = "", "memory.max", "memory.current", "inactive_file"
+    if membership == V1:
+        mount, pages = "memory", "total_inactive_file"
+        limit_file, use_file = "memory.limit_in_bytes", "memory.usage_in_bytes"
     files = {"proc/meminfo": f"MemTotal: {64 * 2**20} kB\nMemAvailable: {16 * 2**20} kB\n"}
     if membership:
         files["proc/self/cgroup"] = membership
     for group, (limit, used, reclaimable) in groups.items():
         place = f"sys/fs/cgroup/{mount}{group}"
-        files[f"{place}/{names[0]}"] = f"{limit}\n"
-        files[f"{place}/{names[1]}"] = f"{used}\n"
-        files[f"{place}/memory.stat"] = f"cache 1\nother_{names[2]} 7\n{names[2]} {reclaimable}\n"
+        files[f"{place}/{limit_file}"] = f"{limit}\n"
+        files[f"{place}/{use_file}"] = f"{used}\n"
+        files[f"{place}/memory.stat"] = f"cache 1\nother_{pages} 7\n{pages} {reclaimable}\n"
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
     return folder
 
 
-V1, V2 = "9:cpuset:/\n4:cpu,memory:/a/b\n0::/\n", "0::/a/b\n"
-
-
 @pytest.mark.parametrize(
-    ("membership", "mount", "names", "groups", "limit_gib", "free_gib"),
+    ("membership", "groups", "limit_gib", "free_gib"),
     [
         # the own group: 5 GiB used, of which 2 GiB are file pages
-        (V2, "", V2_FILES, {"/a/b": (8 * GIB, 5 * GIB, 2 * GIB)}, 8, 5),
-        (V1, "memory", V1_FILES, {"/a/b": (8 * GIB, 5 * GIB, 2 * GIB)}, 8, 5),
-        # an ancestor has the lower limit, another less free memory
-        (V2, "", V2_FILES, {"/a": (4 * GIB, GIB, 0), "/a/b": ("max", GIB, 0)}, 4, 3),
-        (V1, "memory", V1_FILES, {"/a": (4 * GIB, GIB, 0), "/a/b": (UNLIMITED, GIB, 0)}, 4, 3),
-        (V2, "", V2_FILES, {"": (9 * GIB, 8 * GIB, 0), "/a/b": (4 * GIB, GIB, 0)}, 4, 1),
+        (V2, {"/a/b": (8 * GIB, 5 * GIB, 2 * GIB)}, 8, 5),
+        (V1, {"/a/b": (8 * GIB, 5 * GIB, 2 * GIB)}, 8, 5),
+        # an ancestor has the lower limit, or less free memory
+        (V1, {"/a": (4 * GIB, GIB, 0), "/a/b": (UNLIMITED, GIB, 0)}, 4, 3),
+        (V2, {"": (9 * GIB, 8 * GIB, 0), "/a/b": (4 * GIB, GIB, 0)}, 4, 1),
         # namespaces: the mount shows the own group, whatever its path is called
-        (V2, "", V2_FILES, {"": (8 * GIB, 5 * GIB, 0)}, 8, 3),
-        ("0::/../../other\n", "", V2_FILES, {"": (8 * GIB, 5 * GIB, 0)}, 8, 3),
-        (V1, "memory", V1_FILES, {"": (8 * GIB, 5 * GIB, 0)}, 8, 3),
+        (V1, {"": (8 * GIB, 5 * GIB, 0)}, 8, 3),
+        ("0::/../../other\n", {"": (8 * GIB, 5 * GIB, 0)}, 8, 3),
         # other groups, no limit, no groups
-        (V2, "", V2_FILES, {"/a/b": ("max", GIB, 0), "/a/c": (GIB, 0, 0), "/c": (GIB, 0, 0)}, None, 16),
-        (V1, "memory", V1_FILES, {"/a/b": (UNLIMITED, GIB, 0)}, None, 16),
-        ("", "", V2_FILES, {"": (GIB, 0, 0)}, None, 16),
+        (V2, {"/a/b": ("max", GIB, 0), "/a/c": (GIB, 0, 0), "/c": (GIB, 0, 0)}, 64, 16),
+        (V1, {"/a/b": (UNLIMITED, GIB, 0)}, 64, 16),
+        ("", {"": (GIB, 0, 0)}, 64, 16),
     ],
 )
-def test_memory_limits_of_control_groups(
-    tmp_path, monkeypatch, membership, mount, names, groups, limit_gib, free_gib
-):
+def test_memory_limits_of_control_groups(tmp_path, monkeypatch, membership, groups, limit_gib, free_gib):
     monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 64 * GIB // 4096}.__getitem__)
-    root = system(tmp_path, membership, mount, names, groups)
-    assert machine_mib(root) == 1024 * (limit_gib or 64)
+    root = system(tmp_path, membership, groups)
+    assert machine_mib(root) == 1024 * limit_gib
     assert available_mib(root) == 1024 * free_gib

@@ -21,7 +21,6 @@ def rows(*texts: str) -> np.ndarray:
 
 
 def parents_of(masks: np.ndarray, theta: float, level: list[int]) -> list[int]:
-    """`coverage_parents` of dense masks."""
     pixels = masks.reshape(len(masks), -1).astype(np.int64)
     return coverage_parents(pixels @ pixels.T, np.array(level, np.uint8), theta).tolist()
 
@@ -98,7 +97,7 @@ def test_the_tree_of_run_lengths_equals_a_loop_over_pairs(masks, data):
     np.testing.assert_array_equal(depth, depths(parent))
 
 
-def test_levels_by_the_tree_are_depths_for_masks_of_any_head():
+def test_levels_by_the_tree_are_depths_for_masks_of_any_head_and_depend_on_theta():
     masks = rows("##########", "######....", "###.......", "##........", ".......##.")
     by_tree = with_tree_levels(pack(masks, [3, 3, 1, 2, 2]), 0.9)
     assert sorted(zip(by_tree.area_px.tolist(), by_tree.level.tolist(), strict=True)) == [
@@ -109,10 +108,6 @@ def test_levels_by_the_tree_are_depths_for_masks_of_any_head():
         (10, 1),
     ]
     assert (by_tree.content_order() == np.arange(5)).all()
-
-
-def test_levels_by_the_tree_depend_on_theta():
-    # 3 of the second mask's 4 px are in the first
-    found = pack(rows("########..", ".....####."))
-    assert with_tree_levels(found, 0.9).level.tolist() == [1, 1]
-    assert with_tree_levels(found, 0.7).level.tolist() == [1, 2]
+    overlapping = pack(rows("########..", ".....####."))  # 3 of the second mask's 4 px are in the first
+    assert with_tree_levels(overlapping, 0.9).level.tolist() == [1, 1]
+    assert with_tree_levels(overlapping, 0.7).level.tolist() == [1, 2]
