@@ -55,7 +55,7 @@ def write_langsplat(masks_folder: Path, clip_folder: Path, folder: Path) -> None
     require_same_masks(clip_folder, masks_folder)
     for view, stem in stems_of(list(digests)).items():
         masks = load_masks(masks_folder, view, digests)
-        vectors = read_npy(Path(clip_folder) / f"{view}.npy")
+        vectors = read_npy(clip_folder / f"{view}.npy")
         require_every_vector(vectors, clip_folder, "LangSplat's format")
         maps, rows = maps_of(masks)
         write_npy(folder / f"{stem}_s.npy", maps)

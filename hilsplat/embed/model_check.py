@@ -134,7 +134,7 @@ def _second_call(call: Callable[..., Any], *given: object) -> tuple[Any, float]:
 
 
 def _key(folder: Path, variant: str, precision: str) -> str:
-    return f"{Path(folder).name} {variant} {precision}"
+    return f"{folder.name} {variant} {precision}"
 
 
 def _known(cache: Path) -> dict[str, Seconds]:

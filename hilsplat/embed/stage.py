@@ -1,6 +1,5 @@
 """Stage `clip`: CLIP vectors of each node's best crops, or of all masks."""
 
-import math
 from collections.abc import Mapping
 from functools import cache as cache_calls
 from pathlib import Path
@@ -35,7 +34,7 @@ from hilsplat.models.int8 import (
     int8_network,
     use_int8,
 )
-from hilsplat.models.memory import available_mib, needs_of
+from hilsplat.models.memory import needs_of
 from hilsplat.models.network import Network
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, pixel_digests, require_same_masks
@@ -86,9 +85,8 @@ def run_clip(
         chosen = chosen_masks(semantic_tree_folder, settings.crops_per_node)
     model = ClipModel(open_model_folder(Path(settings.model), "clip", variant=settings.variant))
     _choose_precision(model, scene, masks_folder, digests, chosen, cache, settings, threads)
-    needs = needs_of(model.model, settings.batch)
-    threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
-    view_cache = ViewCache(Path(cache) / "clip")
+    threads = needs_of(model.model, settings.batch).views_at_once(threads, memory_mib)
+    view_cache = ViewCache(cache / "clip")
 
     def embed(view: str) -> np.ndarray:
         masks = load_masks(masks_folder, view, digests)

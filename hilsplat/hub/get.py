@@ -344,7 +344,7 @@ def _is_installed(module: str) -> bool:
 
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
-    """Export the networks of a SAM or CLIP model saved by transformers; return the versions of packages used."""
+    """Export the networks of a SAM or CLIP model saved by transformers; return the packages' versions."""
     logger.info("exporting to ONNX; this takes minutes and memory of about three times the weights' size")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
     done = subprocess.run(

@@ -61,7 +61,7 @@ def int8_network(
     """
     source = sha256_of_file(model.networks[name]) if graph is None else sha256_of_bytes(graph)
     beside = model.folder.parent  # a new file in the model folder could change its digest
-    folder = beside if os.access(beside, os.W_OK) else Path(cache)
+    folder = beside if os.access(beside, os.W_OK) else cache
     path = folder / ".int8" / f"{sha256_of_json([source, RECIPE, list(exact)])}.onnx"
     if not path.is_file():
         logger.info("quantising %s of %s, which takes a few seconds; the result is kept", name, model.folder)
@@ -110,7 +110,7 @@ def use_int8(
         inputs: digests of the model and of the data that `measure` reads, the key of cached results.
         measure: function that returns the agreement of int8 with float32, by keys of `LEAST`.
     """
-    kept = ViewCache(Path(cache) / "int8").get(
+    kept = ViewCache(cache / "int8").get(
         sha256_of_json([RECIPE, inputs]),
         lambda: {name: np.array([value]) for name, value in measure().items()},
     )

@@ -1,5 +1,6 @@
 """Memory use of models and free memory, which together limit the number of views processed at once."""
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +40,12 @@ class Needs:
         """Return the memory of a stage that processes this many views at once, MiB."""
         return round(PROCESS_MIB + self.weights_mib + views * self.view_mib)
 
-    def views_at_once(self, threads: int, memory_mib: float) -> int:
-        """Return the number of views that fit into memory: at most one per thread, and at least one."""
+    def views_at_once(self, threads: int, memory_mib: float | None) -> int:
+        """Return the number of views that fit into free memory: at most one per thread, and at least one.
+
+        `memory_mib` limits the memory further, unless it is None.
+        """
+        memory_mib = min(available_mib(), memory_mib or math.inf)
         fitting = int((memory_mib - PROCESS_MIB - self.weights_mib) // self.view_mib)
         return max(1, min(threads, fitting))
 

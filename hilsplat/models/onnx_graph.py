@@ -179,7 +179,7 @@ def _row_loop(
 
 def whole_clip(folder: Path) -> Path | None:
     """Return the path of a folder's network with both halves, or None."""
-    places = (Path(folder) / WHOLE, Path(folder) / "onnx" / WHOLE)
+    places = (folder / WHOLE, folder / "onnx" / WHOLE)
     return next((place for place in places if place.is_file()), None)
 
 

@@ -49,7 +49,7 @@ def digests_in(folder: Path) -> dict[str, str]:
                 f"{folder} was written by another version of hilsplat",
                 expected=f"{MASKS_SHA256} of every view in {INDEX}",
                 found=f"none for view {view}",
-                fix=remake(Path(folder)),
+                fix=remake(folder),
             )
         digests[view] = digest
     return digests
@@ -60,7 +60,7 @@ def load_masks(folder: Path, view: str, digests: Mapping[str, str]) -> Hierarchi
 
     The check adds 0.03 s for 48 views of 300 masks at 800 x 600.
     """
-    path = Path(folder) / f"{view}.npz"
+    path = folder / f"{view}.npz"
     masks = HierarchicalMasks.load(path)
     _require_same(view, digests.get(view), digest_of(masks), f"{path} contains different masks", remake(path))
     return masks

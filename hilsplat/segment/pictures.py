@@ -145,7 +145,7 @@ def masks_overview(
         raise ArtifactError(
             f"{masks_folder} has no view {chosen}", expected=f"one of {', '.join(views[:8])}, ..."
         )
-    masks = HierarchicalMasks.load(Path(masks_folder) / f"{chosen}.npz")
+    masks = HierarchicalMasks.load(masks_folder / f"{chosen}.npz")
     image = Scene.load(scene_folder).image(chosen)
     write_png(out_png, masks_picture(image, masks), text=SOFTWARE)
     if tree_folder is not None:

@@ -1,7 +1,6 @@
 """Stage `masks`: masks at three levels for every training view."""
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from hilsplat.base.levels import LEVELS
 from hilsplat.base.processes import in_order
 from hilsplat.base.progress import stage_log, track
 from hilsplat.models.int8 import CHECKED_VIEWS
-from hilsplat.models.memory import available_mib, needs_of
+from hilsplat.models.memory import needs_of
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.coverage import with_tree_levels
 from hilsplat.segment.digests import digests_in, index_entry, load_masks
@@ -62,7 +61,7 @@ def run_masks(
     """
     scene = Scene.load(scene_folder)
     views = train_views(scene) if key_views is None else list(key_views)
-    view_cache = ViewCache(Path(cache) / "masks")
+    view_cache = ViewCache(cache / "masks")
     taken = digests_in(finished) if finished else {}
     model: SamModel | None = None
     identity: dict[str, str | None] = {"segmenter": settings.segmenter, "model": None, "model_sha256": None}
@@ -88,7 +87,7 @@ def run_masks(
             limit = model.thresholds(settings).points_per_batch
             batch = model.prompts_per_call(limit, settings.points_per_side**2)
             needs = needs_of(model.model, batch, as_exported=model.as_exported)
-            threads = needs.views_at_once(threads, min(memory_mib or math.inf, available_mib()))
+            threads = needs.views_at_once(threads, memory_mib)
             logger.info("masks %s: %d views at once, %.0f MiB each", scene.name, threads, needs.view_mib)
         else:
             logger.info("masks %s: graph segmenter, without a model; the levels are three scales", scene.name)

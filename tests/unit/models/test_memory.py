@@ -16,11 +16,12 @@ def folder(tmp_path, layout: str, config: dict, size: int, megabytes: int = 0) -
     return ModelFolder(tmp_path, layout, config, preprocessing, {"vision_encoder": network}, (network,))
 
 
-def test_views_at_once_by_hand():
+def test_views_at_once_by_hand(monkeypatch):
+    monkeypatch.setattr("hilsplat.models.memory.available_mib", lambda: 16384.0)
     needs = Needs(weights_mib=500.0, view_mib=3000.0)
     # 16 GiB less the process and the weights: 14384 MiB hold four views
-    assert needs.views_at_once(32, 16384.0) == 4
-    assert needs.views_at_once(2, 16384.0) == 2
+    assert needs.views_at_once(32, None) == needs.views_at_once(32, 20000.0) == 4
+    assert needs.views_at_once(2, None) == 2
     assert needs.views_at_once(32, 1000.0) == 1
     assert needs.total_mib(4) == PROCESS_MIB + 500 + 12000
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilsplat.configuration import with_models
-from hilsplat.models.store import EMBEDDED, model_path, present_models, read_model, real_model, user_models
+from hilsplat.models.store import EMBEDDED, model_path, present_models, read_model, real_model
 from hilsplat.settings import ClipSettings, FieldSettings, MasksSettings
 
 AUTO = MasksSettings(segmenter="auto", model="auto")
@@ -90,10 +90,3 @@ def test_models_of_the_user_are_found_from_any_folder_after_those_of_the_project
     assert model_path("models/sam-vit-huge") == of_user / "sam-vit-huge"
     assert model_path("models/sam-vit-base") == Path("models/sam-vit-base")
     assert model_path("models/none") == Path("models/none")
-
-
-def test_by_default_models_are_in_the_data_folder_of_the_user(monkeypatch, tmp_path):
-    monkeypatch.delenv("HILSPLAT_MODELS")
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    monkeypatch.setattr("sys.platform", "linux")
-    assert user_models() == tmp_path / "hilsplat/models"
