@@ -24,7 +24,7 @@ from jaxtyping import Float, Float32, Float64, Int16
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.processes import over_edges
 from hilsplat.field.code import CHUNK_ROWS, Code, LinearCode
-from hilsplat.query.relevancy_kernels import lengths_and_generic, linear_relevancy, projected_relevancy
+from hilsplat.query.relevancy_kernels import lengths_and_generic, texts_relevancy
 
 ROWS_AT_A_TIME = 1 << 16
 """Embeddings or pixels to process at once, so that products with many texts stay small."""
@@ -164,21 +164,20 @@ class LatentRelevancy:
         out = np.empty((len(texts), len(view.generic)), np.float32)
         if not len(texts):
             return out
-        scale = np.float32(self._scale)
         if isinstance(view, LinearView):
             assert isinstance(self._code, LinearCode)  # `prepare` made the view
+            channels, length = view.channels, view.length
             terms = [self._code.cosine_terms(text[None])[:2] for text in texts]
             offsets, slopes = (np.concatenate(each).astype(np.float32) for each in zip(*terms, strict=True))
-
-            def look_up(span: slice) -> None:
-                linear_relevancy(
-                    view.channels, view.length, view.generic, span.start, offsets, slopes, scale, out[:, span]
-                )
         else:
-            weights = np.stack([view.directions @ text / STEPS for text in texts]).astype(np.float32)
+            channels, length = view.coordinates, np.zeros(0, np.float32)
+            offsets = np.zeros(len(texts), np.float32)
+            slopes = np.stack([view.directions @ text / STEPS for text in texts]).astype(np.float32)
+        scale = np.float32(self._scale)
 
-            def look_up(span: slice) -> None:
-                projected_relevancy(view.coordinates, view.generic, span.start, weights, scale, out[:, span])
+        def look_up(span: slice) -> None:
+            first, part = span.start, out[:, span]
+            texts_relevancy(channels, length, view.generic, first, offsets, slopes, scale, part)
 
         self._in_parts(look_up, len(view.generic), ROWS_AT_A_TIME)
         return out
@@ -217,10 +216,16 @@ class LatentRelevancy:
     def _directions(
         self, latents: Float32[np.ndarray, "P D"], among: Float64[np.ndarray, "A C"]
     ) -> tuple[Float32[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-        """Return the `main_directions` of a decoded sample."""
-        some = latents[:: max(1, -(-len(latents) // SAMPLE))]
-        found, others = main_directions(self._code.decode_array(some), among)
-        return found.astype(np.float32), others
+        """Return the fewest directions that lose at most `RESIDUAL` on a decoded sample, and the others.
+
+        `among` contains at least one orthonormal row; all directions are in their span (A = R + B).
+        """
+        some = self._code.decode_array(latents[:: max(1, -(-len(latents) // SAMPLE))]).astype(np.float64)
+        values, turns = np.linalg.eigh(among @ (some.T @ some / max(len(some), 1)) @ among.T)
+        lost = np.sqrt(np.maximum(np.cumsum(values), 0))  # of the smallest directions
+        keep = max(1, int((lost > RESIDUAL).sum()))
+        directions = turns.T @ among
+        return directions[-keep:].astype(np.float32), directions[:-keep]
 
     def _decode(
         self, latents: Float32[np.ndarray, "P D"], directions: Float32[np.ndarray, "R C"]
@@ -263,21 +268,3 @@ def lost_for_error(scale: float, channels: int) -> float:
     relevancy error can reach s / 4 times the sum of `RESIDUAL` and rounding.
     """
     return max(4 * ERROR / scale - channels**0.5 / (2 * STEPS), RESIDUAL)
-
-
-def main_directions(
-    vectors: Float32[np.ndarray, "P C"], among: Float64[np.ndarray, "A C"]
-) -> tuple[Float64[np.ndarray, "R C"], Float64[np.ndarray, "B C"]]:
-    """Return the fewest directions that lose at most `RESIDUAL`, and the other directions (A = R + B).
-
-    Args:
-        vectors: only their components in the span of `among` are used.
-        among: orthonormal rows, at least one; all directions are in their span.
-    """
-    double = vectors.astype(np.float64)
-    squares = among @ (double.T @ double / max(len(vectors), 1)) @ among.T
-    values, turns = np.linalg.eigh(squares)
-    lost = np.sqrt(np.maximum(np.cumsum(values), 0))  # of the smallest directions
-    keep = max(1, int((lost > RESIDUAL).sum()))
-    directions = turns.T @ among
-    return directions[-keep:], directions[:-keep]

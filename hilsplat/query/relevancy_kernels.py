@@ -59,11 +59,11 @@ def lengths_and_generic(channels, cross, mean_square, offsets, slopes, length, g
 
 
 @compiled
-def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
+def texts_relevancy(channels, length, generic, first, offsets, slopes, scale, out):
     """Write the relevancy (T, p) of texts at pixels from `first` on; `channels` has shape (D, P).
 
-    The cosine of a text is (offset + slope . channels) / length. All texts are processed while a block of
-    pixels is in the cache.
+    The cosine of a text is (offset + slope . channels) / length; an empty `length` stands for 1. All texts
+    are processed while a block of pixels is in the cache.
     """
     dots = np.empty(BLOCK, np.float32)
     last = first + out.shape[1]
@@ -71,23 +71,9 @@ def linear_relevancy(channels, length, generic, first, offsets, slopes, scale, o
         end = min(begin + BLOCK, last)
         for text in range(len(out)):
             _dots_of_block(channels, begin, end, offsets[text], slopes[text], dots)
-            for p in range(end - begin):
-                dots[p] /= length[begin + p]
-            _write_relevancy(dots, generic[begin:end], scale, out[text, begin - first : end - first])
-
-
-@compiled
-def projected_relevancy(coordinates, generic, first, weights, scale, out):
-    """Write the relevancy (T, p) of texts at pixels from `first` on; `coordinates` (R, P) have 16 bits.
-
-    The cosine of a text is weights . coordinates. All texts are processed while a block of pixels is cached.
-    """
-    dots = np.empty(BLOCK, np.float32)
-    last = first + out.shape[1]
-    for begin in range(first, last, BLOCK):
-        end = min(begin + BLOCK, last)
-        for text in range(len(out)):
-            _dots_of_block(coordinates, begin, end, np.float32(0), weights[text], dots)
+            if len(length):
+                for p in range(end - begin):
+                    dots[p] /= length[begin + p]
             _write_relevancy(dots, generic[begin:end], scale, out[text, begin - first : end - first])
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+from scipy.special import logit
 
 from hilsplat.base.images import to_uint8
 from hilsplat.base.levels import LEVELS, NONE
@@ -75,11 +76,9 @@ def painted(
         return to_uint8(blend_forward(view, view.colours, threads)[0])
     others = paint.share == 0
     if paint.mode in ("ghost", "isolate"):
-        opacity = gaussians.opacities.astype(np.float32)
-        opacity[others] *= GHOST if paint.mode == "ghost" else np.float32(0)
-        with np.errstate(divide="ignore"):
-            logits = np.log(opacity) - np.log1p(-np.minimum(opacity, np.float32(1 - 1e-6)))
-        gaussians = replace(gaussians, opacity_logits=np.maximum(logits, np.float32(-30)))
+        opacity = gaussians.opacities * np.where(others, GHOST if paint.mode == "ghost" else 0, 1)
+        logits = logit(np.clip(opacity, 1e-13, 1 - 1e-6)).astype(np.float32)
+        gaussians = replace(gaussians, opacity_logits=logits)
     view = project_gaussians(gaussians, camera, degree, threads)
     colours = view.colours
     if paint.mode == "tint":
