@@ -97,16 +97,14 @@ class Dataset:
                 fix="unpack the whole archive again, or correct the scene name",
             )
 
+    def has_part(self, root: Path, scene: str) -> bool:
+        """Return whether a required path of a scene exists; paths outside the folder do not count."""
+        inside = [place for place in self.required(scene) if not place.startswith("..")]
+        return any((root / place).exists() for place in inside)
+
     def _has_begun(self, root: Path) -> bool:
-        """Return whether a folder has a required path of a known scene or, if none are known, any scene."""
-        if not self.scenes:
-            return bool(self.found(root))
-        return any(
-            _at(root, place).exists()
-            for scene in self.scenes
-            for place in self.required(scene)
-            if not place.startswith("..")  # paths outside the folder do not count
-        )
+        """Return whether a folder has a part of a known scene or, if none are known, any scene."""
+        return any(self.has_part(root, scene) for scene in self.scenes) or bool(self.found(root))
 
 
 def _at(root: Path, place: str) -> Path:

@@ -113,12 +113,8 @@ def check(dataset: Dataset, data_root: Path, scenes: Sequence[str] = ()) -> tupl
     data set's folder is missing.
     """
     root = dataset.locate(data_root)
-    known = dict.fromkeys((*dataset.scenes, *dataset.found(root)))
-    absent = []
-    for scene in [] if scenes else known:
-        inside = {place for place in dataset.required(scene) if not place.startswith("..")}
-        if inside <= set(dataset.missing(root, scene)):
-            absent.append(scene)
+    absent = [scene for scene in dataset.scenes if not (scenes or dataset.has_part(root, scene))]
+    known = dataset.scenes or dataset.found(root)
     lines, num_failed = [], 0
     for scene in scenes or [scene for scene in known if scene not in absent]:
         try:

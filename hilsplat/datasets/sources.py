@@ -47,11 +47,10 @@ def unlisted(sources: Collection[str], groups: Collection[str], data_root: str) 
 
     Such a data set has the name of its group; `data_root` is empty if not set.
     """
-    open_ended = [dataset_of(name) for name in groups if data_root and name in DATASETS]
+    open_ended = [DATASETS[name] for name in groups if name in DATASETS and not DATASETS[name].scenes]
     found = [
         f"{dataset.name}/{scene}"
-        for dataset in open_ended
-        if not dataset.scenes
+        for dataset in (open_ended if data_root else ())
         for scene in dataset.found(_folder(dataset, data_root))
     ]
     return [name for name in found if DATA_PREFIX + name not in sources]

@@ -4,6 +4,7 @@ Thresholds were chosen on three sets of real photographs that all register, on b
 over-exposed copies of them, and on pictures of a camera that only rotates (values: docs/scene.md).
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -115,14 +116,10 @@ def _motion_doubts(photos: Sequence[CheckedPhoto]) -> list[str]:
     """Return problems with the camera's motion, measured by matching neighbouring photographs."""
     last = len(photos) - 1
     rows = sorted(set(np.linspace(0, last - 1, min(last, MAX_PAIRS)).round().astype(int))) if last > 0 else []
-    features: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    features = functools.cache(lambda row: _features(photos[row].grey))
     same, turned, moved = [], 0, 0
     for row in rows:
-        for each in (row, row + 1):
-            if each not in features:
-                features[each] = _features(photos[each].grey)
-        motion = pair_motion(features[row], features[row + 1], _feature_size(photos[row].grey))
-        features.pop(row)
+        motion = pair_motion(features(row), features(row + 1), _feature_size(photos[row].grey))
         if motion is None:
             continue
         displacement, turn_share = motion

@@ -253,8 +253,6 @@ def choose_frames(candidates: Sequence[Frame], count: int) -> list[Frame]:
     jitter, which adds path length although the camera stays in place.
     """
     kept: list[Frame] = []
-    if not candidates:
-        return kept
     row_of = _stretches([_step(a, b) for a, b in pairwise(candidates)], count)
     for _, group in groupby(zip(row_of.tolist(), candidates, strict=True), key=lambda item: item[0]):
         best = max((frame for _, frame in group), key=lambda frame: frame.sharpness)

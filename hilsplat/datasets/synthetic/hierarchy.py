@@ -97,14 +97,9 @@ class HierarchyAnnotations:
                 expected=FORMAT,
                 found=record.get("format"),
             )
-        nodes = tuple(
-            AnnotatedNode(
-                node["id"], node["level"], node["parent"], node["text"], tuple(node.get("synonyms", ()))
-            )
-            for node in record["nodes"]
-        )
+        nodes = (AnnotatedNode(**{**node, "synonyms": tuple(node["synonyms"])}) for node in record["nodes"])
         views = {view: tuple(ids) for view, ids in record["views"].items()}
-        return HierarchyAnnotations(folder, nodes, views)
+        return HierarchyAnnotations(folder, tuple(nodes), views)
 
 
 def label_path(folder: Path, view: str, level: Level) -> Path:
