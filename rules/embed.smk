@@ -56,4 +56,4 @@ rule names:
         code=PLAN.code("names"),
     shell:
         "python -m hilsplat --log {log:q} names --semantic-tree {input.semantic_tree:q} --clip {input.clip:q}"
-        " --settings {params.settings:q} --evaluate {params.evaluate:q} --cache {params.cache:q} --threads {threads} --out {output.names:q}"
+        " --settings {params.settings:q} --evaluate {params.evaluate:q} --cache {params.cache:q} --out {output.names:q}"

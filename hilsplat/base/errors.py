@@ -33,11 +33,10 @@ def system_error(error: BaseException) -> HilsplatError | None:
             f"there is not enough memory: {error or 'an allocation failed'}",
             fix="close other programs, raise the limit (ulimit -v), or use smaller or fewer images",
         )
-    problem = PLACES.get(error.errno or 0) if isinstance(error, OSError) else None
-    if problem is None or not isinstance(error, OSError):
+    if not isinstance(error, OSError) or error.errno not in PLACES:
         return None
     return HilsplatError(
-        f"{error.filename or 'standard output or an open file'} {problem}",
+        f"{error.filename or 'standard output or an open file'} {PLACES[error.errno]}",
         found=error.strerror,
         fix="correct the problem, or choose another path",
     )

@@ -35,7 +35,7 @@ def world_make(
     """Make a synthetic scene: images, and the ground truth that only evaluate reads."""
     section = section_of("world", settings)
     beside = (out / "images", out / "truth")
-    with stage("world", out, settings=section, threads=threads, beside=beside) as run:
+    with stage("world", out, settings=section, beside=beside) as run:
         run(source, section, out, threads)
 
 

@@ -24,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 world_app = typer.Typer(help="Make and inspect scenes of the synthetic world.", no_args_is_help=True)
-models_app = typer.Typer(help="Get, list, check, split and train models (SAM, CLIP).", no_args_is_help=True)
+models_app = typer.Typer(help="Get, list, check and split models (SAM, CLIP).", no_args_is_help=True)
 datasets_app = typer.Typer(help="List, check and export published data sets.", no_args_is_help=True)
 cache_app = typer.Typer(help="Show or prune the caches of a results folder.", invoke_without_command=True)
 app.add_typer(world_app, name="world")
@@ -83,7 +83,6 @@ def stage(
     *,
     settings: Any = None,
     seed: int | None = None,
-    threads: int = 1,
     inputs: Mapping[str, Path | Sequence[Path] | None] | None = None,
     plugins: tuple[str, ...] = (),
     beside: tuple[Path, ...] = (),
@@ -107,7 +106,6 @@ def stage(
 
     start_logging(timestamps=True)
     device = getattr(settings, "device", None)
-    os.environ["NUMBA_NUM_THREADS"] = str(max(threads, int(os.environ.get("NUMBA_NUM_THREADS", "1"))))
     given = {key: paths for key, paths in (inputs or {}).items() if paths is not None}
     try:
         paths: list[Path] = []

@@ -50,7 +50,7 @@ def find_poses(
     """Compute the camera poses of photographs, or import a COLMAP model or transforms.json."""
     section = section_of("poses", settings)
     inputs = {"images": images, "poses": poses if poses and poses.exists() else None}
-    with stage("poses", out, settings=section, seed=seed, threads=threads, inputs=inputs) as run:
+    with stage("poses", out, settings=section, seed=seed, inputs=inputs) as run:
         run(images, out, name, unit, render, section, seed, threads, poses)
 
 
@@ -74,9 +74,7 @@ def gaussians(
     section = section_of("gaussians", settings)
     inputs = {"scene": scene, "existing": existing, "dataparser": dataparser, "transforms": transforms}
     beside = (out.with_suffix(".json"), report)
-    with stage(
-        "gaussians", out, settings=section, seed=seed, threads=threads, inputs=inputs, beside=beside
-    ) as run:
+    with stage("gaussians", out, settings=section, seed=seed, inputs=inputs, beside=beside) as run:
         run(scene, out, report, cache, section, seed, threads, existing, dataparser, transforms)
 
 
@@ -113,7 +111,7 @@ def masks(
     if is_diagnostic:
         faults = section_of("perturb", perturb)
         read, both = {"scene": scene, "truth": truth}, {"masks": section, "perturb": faults}
-        with stage("truth_masks", out, settings=both, seed=faults.seed, threads=threads, inputs=read) as run:
+        with stage("truth_masks", out, settings=both, seed=faults.seed, inputs=read) as run:
             run(scene, truth, out, faults, section.min_area_px, threads)
         return
     if features is not None:
@@ -129,15 +127,15 @@ def masks(
                 fix="pass this option, or set masks.key_views to 1",
             )
         inputs |= {"gaussians": gaussians}
-        with stage("key_masks", out, settings=section, threads=threads, inputs=inputs) as run:
+        with stage("key_masks", out, settings=section, inputs=inputs) as run:
             run(scene, gaussians, out, cache, section, threads, memory)
         return
     if gaussians and key_masks and semantic_tree:
         inputs |= {"gaussians": gaussians, "key_masks": key_masks, "semantic_tree": semantic_tree}
-        with stage("guided_masks", out, settings=section, threads=threads, inputs=inputs) as run:
+        with stage("guided_masks", out, settings=section, inputs=inputs) as run:
             run(scene, gaussians, key_masks, semantic_tree, out, cache, section, threads, memory)
         return
-    with stage("masks", out, settings=section, threads=threads, inputs=inputs) as run:
+    with stage("masks", out, settings=section, inputs=inputs) as run:
         run(scene, out, cache, section, threads, memory)
 
 
@@ -171,14 +169,13 @@ def names(
     settings: Settings = "{}",
     evaluate: EvaluateSection = "{}",
     cache: Cache = DEFAULT_CACHE,
-    threads: Threads = 1,
 ) -> None:
     """Name the nodes of a semantic tree from a vocabulary."""
     query, protocol = section_of("query", settings), section_of("evaluate", evaluate)
     own = None if query.vocabulary == AUTO else Path(query.vocabulary)
     inputs = {"semantic_tree": semantic_tree, "clip": clip, "vocabulary": own}
     both = {"query": query, "evaluate": protocol}
-    with stage("names", out, settings=both, threads=threads, inputs=inputs) as run:
+    with stage("names", out, settings=both, inputs=inputs) as run:
         run(semantic_tree, clip, out, cache, query, protocol)
 
 
@@ -203,7 +200,7 @@ def clip(
         with stage("langsplat", out, settings=section, inputs={**inputs, "features": features}) as files:
             files.read_clip(scene, features, out, section)
         return
-    with stage("clip", out, settings=section, threads=threads, inputs=inputs) as run:
+    with stage("clip", out, settings=section, inputs=inputs) as run:
         run(scene, masks, semantic_tree, out, cache, section, threads, memory)
 
 
@@ -220,7 +217,7 @@ def contributions(
     """Compute the weight of each Gaussian in each mask, in one pass over the views."""
     section = section_of("contributions", settings)
     inputs = {"scene": scene, "gaussians": gaussians, "masks": masks}
-    with stage("contributions", out, settings=section, threads=threads, inputs=inputs) as run:
+    with stage("contributions", out, settings=section, inputs=inputs) as run:
         run(scene, gaussians, masks, out, cache, section, threads)
 
 
@@ -244,12 +241,12 @@ def semantic_tree(
             expected="--coverage-tree with evidence: features, and only then",
         )
     if coverage_tree is None:
-        with stage("semantic_tree", out, settings=section, threads=threads, inputs=inputs) as run:
+        with stage("semantic_tree", out, settings=section, inputs=inputs) as run:
             run(contributions, masks, out, section, threads)
         return
     of_field = section_of("field", field_settings)
     both = {"semantic_tree": section, "field": of_field}
-    with stage("feature_tree", out, settings=both, seed=seed, threads=threads, inputs=inputs) as run:
+    with stage("feature_tree", out, settings=both, seed=seed, inputs=inputs) as run:
         run(contributions, masks, coverage_tree, out, section, of_field, seed, threads)
 
 
@@ -289,9 +286,7 @@ def field(
     optional = {"scene": scene, "gaussians": gaussians, "masks": masks, "start": start}
     own_seed = seed if section.is_random else None
     rendered = (scene, gaussians, masks) if scene and gaussians and masks else None
-    with stage(
-        "field", out, settings=section, seed=own_seed, threads=threads, inputs={**inputs, **optional}
-    ) as run:
+    with stage("field", out, settings=section, seed=own_seed, inputs={**inputs, **optional}) as run:
         run(contributions, coverage_tree, autoencoder, out, section, threads, seed, rendered, start)
 
 
@@ -316,9 +311,7 @@ def method(
     inputs |= {"contributions": contributions, "autoencoder": autoencoder}
     plugins = (METHODS.places[section.name],) if section.name in METHODS else ()
     parts = MethodInputs(scene, gaussians, masks, contributions, autoencoder, threads)
-    with stage(
-        "method", out, settings=section, seed=seed, threads=threads, inputs=inputs, plugins=plugins
-    ) as run:
+    with stage("method", out, settings=section, seed=seed, inputs=inputs, plugins=plugins) as run:
         run(parts, out, section, seed)
 
 
@@ -366,9 +359,7 @@ def evaluate(
     read, readers = _truth_inputs(**against)
     inputs = {**parts.as_inputs(), **read}
     beside = (out.with_name("times.csv"), out.with_name("instances.npz"))
-    with stage(
-        "evaluate", out, settings=section, threads=threads, inputs=inputs, plugins=readers, beside=beside
-    ) as run:
+    with stage("evaluate", out, settings=section, inputs=inputs, plugins=readers, beside=beside) as run:
         run(parts, out, section, **named, **against, threads=threads)
 
 
@@ -445,9 +436,7 @@ def figures(
     inputs, both = {**parts.as_inputs(), "fit": fit, **read}, {"figures": section, "evaluate": protocol}
     beside = (out.with_name("registration.png"), out.with_name("fit.png"))
     texts = json_option("--queries", queries, list)
-    with stage(
-        "figures", out, settings=both, threads=threads, inputs=inputs, plugins=readers, beside=beside
-    ) as run:
+    with stage("figures", out, settings=both, inputs=inputs, plugins=readers, beside=beside) as run:
         run(parts, out, section, protocol, fit=fit, **against, queries=texts, threads=threads)
 
 
@@ -473,9 +462,7 @@ def comparison(
     read, readers = _truth_inputs(**against)
     inputs = {f"scores of {variant}": folder / variant / "scores.csv" for variant in compared} | read
     beside = (out.with_name("views.png"), out.with_name("features.png"))
-    with stage(
-        "comparison", out, settings=both, threads=threads, inputs=inputs, plugins=readers, beside=beside
-    ) as run:
+    with stage("comparison", out, settings=both, inputs=inputs, plugins=readers, beside=beside) as run:
         run(folder, compared, named, out, section, protocol, **against, queries=texts, threads=threads)
 
 
