@@ -16,7 +16,7 @@ from hilsplat.query.scene_views import ViewStore
 from hilsplat.scene.finished import FinishedScene
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.build import run_semantic_tree
-from hilsplat.semantic_tree.tree import SemanticTree, ViewNodes
+from hilsplat.semantic_tree.tree import SemanticTree
 from hilsplat.settings import AutoencoderSettings, EvaluateSettings, FieldSettings, SemanticTreeSettings
 from tests.unit.artifact_changes import write_record
 from tests.unit.round_gaussians import round_gaussians
@@ -139,15 +139,9 @@ def test_parts_of_a_likely_thing_are_ranked_first(scene):
     assert added[[NODE["A"], NODE["B"]]].tolist() == [0, 0]
 
     def found(ancestors):
-        return search(
-            scene.tree,
-            margin[None].astype(np.float32),
-            scene.tree.clip,
-            ("x",),
-            threshold=0.9,
-            ancestors=ancestors,
-            level=Level.SUBPART,
-        )
+        margins = margin[None].astype(np.float32)
+        options = {"threshold": 0.9, "ancestors": ancestors, "level": Level.SUBPART}
+        return search(scene.tree, margins, scene.tree.clip, ("x",), **options)
 
     assert found(0.0).ids[0] == NODE["B corner"]
     assert found(0.2).ids.tolist() == [NODE["A top left"]]
@@ -223,39 +217,38 @@ def test_hidden_ancestors_do_not_compete_with_shown_ones(three_wholes):
         assert hits.ids.tolist() == [NODE[found]]
 
 
-FINISHED = ("default/semantic_tree", "default/autoencoder", "default/clip", "default/masks", "scene")
-
-
-def bear_with(root, folders=FINISHED, files=("gaussians.ply", "default/field.safetensors")):
+def bear_without(root, *missing):
     """The folder of a scene in which empty folders and files stand for its parts."""
-    folder = root / "results" / "photos" / "bear"
-    for part in folders:
-        (folder / part).mkdir(parents=True)
-    for name in files:
+    folder = root / "results/photos/bear"
+    for part in {"scene", *(f"default/{name}" for name in ("semantic_tree", "autoencoder", "clip", "masks"))}:
+        if part not in missing:
+            (folder / part).mkdir(parents=True)
+    for name in {"gaussians.ply", "default/field.safetensors"} - {*missing}:
         (folder / name).touch()
     return folder
 
 
-def test_a_scene_opens_with_the_settings_of_its_evaluation(tmp_path):
-    folder = bear_with(tmp_path)
-    variant = folder / "default"
-    (variant / "scores.csv").touch()
+def test_a_scene_opens_with_the_settings_of_its_evaluation_or_panel(tmp_path):
+    folder = bear_without(tmp_path)
+    scores, panel = folder / "default/scores.csv", tmp_path / "results/figures/photos/bear/panel.png"
     assert FinishedScene.locate(folder).evaluate_settings() == EvaluateSettings()
-    settings = {"canonical": ["thing", "surface"], "node_select": 0.9, "a knob of old": 1}
-    write_record(variant / "scores.csv", settings=settings)
+    panel.parent.mkdir(parents=True)  # a scene without labels has a panel only
+    write_record(panel, settings={"figures": {}, "evaluate": {"template": "a photo of a {}"}})
+    assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
+    scores.touch()
+    write_record(scores, settings={"canonical": ["thing"], "node_select": 0.9, "a knob of old": 1})
     found = FinishedScene.locate(folder).evaluate_settings()
-    assert found.canonical == ("thing", "surface")
-    assert found.node_select == 0.9
+    assert (found.canonical, found.node_select) == (("thing",), 0.9)
 
 
 def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
-    folder = bear_with(tmp_path)
+    folder = bear_without(tmp_path)
     (folder / "lifted").mkdir()  # begun, and killed
     with pytest.raises(ArtifactError, match=r"lifted/field\.safetensors is missing"):
         FinishedScene.locate(folder, "lifted")
-    inputs = {"field": {"path": "results/photos/bear/default/field.safetensors"}}
     (folder / "theta").mkdir()
     (folder / "theta/scores.csv").touch()
+    inputs = {"field": {"path": "results/photos/bear/default/field.safetensors"}}
     write_record(folder / "theta/scores.csv", inputs=inputs)
     found = FinishedScene.locate(folder, "theta").parts
     assert found.field == folder / "default/field.safetensors"
@@ -265,24 +258,14 @@ def test_a_variant_uses_the_field_recorded_in_its_scores(tmp_path):
 
 
 def test_a_tree_can_be_queried_before_there_is_a_field(tmp_path):
-    folder = bear_with(tmp_path, ("scene", "default/clip", "default/masks", "omega"), ("gaussians.ply",))
+    later = ("default/semantic_tree", "default/autoencoder", "default/field.safetensors")
+    folder = bear_without(tmp_path, *later)
     with pytest.raises(ArtifactError, match=r"hilsplat run .*default/semantic_tree"):
         FinishedScene.locate(folder)
     (folder / "default/semantic_tree").mkdir()
     parts = FinishedScene.locate(folder).parts
     assert (parts.field, parts.autoencoder) == (None, None)
     assert list(parts.as_inputs()) == ["scene", "gaussians", "semantic_tree", "clip", "masks"]
-    with pytest.raises(ArtifactError, match=r"omega/field\.safetensors is missing"):
-        FinishedScene.locate(folder, "omega")
-
-
-def test_a_scene_without_labels_opens_with_the_settings_of_its_panel(tmp_path):
-    folder = bear_with(tmp_path)
-    panel = tmp_path / "results" / "figures" / "photos" / "bear" / "panel.png"
-    panel.parent.mkdir(parents=True)
-    settings = {"figures": {}, "evaluate": {"template": "a photo of a {}"}}
-    write_record(panel, settings=settings)
-    assert FinishedScene.locate(folder).evaluate_settings().template == "a photo of a {}"
 
 
 def test_the_field_answers_through_the_same_interface(scene):
@@ -296,14 +279,6 @@ def test_look_ups_of_the_field_agree_with_decoding(scene):
     exact = scene.field_relevancy(["B", "A top"], "004.png")
     fast = scene.field_relevancy(["B", "A top"], "004.png", exact=False)
     assert fast == pytest.approx(exact, abs=2e-3)  # a network with d = 4: decoded as well
-
-
-def test_hits_have_gaussians_and_an_oriented_box(scene):
-    (hit,) = scene.query("A top left", "subpart")
-    rows = scene.gaussians_of([hit.node])
-    assert rows.tolist() == np.flatnonzero(region_mask(5)).tolist()
-    # 2 columns and 4 rows of Gaussians one unit apart, in a plane
-    assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
 
 
 @pytest.mark.parametrize(
@@ -348,37 +323,21 @@ def test_answers_in_a_view_are_nodes_that_it_shows(scene, text):
 
 
 def test_a_view_shows_the_nodes_with_a_mask_there(scene, monkeypatch):
-    of_level = ViewNodes(
-        indptr=np.array([0, 2, 3, 3, 3]),
-        nodes=np.array([2, 3, 2], np.int32),
-        shares=np.array([0.4, 0.6, 0.9], np.float32),
-        covered=np.array([True, True, True, False]),
-    )
-    assert of_level.area_px(7).tolist() == [0, 0, 1, 1, 0, 0, 0]
-    empty = ViewNodes(
-        np.zeros(5, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros(4, bool)
-    )
-    assert empty.area_px(7).tolist() == [0] * 7
     monkeypatch.setattr("hilsplat.query.scene_views.MIN_SHOWN_SHARE", 8 / (HEIGHT * WIDTH))
     shown = replace(scene, _views=ViewStore()).nodes_shown("000.png")
     # B corner has 2 x 3 px, A top left 4 x 2
     assert np.flatnonzero(~shown).tolist() == [NODE["B corner"]]
 
 
-def test_path_falls_back_to_the_whole_level(scene):
-    parent = np.where(scene.tree.level == Level.SUBPART, -1, scene.tree.parent).astype(np.int32)
-    orphaned = replace(scene, tree=replace(scene.tree, parent=parent))
-    hits = near(orphaned).select(("A", "A top", "B corner"))
-    assert hits.ids.tolist() == [NODE["B corner"]]
-    assert hits.route == "fallback"
-
-
-def test_query_parses_paths_and_describes_hits(scene):
+def test_hits_describe_a_node_and_its_place(scene):
     (hit,) = scene.query("A > A top")
     assert (hit.node, hit.level, hit.route) == (NODE["A top"], Level.PART, "child")
-    assert hit.score > 0.9
-    assert hit.best_views == ("000.png", "001.png", "002.png")
+    assert hit.score > 0.9 and hit.best_views == ("000.png", "001.png", "002.png")
     assert hit.box[0][0] <= hit.centroid[0] <= hit.box[1][0]
+    (hit,) = scene.query("A top left", "subpart")
+    assert hit.gaussians.tolist() == np.flatnonzero(region_mask(5)).tolist()
+    # 2 columns and 4 rows of Gaussians one unit apart, in a plane
+    assert hit.oriented_box.size == pytest.approx((2.88, 1, 0), abs=0.15)
 
 
 @pytest.mark.parametrize(
@@ -416,10 +375,15 @@ def test_maps_are_high_where_the_region_is(scene, of, ahead_by):
             assert own[inside].min() > own[~inside].max()
 
 
-def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(scene):
+@pytest.fixture
+def thin(scene) -> LanguageScene:
+    """The scene with a first pixel that shows nothing."""
     weights = two_boxes_weights(0).tolil()
-    weights[0] = 0  # the first pixel shows nothing
-    thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
+    weights[0] = 0
+    return replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
+
+
+def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(thin):
     texts, pixels = ["B", "A top"], np.arange(0, HEIGHT * WIDTH, 7)
     vectors = thin.text_vectors(texts)
     shares = thin.view_weights("000.png").toarray()
@@ -442,10 +406,7 @@ def test_cosines_at_pixels_are_those_of_decoded_latents_and_of_nodes(scene):
     assert np.isinf(thin.node_cosine(texts, "000.png", pixels)[:, :, 0]).all()
 
 
-def test_uncovered_pixels_get_the_lowest_relevancy(scene):
-    weights = two_boxes_weights(0).tolil()
-    weights[0] = 0
-    thin = replace(scene, pixel_weights=lambda view: weights.tocsr(), _views=ViewStore())
+def test_uncovered_pixels_get_the_lowest_relevancy(thin):
     for maps in (thin.field_relevancy(["A"], "000.png"), thin.node_relevancy_map(["A"], "000.png")):
         assert maps[0, 0, 0, 0] == maps[0, 0].min()
     assert not thin.node_masks("000.png", np.array([NODE["A"]]))[0, 0]
@@ -481,4 +442,3 @@ def test_field_image_has_one_colour_per_region(scene):
     assert image.shape == (HEIGHT, WIDTH, 3)
     a, b = image[region_mask(0)].mean(axis=0), image[region_mask(1)].mean(axis=0)
     assert np.abs(a - b).max() > 50
-    assert np.array_equal(image, scene.field_image("000.png", Level.WHOLE))
