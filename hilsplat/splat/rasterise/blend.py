@@ -367,61 +367,24 @@ def add_slots(begin, end, tiles, base, tile_start, tile_end, gaussian, slots, co
                     store(flat_sums, i * width + k, added)
 
 
-@compiled(inline="always")
-def _place(pixel):
-    """Return the column and row of a tile's pixel, relative to the tile's corner."""
-    block, lane = pixel // LANES, pixel % LANES
-    return (block & 3) * 4 + (lane & 3), (block >> 2) * 4 + (lane >> 2)
-
-
 @compiled
-def count_weights(
-    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts
+def sparse_rows(
+    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, counts, out
 ):
-    """Count the weights >= `least` of each pixel (row-major) of tiles begin..end."""
-    height, width = size_hw
-    transmittance, found = aligned(PIXELS), np.empty(PIXELS, np.int64)
-    records = aligned(CHUNK * RECORD)
-    entries, by_lane = np.empty(CHUNK, np.int64), aligned(CHUNK * LANES)
-    for tile in range(begin, end):
-        x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
-        found[:] = 0
-        for chunk in range(tile_start[tile], tile_end[tile], CHUNK):
-            if unfinished(transmittance) == 0:
-                break
-            count = min(tile_end[tile] - chunk, CHUNK)
-            gather(chunk - base, count, x0, y0, gaussian, geometry, records)
-            for block in range(BLOCKS):
-                done = weigh(
-                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
-                )[0]
-                for n in range(done):
-                    for lane in range(LANES):
-                        weight = by_lane[n * LANES + lane]
-                        found[block * LANES + lane] += (weight > _ZERO) & (weight >= least)
-        for pixel in range(PIXELS):
-            x, y = _place(pixel)
-            if x0 + x < width and y0 + y < height:
-                counts[(y0 + y) * width + x0 + x] = found[pixel]
+    """Count the weights >= `least` of each pixel (row-major) of tiles begin..end; with `out`, write them.
 
-
-@compiled
-def write_weights(
-    begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, size_hw, geometry, least, longest, out
-):
-    """Write the columns and weights of rows counted by `count_weights`, at most `longest` in each.
-
-    `out` contains the row starts of the sparse matrix, and arrays for its columns (ascending) and weights.
+    `out` is None in the first pass. In the second pass, it contains the length of the longest row, the row
+    starts of the sparse matrix, and arrays for its columns (ascending) and weights.
     """
-    row_start, columns, weights = out
     height, width = size_hw
     transmittance, size_of = aligned(PIXELS), np.empty(PIXELS, np.int64)
-    records = aligned(CHUNK * RECORD)
+    records, by_lane = aligned(CHUNK * RECORD), aligned(CHUNK * LANES)
     entries, rows = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int32)
-    by_lane = aligned(CHUNK * LANES)
-    room = (longest // LANES + 1) * LANES  # a pixel's row and at least one more entry
-    held, held_weights = np.empty(PIXELS * room, np.float32), np.empty(PIXELS * room, np.float32)
-    held_columns, rank = held.view(np.int32), np.empty(room, np.float32)
+    if out is not None:
+        longest, row_start, columns, weights = out
+        room = (longest // LANES + 1) * LANES  # a pixel's row and at least one more entry
+        held, held_weights = np.empty(PIXELS * room, np.float32), np.empty(PIXELS * room, np.float32)
+        held_columns, rank = held.view(np.int32), np.empty(room, np.float32)
     for tile in range(begin, end):
         x0, y0 = start_tile(tile, tiles_x, height, width, transmittance)
         size_of[:] = 0
@@ -434,6 +397,12 @@ def write_weights(
                 done = weigh(
                     block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
                 )[0]
+                if out is None:
+                    for n in range(done):
+                        for lane in range(LANES):
+                            weight = by_lane[n * LANES + lane]
+                            size_of[block * LANES + lane] += (weight > _ZERO) & (weight >= least)
+                    continue
                 for n in range(done):
                     rows[n] = gaussian[chunk - base + entries[n]]
                 for lane in range(LANES if done else 0):
@@ -445,12 +414,16 @@ def write_weights(
                         at += np.int64((weight > _ZERO) & (weight >= least))
                     size_of[pixel] = at - pixel * room
         for pixel in range(PIXELS):
-            x, y = _place(pixel)
-            if x0 + x >= width or y0 + y >= height:
+            block, lane = pixel // LANES, pixel % LANES
+            x, y = x0 + (block & 3) * 4 + (lane & 3), y0 + (block >> 2) * 4 + (lane >> 2)
+            if x >= width or y >= height:
+                continue
+            if out is None:
+                counts[y * width + x] = size_of[pixel]
                 continue
             first, size = pixel * room, size_of[pixel]
             _rank(held, first, size, rank)
-            start = row_start[(y0 + y) * width + x0 + x]
+            start = row_start[y * width + x]
             for k in range(size):
                 at = start + np.int64(rank[k])
                 columns[at], weights[at] = held_columns[first + k], held_weights[first + k]

@@ -18,7 +18,7 @@ from hilsplat.base.processes import over_edges
 from hilsplat.scene.cameras import Camera
 from hilsplat.splat.gaussians import FIELDS, Gaussians
 from hilsplat.splat.rasterise.binning import Tiles, bin_gaussians, fill_lists
-from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, count_weights, write_weights
+from hilsplat.splat.rasterise.blend import add_slots, blend, blend_backward, sparse_rows
 from hilsplat.splat.rasterise.project import GEOMETRY, MOMENTS, pack_camera, project, project_backward
 
 RANGES_PER_THREAD = 4
@@ -213,15 +213,16 @@ def sparse_weights(
     """
     counts = np.zeros(view.size_hw[0] * view.size_hw[1], np.int64)
 
-    def over_bands(work: Callable[..., Any], *arguments: Any) -> None:
+    def over_bands(out: tuple[Any, ...] | None) -> None:
         for band in tile_lists(view, threads):
-            band.over_tiles(work, threads, view.size_hw, view.geometry, np.float32(min_weight), *arguments)
+            known = (view.size_hw, view.geometry, np.float32(min_weight), counts, out)
+            band.over_tiles(sparse_rows, threads, *known)
 
-    over_bands(count_weights, counts)
+    over_bands(None)
     row_start = np.concatenate([[0], np.cumsum(counts)])
     columns, weights = np.empty(row_start[-1], np.int32), np.empty(row_start[-1], np.float32)
     if len(columns):
-        over_bands(write_weights, int(counts.max()), (row_start, columns, weights))
+        over_bands((int(counts.max()), row_start, columns, weights))
     return row_start, columns, weights
 
 

@@ -297,7 +297,6 @@ def project(begin, end, means, log_scales, quats, opacity_logits, sh, degree, ca
         store(columns, 4 * LANES, narrow(0.5 * LOG2_E * xx * inverse))
         store(columns, 5 * LANES, top)
         store(columns, 6 * LANES, narrow(z))
-        store(columns, 7 * LANES, zero)
         _sh_basis(narrow(towards[0]), narrow(towards[1]), narrow(towards[2]), degree, basis)
         red, green, blue = zero + 0.5, zero + 0.5, zero + 0.5
         for k in range((degree + 1) * (degree + 1)):
