@@ -9,7 +9,7 @@ from hilsplat.base.levels import Level
 from hilsplat.datasets.labelled import LabelledScene
 from hilsplat.datasets.points.labelled_points import PointScene
 from hilsplat.datasets.registry import dataset_of, open_labels
-from hilsplat.evaluate.protocols.cards import ProtocolCard, card_named
+from hilsplat.evaluate.protocols.cards import ProtocolCard, card_of
 
 STAND_INS: Mapping[str, tuple[str, ...]] = {
     "tabletop": (*dataset_of("3d_ovs").protocols, "lerf-mask/gaussian-grouping"),
@@ -48,7 +48,7 @@ class ExtraProtocols:
     @staticmethod
     def of(names: tuple[str, ...], level: Level | None = None) -> "ExtraProtocols":
         """Sort named protocols into those for images and those for points."""
-        cards = [card_named(name) for name in names]
+        cards = [card_of(name) for name in names]
         points = tuple(card for card in cards if card.classes)
         return ExtraProtocols(tuple(card for card in cards if not card.classes), points, level)
 

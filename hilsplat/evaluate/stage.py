@@ -117,7 +117,7 @@ def run_evaluate(
                     if isinstance(each, Measured):
                         keep(data, "", each)
                     else:
-                        matches[data, scene, variant, label, each[0]] = each[1]
+                        matches[data, scene, variant, label, "tree"] = each
         counts["rows"] = len(scores)
         write_times(out, dataset, scene, variant, seconds)
         write_instances(out, matches)
@@ -130,8 +130,8 @@ def point_rows(
     extra: ExtraProtocols,
     settings: EvaluateSettings,
     threads: int,
-) -> Iterator[Measured | tuple[str, InstanceMatches]]:
-    """Yield rows of labelled points and instance matches; nothing if no protocol scores points."""
+) -> Iterator[Measured | InstanceMatches]:
+    """Yield rows of labelled points and the tree's instance matches; nothing if no protocol scores points."""
     if not extra.points or isinstance(known, LabelledScene):
         return
     if isinstance(known, PointScene):
@@ -143,14 +143,10 @@ def point_rows(
         points = labelled_points(known.parent, kind)
         transform, error = scene_from_true(Cameras.load(known / "cameras.npz"), answers.scene.cameras)
         if error > MAX_CAMERA_ERROR_M:
-            logger.warning(
-                "%s: cameras are %.2f m from the ground truth (median); point scores are meaningless",
-                answers.scene.name,
-                error,
-            )
-    yield from measure_scene_points(
-        answers, points, transform, extra.points, settings.methods, settings.points, threads
-    )
+            sentence = "%s: cameras are %.2f m from the truth (median); point scores are meaningless"
+            logger.warning(sentence, answers.scene.name, error)
+    methods, mode = settings.methods, settings.points
+    yield from measure_scene_points(answers, points, transform, extra.points, methods, mode, threads)
 
 
 def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, "4 4"], float]:

@@ -248,20 +248,6 @@ def _points(
     return ProtocolCard(name, 1, metrics, averaging, ARGMAX, source, classes=classes, public=public)
 
 
-def card_named(name: str) -> ProtocolCard:
-    """Return the current version of the protocol `benchmark/variant`.
-
-    Raises:
-        ArtifactError: no protocol has that name.
-    """
-    for card in CARDS:
-        if card.name == name:
-            return card
-    raise ArtifactError(
-        f"there is no protocol {name!r}", expected=f"one of {', '.join(card.name for card in CARDS)}"
-    )
-
-
 CARDS: tuple[ProtocolCard, ...] = (
     LERF_LANGSPLAT,
     TREE_NODES,
@@ -364,21 +350,20 @@ CARDS: tuple[ProtocolCard, ...] = (
     VIEW_CONSISTENCY,
 )
 
-PROTOCOLS: dict[str, ProtocolCard] = {card.full_name: card for card in CARDS}
-"""Full name -> protocol."""
+BY_NAME: dict[str, ProtocolCard] = {name: card for card in CARDS for name in (card.name, card.full_name)}
 
 
 def card_of(label: str) -> ProtocolCard:
-    """Return the protocol that a row names, ignoring non-default settings.
+    """Return the protocol named by a row (any non-default settings are ignored) or a data set (no version).
 
     Raises:
         ArtifactError: no protocol has that name and version.
     """
-    full_name = label.split(" (")[0]
-    if full_name not in PROTOCOLS:
+    name = label.split(" (")[0]
+    if name not in BY_NAME:
         raise ArtifactError(
-            f"there is no protocol {full_name!r}",
-            expected=f"one of {', '.join(PROTOCOLS)}",
-            fix="delete the score file that names it and run evaluate again",
+            f"there is no protocol {name!r}",
+            expected=f"one of {', '.join(card.full_name for card in CARDS)}",
+            fix="delete the score file that names it and run evaluate again" if "@" in name else None,
         )
-    return PROTOCOLS[full_name]
+    return BY_NAME[name]

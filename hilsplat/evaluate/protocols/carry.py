@@ -79,7 +79,6 @@ def carried_to(
 
     `frozen`: the fit must not have moved, split or dropped any Gaussian. As in OpenGaussian's
     `scripts/eval_scannet.py`, points whose Gaussian is transparent are not scored.
-    `vote`: a point without a Gaussian within the radius has no prediction, which counts as a miss.
     `density`: the weight opacity * exp(-d**2 / 2), with Mahalanobis distance d, is the alpha that 3DGS
     blends at the point. Candidates are the nearest centres, so a large Gaussian with a distant centre has no
     weight. Weights are relative, so every point has a prediction, even far from all Gaussians.
@@ -147,11 +146,7 @@ def classify(features: Float[np.ndarray, "P D"], texts: Float[np.ndarray, "K D"]
 def _neighbours(
     points: np.ndarray, means: np.ndarray, opacities: np.ndarray, k: int, radius: float, threads: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return index and distance (P, k) of the nearest opaque Gaussians; infinite if there are fewer than k.
-
-    Raises:
-        MisalignedArtifactError: no Gaussian is opaque enough.
-    """
+    """Return index and distance (P, k) of the nearest opaque Gaussians; infinite beyond the last one."""
     opaque = np.flatnonzero(opacities >= OPACITY_MIN)
     if not opaque.size:
         raise MisalignedArtifactError(
@@ -163,13 +158,11 @@ def _neighbours(
     from scipy.spatial import cKDTree  # importing takes 0.2 s and is needed only for points
 
     tree = cKDTree(means[opaque].astype(float))
-    # The radius is inclusive.
-    bound = np.nextafter(radius, np.inf)
+    bound = np.nextafter(radius, np.inf)  # the radius is inclusive
     distance, place = tree.query(
         points.astype(float), k=np.arange(1, k + 1), distance_upper_bound=bound, workers=threads
     )
-    found = np.isfinite(distance)
-    return opaque[np.where(found, place, 0)].astype(np.int64), distance
+    return opaque[np.where(np.isfinite(distance), place, 0)].astype(np.int64), distance
 
 
 def _normalised(weight: np.ndarray) -> np.ndarray:

@@ -57,7 +57,6 @@ def measure_points(
 
     In a class row, `n` is the number of points in the denominator, so that `pooled_points` can pool scenes.
     Classes absent from ground truth and prediction have no row; a scene without ground truth has no rows.
-    Labels are 1 .. K in the order of `classes`; 0 is ignored in ground truth and is a miss in the prediction.
     `carried` names the mode that transferred predictions to the points.
     """
     counts = ClassCounts.of(truth, prediction, len(classes))
@@ -67,9 +66,8 @@ def measure_points(
         ("class_accuracy", class_accuracy(counts), counts.truth),
     ):
         for row in np.flatnonzero(points):
-            yield Measured(
-                method, classes.texts[row], "", metric, protocol, float(values[row]), int(points[row])
-            )
+            value, n = float(values[row]), int(points[row])
+            yield Measured(method, classes.texts[row], "", metric, protocol, value, n)
     if card.averaging == "scenes" and counts.truth.any():
         for metric in filter(MEANS.__contains__, card.metrics):
             yield Measured(method, "", "", metric, protocol, MEANS[metric](counts), int(counts.truth.sum()))
@@ -135,8 +133,7 @@ def classes_of_points(
     fitted = np.flatnonzero(latents.any(axis=1))
     labels = np.zeros(len(latents), dtype=np.int32)
     if len(fitted):
-        decoded = code.decode_array(latents[fitted].astype(np.float32))
-        labels[fitted] = classify(decoded, vectors)
+        labels[fitted] = classify(code.decode_array(latents[fitted].astype(np.float32)), vectors)
     return labels
 
 
@@ -148,13 +145,8 @@ def node_instances(
     nodes = tree.nodes_of(LEVEL)
     cosines = tree.clip[nodes].astype(np.float32) @ scene.text_vectors(classes.texts).T
     own = carried.labels(tree.node_of_gaussian[:, LEVEL.index] + 1) - 1
-    return instance_scan(
-        truth,
-        classes,
-        own[None] == nodes[:, None],
-        np.array(classes.ids)[cosines.argmax(axis=1)],
-        cosines.max(axis=1),
-    )
+    class_ids = np.array(classes.ids)[cosines.argmax(axis=1)]
+    return instance_scan(truth, classes, own[None] == nodes[:, None], class_ids, cosines.max(axis=1))
 
 
 def instance_scan(
@@ -165,9 +157,8 @@ def instance_scan(
     confidences: Float[np.ndarray, " M"],
 ) -> instances.InstanceMatches:
     """Match predicted instances, with class ids as in the data set's files, to the labelled instances."""
-    labels = classes.labels(truth.class_id)
-    ids = np.array([0, *classes.ids])[labels]
-    of_points = np.where(labels > 0, ids * instances.CLASS_STRIDE + truth.instance_id, 0).astype(np.int64)
+    values = truth.class_id * instances.CLASS_STRIDE + truth.instance_id
+    of_points = np.where(classes.labels(truth.class_id) > 0, values, 0).astype(np.int64)
     return instances.match_instances(of_points, masks, class_ids, confidences, classes.ids)
 
 
@@ -185,7 +176,7 @@ def measure_scene_points(
     methods: Sequence[str],
     mode: Mode,
     threads: int = 1,
-) -> Iterator[Measured | tuple[str, instances.InstanceMatches]]:
+) -> Iterator[Measured | instances.InstanceMatches]:
     """Yield the rows of one scene under point protocols, and the instance matches of the tree.
 
     Labelled points are keyed by labelling, in metres; `scene_from_points` is a similarity transform.
@@ -193,7 +184,7 @@ def measure_scene_points(
     """
     radius = VOTE_RADIUS_M * float(np.cbrt(np.linalg.det(scene_from_points[:3, :3])))
     carried_of: dict[int, CarriedPoints] = {}  # labellings of the same mesh share its vertices
-    labels_of: dict[tuple[int, str, str], np.ndarray] = {}  # several protocols have the same classes
+    labels_of: dict[tuple[str, str], np.ndarray] = {}  # several protocols have the same classes
     for card in cards:
         labelling, classes = class_set(card.classes)
         if labelling not in truth:
@@ -205,12 +196,12 @@ def measure_scene_points(
         carried = carried_of[id(points.xyz)]
         if card is INSTANCES:
             if "tree" in methods:
-                yield "tree", node_instances(scene, carried, points, classes)
+                yield node_instances(scene, carried, points, classes)
             continue
         labels = carried.truth(points.labels(classes))
         for method in ("tree", "field"):
             if method in methods:
-                key = (id(points.xyz), method, classes.name)
+                key = method, classes.name
                 if key not in labels_of:
                     labels_of[key] = classes_of_points(scene, carried, method, classes.texts)
                 yield from measure_points(card, method, labels, labels_of[key], classes, carried.mode)

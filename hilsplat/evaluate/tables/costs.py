@@ -77,18 +77,11 @@ def read_costs(scores: Iterable[Path]) -> list[Cost]:
         if not rows:  # a scene without labels
             continue
         jobs = jobs_of(Path(path))
-        first = rows[0]
-        found.append(
-            Cost(
-                first["dataset"],
-                first["scene"],
-                first["variant"],
-                _seconds(jobs, PREPARATION),
-                _seconds(jobs, TRAINING),
-                max((job.peak_mib for stage in TRAINING if (job := jobs.get(stage))), default=0) or math.nan,
-                {row["method"]: float(row["seconds"]) for row in rows},
-            )
-        )
+        place = rows[0]["dataset"], rows[0]["scene"], rows[0]["variant"]
+        times = _seconds(jobs, PREPARATION), _seconds(jobs, TRAINING)
+        peak_mib = max((job.peak_mib for stage in TRAINING if (job := jobs.get(stage))), default=0)
+        query_s = {row["method"]: float(row["seconds"]) for row in rows}
+        found.append(Cost(*place, *times, peak_mib or math.nan, query_s))
     return found
 
 
@@ -137,16 +130,15 @@ def run_efficiency(results: Path, out: Path) -> str:
     jobs.sort(key=lambda job: (places[job.stage], job.stage, job.dataset, job.scene, job.variant))
     columns = ("stage", "dataset", "scene", "variant", "seconds", "cpu_seconds", "peak_mib")
     rows = []
-    of_stage: dict[str, list[Job]] = {}
     for job in jobs:
         numbers = (f"{job.elapsed_s:.2f}", f"{job.cpu_s:.2f}", f"{job.peak_mib:.0f}")
         rows.append([job.stage, job.dataset, job.scene, job.variant, *numbers])
-        of_stage.setdefault(job.stage, []).append(job)
     lines = [
         "| stage | jobs | mean s | longest s | total s | CPU s | peak MiB |",
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
-    for name, of_row in [*of_stage.items(), ("all", jobs)]:
+    for name in [*dict.fromkeys(job.stage for job in jobs), "all"]:
+        of_row = [job for job in jobs if name in (job.stage, "all")]
         times = [job.elapsed_s for job in of_row]
         seconds = (sum(times) / len(times), max(times), sum(times), sum(job.cpu_s for job in of_row))
         shown = " | ".join(f"{value:.1f}" for value in seconds)
@@ -235,9 +227,7 @@ def finished(
     for block in blocks:
         if block.kind != "reported":
             columns = tuple(column for column in block.columns if column not in block.lower_is_better)
-            own = [{name: cell for name, cell in row.cells.items() if name in columns} for row in block.rows]
-            rows = [replace(row, cells=cells) for row, cells in zip(block.rows, own, strict=True)]
-            block = replace(block, rows=tuple(rows), columns=columns)
+            block = replace(block, columns=columns)
         if block.columns:
             repeated.append(block)
     elsewhere = f"Table {name}{SECONDS} adds the times and memory measured on this machine."
@@ -262,8 +252,6 @@ def quality_blocks(
 
     Labels with levels are a separate data set (Hi-LERF) or belong to the scene's own data set.
     """
-    if sources.scores.empty:
-        return []
     quality_columns, blocks = ("Hi-LERF mIoU", "Hi-LERF HC"), []
     scores = with_seeds(sources.scores)
     given = scores[(scores["seed"] == "0") & scores["protocol"].str.startswith(LEVEL_GIVEN.full_name)]
@@ -303,7 +291,6 @@ def by_answer(sources: Sources) -> dict[str, list[tuple[str, str, list[Cost]]]]:
     for cost in sorted(sources.costs, key=lambda cost: cost.scene):
         for method in cost.query_s:
             found.setdefault((cost.dataset, cost.variant, method), []).append(cost)
-
     rows: dict[str, list[tuple[str, str, list[Cost]]]] = {}
     for data, variant, method in sorted(found, key=lambda key: row_place(key[1], key[2], sources.labels)):
         rows.setdefault(data, []).append((variant, method, found[data, variant, method]))

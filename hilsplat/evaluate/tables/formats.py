@@ -53,7 +53,7 @@ def as_csv(table: Table) -> str:
     writer.writerow(["kind", "data", *(name.lower() for name in names), *values, "notes"])
     for block in table.blocks:
         for row in block.rows:
-            cells = [row.cell(column) for column in values]
+            cells = [row.cell(column) if column in block.columns else Cell() for column in values]
             notes = " ".join(dict.fromkeys(cell.note for cell in cells if cell.note))
             shown = [_csv_value(cell, block.kind) for cell in cells]
             writer.writerow([block.kind, block.data, *(row.names.get(n, "") for n in names), *shown, notes])

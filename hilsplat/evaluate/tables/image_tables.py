@@ -29,9 +29,10 @@ def hierarchy_table(sources: Sources) -> Table:
 
     def cells_of(part: "pd.DataFrame") -> dict[str, Cell]:
         ious = part[part["metric"] == "iou"]
+        above = ious.assign(value=(ious["value"] > 0.25).astype(float))
         cells = {
             **measured.level_cells(part),
-            "Acc@0.25": Cell.percent(measured.share_above(part, "iou", 0.25)),
+            "Acc@0.25": Cell.percent(measured.table_value(above, "iou")),
             **{f"HC {name}": Cell.percent(measured.table_value(part, f"hc_{name}")) for name in READINGS},
             "Avg, best threshold": measured.level_cells(part, "best_threshold_iou")["Avg"],
             "Pairs": Cell(str(len(ious)), float(len(ious))) if len(ious) else Cell(),
@@ -139,10 +140,9 @@ def ovs_table(sources: Sources) -> Table:
         del cells["Average mIoU"]
         if (part["dataset"] == "3d_ovs").all():
             part = part[part["scene"].isin(OVS_SCENES)]
-        overall, accuracy = (
-            Cell.percent(measured.table_value(part, name)) for name in ("iou", "pixel_accuracy")
-        )
-        return {**cells, "Overall mIoU": overall, "Overall accuracy": accuracy}
+        for name, metric in (("Overall mIoU", "iou"), ("Overall accuracy", "pixel_accuracy")):
+            cells[name] = Cell.percent(measured.table_value(part, metric))
+        return cells
 
     blocks = [sources.reported("3D-OVS")]
     blocks += measured.measured_blocks(sources, ("3d-ovs/",), cells_of, columns_of)

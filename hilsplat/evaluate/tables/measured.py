@@ -64,8 +64,6 @@ def measured_blocks(
         columns_of: returns the value columns, from the scores of a data set.
         label_of: maps protocols to labels; those with the same label share a row.
     """
-    if sources.scores.empty:
-        return []
     blocks = []
     for data, of_data in with_seeds(sources.scores).groupby("dataset", sort=True):
         placed: list[tuple[tuple, Row]] = []
@@ -81,25 +79,18 @@ def measured_blocks(
                 "Protocol": PROTOCOLS.get(label, label),
             }
             seeds = [cells_of(of_seed) for _, of_seed in part.groupby("seed", sort=True)]
-            if is_truth:
-                seeds = seeds[:1]  # annotations are the same under every seed
+            seeds = seeds[:1] if is_truth else seeds  # annotations are the same under every seed
             if len(seeds) > 1:
                 names["Seeds"] = str(len(seeds))
-            place = (
-                from_truth,
-                list(PROTOCOLS).index(label) if label in PROTOCOLS else -1,
-                *row_place(variant, method, sources.labels),
-                masks,
-                label,
-            )
+            protocol = list(PROTOCOLS).index(label) if label in PROTOCOLS else -1
+            place = from_truth, protocol, *row_place(variant, method, sources.labels), masks, label
             group = label if ranked_by_protocol else ""
             cells = {**mean_over_seeds(seeds), **over_seeds(part)}
             placed.append((place, Row(names, cells, None if is_truth or is_diagnostic else group)))
-        ordered = [row for _, row in sorted(placed, key=lambda each: each[0])]
-        distinct = without_repeats(ordered)
-        if distinct:
+        rows = without_repeats([row for _, row in sorted(placed, key=lambda each: each[0])])
+        if rows:
             columns = tuple(columns_of(selected))
-            blocks.append(Block(*kind_and_title(str(data)), distinct, columns, unranked=unranked))
+            blocks.append(Block(*kind_and_title(str(data)), rows, columns, unranked=unranked))
     return blocks
 
 
@@ -216,11 +207,6 @@ def scene_values(rows: "pd.DataFrame", metric: str, level: str | None = None) ->
 def table_value(rows: "pd.DataFrame", metric: str, level: str | None = None) -> float:
     """Return the unweighted mean of the scenes' numbers; nan if there are no rows."""
     return float(scene_values(rows, metric, level).mean())
-
-
-def share_above(rows: "pd.DataFrame", metric: str, threshold: float) -> float:
-    """Return the share of rows above a threshold, such as Acc@0.25, averaged like other values."""
-    return table_value(rows.assign(value=(rows["value"] > threshold).astype(float)), metric)
 
 
 def level_values(rows: "pd.DataFrame", metric: str) -> dict[Level, float]:

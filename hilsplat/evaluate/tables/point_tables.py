@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hilsplat.evaluate.protocols.cards import card_named, card_of
+from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.tables.measured import measured_blocks, scene_cells, table_value
 from hilsplat.evaluate.tables.rows import Cell, Sources, Table
 
@@ -131,7 +131,7 @@ def scannet_cells(sources: Sources, part: "pd.DataFrame") -> dict[str, Cell]:
     from hilsplat.evaluate.protocols.points import measure_instances, pooled_points
 
     if not of_benchmark.empty:  # the counts of all scenes are pooled
-        means = pooled_points(card_named(BENCHMARK), rows_of_scenes(of_benchmark), SCANNET200)
+        means = pooled_points(card_of(BENCHMARK), rows_of_scenes(of_benchmark), SCANNET200)
         cells |= {column: Cell.percent(means[metric]) for metric, column in SPLIT_COLUMNS.items()}
     if scans:
         rows = measure_instances(first["method"], scans, "nearest")

@@ -24,7 +24,7 @@ from hilsplat.datasets.sources import (
     published,
     unlisted,
 )
-from hilsplat.evaluate.protocols.cards import card_named
+from hilsplat.evaluate.protocols.cards import card_of
 from tests.conftest import PROJECT
 from tests.unit.datasets.writers.labelled import write_lerf_ovs
 
@@ -192,7 +192,7 @@ def test_the_data_set_of_the_documentation_is_read(example, tmp_path):
     assert region.text == "mug"
     assert np.array_equal(region.mask(), mug > 0)
     assert example.DESK.check(tmp_path, "mine").facts
-    assert [card_named(name).name for name in example.DESK.protocols] == list(example.DESK.protocols)
+    assert [card_of(name).name for name in example.DESK.protocols] == list(example.DESK.protocols)
     places = [path for pattern in example.DESK.label_places("mine") for path in tmp_path.glob(pattern)]
     assert tmp_path / "mine/labels/000/mug.png" in places
 

@@ -14,7 +14,7 @@ from hilsplat.datasets.points.labelled_points import LabelledPoints, PointScene
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.files_stage import run_evaluate_files
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
-from hilsplat.evaluate.protocols.cards import LEVEL_AUTO, LEVEL_GIVEN, card_named
+from hilsplat.evaluate.protocols.cards import LEVEL_AUTO, LEVEL_GIVEN, card_of
 from hilsplat.evaluate.protocols.points import measure_points
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import label_of, measure_view
@@ -133,7 +133,7 @@ def data_set(monkeypatch):
     """Function that makes `--labels set/s` open the given labels."""
 
     def put(known, flat=(), points=()):
-        extra = ExtraProtocols(*(tuple(map(card_named, names)) for names in (flat, points)))
+        extra = ExtraProtocols(*(tuple(map(card_of, names)) for names in (flat, points)))
         monkeypatch.setattr(
             ExtraProtocols, "open", staticmethod(lambda name, data_root: ("set", known, extra))
         )
@@ -199,7 +199,7 @@ def test_class_ids_of_points_score_as_the_same_labels_in_memory(data_set, tmp_pa
     (tmp_path / "scannet-10.txt").write_text("\n".join(map(str, of_ten)))
     frame = scored(tmp_path)
     for classes, given in ((SCANNET_19, predicted), (SCANNET_10, of_ten)):
-        card = card_named(f"scannet/opengaussian-{len(classes)}")
+        card = card_of(f"scannet/opengaussian-{len(classes)}")
         truth = known.truth["nyu40"].labels(classes)
         rows = measure_points(card, "files", truth, classes.labels(given), classes, "files")
         expected = {(row.query, row.metric): pytest.approx(row.value, abs=1e-6) for row in rows}

@@ -13,7 +13,7 @@ from hilsplat.datasets.images.ovs3d import FOREGROUND
 from hilsplat.datasets.labelled import mask_region
 from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevancy_mask
 from hilsplat.evaluate.protocols.answers import mask_rows
-from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_LANGSPLAT_V2, OVS_NODES, card_named
+from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_LANGSPLAT_V2, OVS_NODES, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
 from hilsplat.evaluate.protocols.view_truth import ViewTruth, eighth_of, kept_by_pillow
 from hilsplat.query.relevancy import relevancy_of_margins
@@ -99,7 +99,7 @@ def test_canonical_phrases_do_not_choose_the_level():
 def test_a_text_that_the_view_lacks_competes_and_counts_zero():
     cup, fork = query("cup", (0, 16), level=None), query("fork", (0, 0), level=None)
     cosines = {"cup": maps((0, 16)), "fork": maps((8, 32), 0.95)}
-    flat = flat_of([OVS_ARGMAX, card_named("3d-ovs/langsplat")], None, **cosines)
+    flat = flat_of([OVS_ARGMAX, card_of("3d-ovs/langsplat")], None, **cosines)
     assert {row.query for row in added(flat, maps((0, 16)), cup)} == {"cup"}
     assert not added(flat, maps((8, 32)), fork)
     rows = {(row.metric, row.query): row for row in flat.finish()}
@@ -120,7 +120,7 @@ def test_a_pixel_that_no_level_answers_is_a_miss():
     ("text", "level", "cards"),
     [
         ("handle", Level.PART, [LERF_MASK, OVS_ARGMAX]),  # parts are not queried on a stand-in
-        ("cup", Level.WHOLE, [card_named("lerf/opengaussian"), card_named("lerf/tree-nodes")]),  # no map rule
+        ("cup", Level.WHOLE, [card_of("lerf/opengaussian"), card_of("lerf/tree-nodes")]),  # no map rule
     ],
 )
 def test_parts_of_a_stand_in_and_protocols_without_a_map_rule_have_no_rows(text, level, cards):
@@ -235,7 +235,7 @@ def test_wood_wall_alone_is_united_with_wood_table_and_any_grey_is_true(tmp_path
         return high_in((20, 30))[None]
 
     scene = SimpleNamespace(field_relevancy=field_relevancy)
-    flat = FlatProtocols(scene, "v.png", [OVS_LANGSPLAT_V2, card_named("3d-ovs/langsplat")], None)
+    flat = FlatProtocols(scene, "v.png", [OVS_LANGSPLAT_V2, card_of("3d-ovs/langsplat")], None)
     rows = added(flat, high_in((0, 20)), query)
     found = {row.protocol.partition("@")[0]: row.value for row in rows if row.metric == "iou"}
     assert asked == others

@@ -16,7 +16,7 @@ from hilsplat.datasets.points.labelled_points import LABELLINGS, LabelledPoints
 from hilsplat.datasets.registry import DATASETS
 from hilsplat.evaluate.extra_protocols import STAND_INS, ExtraProtocols
 from hilsplat.evaluate.metrics.instances import average_precision, match_instances
-from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_named
+from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.protocols.carry import carried_to
 from hilsplat.evaluate.protocols.points import (
     classes_of_points,
@@ -30,8 +30,8 @@ from hilsplat.evaluate.scores import Measured, read_instances, read_scores, writ
 from hilsplat.evaluate.stage import scene_from_true
 from tests.unit.evaluate.builders import cameras_of, score
 
-OPENGAUSSIAN = PROTOCOLS["scannet/opengaussian-19@1"]
-WAYMO = PROTOCOLS["waymo/segmentation@1"]
+OPENGAUSSIAN = card_of("scannet/opengaussian-19")
+WAYMO = card_of("waymo/segmentation")
 TRUTH = np.array([1, 1, 1, 1, 2, 2, 3, 3, 0, 0])
 PREDICTION = np.array([1, 1, 2, 4, 2, 2, 3, 1, 1, 2])
 
@@ -74,7 +74,7 @@ def test_pooled_rows_equal_points_put_together_also_after_a_file(tmp_path):
 
 
 def test_scannet200_is_split_into_head_common_and_tail():
-    card = PROTOCOLS["scannet200/benchmark@1"]
+    card = card_of("scannet200/benchmark")
     places = [members.index(True) + 1 for members in splits_of(SCANNET200).values()]
     truth = np.repeat(places, 2)
     prediction = truth * np.array([1, 1, 1, 0, 0, 0])  # head right, common half, tail missed
@@ -147,7 +147,7 @@ def test_a_node_is_an_instance_of_its_best_class_also_after_a_file(block_world, 
 
 def test_rows_name_the_mode_and_are_moved_into_the_frame_of_the_scene(block_world, monkeypatch):
     monkeypatch.setitem(LABELLINGS, "drawn", (CLASSES,))
-    card = type(card_named("replica/per-scene"))(
+    card = type(card_of("replica/per-scene"))(
         "drawn/points", 1, ("miou_present",), "scenes", "argmax", "drawn", classes="blocks"
     )
     points, _ = points_of(block_world)
@@ -197,4 +197,4 @@ def test_stand_ins_and_data_sets_name_protocols_that_exist():
     with pytest.raises(SceneError, match="one of tabletop, room, street"):
         ExtraProtocols.of_world("table")
     with pytest.raises(ArtifactError, match="there is no protocol 'lerf/langsplatt'"):
-        card_named("lerf/langsplatt")
+        card_of("lerf/langsplatt")

@@ -10,7 +10,7 @@ from hilsplat.base.levels import LEVELS, Level
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, HierarchyAnnotations, write_hierarchy
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.protocols.answers import PackedMasks, Selections
-from hilsplat.evaluate.protocols.cards import PROTOCOLS, card_of
+from hilsplat.evaluate.protocols.cards import card_of
 from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.evaluate.protocols.views import measure_view
 from hilsplat.settings import EvaluateSettings
@@ -177,7 +177,7 @@ def test_other_protocols_are_measured_with_their_own_rules():
     relevancy[2, 8, 8], relevancy[2, 8, 9] = 0.9, 0.66  # min-max 0.7: just in the mask
     truth = ViewTruth.of_regions([region_of(box((2, 6), (2, 6)), "cup")], SIZE)
     scene = HandMade([], {}, {"cup": relevancy})
-    cards = [PROTOCOLS["3d-ovs/langsplat@2"], PROTOCOLS["3d-ovs/langsplat-raw@2"]]
+    cards = [card_of("3d-ovs/langsplat"), card_of("3d-ovs/langsplat-raw")]
     settings = EvaluateSettings(methods=("field",), filter_px=1, mix=False, majority=False, relevancy_scale=5)
     extra = ExtraProtocols(tuple(cards))
     rows = list(measure_view(Selections(scene), truth, "v.png", PackedMasks(SIZE), settings, extra))
