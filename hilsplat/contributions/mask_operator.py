@@ -1,7 +1,6 @@
 """Mask means as a linear map of the field, its adjoint, and averages of latents over masks.
 
-Rows with a multiple of sixteen float32 channels use the loops `_wide_means` and `_wide_spread`, whose results
-are bit-identical to those of the plain loops.
+Products of float32 rows use vectors of sixteen channels, with the bytes of plain loops over the channels.
 """
 
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from jaxtyping import Float, Float32, Int64, UInt8
 from hilsplat.base.compiled import compiled
 from hilsplat.base.lanes import WIDTH, lanes, load, store
 from hilsplat.base.processes import over_edges
-from hilsplat.contributions.compositing import plus
+from hilsplat.contributions.compositing import padded, plus
 
 MEDIAN_SOFTENING = 1e-4
 """Minimum distance between a latent and the median, to avoid division by zero."""
@@ -51,33 +50,26 @@ class MaskOperator:
         features, A = np.ascontiguousarray(features), self._arrays()
         shares = np.searchsorted(self.indptr, np.linspace(0, self.indptr[-1], self.threads + 1)[1:-1])
         edges = [0, *shares.tolist(), len(out)]
-        if _fills_lanes(out):
+        if out.dtype == np.float32 and out.shape[1] % WIDTH == 0:
             flat = features.reshape(-1), out.shape[1], out.reshape(-1)
             over_edges(_wide_means, edges, self.threads, *A, *flat)
         else:
             over_edges(_means, edges, self.threads, *A, features, out)
         return out
 
-    def spread(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N 3 D"]:
+    def spread(self, values: Float32[np.ndarray, "M D"]) -> Float32[np.ndarray, "N 3 D"]:
         """Return A' x at each level: the adjoint of `means`."""
-        out = np.zeros((self.num_gaussians, 3, values.shape[1]), values.dtype)
-        values, A = np.ascontiguousarray(values), self._arrays()
+        wide = padded(values)
+        width = wide.shape[1]
+        out = np.zeros((self.num_gaussians, 3, width), np.float32)
         parts = 1 if self.threads == 1 else SPREAD_PARTS * self.threads
         edges = np.linspace(0, self.num_gaussians, parts + 1).astype(np.int64).tolist()
-        if _fills_lanes(out):
-            flat = values.reshape(-1), values.shape[1], out.reshape(-1)
-            over_edges(_wide_spread, edges, self.threads, *A, *flat)
-        else:
-            over_edges(_spread, edges, self.threads, *A, values, out)
-        return out
+        flat = wide.reshape(-1), width, out.reshape(-1)
+        over_edges(_spread, edges, self.threads, *self._arrays(), *flat)
+        return np.ascontiguousarray(out[:, :, : values.shape[1]])
 
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.indptr, self.indices, self.data, self.level_index
-
-
-def _fills_lanes(values: np.ndarray) -> bool:
-    """Return whether rows are whole vectors of sixteen float32."""
-    return values.dtype == np.float32 and values.shape[-1] % WIDTH == 0
 
 
 def lifted_average(
@@ -128,17 +120,6 @@ def _means(first, last, indptr, indices, data, level_index, features, out):
 
 
 @compiled
-def _spread(begin, end, indptr, indices, data, level_index, values, out):
-    for m in range(len(level_index)):
-        level = level_index[m]
-        first = indptr[m] + np.searchsorted(indices[indptr[m] : indptr[m + 1]], begin)
-        for k in range(first, _columns_below(end, first, indptr[m + 1], indices)):
-            g, weight = indices[k], data[k]
-            for c in range(values.shape[1]):
-                out[g, level, c] += weight * values[m, c]
-
-
-@compiled
 def _wide_means(first, last, indptr, indices, data, level_index, features, width, out):
     """Compute `_means` for flat features and `out`, with `width` channels per row."""
     num_gaussians = len(features) // (3 * width)
@@ -157,8 +138,8 @@ def _wide_means(first, last, indptr, indices, data, level_index, features, width
 
 
 @compiled
-def _wide_spread(begin, end, indptr, indices, data, level_index, values, width, out):
-    """Compute `_spread` for flat values and `out`, with `width` channels per row."""
+def _spread(begin, end, indptr, indices, data, level_index, values, width, out):
+    """Add columns begin..end of A' x to `out`; values and `out` are flat, with `width` channels per row."""
     masks = len(level_index)
     at = np.empty(masks, np.int64)
     for m in range(masks):

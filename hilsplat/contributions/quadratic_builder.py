@@ -103,7 +103,7 @@ class GramBuilder:
         self._late = [_Rows(end - begin) for begin, end in self._ranges]
         self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
         for _ in range(self._threads):
-            sums, fresh = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
+            sums, fresh = np.zeros((num_gaussians, SUMS)), np.empty(num_gaussians, np.int32)
             self._idle.put((sums, fresh, np.empty(1024, np.int32), np.empty((1024, len(LEVELS)))))
 
     @property
@@ -261,14 +261,12 @@ class QuadraticBuilder:
         """Return all parts added so far as arrays."""
         out = {"nonzeros": np.array([self.weights_nonzeros, self._keeps_weights], np.int64)}
         if self._gram is not None:
+            self._add_waiting(self._gram)
             out |= self._gram.state()
-        held = {"parts": stack_weights(self._parts)} if self._parts else {}
-        if self._waiting.nonzeros:
-            held["waiting"] = self._waiting.held()
-        for name, stacked in held.items():
-            out[f"{name}_valid"] = stacked.valid
-            for what in ("data", "indices", "indptr"):
-                out[f"{name}_{what}"] = getattr(stacked.weights, what)
+        if self._parts:
+            held = stack_weights(self._parts)
+            out |= {"valid": held.valid, "data": held.weights.data}
+            out |= {"columns": held.weights.indices, "starts": held.weights.indptr}
         return out
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -276,13 +274,10 @@ class QuadraticBuilder:
         self.weights_nonzeros, self._keeps_weights = int(state["nonzeros"][0]), bool(state["nonzeros"][1])
         if self._gram is not None:
             self._gram.restore(state)
-        for name in ("parts", "waiting"):
-            if f"{name}_valid" not in state:
-                continue
-            arrays = tuple(state[f"{name}_{what}"] for what in ("data", "indices", "indptr"))
-            shape = (len(arrays[2]) - 1, self._num_gaussians)
-            part = StackedWeights(sp.csr_matrix(arrays, shape=shape), state[f"{name}_valid"])
-            (self._parts if name == "parts" else self._waiting).append(part)
+        if "valid" in state:
+            shape = (len(state["valid"]), self._num_gaussians)
+            matrix = sp.csr_matrix((state["data"], state["columns"], state["starts"]), shape=shape)
+            self._parts = [StackedWeights(matrix, state["valid"])]
 
     def finish(self) -> Quadratic:
         """Return G or W of all added parts."""

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float64, Int32
 
 from hilsplat.base.compiled import compiled
 from hilsplat.base.processes import over_edges
+from hilsplat.contributions.kernels import enlarged
 
 ROWS_AT_A_TIME = 64
 """Number of masks per thread task."""
@@ -70,10 +71,10 @@ def mask_evidence(
     seen = np.where(everywhere < min_covisible * own[:, None], 0.0, everywhere)
     pairs = (*rows, weighted, *by_column, view, seen, everywhere)
     parts = over_edges(_shared_pairs, edges, threads, *pairs)
-    counts, indices, *sums = (np.concatenate(each) for each in zip(*parts, strict=True))
+    counts, indices, sums = (np.concatenate(each) for each in zip(*parts, strict=True))
     indptr = np.concatenate(([0], np.cumsum(counts)))
-    intersection, union = (sp.csr_matrix((values, indices, indptr), shape=(num, num)) for values in sums)
-    return Evidence(intersection, union, seen, view)
+    matrices = [sp.csr_matrix((each, indices, indptr), shape=(num, num)) for each in sums.T.copy()]
+    return Evidence(*matrices, seen, view)
 
 
 @compiled
@@ -90,14 +91,13 @@ def _seen_sizes(begin, end, indptr, indices, sizes, visible, out):
 def _shared_pairs(
     begin, end, indptr, indices, weighted, col_indptr, col_rows, col_shares, view, seen, everywhere
 ):
-    """Return the pairs a < b that share Gaussians: number per row, b, intersection and union."""
+    """Return the pairs a < b that share Gaussians: number per row, b, and intersection and union (E x 2)."""
     num = len(indptr) - 1
     touched_by = np.full(num, -1, np.int64)
     sums = np.zeros(num)
     found = np.empty(num, np.int32)
     counts = np.zeros(end - begin, np.int64)
-    out = np.empty(1024, np.int32)
-    out_intersection, out_union = np.empty(1024), np.empty(1024)
+    out, out_sums = np.empty(1024, np.int32), np.empty((1024, 2))
     done = 0
     for a in range(begin, end):
         count = 0
@@ -116,18 +116,14 @@ def _shared_pairs(
                     sums[b] += weighted[k] * col_shares[t]
         found[:count] = np.sort(found[:count])
         if done + count > len(out):
-            room = 2 * (done + count)
-            more, more_intersection, more_union = np.empty(room, np.int32), np.empty(room), np.empty(room)
-            more[:done], more_intersection[:done] = out[:done], out_intersection[:done]
-            more_union[:done] = out_union[:done]
-            out, out_intersection, out_union = more, more_intersection, more_union
+            out, out_sums = enlarged(out, out_sums, done, 2 * (done + count))
         for place in range(count):
             b = found[place]
             if seen[a, view[b]] == 0.0 and seen[b, view[a]] == 0.0:
                 continue
             out[done] = b
-            out_intersection[done] = sums[b]
-            out_union[done] = everywhere[a, view[b]] + everywhere[b, view[a]] - sums[b]
+            out_sums[done, 0] = sums[b]
+            out_sums[done, 1] = everywhere[a, view[b]] + everywhere[b, view[a]] - sums[b]
             counts[a - begin] += 1
             done += 1
-    return counts, out[:done].copy(), out_intersection[:done].copy(), out_union[:done].copy()
+    return counts, out[:done].copy(), out_sums[:done].copy()

@@ -280,18 +280,11 @@ class ViewNodes:
 
 @compiled
 def _summed_by_node(indptr, indices, data, node_of_gaussian):
-    num_pixels = len(indptr) - 1
-    out_indptr = np.zeros(num_pixels + 1, np.int64)
-    room = max(1024, 2 * num_pixels)
-    nodes, shares = np.empty(room, np.int32), np.empty(room, np.float32)
+    out_indptr = np.zeros(len(indptr), np.int64)
+    # untouched pages of these arrays take no memory
+    nodes, shares = np.empty(len(indices), np.int32), np.empty(len(indices), np.float32)
     done = 0
-    for p in range(num_pixels):
-        longest = indptr[p + 1] - indptr[p]
-        if done + longest > room:
-            room = 2 * (done + longest)
-            more_nodes, more_shares = np.empty(room, np.int32), np.empty(room, np.float32)
-            more_nodes[:done], more_shares[:done] = nodes[:done], shares[:done]
-            nodes, shares = more_nodes, more_shares
+    for p in range(len(indptr) - 1):
         first = done
         for k in range(indptr[p], indptr[p + 1]):
             node = node_of_gaussian[indices[k]]
