@@ -6,12 +6,10 @@ the scanner's positions are recorded, not estimated from the images.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from hilsplat.base.artifacts import write_npz
 from hilsplat.base.levels import NONE
 from hilsplat.world.scenes.scene import WorldScene
 
@@ -51,10 +49,6 @@ class LidarScan:
     range_m: Float32[np.ndarray, " P"]
     beam: Int32[np.ndarray, " P"]
     origins: Float[np.ndarray, "S 3"]
-
-    def save(self, path: Path) -> None:
-        """Write all fields as .npz; identical scans produce identical bytes."""
-        write_npz(path, **vars(self))
 
 
 def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:

@@ -213,12 +213,11 @@ def _panel(
 
 def node_colours(count: int) -> UInt8[np.ndarray, "N 3"]:
     """Return a colour per node; consecutive nodes have very different hues (golden-ratio steps)."""
-    hue = (0.13 + 0.618034 * np.arange(count)) % 1
-    value = 0.70 + 0.30 * ((np.arange(count) // 3) % 2)
-    saturation = 0.55 + 0.35 * ((np.arange(count) // 2) % 2)
-    channel = (hue[:, None] * 6 + np.array([5.0, 3.0, 1.0])) % 6
-    ramp = np.clip(np.minimum(channel, 4 - channel), 0, 1)
-    return (255 * value[:, None] * (1 - saturation[:, None] * ramp)).astype(np.uint8)
+    from matplotlib.colors import hsv_to_rgb
+
+    row = np.arange(count)
+    hsv = ((0.13 + 0.618034 * row) % 1, 0.55 + 0.35 * (row // 2 % 2), 0.70 + 0.30 * (row // 3 % 2))
+    return (255 * hsv_to_rgb(np.stack(hsv, axis=1))).astype(np.uint8)
 
 
 def coloured(

@@ -23,11 +23,9 @@ def split_of_seed(seed: int) -> str:
 
 
 def require_split(seed: int, split: str) -> None:
-    """Raise `SceneError` if a scene seed is not in a split, or the split is unknown."""
-    if split not in SPLITS:
-        raise SceneError(f"unknown split {split!r} of scene seeds", expected=f"one of {', '.join(SPLITS)}")
-    if seed not in SPLITS[split]:
-        seeds = SPLITS[split]
+    """Raise `SceneError` if a scene seed is not in one of `SPLITS`."""
+    seeds = SPLITS[split]
+    if seed not in seeds:
         raise SceneError(
             f"scene seed {seed} is not in the {split} split",
             expected=f"{seeds.start} to {seeds.stop - 1}",

@@ -71,11 +71,9 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _flat(triangles: np.ndarray) -> Mesh:
-    """Return a flat-shaded mesh without degenerate triangles."""
-    triangles = np.asarray(triangles, dtype=np.float64)
+    """Return a flat-shaded mesh of non-degenerate triangles."""
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    keep = np.linalg.norm(normal, axis=1) > 1e-12
-    return Mesh(triangles[keep], np.repeat(_unit(normal[keep])[:, None], 3, axis=1))
+    return Mesh(triangles, np.repeat(_unit(normal)[:, None], 3, axis=1))
 
 
 def _fan(polygon: np.ndarray) -> list[np.ndarray]:
@@ -139,13 +137,10 @@ def lathe(profile: Sequence[tuple[Number, Number]], segments: int = 28) -> Mesh:
     """Return a surface of revolution about z.
 
     Args:
-        profile: (radius, z) from bottom to top along the outside, so that normals point outwards.
+        profile: distinct (radius, z) from bottom to top along the outside, so that normals point outwards.
         segments: number of facets around the axis.
     """
     points = np.asarray(profile, dtype=np.float64)
-    steps = np.diff(points, axis=0)
-    keep = np.concatenate([[True], np.linalg.norm(steps, axis=1) > 1e-9])
-    points = points[keep]
     steps = np.diff(points, axis=0)
     normals = _unit(np.stack([steps[:, 1], -steps[:, 0]], axis=1))  # (radial, z) of each piece
     smooth = np.cos(np.radians(SMOOTH_BELOW_DEG))

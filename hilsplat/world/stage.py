@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilsplat.base.artifacts import atomic_folder, require_free_space, write_index, write_json
+from hilsplat.base.artifacts import atomic_folder, require_free_space, write_index, write_json, write_npz
 from hilsplat.base.errors import SceneError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS
@@ -61,15 +61,13 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
     `settings`, not on `threads`.
 
     Raises:
-        SceneError: if the source does not name a scene, or no object fits into it.
+        SceneError: if the source does not name a scene.
         DiskSpaceError: if the disk is too full.
     """
     kind, seed = parse_source(source)
     out = Path(out)
     with stage_log("world", source) as counts:
         scene = _scene(kind, seed, settings.objects)
-        if not scene.placed:
-            raise SceneError(f"no object fits in {source}", fix="use another seed")
         cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
         require_free_space(out, needed_mib=5 + settings.views * settings.image_px**2 * 4 / 2**20)
         smallest = smallest_areas(settings.image_px, settings.min_area_px)
@@ -90,14 +88,12 @@ def run_world(source: str, settings: WorldSettings, out: Path, threads: int) -> 
             write_mesh(folder / "mesh.ply", scene, cameras, MESH_EDGE.get(kind))
             if kind == "street":
                 centres = np.stack([cameras[name].centre for name in cameras.names])
-                scan_street(scene, centres).save(folder / "lidar.npz")
+                write_npz(folder / "lidar.npz", **vars(scan_street(scene, centres)))
             write_json(folder / "scene.json", _record(source, scene))
             index = {name: {"annotated": len(ids)} for name, ids in annotated.items()}
             write_index(folder, index, source=source)
-        placed = f"{len(scene.placed)} of {scene.asked}"
-        counts.update(
-            views=len(cameras), objects=placed, nodes=len(scene.nodes), triangles=len(scene.triangles)
-        )
+        counts.update(views=len(cameras), objects=f"{len(scene.placed)} of {scene.asked}")
+        counts.update(nodes=len(scene.nodes), triangles=len(scene.triangles))
 
 
 def _record(source: str, scene: WorldScene) -> dict[str, object]:
@@ -119,7 +115,7 @@ _scene = lru_cache(maxsize=1)(build_scene)
 
 
 def _render(kind: str, seed: int, settings: WorldSettings, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render one view and its labels; at module level, so that worker processes can import it."""
+    """Render one view and its labels in a worker process."""
     scene = _scene(kind, seed, settings.objects)
     cameras = scene_cameras(scene, settings.views, settings.image_px, settings.arc_deg)
     return render_and_label(scene, cameras[cameras.names[row]], settings.samples)

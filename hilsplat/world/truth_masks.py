@@ -12,7 +12,7 @@ comparable.
 """
 
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,7 +51,7 @@ REACH = 3.0
 WAVES = 48
 """Number of plane waves that are summed for a boundary's displacement."""
 
-Borders = dict[int, dict[int, int]]
+Borders = dict[int, Counter[int]]
 """Node -> adjacent sibling -> length of their common border, px."""
 
 
@@ -164,19 +164,18 @@ class TrueNodes:
         labels: Iterable[Int32[np.ndarray, "3 H W"]],
     ) -> "TrueNodes":
         """Measure the borders in all views; `labels` has one image of node ids per view, -1 for none."""
-        total: Borders = defaultdict(lambda: defaultdict(int))
+        total: Borders = defaultdict(Counter)
         alone = TrueNodes(nodes, frozenset(background), {})
         for view in labels:
             for level in LEVELS:
                 for node, around in sibling_borders(view[level.index], alone).items():
-                    for other, length in around.items():
-                        total[node][other] += length
+                    total[node].update(around)
         return replace(alone, partner={node: longest_border(total[node]) for node in sorted(total)})
 
 
 def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borders:
     """Return the common borders of sibling nodes at one level, without the surroundings."""
-    borders: Borders = defaultdict(lambda: defaultdict(int))
+    borders: Borders = defaultdict(Counter)
     for first, second in ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:])):
         differ = (first != second) & (first != NONE) & (second != NONE)
         pairs = np.stack([first[differ], second[differ]], axis=1)
@@ -186,7 +185,7 @@ def sibling_borders(labels: Int32[np.ndarray, "H W"], truth: TrueNodes) -> Borde
             if siblings and not {a, b} & truth.background:
                 borders[a][b] += int(length)
                 borders[b][a] += int(length)
-    return {node: dict(around) for node, around in borders.items()}
+    return borders
 
 
 def longest_border(around: Mapping[int, int]) -> int:
