@@ -4,6 +4,7 @@ import numpy as np
 
 from hilsplat.segment.masks import HierarchicalMasks
 from models.training.data import LabelledNode, LabelledViews
+from tests.unit.segment.handmade import pack
 
 
 def drawn_views(count: int, size: int, seed: int = 0) -> LabelledViews:
@@ -41,6 +42,5 @@ def drawn_views(count: int, size: int, seed: int = 0) -> LabelledViews:
 
 def drawn_masks(*masks_of_level: tuple[int, np.ndarray]) -> HierarchicalMasks:
     """Masks of a view, given with their levels; all scores are 1."""
-    ones = np.ones(len(masks_of_level), np.float32)
-    level = np.array([level for level, _ in masks_of_level], np.uint8)
-    return HierarchicalMasks.from_dense(np.stack([mask for _, mask in masks_of_level]), level, ones, ones)
+    level, masks = zip(*masks_of_level, strict=True)
+    return pack(np.stack(masks), level)

@@ -21,19 +21,20 @@ from models.training.sam import (
 )
 
 
-def session(path) -> onnxruntime.InferenceSession:
+def run_network(path, **inputs: np.ndarray) -> list[np.ndarray]:
+    """All outputs of an exported network."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return session.run(None, inputs)
 
 
 def decoded(folder, network, pixels, points, labels):
     """Embeddings, predicted IoUs and logits of the exported segmenter."""
-    vision = session(folder / "onnx/vision_encoder.onnx")
-    place, shared = vision.run(None, {"pixel_values": pixels.numpy()})
-    feeds = {"input_points": points.numpy(), "input_labels": labels.numpy()}
-    feeds |= {"image_embeddings": place, "image_positional_embeddings": shared}
-    return place, *session(folder / f"onnx/{network}.onnx").run(["iou_scores", "pred_masks"], feeds)
+    place, shared = run_network(folder / "onnx/vision_encoder.onnx", pixel_values=pixels.numpy())
+    inputs = {"image_embeddings": place, "image_positional_embeddings": shared}
+    inputs |= {"input_points": points.numpy(), "input_labels": labels.numpy()}
+    return place, *run_network(folder / f"onnx/{network}.onnx", **inputs)  # predicted IoUs, logits
 
 
 def round_to_half(module: torch.nn.Module) -> torch.nn.Module:
@@ -128,20 +129,16 @@ def test_exported_clip_equals_torch(tmp_path):
     export_clip(vision, text, tokenizer, tmp_path)
     for batch in (1, 3):
         pixels = torch.randn(batch, 3, CROP_PX, CROP_PX)
-        (found,) = session(tmp_path / "onnx" / "vision_model.onnx").run(
-            None, {"pixel_values": pixels.numpy()}
-        )
+        (found,) = run_network(tmp_path / "onnx/vision_model.onnx", pixel_values=pixels.numpy())
         with torch.no_grad():
             assert np.abs(found - vision(pixels).numpy()).max() < 1e-3
         assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, abs=1e-4)
     stored = Tokenizer.from_file(str(tmp_path / "tokenizer.json"))
     for phrases in (["bear"], ["bear", "the HEAD of a zebra", "object"]):
         encoded = stored.encode_batch(phrases)
-        words = np.array([row.ids for row in encoded], dtype=np.int64)
-        mask = np.array([row.attention_mask for row in encoded], dtype=np.int64)
-        (found,) = session(tmp_path / "onnx" / "text_model.onnx").run(
-            None, {"input_ids": words, "attention_mask": mask}
-        )
+        words = np.array([row.ids for row in encoded])
+        mask = np.array([row.attention_mask for row in encoded])
+        (found,) = run_network(tmp_path / "onnx/text_model.onnx", input_ids=words, attention_mask=mask)
         with torch.no_grad():
             expected = text(torch.from_numpy(words), torch.from_numpy(mask)).numpy()
         assert np.abs(found - expected).max() < 1e-3

@@ -40,11 +40,15 @@ def weights_of(run) -> np.ndarray:
     return torch.cat([p.detach().flatten() for module in run[:2] for p in module.parameters()]).numpy()
 
 
-def test_resuming_after_an_interruption_gives_the_same_weights(tmp_path, monkeypatch):
+def test_an_interrupted_and_extended_training_gives_the_weights_of_a_single_run(tmp_path, monkeypatch):
     views = drawn_views(2, 64)
     tuning = Tuning(peak=2e-3, warmup=2, measure_every=100, save_every=2)
-    whole = train_sam(views, views, Budget(steps=6), 3, tmp_path / "a", **WINDOWS, tuning=tuning)
-    steps = iter(range(6))
+
+    def train(steps, folder):
+        return train_sam(views, views, Budget(steps=steps), 3, tmp_path / folder, **WINDOWS, tuning=tuning)
+
+    whole = train(8, "a")
+    steps = iter(range(4))
 
     def killed(*args):
         if next(steps) == 3:
@@ -53,19 +57,9 @@ def test_resuming_after_an_interruption_gives_the_same_weights(tmp_path, monkeyp
 
     with monkeypatch.context() as context, pytest.raises(KeyboardInterrupt):
         context.setattr("models.training.train_sam.training_loss", killed)
-        train_sam(views, views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
-    assert (tmp_path / "b" / "sam.safetensors").is_file()
-    resumed = train_sam(views, views, Budget(steps=6), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
-    assert np.array_equal(weights_of(whole), weights_of(resumed))
-
-
-def test_extending_a_finished_training_gives_the_weights_of_a_longer_one(tmp_path):
-    views = drawn_views(2, 64)
-    tuning = Tuning(peak=2e-3, warmup=2, measure_every=100, save_every=100)
-    longer = train_sam(views, views, Budget(steps=8), 3, tmp_path / "a", **WINDOWS, tuning=tuning)
-    train_sam(views, views, Budget(steps=4), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
-    extended = train_sam(views, views, Budget(steps=8), 3, tmp_path / "b", **WINDOWS, tuning=tuning)
-    assert np.array_equal(weights_of(longer), weights_of(extended))
+        train(4, "b")
+    train(4, "b")
+    assert np.array_equal(weights_of(whole), weights_of(train(8, "b")))
 
 
 def test_a_budget_in_minutes_schedules_the_decay_from_the_speed():
@@ -94,13 +88,10 @@ def test_segmentation_loss_is_near_zero_for_the_ground_truth_and_ignores_unknown
     right, wrong = (truth * 2 - 1) * 20, (1 - truth * 2) * 20
     known = torch.tensor([[[1.0, 1.0, 1.0]]])
     masks, quality = segmentation_loss(torch.ones(1, 1, 3), right, truth, weights, known)
-    assert masks.item() == pytest.approx(0.0, abs=1e-3)
-    assert quality.item() == pytest.approx(0.0, abs=1e-6)
+    assert masks.item() < 1e-3 and quality.item() < 1e-6
     one_wrong = torch.cat([right[:, :, :2], wrong[:, :, 2:]], dim=2)
     partly = torch.tensor([[[1.0, 1.0, 0.0]]])
-    masks, quality = segmentation_loss(partly, one_wrong, truth, weights, partly)
-    assert masks.item() == pytest.approx(0.0, abs=1e-3)
-    assert quality.item() == pytest.approx(0.0, abs=1e-6)
+    assert sum(segmentation_loss(partly, one_wrong, truth, weights, partly)).item() < 1e-3
 
 
 def test_logits_at_sampled_pixels_equal_those_of_the_whole_mask(trained):
