@@ -1,12 +1,10 @@
 """Outlines around clicks and boxes, by the SAM that made the masks of a scene."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from hilsplat.annotate.proposals import KEPT_VIEWS, Clicks
+from hilsplat.annotate.proposals import Clicks
 from hilsplat.base.artifacts import write_index
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.images import write_png
@@ -33,20 +31,15 @@ def iou(found: np.ndarray, expected: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Scene:
-    """Photographs of two discs on a grey table."""
+    """A photograph of two discs on a grey table."""
     folder = tmp_path_factory.mktemp("results") / "photos/discs/scene"
-    names = tuple(f"{number:03d}.png" for number in range(KEPT_VIEWS + 1))
-    rng = np.random.default_rng(0)
-    for name in names:
-        pixels = np.full((*SIZE, 3), 120.0) + rng.normal(0, 6, (*SIZE, 1))
-        for each in (LEFT, RIGHT):
-            pixels[disc(*each)] = (215, 60, 40)
-        write_png(folder / "images" / name, np.clip(pixels, 0, 255).astype(np.uint8))
-    many = len(names)
-    poses, sizes = np.tile(np.eye(4), (many, 1, 1)), np.full((many, 2), SIZE, np.int32)
-    cameras = Cameras(names, poses, np.tile(np.diag([200.0, 200, 1]), (many, 1, 1)), sizes)
-    points = np.zeros((0, 3), np.float32)
-    split = dict.fromkeys(names, "train")
+    pixels = np.full((*SIZE, 3), 120.0) + np.random.default_rng(0).normal(0, 6, (*SIZE, 1))
+    for each in (LEFT, RIGHT):
+        pixels[disc(*each)] = (215, 60, 40)
+    write_png(folder / "images/000.png", np.clip(pixels, 0, 255).astype(np.uint8))
+    camera = np.eye(4)[None], np.diag([200.0, 200, 1])[None], np.array([SIZE], np.int32)
+    points, split = np.zeros((0, 3), np.float32), {"000.png": "train"}
+    cameras = Cameras(("000.png",), *camera)
     made = Scene(folder, "photos/discs", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4))
     made.save()
     return made
@@ -85,17 +78,8 @@ def test_something_must_be_clicked_inside_the_photograph(clicks):
             clicks.outlines("000.png", asked, None)
 
 
-def test_features_of_the_last_photographs_are_kept(clicks, scene):
-    for view in scene.views():
-        clicks.encoded(view)
-    assert clicks.encoded.cache_info().currsize == KEPT_VIEWS < len(scene.views())
-
-
-@pytest.mark.parametrize("segmenter", ["graph", None])
-def test_a_scene_without_sam_masks_reports_it(scene, tmp_path, segmenter):
-    if segmenter:
-        write_index(tmp_path / "masks", {}, segmenter=segmenter, model=None)
-    without = Clicks(scene, Path(tmp_path / "masks"))
-    assert without.name == ""
+def test_a_scene_without_sam_masks_reports_it(scene, tmp_path):
+    assert Clicks(scene, tmp_path / "masks").name == ""  # before there are masks
+    write_index(tmp_path / "masks", {}, segmenter="graph", model=None)
     with pytest.raises(SettingsError, match="without SAM"):
-        without.outlines("000.png", [(60, 90, True)], None)
+        Clicks(scene, tmp_path / "masks").outlines("000.png", [(60, 90, True)], None)

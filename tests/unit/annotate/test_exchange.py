@@ -43,10 +43,10 @@ def files_of(data: bytes) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("kind", ["hilsplat", "isat", "labelme", "coco"])
-def test_exported_files_are_read_back_with_levels_and_parents(kind, known, cameras):
-    found: dict[str, list[Label]] = {}
-    for name, text in files_of(exported(kind, known, cameras)).items():
-        found |= imported(name, text, cameras)
+def test_exported_files_are_read_back_with_levels_and_parents_and_change_nothing(kind, known, cameras):
+    files = [imported(name, text, cameras) for name, text in files_of(exported(kind, known, cameras)).items()]
+    assert merged(known, files, dict.fromkeys(cameras.names, SIZE)) == ({}, 0, 4)
+    found = {view: labels for file in files for view, labels in file.items()}
     assert found.keys() == known.keys()
     for view, labels in known.items():
         by_id = {label.id: label for label in found[view]}
@@ -121,16 +121,13 @@ def shapes(shape: str) -> str:
         ('{"shapes": [], "imagePath": "DSC_9.jpg"}', "not match a photograph"),
         ('{"shapes": [], "imagePath": "DSC_1.jpg", "imageHeight": 60, "imageWidth": 80}', "80 x 60 px"),
         (shapes('{"label": "a", "points": [[1, 1]], "shape_type": "circle"}'), "circle"),
-        (shapes('{"label": "", "points": [[1, 1], [5, 5]]}'), "text: "),
         (shapes('{"label": "  ", "points": [[1, 1], [5, 5]]}'), "text: "),
         (shapes('{"label": "a\\u0007", "points": [[1, 1], [5, 5]]}'), "text: "),
         (200_000 * "[" + 200_000 * "]", "nested too deeply"),
         (shapes('{"label": "a", "points": [[1, 1e999], [5, 5]]}'), "read"),
-        (shapes('{"label": "a", "points": [[1, NaN], [5, 5]]}'), "read"),
         (shapes('{"label": "a", "points": [[1, 1]], "group_id": [1]}'), "read"),
         (shapes("7"), "read"),
         ('{"shapes": [], "imagePath": "DSC_1", "imageHeight": [1], "imageWidth": NaN}', "not match the size"),
-        ('{"annotations": [7], "images": [], "categories": []}', "COCO"),
         ('{"annotations": [], "images": [], "categories": [{"id": [1], "name": "a"}]}', "COCO"),
         ('{"objects": [7], "info": {"name": "DSC_1", "width": 40, "height": 30}}', "file.json, object 0"),
         ('{"objects": [], "info": 7}', "valid image size"),
@@ -179,12 +176,6 @@ def test_two_things_with_one_text_stay_separate():
     files = [numbered(view, ("mug", 2, 2), ("mug", 20, 2)) for view in SIZES]
     found, _, _ = merged({}, files, SIZES)
     assert [[label.id for label in found[view]] for view in SIZES] == [[1, 2], [1, 2]]
-
-
-@pytest.mark.parametrize("kind", ["hilsplat", "isat", "labelme", "coco"])
-def test_importing_our_own_export_changes_nothing(kind, known, cameras):
-    files = [imported(name, text, cameras) for name, text in files_of(exported(kind, known, cameras)).items()]
-    assert merged(known, files, SIZES) == ({}, 0, 4)
 
 
 def test_a_corrected_region_replaces_that_of_the_same_thing(known, cameras):

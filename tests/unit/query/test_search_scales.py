@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from hilsplat.base.levels import Level
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.node_search import margin_range, search
+from hilsplat.query.node_search import search
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -46,13 +46,6 @@ def test_twins_do_not_make_the_penalty_vanish():
     tree = tree_of([1, 1, 2, 2], [-1, -1, 0, -1])
     hits = searched(tree, [[3.0, 2.9, 0, 0], [0, 0, 2.00, 2.01]], "bear", "head")
     assert (hits.ids.tolist(), hits.route) == ([2], "child")
-
-
-def test_the_range_of_margins_includes_zero():
-    assert margin_range(np.array([-1.0, 4.0])) == 5.0
-    assert margin_range(np.array([2.0, 4.0])) == 4.0
-    assert margin_range(np.array([-2.0, -1.0])) == 2.0
-    assert margin_range(np.zeros(0)) == 0.0
 
 
 COSINES = (0.30, 0.35, 0.28)
