@@ -83,10 +83,6 @@ class ClipModel:
         """Fixed number of crops per call of the vision network, if any; it is 1 in open_clip's exports."""
         return self.vision.fixed_axis(self.pixels, 0)
 
-    def use_int8(self, network: Network) -> None:
-        """Replace the vision network with its int8 version."""
-        self.__dict__["vision"], self.precision = network, "int8"
-
     def _pad_id(self, text_config: dict[str, Any]) -> int:
         """Return the padding token's id from the tokenizer, else its configuration, else the model's."""
         named = (self.tokenizer.padding or {}).get("pad_id")

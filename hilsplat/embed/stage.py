@@ -1,7 +1,6 @@
 """Stage `clip`: CLIP vectors of each node's best crops, or of all masks."""
 
 from collections.abc import Mapping
-from functools import cache as cache_calls
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,6 @@ from hilsplat.models.int8 import (
     use_int8,
 )
 from hilsplat.models.memory import needs_of
-from hilsplat.models.network import Network
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks, pixel_digests, require_same_masks
 from hilsplat.settings import ClipSettings
@@ -172,25 +170,20 @@ def _choose_precision(
             for view, row in places
         ]
     )
+    quantised = int8_network(model.model, "vision_model", cache)
 
-    @cache_calls
-    def quantised() -> Network:
-        return int8_network(model.model, "vision_model", cache)
+    def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        (found,) = quantised(**{model.pixels: model.prepare(one[None])})
+        return model.embed_crops(one[None]), unit(found)
 
     def measure() -> dict[str, float]:
-        network = quantised()  # computed once, before the threads start
-
-        def both(one: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            (found,) = network(**{model.pixels: model.prepare(one[None])})
-            return model.embed_crops(one[None]), unit(found)
-
         pairs = zip(*in_order(both, list(crops), threads), strict=True)
         full, found = (np.concatenate(each) for each in pairs)
         return agreement_of_vectors(full, found, model.embed_texts(list(WORDS)))
 
     inputs = {"model": model.digest, "crops": sha256_of_bytes(crops.tobytes()), "words": WORDS}
     if use_int8(settings.precision, "CLIP", cache, inputs, measure):
-        model.use_int8(quantised())
+        model.vision, model.precision = quantised, "int8"
 
 
 def chosen_masks(semantic_tree_folder: Path, per_node: int) -> dict[str, Int64[np.ndarray, " m"]]:

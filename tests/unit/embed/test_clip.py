@@ -6,7 +6,6 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from onnx import helper
 
 from hilsplat.base.artifacts import read_index, read_npy, sha256_of_path, write_index, write_npz
 from hilsplat.base.errors import MisalignedArtifactError, ModelError, SettingsError
@@ -20,7 +19,7 @@ from hilsplat.segment.digests import digests_in, index_entry
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import ClipSettings
 from tests.unit.finished_desk import write_colour_clip
-from tests.unit.segment.handmade import pack, save_network, save_scene, tensor
+from tests.unit.segment.handmade import pack, save_network, save_scene
 
 
 @pytest.fixture
@@ -159,12 +158,11 @@ def test_int8_is_used_only_if_it_agrees_on_crops_of_the_scene(
     weights = np.random.default_rng(0).uniform(0.1, 1, (48, 3)).astype(np.float32)
     weights[16:] *= -1
     weights[47] = largest
-    nodes = [
-        helper.make_node("Flatten", ["pixel_values"], ["flat"], name="flatten"),
-        helper.make_node("MatMul", ["flat", "weights"], ["image_embeds"], name="product"),
-    ]
-    inputs, outputs = [tensor("pixel_values", ["batch", 3, 4, 4])], [tensor("image_embeds", ["batch", 3])]
-    save_network(colour_clip / "vision_model.onnx", nodes, inputs, outputs, {"weights": weights})
+    text = """vision (float[batch,3,4,4] pixel_values) => (float[batch,3] image_embeds) {
+        [flatten] flat = Flatten (pixel_values)
+        [product] image_embeds = MatMul (flat, weights)
+    }"""
+    save_network(colour_clip / "vision_model.onnx", text, weights=weights)
     settings = ClipSettings(model=str(colour_clip))
     with caplog.at_level("INFO"):
         run_clip(scene, masks, None, tmp_path / "auto", tmp_path / "cache", settings, threads=1)

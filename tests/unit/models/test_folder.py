@@ -6,14 +6,14 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from onnx import helper, numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 
 from hilsplat.base.errors import ModelError
 from hilsplat.models.folder import external_weights, open_model_folder, variants_of
 from hilsplat.models.onnx_graph import split_clip
 from hilsplat.segment.sam import SamModel
 from tests.conftest import PROJECT
-from tests.unit.segment.handmade import move_weights, save_network, tensor
+from tests.unit.segment.handmade import move_weights, save_network
 
 TINY = PROJECT / "models/sam-tiny"
 
@@ -38,10 +38,11 @@ def test_the_digest_covers_external_weights_in_a_file_of_any_name(sam, location)
 
 
 def test_external_weights_of_constants_are_found(tmp_path):
-    value = numpy_helper.from_array(np.ones(4096, np.float32), "value")
-    path = tmp_path / "constant.onnx"
+    value = numpy_helper.from_array(np.ones(99, np.float32))
     constant = helper.make_node("Constant", [], ["y"], value=value)
-    save_network(path, [constant], [], [tensor("y", [4096])], {})
+    output = helper.make_tensor_value_info("y", TensorProto.FLOAT, [99])
+    path = tmp_path / "constant.onnx"
+    onnx.save(helper.make_model(helper.make_graph([constant], "constant", [], [output])), path)
     move_weights(path, "elsewhere")
     assert external_weights(path, tmp_path) == [tmp_path / "elsewhere"]
 
@@ -81,15 +82,14 @@ def test_variants_are_those_that_all_networks_have(sam):
 
 def write_whole_clip(folder, external: bool) -> None:
     """A `model.onnx` whose halves scale their inputs by different weights."""
-    nodes = [
-        helper.make_node("Mul", ["pixel_values", "vision"], ["image_embeds"]),
-        helper.make_node("Mul", ["input_ids", "text"], ["words"]),
-        helper.make_node("Mul", ["words", "attention_mask"], ["text_embeds"]),
-    ]
-    inputs = [tensor(name, [1, 64]) for name in ("pixel_values", "input_ids", "attention_mask")]
-    outputs = [tensor(name, [1, 64]) for name in ("image_embeds", "text_embeds")]
+    text = """whole (float[1,64] pixel_values, float[1,64] input_ids, float[1,64] attention_mask)
+    => (float[1,64] image_embeds, float[1,64] text_embeds) {
+        image_embeds = Mul (pixel_values, more)
+        words = Mul (input_ids, less)
+        text_embeds = Mul (words, attention_mask)
+    }"""
     numbers = np.arange(64, dtype=np.float32)
-    save_network(folder / "model.onnx", nodes, inputs, outputs, {"vision": numbers, "text": -numbers})
+    save_network(folder / "model.onnx", text, more=numbers, less=-numbers)
     if external:
         move_weights(folder / "model.onnx", "model.onnx_data")
 

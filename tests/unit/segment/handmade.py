@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
 
 from hilsplat.base.images import write_png
 from hilsplat.models.layouts import DECODER, PREVIEW
@@ -62,11 +62,10 @@ def save_scene(
     return folder
 
 
-def save_network(
-    path: Path, nodes: list, inputs: list, outputs: list, constants: dict[str, np.ndarray]
-) -> None:
-    initialisers = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "hand-made", inputs, outputs, initialisers)
+def save_network(path: Path, text: str, **constants: np.ndarray) -> None:
+    """Write a network given in ONNX's text format, with the values of its constants."""
+    graph = onnx.parser.parse_graph(text)
+    graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in constants.items())
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     onnx.checker.check_model(model)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,54 +80,40 @@ def move_weights(path: Path, location: str) -> None:
     onnx.save(model, path, save_as_external_data=True, location=location, **options)
 
 
-def tensor(name: str, shape: list, kind: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, kind, shape)
-
-
 def _write_disc_decoder(path: Path, every: slice, points_name: str, heads: int, cell_px: float) -> None:
     """Write the decoder of `write_disc_sam`; masks contain only the rows and columns in `every`."""
     centres = ((np.arange(LOW, dtype=np.float32) + 0.5) * FRAME / LOW)[every]
     low = len(centres)
     x, y = np.meshgrid(centres, centres)
-    to_middle_of_cell = [
-        helper.make_node("Div", [points_name, "cell"], ["in_cells"]),
-        helper.make_node("Floor", ["in_cells"], ["corner"]),
-        helper.make_node("Add", ["corner", "half"], ["middle"]),
-        helper.make_node("Mul", ["middle", "cell"], ["centre"]),
-    ]
+    to_middle_of_cell = f"""
+        in_cells = Div ({points_name}, cell)
+        corner = Floor (in_cells)
+        middle = Add (corner, half)
+        centre = Mul (middle, cell)
+    """
     save_network(
         path,
-        [
-            *(to_middle_of_cell if cell_px else [helper.make_node("Identity", [points_name], ["centre"])]),
-            helper.make_node("Sub", ["centre", "grid"], ["offset"]),  # (1, P, 256, 2)
-            helper.make_node("Mul", ["offset", "offset"], ["squared"]),
-            helper.make_node("ReduceSum", ["squared", "last"], ["sum"], keepdims=0),
-            helper.make_node("Sqrt", ["sum"], ["distance"]),
-            helper.make_node("Unsqueeze", ["distance", "two"], ["apart"]),  # (1, P, 1, 256)
-            helper.make_node("Sub", ["radii", "apart"], ["logits"]),  # (1, P, 3, 256)
-            helper.make_node("Reshape", ["logits", "shape"], ["pred_masks"]),
-            helper.make_node("ReduceMax", ["logits"], ["peak"], axes=[3], keepdims=0),
-            helper.make_node("Mul", ["peak", "zero"], ["nothing"]),
-            helper.make_node("Add", ["nothing", "scores"], ["iou_scores"]),
-        ],
-        [
-            tensor(points_name, [1, "P", 1, 2]),
-            tensor("input_labels", [1, "P", 1], TensorProto.INT64),
-            tensor("image_embeddings", [1, 3, LOW, LOW]),
-            tensor("image_positional_embeddings", [1, 3, LOW, LOW]),
-        ],
-        [tensor("iou_scores", [1, "P", heads]), tensor("pred_masks", [1, "P", heads, low, low])],
-        {
-            "cell": np.array([cell_px], np.float32),
-            "half": np.array([0.5], np.float32),
-            "grid": np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
-            "last": np.array([3]),
-            "two": np.array([2]),
-            "radii": np.array((RADII + RADII)[:heads], np.float32)[None, None, :, None],
-            "shape": np.array([1, -1, heads, low, low]),
-            "zero": np.zeros(1, np.float32),
-            "scores": np.array((SCORES + SCORES)[:heads], np.float32),
-        },
+        f"""discs (
+            float[1,P,1,2] {points_name}, int64[1,P,1] input_labels,
+            float[1,3,{LOW},{LOW}] image_embeddings, float[1,3,{LOW},{LOW}] image_positional_embeddings
+        ) => (float[1,P,{heads}] iou_scores, float[1,P,{heads},{low},{low}] pred_masks) {{
+            {to_middle_of_cell if cell_px else f"centre = Identity ({points_name})"}
+            offset = Sub (centre, grid)
+            distance = ReduceL2 <axes = [3]> (offset)
+            apart = Transpose <perm = [0, 1, 3, 2]> (distance)
+            logits = Sub (radii, apart)
+            pred_masks = Reshape (logits, shape)
+            peak = ReduceMax <axes = [3], keepdims = 0> (logits)
+            nothing = Mul (peak, zero)
+            iou_scores = Add (nothing, scores)
+        }}""",
+        cell=np.array([cell_px], np.float32),
+        half=np.array([0.5], np.float32),
+        grid=np.stack([x.reshape(-1), y.reshape(-1)], axis=1)[None, None],
+        radii=np.array((RADII + RADII)[:heads], np.float32)[None, None, :, None],
+        shape=np.array([1, -1, heads, low, low]),
+        zero=np.zeros(1, np.float32),
+        scores=np.array((SCORES + SCORES)[:heads], np.float32),
     )
 
 
@@ -139,20 +124,14 @@ def write_disc_sam(
 
     With `cell_px`, discs are centred in the point's grid cell, and the model has a preview.
     """
+    features = f"float[batch,3,{LOW},{LOW}]"
     save_network(
         folder / "onnx" / "vision_encoder.onnx",
-        [
-            helper.make_node(
-                "AveragePool", ["pixel_values"], ["image_embeddings"], kernel_shape=[2, 2], strides=[2, 2]
-            ),
-            helper.make_node("Identity", ["image_embeddings"], ["image_positional_embeddings"]),
-        ],
-        [tensor("pixel_values", ["batch", 3, FRAME, FRAME])],
-        [
-            tensor("image_embeddings", ["batch", 3, LOW, LOW]),
-            tensor("image_positional_embeddings", ["batch", 3, LOW, LOW]),
-        ],
-        {},
+        f"""encoder (float[batch,3,{FRAME},{FRAME}] pixel_values)
+        => ({features} image_embeddings, {features} image_positional_embeddings) {{
+            image_embeddings = AveragePool <kernel_shape = [2, 2], strides = [2, 2]> (pixel_values)
+            image_positional_embeddings = Identity (image_embeddings)
+        }}""",
     )
     networks = {DECODER: slice(None), PREVIEW: slice(None, None, 2)} if cell_px else {DECODER: slice(None)}
     for name, every in networks.items():

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from onnx import TensorProto, helper
 
 from hilsplat.base.errors import ModelError
 from hilsplat.models.layouts import NetworkSpec
 from hilsplat.models.network import Network, require_one_space
 from hilsplat.segment.sam import SamModel
-from tests.unit.segment.handmade import save_network, tensor, write_disc_sam
+from tests.unit.segment.handmade import save_network, write_disc_sam
 
 ENCODER, CONFIG, PREPROCESSOR = "onnx/vision_encoder.onnx", "config.json", "preprocessor_config.json"
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 2548000000\n"
@@ -66,19 +65,20 @@ def as_torch(folder: Path) -> None:
     (folder / "model.safetensors").touch()
 
 
-def retyped(folder: Path, channels: int, kind: int) -> None:
+def retyped(folder: Path, kind: str, channels: int) -> None:
     """Replace the encoder by one with another type of input."""
-    nodes = [
-        helper.make_node("Cast", ["pixel_values"], ["as_float"], to=TensorProto.FLOAT),
-        helper.make_node("GlobalAveragePool", ["as_float"], ["image_embeddings"]),
-        helper.make_node("Identity", ["image_embeddings"], ["image_positional_embeddings"]),
-    ]
-    outputs = [tensor(node.output[0], [1, channels, 1, 1]) for node in nodes[1:]]
-    save_network(folder / ENCODER, nodes, [tensor("pixel_values", [1, channels, 32, 32], kind)], outputs, {})
+    features = f"float[1,{channels},1,1]"
+    text = f"""encoder ({kind}[1,{channels},32,32] pixel_values)
+    => ({features} image_embeddings, {features} image_positional_embeddings) {{
+        as_float = Cast <to = 1> (pixel_values)
+        image_embeddings = GlobalAveragePool (as_float)
+        image_positional_embeddings = Identity (image_embeddings)
+    }}"""
+    save_network(folder / ENCODER, text)
 
 
-of_bytes = partial(retyped, channels=3, kind=TensorProto.UINT8)
-of_grey = partial(retyped, channels=1, kind=TensorProto.FLOAT)
+of_bytes = partial(retyped, kind="uint8", channels=3)
+of_grey = partial(retyped, kind="float", channels=1)
 with_other_name = partial(write_disc_sam, points_name="point_coords")
 with_four_heads = partial(write_disc_sam, heads=4)
 
@@ -102,9 +102,8 @@ def test_missing_and_unsuitable_networks_are_refused(own_sam, change: Callable[[
 
 
 def test_networks_with_undeclared_shapes_are_checked_when_they_run(tmp_path):
-    path, either = tmp_path / "network.onnx", ["rows", "columns"]
-    same = helper.make_node("Identity", ["x"], ["y"])
-    save_network(path, [same], [tensor("x", either)], [tensor("y", either)], {})
+    path = tmp_path / "network.onnx"
+    save_network(path, "same (float[a,b] x) => (float[a,b] y) { y = Identity (x) }")
     network = Network(path, NetworkSpec({"x": (None, None)}, {"y": (None, 3)}))
     network(x=np.zeros((1, 3)))
     with pytest.raises(ModelError, match=r"returned y of shape \(1, 4\)\n  expected  y \(any, 3\)"):
