@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import types
 from pathlib import Path
 
 import numpy as np
@@ -139,14 +138,11 @@ def test_segments_on_disk_without_a_row_are_listed(root):
     assert unlisted(sources, ["lerf", "waymo"], str(root)) == ["waymo/two"]
 
 
-def test_a_scene_is_scored_against_all_labels_on_its_images(root):
+def test_all_labels_on_a_scenes_images_score_it_and_only_evaluation_reads_them(root):
     both = ("lerf_ovs/figurines", "hi_lerf/figurines")
     assert label_sets("data:lerf_ovs/figurines", str(root), "lerf/figurines") == both
     assert label_sets("data:3d_ovs/bed", str(root), "3d_ovs/bed") == ("3d_ovs/bed",)
     assert label_sets("data:lerf_ovs/ramen", str(root), "lerf/ramen") == ()
-
-
-def test_label_files_are_those_that_only_evaluation_reads(root):
     label, masks = root / "lerf_ovs/label/figurines/frame_00041.json", root / "3d_ovs/bed/segmentations"
     assert label_files("lerf_ovs/figurines", str(root)) == (label,)
     assert label_files("3d_ovs/bed", str(root)) == (masks / "00/banana.png", masks / "classes.txt")
@@ -171,33 +167,21 @@ def test_unknown_data_sets_missing_scene_names_and_needless_exports_are_refused(
         export_images("lerf_ovs/figurines", root, root / "out")
 
 
-EXTENDING = PROJECT / "docs" / "extending.md"
-
-
-@pytest.fixture(scope="module")
-def example() -> types.ModuleType:
-    code = re.search(r"```python\n(# hilsplat/datasets/desk_labels\.py.*?)```", EXTENDING.read_text(), re.S)
-    module = types.ModuleType("desk_labels")
-    exec(compile(code[1], "desk_labels.py", "exec"), module.__dict__)
-    return module
-
-
-def test_the_data_set_of_the_documentation_is_read(example, tmp_path):
-    mug = np.zeros((6, 8), np.uint8)
+def test_the_data_set_of_the_documentation_is_read(tmp_path):
+    page = (PROJECT / "docs/extending.md").read_text()
+    code = re.search(r"```python\n(# hilsplat/datasets/desk_labels\.py.*?)```", page, re.S)
+    names = {"__name__": "desk_labels"}
+    exec(code[1], names)
+    desk, mug = names["DESK"], np.zeros((6, 8), np.uint8)
     mug[1:4, 2:5] = 255
     write_png(tmp_path / "mine/images/000.png", np.zeros((6, 8, 3), np.uint8))
+    with pytest.raises(SceneError, match="also mine/labels"):
+        desk.open(tmp_path, "mine")
     write_png(tmp_path / "mine/labels/000/mug.png", np.repeat(mug[..., None], 3, axis=2))
-    scene = example.DESK.open(tmp_path, "mine")
-    (region,) = scene.views["000.png"]
+    (region,) = desk.open(tmp_path, "mine").views["000.png"]
     assert region.text == "mug"
     assert np.array_equal(region.mask(), mug > 0)
-    assert example.DESK.check(tmp_path, "mine").facts
-    assert [card_of(name).name for name in example.DESK.protocols] == list(example.DESK.protocols)
-    places = [path for pattern in example.DESK.label_places("mine") for path in tmp_path.glob(pattern)]
+    assert desk.check(tmp_path, "mine").facts
+    assert [card_of(name).name for name in desk.protocols] == list(desk.protocols)
+    places = [path for pattern in desk.label_places("mine") for path in tmp_path.glob(pattern)]
     assert tmp_path / "mine/labels/000/mug.png" in places
-
-
-def test_a_missing_folder_of_the_documented_data_set_is_named(example, tmp_path):
-    (tmp_path / "mine/images").mkdir(parents=True)
-    with pytest.raises(SceneError, match="also mine/labels"):
-        example.DESK.open(tmp_path, "mine")

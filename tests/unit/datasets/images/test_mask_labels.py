@@ -101,22 +101,6 @@ def distort(folder):
     model.write(folder / "sparse" / "0")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda at: write_png(at / "test_mask/0/dr. bear.png", BLACK), "a prompt without a dot"),
-        (lambda at: (at / "test_mask/first").mkdir(), "0, 1, first"),
-        (train_on_all, r"has no test views\n.*\n.*4 posed images, all in images_train"),
-        (lambda at: (at / "images_train").rename(at / "train"), r"also teatime/images_train\n"),
-        (distort, r"have lens distortion\n.*PINHOLE or SIMPLE_PINHOLE.*\n.*OPENCV"),
-    ],
-)
-def test_unusable_scenes_of_lerf_mask_are_refused(teatime, change, message):
-    change(teatime)
-    with pytest.raises(SceneError, match=message):
-        open_scene(teatime)
-
-
 # ---- 3D-OVS ---------------------------------------------------------------------------------------
 
 
@@ -213,30 +197,39 @@ def test_masks_of_another_size_or_an_unknown_class_are_reported(bed):
     assert "03: masks of unknown classes are ignored: wood" in scene.warnings
 
 
-MASKS = "segmentations"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda at: (at / MASKS / "classes.txt").write_text("\n \n"), "no class"),
-        (lambda at: (at / MASKS / "classes.txt").write_text("hand\nhand \n"), "duplicates: hand"),
-        (lambda at: write_png(at / "images/00.png", BLACK), "00.jpg, 00.png|00.png, 00.jpg"),
-        (lambda at: write_png(at / MASKS / "00/bear.png", BLACK.T.copy()), "bear.png does not match the"),
-        (
-            lambda at: (at / MASKS / "03/bear.png").rename(at / MASKS / "03/Bear.png"),
-            r"has no masks for: bear\n.*\n.*not in classes.txt: Bear",
-        ),
-        (lambda at: (at / "images/03.jpg").unlink(), r"labelled views have no image: 03\.png"),
-    ],
-)
-def test_unusable_scenes_of_3d_ovs_are_refused(bed, change, message):
-    change(bed)
-    with pytest.raises(SceneError, match=message):
-        open_scene(bed)
-
-
 def test_a_scene_without_any_pose_is_reported(bed):
     (bed / "poses_bounds.npy").unlink()
     assert open_scene(bed).poses is None
     assert any("no poses" in line for line in open_scene(bed).report().warnings)
+
+
+# ---- both -----------------------------------------------------------------------------------------
+
+MASKS = "segmentations"
+
+
+@pytest.mark.parametrize(
+    ("scene", "change", "message"),
+    [
+        ("teatime", lambda at: write_png(at / "test_mask/0/dr. bear.png", BLACK), "a prompt without a dot"),
+        ("teatime", lambda at: (at / "test_mask/first").mkdir(), "0, 1, first"),
+        ("teatime", train_on_all, r"has no test views\n.*\n.*4 posed images, all in images_train"),
+        ("teatime", lambda at: (at / "images_train").rename(at / "train"), r"also teatime/images_train\n"),
+        ("teatime", distort, r"have lens distortion\n.*PINHOLE or SIMPLE_PINHOLE.*\n.*OPENCV"),
+        ("bed", lambda at: (at / MASKS / "classes.txt").write_text("\n \n"), "no class"),
+        ("bed", lambda at: (at / MASKS / "classes.txt").write_text("hand\nhand \n"), "duplicates: hand"),
+        ("bed", lambda at: write_png(at / "images/00.png", BLACK), "00.jpg, 00.png|00.png, 00.jpg"),
+        ("bed", lambda at: write_png(at / MASKS / "00/bear.png", BLACK.T.copy()), "bear.png does not match"),
+        (
+            "bed",
+            lambda at: (at / MASKS / "03/bear.png").rename(at / MASKS / "03/Bear.png"),
+            r"has no masks for: bear\n.*\n.*not in classes.txt: Bear",
+        ),
+        ("bed", lambda at: (at / "images/03.jpg").unlink(), r"labelled views have no image: 03\.png"),
+    ],
+)
+def test_unusable_scenes_are_refused(request, scene, change, message):
+    folder = request.getfixturevalue(scene)
+    change(folder)
+    with pytest.raises(SceneError, match=message):
+        open_scene(folder)

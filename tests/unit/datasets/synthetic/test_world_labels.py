@@ -44,6 +44,14 @@ def street(tmp_path_factory):
     return make_world("street", tmp_path_factory.mktemp("street"))
 
 
+@pytest.fixture(scope="module")
+def data_root(room, tmp_path_factory):
+    """A data root with the room as a scan of ScanNet."""
+    root = tmp_path_factory.mktemp("data")
+    write_room_as_scannet(room, root / "scannet", "scene0000_00")
+    return root
+
+
 def same_images(read, true, read_from_true=IDENTITY):
     for image, view in zip(read, true, strict=True):
         np.testing.assert_allclose(image.cam_from_world @ read_from_true, view.cam_from_world, atol=1e-9)
@@ -60,9 +68,8 @@ def classes_of(mesh, seen=slice(None)):
     return {labelling: of_text[mesh.whole[seen]] for labelling, of_text in ids.items()}
 
 
-def test_room_as_scannet_reads_back_equal(room, tmp_path):
-    write_room_as_scannet(room, tmp_path, "scene0000_00")
-    scene, mesh = scannet.open_scan(tmp_path, "scene0000_00"), LabelledMesh(room)
+def test_room_as_scannet_reads_back_equal(room, data_root):
+    scene, mesh = scannet.open_scan(data_root / "scannet", "scene0000_00"), LabelledMesh(room)
     np.testing.assert_array_equal(scene.truth["nyu40"].xyz, mesh.xyz)
     np.testing.assert_array_equal(scene.truth["nyu40"].faces, mesh.faces)
     np.testing.assert_array_equal(scene.truth["nyu40"].instance_id, mesh.whole + 1)
@@ -72,16 +79,15 @@ def test_room_as_scannet_reads_back_equal(room, tmp_path):
     same_images(scene.images, posed_images(room))
 
 
-def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(room, tmp_path):
-    data, source = tmp_path / "data", tmp_path / "source"
-    write_room_as_scannet(room, data / "scannet", "scene0000_00")
-    assert export_images("scannet/scene0000_00", data, source) == 3
+def test_gaussians_frozen_at_the_vertices_of_a_scan_are_its_points(data_root, tmp_path):
+    source = tmp_path / "source"
+    assert export_images("scannet/scene0000_00", data_root, source) == 3
     settings = PosesSettings(test_every=0)
     run_poses(source, tmp_path / "scene", "scannet/scene0000_00", "metre", False, settings, 0, 1)
     scene = Scene.load(tmp_path / "scene")
     settings = GaussiansSettings(initial="frozen", iterations=2, max_gaussians=100)
     gaussians, _ = fit_gaussians(scene, settings, seed=0)
-    truth = open_labels("scannet/scene0000_00", data).truth["nyu40"]
+    truth = open_labels("scannet/scene0000_00", data_root).truth["nyu40"]
     places = truth.xyz @ scene.scene_from_source[:3, :3].T + scene.scene_from_source[:3, 3]
     np.testing.assert_allclose(gaussians.means, places, atol=1e-5)
 

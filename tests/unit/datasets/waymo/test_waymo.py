@@ -159,17 +159,13 @@ def test_a_written_segment_reads_back_in_the_frame_of_its_first_vehicle(root):
     dataset = DATASETS["waymo"]
     assert dataset.locate(root.parent) == root and dataset.found(root) == (SEGMENT,)
     assert dataset.missing(root, SEGMENT) == ()
-    report = DATASETS["waymo"].check(root, SEGMENT)
-    assert report.facts["waymo points visible to a camera"] == 6
-    (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
-    assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
-
-
-def test_projections_are_optional_and_reported(root):
-    (root / "validation" / "lidar_camera_projection" / f"{SEGMENT}.parquet").unlink()
+    assert dataset.check(root, SEGMENT).facts["waymo points visible to a camera"] == 6
+    (root / "validation" / "lidar_camera_projection" / f"{SEGMENT}.parquet").unlink()  # optional
     scene = open_segment(root, SEGMENT)
     assert scene.truth["waymo"].visible is None
     assert scene.warnings[0].startswith("lidar_camera_projection is missing")
+    (root / "validation" / "vehicle_pose" / f"{SEGMENT}.parquet").unlink()
+    assert dataset.missing(root, SEGMENT) == (f"validation/vehicle_pose/{SEGMENT}.parquet",)
 
 
 def test_damaged_components_are_refused_with_a_fix(root):

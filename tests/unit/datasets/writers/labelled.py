@@ -108,7 +108,7 @@ def write_lerf_ovs(world: TrueWorld, root: Path, scene: str, views: Sequence[str
     stems = _write_images(world, root / scene, LERF_STEMS)
     for view in views:
         objects = [
-            isat_object(text, [polygon], int(world.mask(view, [node]).sum()))
+            isat_object(text, [polygon])
             for text, nodes in world.nodes(view).items()
             for node in nodes
             for polygon in trace_polygons(world.mask(view, [node]))
@@ -163,10 +163,9 @@ def write_hi(
         shown = {node for level in LEVELS for ids in world.nodes(view, level).values() for node in ids}
         objects = []
         for node in sorted(shown):
-            mask = world.mask(view, [node])
             parent = nodes[node].parent
             keys = {"id": node, "parent": parent if parent in shown else None, "level": nodes[node].level}
-            objects.append(isat_object(nodes[node].text, trace_polygons(mask), int(mask.sum()), **keys))
+            objects.append(isat_object(nodes[node].text, trace_polygons(world.mask(view, [node])), **keys))
         _write_labels(world, root / "label" / scene, view, names[view], objects)
 
 
@@ -186,7 +185,7 @@ def _write_images(
 
 def _write_labels(world: TrueWorld, folder: Path, view: str, stem: str, objects: list[dict]) -> None:
     height, width = world.cameras[view].size_hw
-    info = {"name": f"{stem}.jpg", "width": width, "height": height, "depth": 3, "note": ""}
+    info = {"name": f"{stem}.jpg", "width": width, "height": height}
     write_json(folder / f"{stem}.json", {"info": info, "objects": objects})
 
 
@@ -194,18 +193,14 @@ def _write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
     write_png(path, mask.astype(np.uint8) * np.uint8(255))
 
 
-def isat_object(category: str, polygons: list[np.ndarray], area_px: int, **keys: Any) -> dict[str, Any]:
-    """Return the keys of one object as the tool writes them: a single polygon is not nested."""
+def isat_object(category: str, polygons: list[np.ndarray], **keys: Any) -> dict[str, Any]:
+    """Return keys of one object as the tool writes them: a single polygon is not nested."""
     points = np.concatenate(polygons)
     lists = [polygon.astype(float).tolist() for polygon in polygons]
     return {
         "category": category,
         "group": 1,
         "segmentation": lists[0] if len(lists) == 1 else lists,
-        "area": float(area_px),
-        "layer": 1.0,
         "bbox": [float(n) for n in (*points.min(axis=0), *points.max(axis=0))],
-        "iscrowd": 0,
-        "note": "",
         **keys,
     }

@@ -108,8 +108,7 @@ def write_scan(
     K[:3, :3] = images[0].K - HALF_PIXEL
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", K)
     height, width = images[0].size_hw
-    info = f"colorHeight = {height}\ncolorWidth = {width}\nsceneType = Synthetic room\n"
-    write_text(folder / f"{scan}.txt", info)
+    write_text(folder / f"{scan}.txt", f"colorHeight = {height}\ncolorWidth = {width}\nsceneType = Office\n")
     vertices = _grey_vertices(xyz)
     write_ply(folder / f"{scan}_vh_clean_2.ply", vertices, faces, {})
     of_object = np.array([categories[name][1] for name in objects] + [0], dtype=np.uint16)
@@ -125,12 +124,10 @@ def write_scan(
         side = xyz[rows, 0] > np.median(xyz[rows, 0])
         segment[rows] = SEGMENT_STEP * (2 * number + 1 + side)
         members = np.unique(segment[rows]).tolist()
-        groups.append({"id": len(groups), "objectId": number, "segments": members, "label": category})
-    name = f"{scan}_vh_clean_2.0.010000.segs.json"
-    record = {"params": {}, "sceneId": scan, "segIndices": segment.tolist()}
-    write_text(folder / name, json.dumps(record))
-    whole = {"sceneId": f"scannet.{scan}", "segGroups": groups, "segmentsFile": f"scannet.{name}"}
-    write_text(folder / f"{scan}.aggregation.json", json.dumps(whole))
+        groups.append({"objectId": number, "segments": members, "label": category})
+    segments = json.dumps({"segIndices": segment.tolist()})
+    write_text(folder / f"{scan}_vh_clean_2.0.010000.segs.json", segments)
+    write_text(folder / f"{scan}.aggregation.json", json.dumps({"segGroups": groups}))
 
 
 UNDEFINED, NO_OBJECT = -1, -2
@@ -152,22 +149,10 @@ def write_semantic_mesh(
     quads = faces[:, [0, 1, 2, 2]]
     of_face = (object_of_face + 1).astype(np.int32)
     labels = [NO_OBJECT, *(number or UNDEFINED for number in classes)]
-    objects = [
-        {"id": row, "class_id": number, "class_name": REPLICA_NAMES.get(number, "undefined")}
-        for row, number in enumerate(labels)
-        if row
-    ]
-    info = {
-        "classes": [
-            {"id": n, "name": name, "children": [], "parents": []} for n, name in REPLICA_NAMES.items()
-        ],
-        "gravity_dir": [0.0, 0.0, -1.0],
-        "id_to_label": labels,
-        "objects": objects[::-1],  # real files do not sort them either
-    }
+    names = [{"id": number, "name": name} for number, name in REPLICA_NAMES.items()]
     habitat.mkdir(parents=True)
     write_ply(habitat / "mesh_semantic.ply", _grey_vertices(xyz), quads, {"object_id": of_face})
-    (habitat / "info_semantic.json").write_text(json.dumps(info, indent=1))
+    write_json(habitat / "info_semantic.json", {"classes": names, "id_to_label": labels})
 
 
 def write_sequence(folder: Path, images: Sequence[PosedImage]) -> None:
