@@ -44,6 +44,7 @@ from hilsplat.settings import (
 from hilsplat.splat.gaussians import Gaussians, morton_order
 from hilsplat.splat.ply import save_ply
 from hilsplat.splat.rasterise.api import pixel_weights
+from hilsplat.world.views import looking_at
 
 ROWS = 20  # number of rows and of columns of balls, which are one metre apart
 RADIUS = 0.38
@@ -86,16 +87,11 @@ def made_gaussians(number: int) -> tuple[Gaussians, np.ndarray]:
 def ring_of_cameras(number: int, size_hw: tuple[int, int]) -> Cameras:
     """Return cameras at two heights around the balls that look at points near the middle."""
     rng = np.random.default_rng(1)
-    poses = np.tile(np.eye(4), (number, 1, 1))
+    poses = np.empty((number, 4, 4))
     for index in range(number):
         angle = 2 * np.pi * index / number
         at = np.array([np.cos(angle), np.sin(angle), 0]) * ROWS * 0.55 + [0, 0, (3.0, 5.5)[index % 2]]
-        forward = np.append(rng.uniform(-ROWS / 6, ROWS / 6, 2), 0) - at
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        turn = np.stack([right, np.cross(forward, right), forward])
-        poses[index, :3, :3], poses[index, :3, 3] = turn, -turn @ at
+        poses[index] = looking_at(at, np.append(rng.uniform(-ROWS / 6, ROWS / 6, 2), 0))
     focal = 0.9 * size_hw[1]
     K = np.array([[focal, 0, size_hw[1] / 2], [0, focal, size_hw[0] / 2], [0, 0, 1]])
     names = tuple(f"{index:04d}.png" for index in range(number))
@@ -225,9 +221,8 @@ def main() -> None:
         seconds, peak = done.stdout.split()[-2:]
         rows.append((stage, seconds, peak))
         print(*rows[-1], flush=True)
-    rows.append(
-        ("all", f"{sum(float(row[1]) for row in rows):.1f}", max((row[2] for row in rows), key=float))
-    )
+    seconds = sum(float(row[1]) for row in rows)
+    rows.append(("all", f"{seconds:.1f}", max((row[2] for row in rows), key=float)))
     table = markdown_table(("stage", "s", "peak MiB"), rows, 1)
     (given.out / "times.md").write_text(table + "\n")
     times = {stage: [float(seconds), float(peak)] for stage, seconds, peak in rows}

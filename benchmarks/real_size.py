@@ -151,6 +151,25 @@ def export_clip(out: Path) -> None:
     split_whole(out)
 
 
+def export(name: str, out: Path) -> None:
+    """Export one model."""
+    if name == "clip":
+        export_clip(out)
+    elif name == "sam2.1-small":
+        export_sam2(out)
+    else:
+        export_sam(name, out)
+
+
+def export_missing(store: Path, sam: str) -> dict[str, Path]:
+    """Export missing networks, each in its own process, because exporters do not free gigabytes of memory."""
+    places = {"sam": store / f"sam-{sam}", "clip": store / "clip"}
+    for kind, name, done in (("sam", sam, "vision_encoder.onnx"), ("clip", "clip", "vision_model.onnx")):
+        if not (places[kind] / done).is_file():
+            _run(f"export-{name}", places[kind], PHOTOGRAPHS)
+    return places
+
+
 def measure(step: str, models: Path, photograph: Path, points: int) -> dict[str, float]:
     """Measure processor seconds and peak memory of one step on one photograph in this process."""
     from hilsplat.base.images import read_image, resize_to_fit
@@ -246,14 +265,8 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("results/.cache/real-size"))
     parser.add_argument("--step", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.step == "export-clip":
-        export_clip(given.models)
-        return
-    if given.step == "export-sam2.1-small":
-        export_sam2(given.models)
-        return
     if given.step and given.step.startswith("export-"):
-        export_sam(given.step.removeprefix("export-"), given.models)
+        export(given.step.removeprefix("export-"), given.models)
         return
     if given.step == "decoders":
         print(json.dumps(compare_decoders(given.models, given.photographs, given.points)))
@@ -263,13 +276,7 @@ def main() -> None:
         return
     if not given.photographs.is_dir():
         sys.exit(f"skipped: {given.photographs} does not exist; pass a folder of photographs")
-    places = {"sam": given.models / f"sam-{given.sam}", "clip": given.models / "clip"}
-    for kind, step, done in (
-        ("sam", f"export-{given.sam}", "vision_encoder.onnx"),
-        ("clip", "export-clip", "vision_model.onnx"),
-    ):
-        if not (places[kind] / done).is_file():
-            _run(step, places[kind], given.photographs)
+    places = export_missing(given.models, given.sam)
     photographs = sorted(given.photographs.iterdir())[: given.views]
     steps = [(photograph, "sam", "decoders") for photograph in photographs]
     steps += [(photograph, kind, kind) for photograph in photographs for kind in ("sam", "clip")]

@@ -18,7 +18,7 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.real_size import PHOTOGRAPHS, SIZES, export_clip, export_sam, export_sam2
+from benchmarks.real_size import PHOTOGRAPHS, SIZES, export_missing
 
 PROJECT = Path(__file__).resolve().parents[1]
 SCENE = "photos/rehearsal"
@@ -44,26 +44,6 @@ class Finder(importlib.abc.MetaPathFinder):
 sys.meta_path.insert(0, Finder())
 """
 """`sitecustomize.py` of all processes of the run, which patches SAM with canned outputs on import."""
-
-
-def make_models(store: Path, sam: str) -> dict[str, Path]:
-    """Export missing networks, each in its own process, because exporters do not free gigabytes of memory."""
-    kinds = {f"sam-{sam}": "sam", "clip": "clip"}
-    for name in kinds:
-        if not (store / name / "config.json").is_file():
-            words = [sys.executable, "-m", "benchmarks.rehearsal", str(store), "--export", name]
-            subprocess.run(words, env={**os.environ, "HF_HUB_OFFLINE": "1"}, check=True)
-    return {kind: store / name for name, kind in kinds.items()}
-
-
-def export(store: Path, name: str) -> None:
-    """Export one model into a store."""
-    if name == "clip":
-        export_clip(store / name)
-    elif name == "sam-sam2.1-small":
-        export_sam2(store / name)
-    else:
-        export_sam(name.removeprefix("sam-"), store / name)
 
 
 def make_project(folder: Path, models: dict[str, Path], precision: str) -> list[str]:
@@ -133,17 +113,13 @@ def main() -> None:
         "--models", type=Path, default=Path("results/.cache/real-size"), help="exported models"
     )
     parser.add_argument("--cores", type=int, default=2)
-    parser.add_argument("--export", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.export:
-        export(given.folder, given.export)
-        return
     if not given.photographs.is_dir():
         print(f"skipped: {given.photographs} does not exist; pass a folder of photographs")
         return
     if given.folder.exists():
         sys.exit(f"{given.folder} exists, and its caches would shorten the run; pass a new folder")
-    models = make_models(given.models.resolve(), given.sam)
+    models = export_missing(given.models.resolve(), given.sam)
     given.folder.mkdir(parents=True)
     folder = given.folder.resolve()
     options = make_project(folder, models, given.precision)

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.levels import LEVELS
@@ -92,23 +92,9 @@ def test_the_written_mesh_gives_the_depth_of_the_scene_along_the_optical_axis(tm
     assert np.isinf(depth[:8]).all()
 
 
-def quad(path):
-    """Write a mesh whose only face has four corners."""
-    vertices = np.zeros(4, dtype=[(axis, "f4") for axis in "xyz"])
-    faces = np.empty(1, dtype=[("vertex_indices", object)])
-    faces[0] = (np.arange(4, dtype=np.int32),)
-    PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(str(path))
-
-
-@pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (lambda path: None, r"mesh\.ply is missing"),
-        (lambda path: path.write_bytes(b"no mesh"), r"mesh\.ply cannot be read"),
-        (quad, r"mesh\.ply cannot be read"),
-    ],
-)
-def test_a_missing_or_damaged_mesh_is_reported(tmp_path, write, message):
-    write(tmp_path / "mesh.ply")
-    with pytest.raises(ArtifactError, match=message):
+@pytest.mark.parametrize(("content", "message"), [(None, "is missing"), (b"no mesh", "cannot be read")])
+def test_a_missing_or_damaged_mesh_is_reported(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "mesh.ply").write_bytes(content)
+    with pytest.raises(ArtifactError, match=rf"mesh\.ply {message}"):
         TrueMesh.load(tmp_path / "mesh.ply")

@@ -13,11 +13,10 @@ from hilsplat.base.artifacts import (
     write_index,
     write_json,
 )
-from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError, SettingsError
+from hilsplat.base.errors import ArtifactError, HilsplatError, MisalignedArtifactError
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.cli import stage_commands
-from hilsplat.configuration import parse_section
 from hilsplat.datasets.synthetic.hierarchy import AnnotatedNode, write_hierarchy
 from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.settings import PerturbSettings
@@ -315,11 +314,6 @@ def test_an_incomplete_truth_folder_is_refused(world):
     (world / "truth" / "index.json").unlink()
     with pytest.raises(ArtifactError, match="truth is missing or incomplete"):
         make(world)
-
-
-def test_probabilities_above_1_are_refused():
-    with pytest.raises(SettingsError, match=r"perturb\.missing\.2: Input should be less than or equal to 1"):
-        parse_section("perturb", '{"missing": [0, 0, 2]}')
 
 
 def command(world, settings, **options):
