@@ -16,7 +16,7 @@ MIB = 2**20
 
 @pytest.fixture
 def cache(tmp_path) -> Path:
-    """Entries of 1 MiB: masks unused for 0 to 3 days, one of clip for 9, a training state, model digests."""
+    """Entries of 1 MiB: masks unused for 0 to 3 days, a CLIP entry for 9; other files for 99 days."""
     for place, days in (("masks", 0), ("masks", 1), ("masks", 2), ("masks", 3), ("clip", 9), ("models", 99)):
         path = tmp_path / place / f"{days}" / f"{days}.npz"
         path.parent.mkdir(parents=True)
@@ -45,12 +45,8 @@ def test_the_table_names_each_cache(cache):
     ]
 
 
-def test_no_cache_yet_is_no_error(tmp_path):
-    assert "0.0 MiB" in size_table(tmp_path / "nowhere")
+def test_only_old_view_entries_are_deleted(cache, tmp_path):
     assert prune_cache(tmp_path / "nowhere", [], days=0.0) == (0, 0)
-
-
-def test_only_old_view_entries_are_deleted(cache):
     assert prune_cache(cache, [], days=2.0) == (3, 3.0)
     assert left(cache) == [
         "masks/.writing-00000000-x/new.npz",
@@ -61,16 +57,14 @@ def test_only_old_view_entries_are_deleted(cache):
 
 
 def test_the_least_recently_used_entries_are_deleted_first(cache):
+    before = left(cache)
     assert prune_cache(cache, ["masks"], max_mib=2.5) == (2, 2.0)
-    assert "masks/1/1.npz" in left(cache)
-    assert "masks/2/2.npz" not in left(cache)
-    assert "clip/9/9.npz" in left(cache)
+    assert set(before) - set(left(cache)) == {"masks/2/2.npz", "masks/3/3.npz"}
 
 
-def test_a_stage_without_a_cache_to_prune_is_refused(cache):
+def test_an_unknown_cache_is_refused(cache):
     with pytest.raises(HilsplatError, match=r"models\n.*masks, clip, contributions, gaussians"):
         prune_cache(cache, ["masks", "models"], days=0.0)
-    assert len(left(cache)) == 7
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from hilsplat.base.errors import HilsplatError, SettingsError
 from hilsplat.workflow import targets
 from hilsplat.workflow.models import models_of_photographs
-from hilsplat.workflow.plan import Plan, any_of, some
+from hilsplat.workflow.plan import Plan
 from hilsplat.workflow.records import expected_artifacts
 from tests.unit.models.test_store import write_model
 from tests.unit.workflow.plans import BENCHMARK, Job, plan_of
@@ -170,8 +170,10 @@ def test_a_comparison_reads_each_shared_artifact_once(tmp_path):
     assert variants_in(found.compared_scores(job)) == ["default", "theta", "network"]
 
 
-def test_variants_have_our_field_or_a_baselines(tmp_path):
+def test_variants_differ_in_the_method_of_the_field_and_in_the_crops(tmp_path):
     found = plan(tmp_path)
+    assert found.crops_tree(Job()) == ["results/synthetic/one/default/semantic_tree"]
+    assert found.crops_tree(Job(variant="own")) == [], "every mask is embedded"
     assert found.variants(by_baseline=True) == "lifted"
     assert found.variants(by_baseline=False) == "default|network|own|theta|truth"
     assert found.baseline(Job(variant="lifted")) == ("hilsplat.methods.lifted:fit",)
@@ -215,12 +217,6 @@ def test_key_views_are_embedded_before_a_full_size_sam_segments_the_others(tmp_p
     assert guided.key_parts(desk, "semantic_tree") == ["results/photos/desk/key-views/semantic_tree"]
     assert guided.key_parts(one, "masks") == found.key_parts(desk, "masks") == []
     assert plan(tmp_path, **(config | {"variants": {}})).first_answer(desk) == []
-
-
-def test_a_vector_per_mask_is_made_only_for_variants_whose_targets_are_masks(tmp_path):
-    found = plan(tmp_path)
-    assert found.crops_tree(Job()) == ["results/synthetic/one/default/semantic_tree"]
-    assert found.crops_tree(Job(variant="own")) == []
 
 
 def test_each_photograph_is_an_input_and_hidden_files_are_not(tmp_path):
@@ -287,16 +283,10 @@ def test_a_segmenter_without_weights_and_a_missing_model_have_no_digest(tmp_path
 OF_PHOTOGRAPHS = {"photos": {"masks": {"segmenter": "auto", "model": "auto"}, "clip": {"model": "auto"}}}
 
 
-@pytest.fixture
-def embedded_models(tmp_path, monkeypatch) -> None:
-    """A project that has only the embedded models."""
+def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_model(Path("models/sam-tiny"), "sam", embedded=True)
     write_model(Path("models/clip-tiny"), "clip", embedded=True)
-
-
-@pytest.mark.usefixtures("embedded_models")
-def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path):
     config = {"groups": ["benchmark", "photos"], "overrides": OF_PHOTOGRAPHS}
     drawn, photo, doubt = plan(tmp_path, **config).model_lines()
     assert drawn == "synthetic/one, synthetic/two, rooms/room: masks by sam-tiny; text queries by clip-tiny"
@@ -314,15 +304,9 @@ def test_a_run_names_its_models_and_warns_if_answers_are_meaningless(tmp_path):
         assert models_of_photographs(file, "desk") == [line]
 
 
-def test_a_pattern_matches_only_its_names():
-    assert any_of([]) == "(?!)"
-    assert any_of(["b", "a.c"]) == r"a\.c|b"
-    assert some(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
-
-
 READY = {"params.truth", "params.option", "params.existing", "params.absent", "params.poses"}
 READY |= {"resources.mem_mib", "threads"}
-"""What commands take unquoted: options that the plan has quoted, and numbers."""
+"""Unquoted parts of commands: options that the plan has quoted, and numbers."""
 
 
 def test_every_rule_quotes_what_it_puts_into_a_command(project):

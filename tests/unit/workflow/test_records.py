@@ -64,9 +64,7 @@ def problems(expected: dict[Path, Expected] | None = None) -> dict[str, str]:
     ],
 )
 def test_other_settings_are_found(results, change, reason):
-    assert (
-        reason in problems({MASKS: EXPECTED[MASKS], TREE: replace(EXPECTED[TREE], **change)})["coverage_tree"]
-    )
+    assert reason in problems({TREE: replace(EXPECTED[TREE], **change)})["coverage_tree"]
 
 
 def test_missing_and_cut_files_are_found(results):
@@ -157,7 +155,6 @@ def test_a_plan_expects_what_its_rules_write(tmp_path, monkeypatch):
 
 
 def test_a_moved_folder_is_still_whole(results, tmp_path):
-    assert verify(results) == ("2 artifacts in results: 2 whole", True)
     shutil.rmtree(tmp_path / "photos")
     copy = shutil.copytree(results, tmp_path / "elsewhere/copy")
     assert verify(copy) == (f"2 artifacts in {copy}: 2 whole", True)

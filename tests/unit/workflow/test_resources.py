@@ -71,10 +71,7 @@ def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
     assert JobResources(scene).threads(JOB) == 3
     tiny = plan(tmp_path, world={"views": 12, "image_px": 128})
     assert JobResources(tiny).threads(JOB) == 1
-
-
-def test_cores_go_to_jobs_before_threads(tmp_path):
-    scene = plan(tmp_path, world={"views": 40, "image_px": 384})
+    # cores go to jobs before threads
     threads = {cores: JobResources(scene, cores).threads(JOB) for cores in (1, 2, 8)}
     assert threads == {1: 1, 2: 2, 8: 3}
     variants = len(scene.run.variant_names())
