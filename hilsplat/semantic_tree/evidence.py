@@ -73,8 +73,9 @@ def mask_evidence(
     parts = over_edges(_shared_pairs, edges, threads, *pairs)
     counts, indices, sums = (np.concatenate(each) for each in zip(*parts, strict=True))
     indptr = np.concatenate(([0], np.cumsum(counts)))
-    matrices = [sp.csr_matrix((each, indices, indptr), shape=(num, num)) for each in sums.T.copy()]
-    return Evidence(*matrices, seen, view)
+    both = sums.T.copy()
+    intersection, union = (sp.csr_matrix((each, indices, indptr), shape=(num, num)) for each in both)
+    return Evidence(intersection, union, seen, view)
 
 
 @compiled
