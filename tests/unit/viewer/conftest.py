@@ -1,7 +1,9 @@
 """A finished desk and the server of its page, without a browser."""
 
+import asyncio
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,12 @@ def browser_of(app: Guard) -> TestClient:
 
 def browsing(shown: ViewerScene) -> TestClient:
     return browser_of(Viewer(shown).app(TOKEN))
+
+
+def run_apart(work: Callable[[], Coroutine]):
+    """Run a coroutine in its own thread, because browser tests in this process leave a loop running."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(lambda: asyncio.run(work())).result()
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from starlette.testclient import TestClient
 from hilsplat.splat.ply import load_ply, save_ply
 from hilsplat.viewer import exports
 from hilsplat.viewer.viewer_scene import ViewerScene
-from hilsplat.web.scene_thread import ShownScene
 from tests.unit.artifact_changes import write_again
 from tests.unit.finished_desk import SCENE
 from tests.unit.viewer.conftest import browsing
@@ -134,16 +133,3 @@ def test_a_page_gets_no_data_of_a_later_state(page, desk):
     for path in ("splats/0", "nodes/default", "variant/default", "thumb/0"):
         assert page.get(f"/api/{path}", params={"of": page.state}).status_code == 409
         assert page.get(f"/api/{path}", params={"of": again}).status_code == 200
-
-
-def test_created_and_replaced_files_count_as_changed(tmp_path):
-    shown, file, folder = ShownScene(), tmp_path / "a.npz", tmp_path / "b"
-    file.write_bytes(b"one")
-    shown.note([file, folder])
-    assert shown.changed() == []
-    write_again(file)
-    assert shown.changed() == ["a.npz"] and shown.changed(folder) == []
-    shown.note([file])  # the state before opening is what counts
-    folder.mkdir()
-    (folder / "index.json").write_text("{}")
-    assert shown.changed() == ["a.npz", "b"]

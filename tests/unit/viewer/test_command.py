@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -16,6 +15,7 @@ import pytest
 from hilsplat.base.errors import SettingsError
 from hilsplat.web.server import listening_at
 from tests.conftest import PROJECT
+from tests.unit.viewer.conftest import run_apart
 
 
 def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
@@ -48,17 +48,15 @@ def test_the_socket_sends_without_delay():
     async def nodelay() -> int:
         found = asyncio.get_running_loop().create_future()
 
-        class Server(asyncio.Protocol):
-            def connection_made(self, transport: asyncio.Transport) -> None:
-                accepted = transport.get_extra_info("socket")
-                found.set_result(accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+        def accepted(_, writer: asyncio.StreamWriter) -> None:
+            connection = writer.get_extra_info("socket")
+            found.set_result(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
 
         with listening_at(0) as listening:
-            server = await asyncio.get_running_loop().create_server(Server, sock=listening)
+            server = await asyncio.start_server(accepted, sock=listening)
             with socket.create_connection(listening.getsockname()):
                 value = await found
             server.close()
             return value
 
-    with ThreadPoolExecutor(1) as pool:  # a browser test before this one leaves a loop running in this thread
-        assert pool.submit(lambda: asyncio.run(nodelay())).result()
+    assert run_apart(nodelay)
