@@ -15,9 +15,7 @@ from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.splat.coordinates import write_source_ply
 
 
-def maps_of(
-    masks: HierarchicalMasks,
-) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
+def maps_of(masks: HierarchicalMasks) -> tuple[Float32[np.ndarray, "4 H W"], Int64[np.ndarray, " N"]]:
     """Return LangSplat's four maps of a view, and the mask of each row of the view's vectors.
 
     The mixed-level map contains all masks, painted from large to small.
