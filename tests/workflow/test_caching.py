@@ -1,7 +1,6 @@
 """Stages that an edit reruns."""
 
-import ast
-
+from tests.unit.base.test_identity import edit_function
 from tests.workflow.conftest import Project
 
 AFTER_FIELD = {"field", "evaluate", "table", "figures", "comparison", "sweep_plot"}
@@ -25,10 +24,7 @@ def test_an_edit_reruns_its_stage_and_what_follows(copy_of_finished: Project) ->
     ):
         file = copy_of_finished.root / path
         text = file.read_text()
-        tree = ast.parse(text)
-        [node] = [each for each in tree.body if isinstance(each, ast.FunctionDef) and each.name == function]
-        node.body.append(ast.parse("EDITED = 1").body[0])
-        file.write_text(ast.unparse(ast.fix_missing_locations(tree)))
+        edit_function(copy_of_finished.root, f"{path}:{function}")
         assert copy_of_finished.planned() == expected, path
         file.write_text(text)
 
@@ -44,10 +40,3 @@ def test_settings_and_models_rerun_the_stages_that_read_them(copy_of_finished: P
     card = copy_of_finished.root / "models/clip-tiny/config.json"
     card.write_text(card.read_text() + "\n")
     assert copy_of_finished.planned() == FROM_CLIP
-
-
-def test_every_rule_carries_the_digest_of_its_code(project) -> None:
-    for path in sorted((project / "rules").glob("*.smk")):
-        for rule in path.read_text().split("\nrule ")[1:]:
-            if "python -m hilsplat" in rule:
-                assert "code=PLAN.code(" in rule, (path.name, rule.split(":")[0])

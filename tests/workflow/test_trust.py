@@ -22,12 +22,6 @@ def drawn(finished: Project, tmp_path_factory: pytest.TempPathFactory) -> Projec
     return made
 
 
-def forget(project: Project) -> None:
-    """Remove Snakemake's own records."""
-    for record in (project.root / ".snakemake/metadata").iterdir():
-        record.unlink()
-
-
 def damage_file(project: Project) -> None:
     sorted((project.root / IMAGES).glob("*.png"))[0].unlink()
 
@@ -42,7 +36,8 @@ def test_damage_is_repaired_even_without_snakemakes_records(
 ) -> None:
     before = drawn.files(IMAGES)
     damage(drawn)
-    forget(drawn)
+    for record in (drawn.root / ".snakemake/metadata").iterdir():
+        record.unlink()
     found = drawn.run(sys.executable, "-m", "hilsplat", "verify", check=False)
     assert f"snakemake --cores 2 --forcerun {IMAGES}" in found.stdout
     made = drawn.hilsplat_run(IMAGES)
@@ -51,24 +46,13 @@ def test_damage_is_repaired_even_without_snakemakes_records(
     assert "Nothing to be done" in drawn.hilsplat_run(IMAGES).stderr
 
 
-def test_other_settings_count_even_without_snakemakes_records(drawn: Project) -> None:
-    forget(drawn)
-    config = drawn.root / "config/config.yaml"
-    text = config.read_text()
-    try:
-        drawn.edit("config/config.yaml", "world: {views: 12,", "world: {views: 13,")
-        assert "rule world:" in drawn.hilsplat_run(IMAGES, "--", "-n").stdout
-    finally:
-        config.write_text(text)
-
-
 def test_an_unusable_setting_is_refused_before_any_job(drawn: Project) -> None:
     before = drawn.files("results")
     for start in (drawn.hilsplat_run, drawn.snakemake):
         separator = ["--"] if start == drawn.hilsplat_run else []
         words = [*separator, "--forcerun", IMAGES, "--config", "clip={'model': 'models/nope'}"]
         refused = start(IMAGES, *words, check=False)
-        assert refused.returncode != 0
+        assert refused.returncode != 0 and "Traceback" not in refused.stderr
         assert "models/nope is missing" in refused.stdout + refused.stderr
     assert drawn.files("results") == before
 
