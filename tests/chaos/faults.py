@@ -14,6 +14,7 @@ from pathlib import Path
 
 from tests.workflow.conftest import Project
 
+COMMAND = [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2"]
 POLL_S = 0.25
 LEFT_KIB = 64  # space left on a full disk
 WAKE_S = 60  # maximum time in which a job that was frozen at its start detects that its Snakemake has ended
@@ -31,15 +32,13 @@ def children(pid: int) -> list[int]:
     """Return the processes that any thread of a process started."""
     found: list[int] = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
+        with contextlib.suppress(OSError):
             found += map(int, task.read_text().split())
-        except OSError:
-            continue
     return found
 
 
 class Run:
-    """A run of Snakemake in a project, started as by a user, and problems that need manual intervention."""
+    """A run of `COMMAND` in a project, and problems that need manual intervention."""
 
     def __init__(self, project: Project) -> None:
         self.project = project
@@ -51,7 +50,7 @@ class Run:
         self.start_s = time.monotonic()
         with self._log.open("w") as stream:
             self.process = subprocess.Popen(
-                self.command,
+                COMMAND,
                 cwd=project.root,
                 env=project.environment(),
                 stdout=stream,
@@ -59,17 +58,11 @@ class Run:
                 start_new_session=True,
             )
 
-    @property
-    def command(self) -> list[str]:
-        """The command that a user types."""
-        return [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2"]
-
     def said(self) -> str:
         """Return the end of its output."""
         return self._log.read_text()[-4000:]
 
     def is_running(self) -> bool:
-        """Return whether it has not ended."""
         return self.process.poll() is None
 
     def look(self) -> list[int]:
@@ -80,7 +73,6 @@ class Run:
         return [pid for pid in self.jobs if not has_ended(pid)]
 
     def what_runs(self) -> str:
-        """Return the running stages."""
         return ", ".join(self.jobs[pid] for pid in self.look()) or "nothing"
 
     def watch_for(self, seconds: float, until_a_job: bool = False) -> None:
@@ -157,7 +149,7 @@ class Run:
 
     def run_twice(self, chance: random.Random) -> None:
         """Start a second run in the same project, which must refuse without disturbing the first."""
-        second = self._beside(self.command)
+        second = self._beside(COMMAND)
         said = second.stdout + second.stderr
         if self.is_running() and (second.returncode == 0 or "another hilsplat run" not in said):
             self.problems.append(f"a second run was not refused:\n{said}")
