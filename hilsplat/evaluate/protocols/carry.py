@@ -67,10 +67,6 @@ class CarriedPoints:
             result[rows] = np.einsum("pk,pkd->pd", self.weight[rows], of_gaussian[self.index[rows]])
         return result
 
-    def truth(self, labels: Int[np.ndarray, " P"]) -> Int[np.ndarray, " P"]:
-        """Return the labels, set to 0 (ignored) at points that are not scored."""
-        return np.where(self.is_scored, labels, 0).astype(labels.dtype)
-
 
 def carried_to(
     points: Float[np.ndarray, "P 3"], gaussians: Gaussians, mode: Mode, radius: float, threads: int = 1

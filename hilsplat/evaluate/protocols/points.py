@@ -198,7 +198,7 @@ def measure_scene_points(
             if "tree" in methods:
                 yield node_instances(scene, carried, points, classes)
             continue
-        labels = carried.truth(points.labels(classes))
+        labels = np.where(carried.is_scored, points.labels(classes), 0)
         for method in ("tree", "field"):
             if method in methods:
                 key = method, classes.name

@@ -35,11 +35,11 @@ class Query:
     truth: Bool[np.ndarray, "H W"]
     boxes_xyxy: Int[np.ndarray, "B 4"]  # of each annotated node, borders included
     eighth: Bool[np.ndarray, "h w"]  # at one eighth of the image's size, resized from the label
-    any_grey: Bool[np.ndarray, "H W"] | None = None  # region for ground truth `any grey`, if it differs
+    any_grey: Bool[np.ndarray, "H W"]  # region for protocols with the ground truth `any grey`
 
     def region(self, truth: str) -> Bool[np.ndarray, "H W"]:
         """Return the ground-truth region for protocols with the given `truth`: `labels` or `any grey`."""
-        return self.any_grey if truth == "any grey" and self.any_grey is not None else self.truth
+        return self.any_grey if truth == "any grey" else self.truth
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,15 @@ class ViewTruth:
             image_hw: size of the image, if it differs from `size_hw`.
             min_px: texts and paths with fewer pixels in the view are omitted.
         """
-        small_hw = eighth_of(image_hw or size_hw)
+        height, width = image_hw or size_hw
+        small_hw = max(1, height // EIGHTH), max(1, width // EIGHTH)
         single: list[Query] = []
         by_path: dict[tuple[str, ...], np.ndarray] = {}
         for region in regions:
             mask, path, level = region.mask(size_hw), region.path, region.level
             if level is not None and not mask.any():
                 continue
-            grey = region.mask(size_hw, any_grey=True) if region.any_grey else None
+            grey = region.mask(size_hw, any_grey=True) if region.any_grey else mask
             small = region.pixels()[np.ix_(*kept_by_pillow(region.size_hw, small_hw))]
             single.append(Query(region.text, level, (path,), mask, region.boxes(size_hw), small, grey))
             if level is not None and len(path) == int(level):
@@ -152,19 +153,13 @@ def _merged(queries: Iterable[Query], by_level: bool) -> tuple[Query, ...]:
     merged = []
     for (text, level), same in groups.items():
         paths = tuple(dict.fromkeys(path for query in same for path in query.paths))
-        truth = np.any([query.truth for query in same], axis=0)
         boxes = np.concatenate([query.boxes_xyxy for query in same])
-        eighth = np.any([query.eighth for query in same], axis=0)
-        grey = None
-        if any(query.any_grey is not None for query in same):
-            grey = np.any([query.region("any grey") for query in same], axis=0)
+        truth, eighth, grey = (
+            np.any([getattr(query, name) for query in same], axis=0)
+            for name in ("truth", "eighth", "any_grey")
+        )
         merged.append(Query(text, level, paths, truth, boxes, eighth, grey))
     return tuple(merged)
-
-
-def eighth_of(size_hw: tuple[int, int]) -> tuple[int, int]:
-    """Return the height and width at which 3D-OVS compares an image of this size."""
-    return max(1, size_hw[0] // EIGHTH), max(1, size_hw[1] // EIGHTH)
 
 
 def kept_by_pillow(

@@ -113,26 +113,21 @@ def block_world(tmp_path_factory):
 
 @pytest.fixture
 def opened(block_world, monkeypatch):
-    """Parts of the block world, the inputs with which a stage opens them, and the evaluate stage."""
+    """Parts of the block world, its truth, and the evaluate stage."""
     from hilsplat.evaluate import stage
     from hilsplat.evaluate.figures import panel
     from hilsplat.evaluate.scores import read_scores
     from hilsplat.scene.finished import SceneParts
 
-    asked, folder = {}, block_world.folder
-
-    def open_scene(parts, settings, **options):
-        asked.update(options, parts=parts, settings=settings)
-        return block_world.answers
-
+    opener, folder = SimpleNamespace(from_parts=lambda *_, **__: block_world.answers), block_world.folder
     for module in (stage, panel):
-        monkeypatch.setattr(module, "LanguageScene", SimpleNamespace(from_parts=open_scene))
+        monkeypatch.setattr(module, "LanguageScene", opener)
     names = ("scene", "gaussians", "semantic_tree", "field", "autoencoder", "clip", "masks")
     parts = SceneParts(**{name: folder / name for name in names})
 
-    def evaluate(out, settings=None, **changes):
+    def evaluate(out, **changes):
         given = {"dataset": "synthetic", "scene": "blocks", "truth": folder / "truth", **changes}
-        stage.run_evaluate(parts, out, settings or EvaluateSettings(), **given)
+        stage.run_evaluate(parts, out, EvaluateSettings(), **given)
         return read_scores([out])
 
-    return SimpleNamespace(parts=parts, truth=folder / "truth", asked=asked, evaluate=evaluate)
+    return SimpleNamespace(parts=parts, truth=folder / "truth", evaluate=evaluate)

@@ -37,7 +37,7 @@ def carried(xs, mode, gaussians=None, radius=0.0):
 def test_frozen_gaussians_are_the_points_and_transparent_ones_are_not_scored():
     found = carried([0, 1, 2], "frozen", gaussians_of([0.09, 0.1, 0.8]))
     assert found.labels(LABELS).tolist() == [1, 2, 3]
-    assert found.truth(np.array([5, 6, 7])).tolist() == [0, 6, 7]
+    assert found.is_scored.tolist() == [False, True, True]
     with pytest.raises(MisalignedArtifactError, match=r"expected  4 Gaussians, one per point"):
         carried([0, 1, 2, 3], "frozen")
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from hilsplat.base.images import write_png
 from hilsplat.base.levels import Level
@@ -15,7 +14,7 @@ from hilsplat.evaluate.metrics.relevancy_rule import SmoothedRelevancy, relevanc
 from hilsplat.evaluate.protocols.answers import mask_rows
 from hilsplat.evaluate.protocols.cards import LERF_MASK, OVS_ARGMAX, OVS_LANGSPLAT_V2, OVS_NODES, card_of
 from hilsplat.evaluate.protocols.flat_views import FlatProtocols
-from hilsplat.evaluate.protocols.view_truth import ViewTruth, eighth_of, kept_by_pillow
+from hilsplat.evaluate.protocols.view_truth import ViewTruth
 from hilsplat.query.relevancy import relevancy_of_margins
 from tests.unit.evaluate.builders import box, region_of
 
@@ -52,15 +51,6 @@ def flat_of(cards, level=Level.WHOLE, **cosines):
 def added(flat, found, text, method="field", nodes_mask=None):
     """Rows of a text, labelled at its own level, whose relevancy is given."""
     return list(flat.add(method, found, nodes_mask, text, [text]))
-
-
-def test_an_eighth_takes_the_pixels_that_pillow_takes():
-    rows, columns = kept_by_pillow(SIZE, eighth_of(SIZE))
-    assert (rows.tolist(), columns.tolist()) == ([4, 12], [4, 12, 20, 28])
-    rows, columns = kept_by_pillow((728, 986), eighth_of((728, 986)))  # sides that 8 does not divide
-    picture = np.arange(728 * 986, dtype=np.int32).reshape(728, 986)
-    small = Image.fromarray(picture).resize((123, 91), Image.Resampling.NEAREST)
-    np.testing.assert_array_equal(picture[np.ix_(rows, columns)], np.asarray(small))
 
 
 def test_argmax_compares_labelled_pixels_of_a_stand_in_alone():
