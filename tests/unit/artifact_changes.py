@@ -1,4 +1,4 @@
-"""Changes of artifacts as another run would have made them: with a record, and with a seal that fits."""
+"""Changes to artifacts as another run would make them: with provenance and a matching seal."""
 
 import shutil
 from pathlib import Path
@@ -8,21 +8,13 @@ from hilsplat.base.artifacts import atomic_folder, provenance_path, read_index, 
 
 
 def write_record(artifact: Path, **parts: Any) -> None:
-    """Write provenance with these parts, and nothing in the others."""
-    empty = {
-        "stage": "",
-        "code": "",
-        "plugins": [],
-        "settings": {},
-        "seed": None,
-        "inputs": {},
-        "outputs": {},
-    }
-    write_json(provenance_path(artifact), {**empty, **parts})
+    """Write a provenance record with these fields; the others are empty."""
+    empty = {"stage": "", "code": "", "plugins": [], "settings": {}, "inputs": {}, "outputs": {}}
+    write_json(provenance_path(artifact), {**empty, "seed": None, **parts})
 
 
 def write_again(artifact: Path) -> None:
-    """Replace an artifact by an equal one, as a stage that was rerun does."""
+    """Replace an artifact by an equal one, as a rerun stage does."""
     if artifact.is_dir():
         with atomic_folder(artifact) as new:
             shutil.copytree(artifact, new, dirs_exist_ok=True)
@@ -32,6 +24,6 @@ def write_again(artifact: Path) -> None:
 
 
 def change_index(folder: Path, **entries: Any) -> None:
-    """Change entries of a folder's index, and seal the folder as it is now."""
+    """Change entries of a folder's index, and update its seal."""
     index = {**read_index(folder), **entries}
     write_index(folder, index.pop("views"), **index)

@@ -2,63 +2,50 @@
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from hilsplat.evaluate.tables.build import TABLES
 from tests.workflow.conftest import copy_project
 
-LABEL_OF = {
-    "lerf/figurines": "data/lerf_ovs/label/figurines/frame_00041.json",
-    "3d_ovs/bed": "data/3d_ovs/bed/segmentations/00/banana.png",
-}
-
-
-def touch(*paths: Path) -> None:
-    for path in paths:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"")
+LABELS = (
+    "data/lerf_ovs/label/figurines/frame_00041.json",
+    "data/3d_ovs/bed/segmentations/00/banana.png",
+)
+SCAN = "data/scannet/scans/scene0000_00"
+OTHER_FILES = (
+    "data/lerf_ovs/figurines/images/frame_00041.jpg",
+    "data/lerf_ovs/figurines/sparse/0/images.bin",
+    "data/3d_ovs/bed/images/00.jpg",
+    "data/3d_ovs/bed/sparse/0/images.bin",
+    "data/3d_ovs/bed/segmentations/classes.txt",
+    "data/replica/replica/room_0/habitat/mesh_semantic.ply",
+    *(f"{SCAN}/{name}" for name in ("color/0.jpg", "pose/0.txt", "intrinsic/intrinsic_color.txt")),
+    *(f"{SCAN}/scene0000_00_vh_clean_2.{end}" for end in ("ply", "labels.ply", "0.010000.segs.json")),
+    f"{SCAN}/scene0000_00.aggregation.json",
+)
 
 
 @pytest.fixture(scope="module")
 def planned(project, tmp_path_factory) -> str:
     """Dry run of the paper's configuration with one scene of LERF, one of 3D-OVS and one scan present."""
     copy = copy_project(project, tmp_path_factory.mktemp("data") / "project", results=False)
-    data = copy.root / "data"
-    touch(
-        data / "lerf_ovs/figurines/images/frame_00041.jpg",
-        data / "lerf_ovs/figurines/sparse/0/images.bin",
-        data / "lerf_ovs/label/figurines/frame_00041.json",
-        data / "3d_ovs/bed/images/00.jpg",
-        data / "3d_ovs/bed/sparse/0/images.bin",
-        data / "3d_ovs/bed/segmentations/classes.txt",
-        data / "3d_ovs/bed/segmentations/00/banana.png",
-        data / "replica/replica/room_0/habitat/mesh_semantic.ply",
-    )
-    scan = data / "scannet/scans/scene0000_00"
-    mesh = "scene0000_00_vh_clean_2"
-    names = (
-        f"{mesh}.ply",
-        f"{mesh}.labels.ply",
-        f"{mesh}.0.010000.segs.json",
-        "scene0000_00.aggregation.json",
-    )
-    touch(scan / "color/0.jpg", scan / "pose/0.txt", scan / "intrinsic/intrinsic_color.txt")
-    touch(*(scan / name for name in names))
+    for path in (*LABELS, *OTHER_FILES):
+        (copy.root / path).parent.mkdir(parents=True, exist_ok=True)
+        (copy.root / path).touch()
     models = ('masks={"model": "models/sam-tiny"}', 'clip={"model": "models/clip-tiny"}')
     result = copy.snakemake("-n", "-p", "--config", *models, "data_root=data", config="paper", check=False)
     return result.stdout + result.stderr
 
 
 def blocks(planned: str) -> Iterator[tuple[str, str]]:
-    """(rule, what the dry run prints of the job)."""
+    """Yield the rule of each job, and the dry run's output about the job."""
     for part in re.split(r"^(?=(?:local)?rule )", planned, flags=re.M):
         if found := re.match(r"(?:local)?rule (\w+):", part):
             yield found[1], part
 
 
-@pytest.mark.parametrize("label", LABEL_OF.values())
+@pytest.mark.parametrize("label", LABELS)
 def test_labels_are_inputs_of_evaluation_and_figures_only(planned, label):
     readers = {rule for rule, text in blocks(planned) if label in text.partition("output:")[0]}
     assert readers == {"evaluate", "figures", "comparison"}
