@@ -6,7 +6,7 @@
 A fault is injected into a run at a random time; then the same command is started again. When the run is
 complete, its tables are compared byte by byte with those of an undisturbed run, and the next run starts
 without results. After that, user commands are killed while they write (`commands`). The final report
-lists kills and their cost. The exit code is 1 if a table differs, or if a start without a fault failed.
+lists the faults. The exit code is 1 if a table differs, or if a start without a fault failed.
 
 The faults of a full and a read-only disk need results on a small tmpfs; they are skipped with a notice if
 this user may not mount one.
@@ -36,24 +36,20 @@ SLACK_S = 3600  # maximum time of a start without a fault, in addition to that o
 
 @dataclass
 class Tally:
-    """Faults, seconds in all starts, complete runs, and problems that need manual intervention so far."""
+    """Faults, complete runs, and problems that need manual intervention so far."""
 
     kills: int = 0
     faults: Counter[str] = field(default_factory=Counter)
-    seconds: float = 0.0
     finished: int = 0
     problems: list[str] = field(default_factory=list)
 
-    def report(self, whole_s: float) -> str:
-        """Return the final lines of output; an undisturbed run takes `whole_s` seconds."""
+    def report(self) -> str:
+        """Return the final lines of output."""
         lines = [f"{self.kills} kills, {self.finished} complete runs"]
         lines += [f"  {name}: {count}" for name, count in sorted(self.faults.items())]
-        if self.kills:
-            lost_s = (self.seconds - self.finished * whole_s) / self.kills
-            lines.append(f"seconds lost per kill, including those of other faults: {lost_s:.1f}")
         lines += [f"PROBLEM {problem}" for problem in self.problems]
-        whole = "no manual intervention was needed, and no table differs"
-        lines.append("manual intervention was needed" if self.problems else whole)
+        if not self.problems:
+            lines.append("no manual intervention was needed, and no table differs")
         return "\n".join(lines)
 
 
@@ -102,7 +98,6 @@ def torment(
             if fault.ends_run:
                 break
         code = run.wait(whole_s + SLACK_S)
-        tally.seconds += time.monotonic() - run.start_s
         tally.problems += run.problems
         if code != 0 and not may_fail:
             tally.problems.append(f"a start without a fault ended with {code}:\n{run.said()}")
@@ -150,7 +145,7 @@ def main() -> None:
     try:
         tally = torment(project, reference, whole_s, options, disk)
         chance = random.Random(options.seed)
-        tally.problems += kill_commands(work / "commands", max(1, options.kills // 3), chance)
+        tally.problems += kill_commands(root / "commands", max(1, options.kills // 3), chance)
         kept = bool(tally.problems)
         if kept:
             shutil.copytree(results, root / "results-kept", symlinks=True)
@@ -158,12 +153,10 @@ def main() -> None:
     finally:
         if disk:
             subprocess.run(["umount", "--lazy", str(results)], check=False)
-    print(tally.report(whole_s), flush=True)
-    if not kept:
-        shutil.rmtree(root)
-    if options.work is None:
-        shutil.rmtree(work / "undisturbed" if kept else work)
-    sys.exit(1 if kept else 0)
+    print(tally.report(), flush=True)
+    if kept:
+        sys.exit(1)
+    shutil.rmtree(root if options.work else work)
 
 
 if __name__ == "__main__":

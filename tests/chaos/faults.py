@@ -47,7 +47,6 @@ class Run:
         self._frozen: list[int] = []
         self._log = project.root / "said.log"
         self._filler = project.root / "results/filler"
-        self.start_s = time.monotonic()
         with self._log.open("w") as stream:
             self.process = subprocess.Popen(
                 COMMAND,
