@@ -249,7 +249,6 @@ class PerturbSettings(Section):
     """
 
     seed: int = knob(0, "seed of the faults; independent of the run's seed", ge=0)
-    background: bool = knob(True, "also mask the surroundings (table, floor, walls), as SAM does")
     boundary_px: float = knob(
         0.6, "standard deviation of the boundary's displacement along its normal", unit="px", ge=0, le=64
     )
@@ -261,11 +260,7 @@ class PerturbSettings(Section):
     missing: tuple[Share, Share, Share] = knob(
         (0.01, 0.04, 0.1), "probability that a mask is missing: whole, part, subpart"
     )
-    missing_level: tuple[Share, Share, Share] = knob(
-        (0.0, 0.0, 0.0), "probability that a view has no masks of the level: whole, part, subpart"
-    )
     wrong_level: Share = knob(0.02, "probability that a mask is one level off")
-    dropped_views: Share = knob(0.0, "probability that a view has no masks at all")
     systematic_merge: Share = knob(
         0.02, "probability per node, drawn once per scene, of the same wrong merge in most views"
     )

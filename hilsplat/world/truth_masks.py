@@ -40,9 +40,7 @@ logger = logging.getLogger(__name__)
 SEGMENTER = "truth-perturbed"
 """Name of the segmenter, and label prefix of its masks."""
 
-FAULTS = PerturbSettings.model_fields.keys() - {
-    *("seed", "background", "boundary_smooth_px", "systematic_share", "score_noise")
-}
+FAULTS = ("boundary_px", "merge", "split", "missing", "wrong_level", "systematic_merge", "systematic_missing")
 """Settings that change masks; if all are 0, the masks are exact."""
 
 REACH = 3.0
@@ -308,12 +306,11 @@ def faulty_masks(
 ) -> tuple[HierarchicalMasks, dict[str, int]]:
     """Return one view's true regions as masks, with faults applied in this order.
 
-    1. Dropped views, missing levels.
-    2. Merges: a group of nodes becomes one mask (`merged_groups`).
-    3. Missing masks: a group is dropped by its lowest node's draw, or by any node's systematic fault.
-    4. Splits (`cut_in_two`), then boundaries (`displaced`). Each mask is changed separately, so masks may
+    1. Merges: a group of nodes becomes one mask (`merged_groups`).
+    2. Missing masks: a group is dropped by its lowest node's draw, or by any node's systematic fault.
+    3. Splits (`cut_in_two`), then boundaries (`displaced`). Each mask is changed separately, so masks may
        then overlap or leave gaps.
-    5. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
+    4. Wrong levels: whole becomes part, subpart becomes part, part becomes either.
 
     `predicted_iou` is the mask's best IoU with the true region of one of its nodes, plus noise. `stability`
     is the mean of that IoU and 1, plus noise. Both scores are clipped to [0, 1]. A systematic merge thus
@@ -327,15 +324,12 @@ def faulty_masks(
     Returns:
         The masks in `content_order`, and the number of faults of each kind.
     """
-    counts = dict.fromkeys(("missing_levels", "merged", "missing", "split", "wrong_level"), 0)
+    counts = dict.fromkeys(("merged", "missing", "split", "wrong_level"), 0)
     found: list[tuple[np.ndarray, Level, float, float]] = []
-    dropped = draws.chance("dropped view", view) < settings.dropped_views
-    for level in LEVELS if not dropped else ():
-        if draws.chance("missing level", view, level.label) < settings.missing_level[level.index]:
-            counts["missing_levels"] += 1
-            continue
+    for level in LEVELS:
         of_level = labels[level.index]
-        ids = _visible(of_level, truth, settings, min_area_px)
+        areas = zip(*np.unique(of_level, return_counts=True), strict=True)
+        ids = [int(node) for node, area_px in areas if node != NONE and area_px >= min_area_px]
         borders = sibling_borders(of_level, truth)
         for group in merged_groups(ids, borders, truth, view, draws, settings):
             lead = group[0]
@@ -367,16 +361,7 @@ def faulty_masks(
         np.array([each[2] for each in found], np.float32),
         np.array([each[3] for each in found], np.float32),
     )
-    return masks.take(masks.content_order()), {"dropped": int(dropped), **counts}
-
-
-def _visible(
-    of_level: Int32[np.ndarray, "H W"], truth: TrueNodes, settings: PerturbSettings, min_area_px: int
-) -> list[int]:
-    """Return the nodes of a level that are large enough for a mask in a view, in ascending order."""
-    areas = zip(*np.unique(of_level, return_counts=True), strict=True)
-    ids = [int(node) for node, area_px in areas if node != NONE and area_px >= min_area_px]
-    return [node for node in ids if settings.background or node not in truth.background]
+    return masks.take(masks.content_order()), counts
 
 
 def _scores(

@@ -8,15 +8,7 @@ import pytest
 from hilsplat.base.errors import SceneError
 from hilsplat.world.objects.builder import NEIGHBOUR_CONTRAST, PARENT_CONTRAST, Builder
 from hilsplat.world.objects.catalogue import CLASSES, TABLETOP, build_object
-from hilsplat.world.paints import (
-    COLOURS,
-    KINDS,
-    TEXTURES,
-    PaintBox,
-    colour_word,
-    lab_from_srgb,
-    srgb_from_linear,
-)
+from hilsplat.world.paints import COLOURS, KINDS, TEXTURES, colour_word, lab_from_srgb, srgb_from_linear
 from hilsplat.world.scenes.kinds import build_scene
 from hilsplat.world.shapes import Mesh, box, cylinder, extrude, loft, ring, sphere, sweep
 from hilsplat.world.textures import pattern
@@ -157,10 +149,10 @@ def test_colour_words_match_the_average_colour():
         assert colour_word(np.array(colour)) == word
     # L*a*b* of pure sRGB red, from the CIE formulas: 53.24, 80.09, 67.20.
     assert lab_from_srgb(np.array([1.0, 0, 0])) == pytest.approx([53.24, 80.09, 67.20], abs=0.05)
-    box_of_paints = PaintBox(np.random.default_rng(0))
+    builder = Builder("thing", np.random.default_rng(0))
     for group in ("plastic", "ceramic", "cloth", "metal", "wood", "stone", "fur", "tiles"):
         for _ in range(12):
-            paint = box_of_paints.draw(group)
+            paint = builder.paint(group)
             assert colour_word(paint.seen) == paint.colour
             assert colour_word(paint.paled(0.4).seen) == paint.paled(0.4).colour
             assert paint.shaded(0.5).seen.max() < paint.seen.max() < paint.shaded(1.5).seen.max() <= 0.95

@@ -8,6 +8,7 @@ import pytest
 from hilsplat.world.objects.catalogue import CLASSES
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras, training_camera
 from hilsplat.world.scenes.room import room_of
+from hilsplat.world.scenes.street import part_boxes
 
 CLASSES_SEEN = {
     # 16 of ScanNet's 19 classes; bathrooms have the other three
@@ -22,12 +23,9 @@ def rooms():
     return [build_scene("room", seed, (9, 12, 15)[seed % 3]) for seed in range(100, 108)]
 
 
-def box_of(scene, node, without=None):
-    mine = (scene.node_ids == node).any(axis=1)
-    for other in scene.nodes:
-        if other.text == without:
-            mine &= scene.node_ids[:, 2] != other.id
-    points = scene.triangles[mine].reshape(-1, 3)
+def box_of(scene, thing):
+    """Lowest and highest corner of an object."""
+    points = scene.triangles[scene.node_ids[:, 0] == thing.node].reshape(-1, 3)
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -35,11 +33,6 @@ def half_of(scene):
     """Half the width and depth of a room, m."""
     room = room_of(scene)
     return np.array([room.width, room.depth]) / 2
-
-
-def overlap(first, second):
-    """How deep two boxes run into each other on their best axis, m; not positive if they do not meet."""
-    return float((np.minimum(first[1], second[1]) - np.maximum(first[0], second[0])).min())
 
 
 def test_eight_rooms_contain_the_classes_of_scannet(rooms):
@@ -50,48 +43,33 @@ def test_a_room_contains_the_requested_objects_and_its_fixtures(rooms):
     for scene in rooms:
         assert len(scene.placed) == scene.asked or scene.asked == 20  # 15 objects do not always fit
         assert len(scene.placed) >= scene.asked - 3
-        names = {thing.name for thing in scene.placed}
+        yaw_deg = {thing.name: thing.yaw_deg for thing in scene.placed}
+        names = set(yaw_deg)
         assert {"door", "window", "curtain", "picture"} <= names
+        assert yaw_deg["curtain"] == yaw_deg["window"]
         assert len(names & set(CLASSES["room"])) >= 8
 
 
 def test_objects_do_not_intersect(rooms):
     for scene in rooms:
-        # The backsplash of a counter is behind the objects on it; the next test checks it.
-        boxes = [box_of(scene, thing.node, without="counter backsplash") for thing in scene.placed]
-        for (a, first), (b, second) in itertools.combinations(zip(scene.placed, boxes, strict=True), 2):
-            if {a.name, b.name} == {"window", "curtain"}:
-                continue  # a curtain hangs around its window
-            # Boxes along the axes, or circles around turned things: either proves that they do not meet.
+        boxes = []
+        for thing in scene.placed:
+            own = scene.node_ids[:, 0] == thing.node
+            _, part, subpart = scene.node_ids[own].T
+            boxes.append((thing, *part_boxes(scene.triangles[own], np.where(subpart >= 0, subpart, part))))
+        for (a, low_a, high_a), (b, low_b, high_b) in itertools.combinations(boxes, 2):
+            # Boxes around parts and subparts, or circles around turned things: either proves that they do not
+            # meet. The depth of an overlap is that on the best axis, m.
+            depth = (np.minimum(high_a[:, None], high_b) - np.maximum(low_a[:, None], low_b)).min(axis=2)
             apart = np.linalg.norm(np.subtract(a.centre_xy, b.centre_xy)) - a.footprint - b.footprint
-            assert overlap(first, second) < 0.012 or apart > 0, (scene.seed, a.name, b.name)
-
-
-def test_objects_on_a_counter_do_not_intersect_its_backsplash(rooms):
-    found = 0
-    for scene in rooms:
-        for node, thing in itertools.product(scene.nodes, scene.placed):
-            if node.text == "counter backsplash" and thing.base_z > 0:
-                assert overlap(box_of(scene, thing.node), box_of(scene, node.id)) < 0.012, thing.name
-                found += 1
-    assert found > 5
-
-
-def test_curtains_are_beside_their_window(rooms):
-    for scene in rooms[:5]:
-        placed = {thing.name: thing for thing in scene.placed}
-        panels = [node.id for node in scene.nodes if node.text == "curtain panel"]
-        assert len(panels) == 2
-        for panel in panels:
-            assert overlap(box_of(scene, placed["window"].node), box_of(scene, panel)) < 0
-        assert placed["curtain"].yaw_deg == placed["window"].yaw_deg
+            assert depth.max() < 0.012 or apart > 0, (scene.seed, a.name, b.name)
 
 
 def test_every_object_has_support_or_hangs_on_a_wall(rooms):
     for scene in rooms:
         half = half_of(scene)
         for thing in scene.placed:
-            low, high = box_of(scene, thing.node)
+            low, high = box_of(scene, thing)
             assert low[2] == pytest.approx(thing.base_z, abs=1e-5)
             if thing.name in ("window", "curtain", "picture", "mirror", "door"):
                 assert min(np.abs(half - high[:2]).min(), np.abs(half + low[:2]).min()) < 1e-5
@@ -119,7 +97,7 @@ def test_cameras_are_clear_of_objects_and_overlap_enough_for_structure_from_moti
         centres = np.stack([camera.centre for camera in ordered])
         assert (np.abs(centres[:, :2]) < half_of(scene) - 0.5).all()
         for thing in scene.placed:
-            low, high = box_of(scene, thing.node)
+            low, high = box_of(scene, thing)
             away = np.linalg.norm(np.maximum(0, np.maximum(low - centres, centres - high)), axis=1)
             assert away.min() > 0.1, (scene.seed, thing.name)
         for a, b in itertools.pairwise([*ordered, ordered[0]]):
@@ -131,7 +109,7 @@ def test_cameras_are_clear_of_objects_and_overlap_enough_for_structure_from_moti
 def test_training_cameras_are_inside_the_room_and_outside_objects(rooms):
     rng = np.random.default_rng(3)
     for scene in rooms[:6]:
-        boxes = [box_of(scene, thing.node) for thing in scene.placed]
+        boxes = [box_of(scene, thing) for thing in scene.placed]
         for _ in range(20):
             centre = training_camera(scene, rng, 64).centre
             assert (np.abs(centre[:2]) < half_of(scene) - 0.1).all()
