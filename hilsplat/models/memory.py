@@ -100,37 +100,37 @@ CGROUP_FILES = {
 """Control group version -> files with memory limit and use, and key of reclaimable pages in `memory.stat`."""
 
 
-def machine_mib(system: Path = SYSTEM) -> float:
+def machine_mib() -> float:
     """Return the memory in MiB available to this process: that of its machine, container or cluster job."""
     physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / MIB
-    return min([physical, *(limit for limit, _ in _cgroups(system))])
+    return min([physical, *(limit for limit, _ in _cgroups())])
 
 
-def available_mib(system: Path = SYSTEM) -> float:
+def available_mib() -> float:
     """Return the memory in MiB that is currently free on the machine and in the container or cluster job."""
     try:
-        lines = (system / "proc/meminfo").read_text(encoding="ascii").splitlines()
+        lines = (SYSTEM / "proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:  # not Linux
-        return machine_mib(system)
+        return machine_mib()
     (found,) = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    return min([int(found) / 1024, *(limit - used for limit, used in _cgroups(system))])
+    return min([int(found) / 1024, *(limit - used for limit, used in _cgroups())])
 
 
-def _cgroups(system: Path) -> list[tuple[float, float]]:
+def _cgroups() -> list[tuple[float, float]]:
     """Return the limit and use in MiB of each control group that contains this process and limits its memory.
 
     Groups are nested, and each limit applies. Reclaimable file pages do not count as used. Version 1 reports
     a limit of 8 EiB for groups without a limit.
     """
     try:
-        lines = (system / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+        lines = (SYSTEM / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:  # not Linux
         return []
     found = []
     for _, controllers, path in (line.split(":", 2) for line in lines):
         if controllers and "memory" not in controllers.split(","):
             continue
-        mount = system / "sys/fs/cgroup" / ("memory" if controllers else "")
+        mount = SYSTEM / "sys/fs/cgroup" / ("memory" if controllers else "")
         limit_file, use_file, reclaimable = CGROUP_FILES[1 if controllers else 2]
         own = mount / path.lstrip("/")
         if ".." in own.parts or not own.is_dir():  # inside a container, the mount is the container's group

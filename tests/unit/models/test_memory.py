@@ -51,8 +51,8 @@ GIB, UNLIMITED = 2**30, 9223372036854771712
 V1, V2 = "9:cpuset:/\n4:cpu,memory:/a/b\n0::/\n", "0::/a/b\n"
 
 
-def system(folder: Path, membership: str, groups: dict) -> Path:
-    """A folder with `proc` and `sys` of a process: limit, use and reclaimable pages by control group."""
+def write_system(folder: Path, membership: str, groups: dict) -> None:
+    """Write `proc` and `sys` of a process: limit, use and reclaimable pages by control group."""
     mount, limit_file, use_file, pages = "", "memory.max", "memory.current", "inactive_file"
     if membership == V1:
         mount, pages = "memory", "total_inactive_file"
@@ -68,7 +68,6 @@ def system(folder: Path, membership: str, groups: dict) -> Path:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    return folder
 
 
 @pytest.mark.parametrize(
@@ -91,6 +90,7 @@ def system(folder: Path, membership: str, groups: dict) -> Path:
 )
 def test_memory_limits_of_control_groups(tmp_path, monkeypatch, membership, groups, limit_gib, free_gib):
     monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 64 * GIB // 4096}.__getitem__)
-    root = system(tmp_path, membership, groups)
-    assert machine_mib(root) == 1024 * limit_gib
-    assert available_mib(root) == 1024 * free_gib
+    monkeypatch.setattr("hilsplat.models.memory.SYSTEM", tmp_path)
+    write_system(tmp_path, membership, groups)
+    assert machine_mib() == 1024 * limit_gib
+    assert available_mib() == 1024 * free_gib
