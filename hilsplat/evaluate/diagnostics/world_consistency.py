@@ -340,6 +340,6 @@ def answers_in_view(
     return [
         stored.get(key)
         if key in stored
-        else relevancy_mask(SmoothedRelevancy.of(maps[query.text], rule), query.level, rule)[0]
+        else relevancy_mask(SmoothedRelevancy.of(maps[query.text], rule), query.level, rule)
         for query, key in zip(queries, keys, strict=True)
     ]

@@ -52,7 +52,7 @@ class Answerer:
             for view, texts in texts_of.items()
         }
         return [
-            relevancy_mask(SmoothedRelevancy.of(maps[row.view][row.path[-1]], rule), row.level, rule)[0]
+            relevancy_mask(SmoothedRelevancy.of(maps[row.view][row.path[-1]], rule), row.level, rule)
             for row in rows
         ]
 

@@ -207,8 +207,8 @@ def draw_queries(
         hits = row.hits(answers)
         level = row.level or hits.level
         smoothed = SmoothedRelevancy.of(relevancy, rule)
-        field_mask, _ = relevancy_mask(smoothed, level, rule)
-        points, _ = peak_points(smoothed.filtered, level)
+        field_mask = relevancy_mask(smoothed, level, rule)
+        points = peak_points(smoothed.filtered, level)
         pictures = [("tree", answers.node_masks(row.view, hits.ids))]
         if columns == 7:
             pictures.append(("tree, path", row.tree_mask(answers, by_path=True)))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import Level
 
 BOUNDARY_RATIO = 0.02
 """Boundary width as a fraction of the image diagonal (Cheng et al. 2021)."""
@@ -80,18 +80,14 @@ def pixel_accuracy(prediction: Bool[np.ndarray, "K H W"], truth: Bool[np.ndarray
     return float((prediction == truth).all(axis=0).mean())
 
 
-def peak_points(
-    filtered: Float[np.ndarray, "3 H W"], level: Level | None
-) -> tuple[Int[np.ndarray, "P 2"], Level]:
-    """Return all pixels (x, y) with the maximum of a filtered map, and the level of the map.
+def peak_points(filtered: Float[np.ndarray, "L H W"], level: Level | None) -> Int[np.ndarray, "P 2"]:
+    """Return all pixels (x, y) with the maximum of the filtered map of a level.
 
-    If `level` is None, the level with the highest maximum is used; the finest wins ties, as in LangSplat.
+    If `level` is None, the map with the highest maximum is used; the finest wins ties, as in LangSplat.
     """
-    if level is None:
-        level = max(LEVELS, key=lambda each: (filtered[each.index].max(), each.index))
-    chosen = filtered[level.index]
+    chosen = max(filtered[::-1], key=np.max) if level is None else filtered[level.index]
     pixels = np.flatnonzero(chosen == chosen.max())  # np.nonzero in two dimensions is six times slower
-    return np.stack([pixels % chosen.shape[1], pixels // chosen.shape[1]], axis=1), level
+    return np.stack([pixels % chosen.shape[1], pixels // chosen.shape[1]], axis=1)
 
 
 def hits_a_box(points_xy: Int[np.ndarray, "P 2"], boxes_xyxy: Int[np.ndarray, "B 4"]) -> bool:

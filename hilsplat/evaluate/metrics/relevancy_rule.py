@@ -142,7 +142,7 @@ def relevancy_mask(
     level: Level | None,
     rule: RelevancyRule,
     united: Float[np.ndarray, "3 H W"] | None = None,
-) -> tuple[Bool[np.ndarray, "H W"], Level]:
+) -> Bool[np.ndarray, "H W"]:
     """Return the mask of a level, or of the level that the rule chooses if `level` is None; finer wins ties.
 
     `united` is the unfiltered relevancy of another text, whose mask is merged with the first text's mask
@@ -156,10 +156,9 @@ def relevancy_mask(
         return majority_smooth(mask, rule.border) if rule.majority else mask
 
     if level is not None:
-        return mask_of(level), level
+        return mask_of(level)
     if rule.level_rule == "max":
-        chosen = max(rule.levels, key=lambda each: (smoothed.mixed[each.index].max(), each))
-        return mask_of(chosen), chosen
+        return mask_of(max(rule.levels, key=lambda each: (smoothed.mixed[each.index].max(), each)))
     masks = {each: mask_of(each) for each in rule.levels}
 
     def mean_in_mask(level: Level) -> float:
@@ -167,5 +166,4 @@ def relevancy_mask(
             return np.inf if rule.empty_wins else -np.inf
         return float(smoothed.mixed[level.index][masks[level]].mean())
 
-    chosen = max(rule.levels, key=lambda each: (mean_in_mask(each), each))
-    return masks[chosen], chosen
+    return masks[max(rule.levels, key=lambda each: (mean_in_mask(each), each))]

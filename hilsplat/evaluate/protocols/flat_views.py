@@ -89,9 +89,9 @@ class FlatProtocols:
                 smoothed = smoothed_by(rule.filter_px, rule.mix, rule.border)
                 other = dict(card.united).get(flat.text)
                 united = relevancy_of(self.scene, method, (other,), self.view)[0] if other else None
-                mask, _ = relevancy_mask(smoothed, None, rule, united)
+                mask = relevancy_mask(smoothed, None, rule, united)
                 if {"localization_box", "localization_mask"} & set(card.metrics):
-                    points, _ = peak_points(smoothed.filtered, None)
+                    points = peak_points(smoothed.filtered, None)
             answered = replace(flat, truth=region)
             yield from mask_rows(method, answered, card.labelled(self.words), mask, points, card.metrics)
         if OVS_ARGMAX in self.cards:

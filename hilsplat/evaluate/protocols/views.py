@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import Level
 from hilsplat.evaluate.extra_protocols import ExtraProtocols
 from hilsplat.evaluate.metrics import hierarchy
 from hilsplat.evaluate.metrics.masks import best_threshold_iou, peak_points
@@ -94,12 +94,6 @@ def measure_view(
     flat_views = FlatProtocols(scene, view, extra.flat, extra.level, relevancy_departures(settings))
     rule = rule_of(settings)
 
-    def by_map(smoothed: SmoothedRelevancy, level: Level | None) -> np.ndarray:
-        return relevancy_mask(smoothed, level, rule)[0]
-
-    def by_nodes(text: str, level: Level | None) -> np.ndarray:
-        return answers.of_nodes((text,), level)
-
     needs_nodes = "tree" in settings.methods or "tree-path" in settings.methods
     categories = [*truth.categories, *(truth.absent if extra.flat else ())]
     height, width = masks.size_hw
@@ -117,11 +111,11 @@ def measure_view(
                 mask = None
                 if category.truth.any():
                     smoothed = SmoothedRelevancy.of(found[row], rule)
-                    flat, answer = cards.LERF_LANGSPLAT, partial(by_map, smoothed)
+                    flat, answer = cards.LERF_LANGSPLAT, partial(relevancy_mask, smoothed, rule=rule)
                     if method == "tree":
-                        flat, answer = cards.TREE_NODES, partial(by_nodes, category.text)
+                        flat, answer = cards.TREE_NODES, partial(answers.of_nodes, (category.text,))
                         yield from answers.scene_wide_rows(queries)
-                        mask = by_nodes(category.text, None)
+                        mask = answer(None)
                     yield from answers.rows(method, flat, smoothed, answer, category, queries)
                 yield from flat_views.add(method, found[row], mask, category, queries)
             if nodes is not None and "tree-path" in settings.methods:
@@ -161,13 +155,13 @@ class _ViewAnswers:
             label_of(card, method, self.settings) for card in (flat, cards.LEVEL_GIVEN, cards.LEVEL_AUTO)
         )
         auto_mask = answer(None)
-        auto_points, _ = peak_points(smoothed.filtered, None)
+        auto_points = peak_points(smoothed.filtered, None)
         yield from mask_rows(method, category, united, auto_mask, auto_points)
         self.masks.put((method, auto, category.text), auto_mask)
         for query in queries:
             assert query.level is not None
             given_mask = answer(query.level)
-            given_points, _ = peak_points(smoothed.filtered, query.level)
+            given_points = peak_points(smoothed.filtered, query.level)
             yield from mask_rows(method, query, given, given_mask, given_points)
             yield from mask_rows(method, query, auto, auto_mask, auto_points)
             best = best_threshold_iou(smoothed.mixed[query.level.index], query.truth)
@@ -200,7 +194,7 @@ class _ViewAnswers:
                     inside |= self.of_nodes(path[:-1], Level(len(path) - 1) if is_full else None)
             level_map = relevancy[query.level.index]
             filtered = mean_filter(np.where(inside, level_map, 0) if inside.any() else level_map, side_px)
-            points, _ = peak_points(np.stack([filtered] * len(LEVELS)), query.level)
+            points = peak_points(filtered[None], None)
             yield from mask_rows("tree-path", query, protocol, mask, points)
 
     def consistency_rows(self, truth: ViewTruth) -> Iterator[Measured]:

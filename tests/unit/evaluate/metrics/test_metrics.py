@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS
 from hilsplat.evaluate.metrics.hierarchy import Family, consistency_per_child, hierarchical_consistency
 from hilsplat.evaluate.metrics.masks import (
     argmax_masks,
@@ -100,7 +100,8 @@ def test_the_mean_in_the_mask_chooses_the_higher_mean_not_the_higher_value():
     relevancy[0, 0, :2] = 0.9, 0.5  # mean 0.7
     relevancy[1, 0, :4] = 0.6, 0.6, 0.6, 0.9  # mean 0.675; the mask of the subpart is empty
     rule = RelevancyRule(1, threshold=0.0, threshold_on="raw", majority=False, level_rule="mean_in_mask")
-    assert relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)[1] is Level.WHOLE
+    mask = relevancy_mask(SmoothedRelevancy.of(relevancy, rule), None, rule)
+    np.testing.assert_array_equal(mask, relevancy[0] > 0)
 
 
 def test_rule_names_what_departs_from_langsplat():
@@ -124,24 +125,21 @@ def test_majority_inside_the_image_includes_the_last_row_and_column():
 
 @pytest.mark.parametrize("level_rule", ["max", "mean_in_mask"])
 @pytest.mark.parametrize(
-    ("values", "levels", "chosen", "place"),
+    ("values", "levels", "place"),
     [
-        ((0.6, 0.7, 0.9), LEVELS, Level.SUBPART, [1, 1]),
-        ((0.6, 0.7, 0.9), LEVELS[:2], Level.PART, [5, 5]),
-        ((0.9, 0.9, 0.9), LEVELS, Level.SUBPART, [1, 1]),  # LangSplat stacks s, m, l; argmax takes the first
+        ((0.6, 0.7, 0.9), LEVELS, [1, 1]),
+        ((0.6, 0.7, 0.9), LEVELS[:2], [5, 5]),
+        ((0.9, 0.9, 0.9), LEVELS, [1, 1]),  # LangSplat stacks s, m, l; argmax takes the first
     ],
 )
-def test_the_finest_of_the_levels_with_the_highest_value_is_chosen(level_rule, values, levels, chosen, place):
+def test_the_finest_of_the_levels_with_the_highest_value_is_chosen(level_rule, values, levels, place):
     relevancy = np.zeros((3, 8, 8), dtype=np.float32)
     relevancy[0, 2, 2], relevancy[1, 5, 5], relevancy[2, 1, 1] = values
     rule = RelevancyRule(filter_px=1, majority=False, level_rule=level_rule, levels=levels)
     smoothed = SmoothedRelevancy.of(relevancy, rule)
-    mask, level = relevancy_mask(smoothed, None, rule)
-    assert level is chosen
-    assert np.argwhere(mask).tolist() == [place]
+    assert np.argwhere(relevancy_mask(smoothed, None, rule)).tolist() == [place]
     if levels == LEVELS:
-        points, level = peak_points(smoothed.filtered, None)
-        assert (points.tolist(), level) == ([place], chosen)
+        assert peak_points(smoothed.filtered, None).tolist() == [place]
 
 
 # --- masks ----------------------------------------------------------------------------------------
@@ -219,8 +217,7 @@ def test_argmax_protocol_of_3d_ovs_on_four_pixels():
 def test_any_of_several_maxima_may_hit_and_borders_count():
     filtered = np.zeros((3, 24, 24), dtype=np.float32)
     filtered[1, 5, 10] = filtered[1, 5, 12] = 0.8
-    points, level = peak_points(filtered, None)
-    assert level is Level.PART
+    points = peak_points(filtered, None)
     assert points.tolist() == [[10, 5], [12, 5]]
     assert hits_a_box(points, np.array([[0, 0, 9, 9], [12, 5, 20, 20]]))
     assert not hits_a_box(points, np.array([[0, 0, 9, 9], [13, 5, 20, 20]]))

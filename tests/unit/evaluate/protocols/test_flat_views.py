@@ -152,7 +152,7 @@ def window_means(values, reach):
 
 
 def by_the_released_rule(coarse_to_fine, united=None):
-    """Mask and level; LangSplatV2 stacks its levels from fine to coarse and never takes the finest."""
+    """Mask; LangSplatV2 stacks its levels from fine to coarse and never takes the finest."""
 
     def in_range(values):
         shifted = values - values.min()
@@ -169,8 +169,7 @@ def by_the_released_rule(coarse_to_fine, united=None):
         if level is not Level.SUBPART:
             with np.errstate(invalid="ignore"):
                 scores.append((mixed * masks[-1]).sum() / np.float64(masks[-1].sum()))
-    chosen = int(np.argmax(scores))  # NaN is the largest, as in torch
-    return masks[chosen], (Level.SUBPART, Level.PART, Level.WHOLE)[chosen]
+    return masks[int(np.argmax(scores))]  # NaN is the largest, as in torch
 
 
 def blobs(rng, size_hw):
@@ -186,23 +185,19 @@ def blobs(rng, size_hw):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_masks_and_levels_are_those_of_the_released_rule(seed):
+def test_masks_are_those_of_the_released_rule(seed):
     rng = np.random.default_rng(seed)
     maps = blobs(rng, (24, 31))
     united = blobs(rng, (24, 31)) if seed % 2 else None
-    mask, level = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE, united)
-    expected, expected_level = by_the_released_rule(maps, united)
-    np.testing.assert_array_equal(mask, expected)
-    assert level is expected_level
+    mask = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE, united)
+    np.testing.assert_array_equal(mask, by_the_released_rule(maps, united))
 
 
 def test_an_empty_mask_wins_the_level():
     maps = np.full((3, 40, 40), 0.1, np.float32)
     maps[Level.WHOLE.index, :20] = 0.9
     maps[Level.PART.index, 20, 20] = 0.9  # one pixel, which the majority filter removes
-    mask, level = relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE)
-    assert level is Level.PART
-    assert not mask.any()
+    assert not relevancy_mask(SmoothedRelevancy.of(maps, RULE), None, RULE).any()
 
 
 @pytest.mark.parametrize(

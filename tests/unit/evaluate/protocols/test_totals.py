@@ -8,18 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilsplat.evaluate.protocols.cards import (
-    CARDS,
-    LERF_LANGSPLAT,
-    LERF_MASK,
-    LEVEL_GIVEN,
-    OVS_ARGMAX,
-)
-from hilsplat.evaluate.tables.measured import (
-    level_averages_of_scenes,
-    scene_values,
-    table_value,
-)
+from hilsplat.evaluate.protocols.cards import CARDS, LERF_LANGSPLAT, LERF_MASK, LEVEL_GIVEN, OVS_ARGMAX
+from hilsplat.evaluate.tables.measured import level_averages_of_scenes, scene_values, table_value
 
 
 def rows_of(card, values, metric="iou", **more):
@@ -33,17 +23,11 @@ def rows_of(card, values, metric="iou", **more):
 PAIRS = {("f1", "apple"): 0.8, ("f1", "egg"): 0.3, ("f2", "apple"): 0.6}
 
 
-@pytest.mark.parametrize(("card", "expected"), [(LERF_LANGSPLAT, 1.7 / 3), (LERF_MASK, (0.7 + 0.3) / 2)])
-def test_pairs_of_a_scene_weigh_equally_but_classes_are_averaged_over_views_first(card, expected):
-    assert table_value(rows_of(card, PAIRS), "iou") == pytest.approx(expected)
-    departing = rows_of(card, PAIRS, protocol=f"{card.full_name} (filter 20)")
-    assert table_value(departing, "iou") == pytest.approx(expected)
-
-
 @pytest.mark.parametrize(("card", "first"), [(LERF_LANGSPLAT, 0.4), (LERF_MASK, (0.3 + 0.6) / 2)])
-def test_scenes_weigh_equally_whatever_their_rows(card, first):
+@pytest.mark.parametrize("departures", ["", " (filter 20)"])
+def test_pairs_or_classes_of_a_scene_weigh_equally_and_so_do_scenes(card, first, departures):
     one = [("one", "f1", "a", 0.2), ("one", "f2", "a", 0.4), ("one", "f1", "b", 0.6)]
-    rows = rows_of(card, [*one, ("two", "f", "a", 0.1)])
+    rows = rows_of(card, [*one, ("two", "f", "a", 0.1)], protocol=card.full_name + departures)
     assert scene_values(rows, "iou").to_dict() == pytest.approx({"one": first, "two": 0.1})
     assert table_value(rows, "iou") == pytest.approx((first + 0.1) / 2)
 
