@@ -35,11 +35,7 @@ class FieldScene(SceneViews):
     _texts: dict[str, np.ndarray] = field(default_factory=dict, repr=False, kw_only=True)
 
     def trained(self) -> tuple[LanguageField, Code]:
-        """Return the language field and the code that decodes it.
-
-        Raises:
-            ArtifactError: the run has not computed the field yet.
-        """
+        """Return the language field and its code; raise ArtifactError if they are not computed yet."""
         if self.language is None or self.autoencoder is None:
             raise ArtifactError(
                 f"{self.scene.name} has no language field yet",

@@ -176,8 +176,7 @@ def automatic_level(
 
     This is LangSplat's rule, applied to nodes instead of pixels. A node's vector is an average over views,
     and a level has tens of nodes, so noise does not favour the finest level, as it does for a maximum over
-    100,000 pixels. Rules that choose the best node's parent, standardise each level's margins or compare
-    siblings were all worse on development scenes (docs/experiments.md, "Query").
+    100,000 pixels. docs/experiments.md ("Query") compares it with other rules.
     """
     levels = tree.level if shown is None else tree.level[shown]
     own = margin if shown is None else margin[shown]
@@ -189,9 +188,8 @@ def automatic_level(
 def margin_range(margin: Float64[np.ndarray, " n"]) -> float:
     """Return the range of the nodes' margins for a text, extended to include 0, the margin of a tie.
 
-    A path's penalties are scaled by this range. Among many objects, some are further from a text than a
-    canonical phrase is, so the nodes' range includes 0. With a single object, or objects that all match the
-    text, the range of the nodes alone would be close to 0 and penalties would vanish.
+    A path's penalties are scaled by this range. For a single object, or objects that all match the text, the
+    range of the nodes alone would be close to 0 and penalties would vanish.
     """
     return float(margin.max(initial=0.0) - margin.min(initial=0.0))
 

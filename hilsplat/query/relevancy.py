@@ -7,9 +7,7 @@
 - Network: every pixel of a view is decoded once. The decoded vectors are close to a subspace of few
   directions (about 65 of 128, 105 of 512). Each vector is stored as its coordinates in the subspace, in 16
   bits, with the cosine of its nearest canonical phrase, computed from the full vector. A text then costs one
-  product per pixel and direction. The directions are computed from a sample of the pixels. Every pixel is
-  then checked: pixels whose loss exceeds the bound (`lost_for_error`), such as pixels of a small unsampled
-  object, get additional directions.
+  product per pixel and direction.
 
 Both forms are stored channel by channel, so that the compiler can process eight or sixteen pixels at once.
 Memory bandwidth is the bottleneck: three levels of a 986 x 728 view at d = 16 take 138 MB.
@@ -193,12 +191,11 @@ class LatentRelevancy:
         return LinearView(channels, length, generic)
 
     def _prepare_projected(self, latents: Float32[np.ndarray, "P D"]) -> ProjectedView:
-        """Decode all pixels, and add directions until no pixel's loss exceeds the limit.
+        """Decode all pixels, and add directions until no pixel's loss exceeds `lost_for_error`.
 
-        The directions computed from a sample lose `RESIDUAL` on that sample. Pixels whose loss exceeds the
-        limit get additional directions in the same way, orthogonal to all previous ones. The other pixels
-        have coordinate 0 along the new directions, so their loss does not change. Each round uses at least
-        one of the C directions, so the loop ends.
+        The first directions are computed from a sample. Pixels that lose too much, such as those of a small
+        unsampled object, get more in the same way, orthogonal to all previous ones; the other pixels have
+        coordinate 0 along these. Each round uses at least one of the C directions, so the loop ends.
         """
         may_lose = lost_for_error(self._scale, self._code.channels)
         directions, others = self._directions(latents, np.eye(self._code.channels))
@@ -261,8 +258,7 @@ def lost_for_error(scale: float, channels: int) -> float:
 
         4 `ERROR` / s - sqrt(C) / (2 `STEPS`),
 
-    which is 4.5e-4 with s = 10 and C = 512. (Loss and rounding are orthogonal, so their combined length is
-    less than their sum, which leaves a margin for 32-bit sums.)
+    which is 4.5e-4 with s = 10 and C = 512.
 
     Departs: the result is at least `RESIDUAL`. At s >= 20 (C = 512), 16 bits are too few for `ERROR`, and the
     relevancy error can reach s / 4 times the sum of `RESIDUAL` and rounding.

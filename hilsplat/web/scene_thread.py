@@ -45,10 +45,7 @@ class ShownScene:
             self._seen.setdefault(part, _state_of(part))
 
     def changed(self, *parts: Path) -> list[str]:
-        """Return the names of the given parts (default: all) that were rewritten or deleted.
-
-        The page still shows the parts as they were opened.
-        """
+        """Return the names of the given parts (default: all) that were rewritten or deleted since."""
         return sorted({part.name for part in parts or self._seen if _state_of(part) != self._seen[part]})
 
     @contextmanager
@@ -118,10 +115,7 @@ class SceneThread(Generic[Shown]):
         ]
 
     def get(self, work: Callable[[Shown, Mapping[str, Any]], Any], *, behind: bool = False) -> Handler:
-        """Return a handler that sends the result of `work`, called with the scene and the path's parameters.
-
-        With `behind`, `work` is run by `do_behind`.
-        """
+        """Return a handler that sends the result of `work` for the scene and the path's parameters."""
         do = self.do_behind if behind else self.do
 
         async def handle(request: Request) -> Response:

@@ -145,17 +145,13 @@ def configured(app: Guard) -> uvicorn.Config:
 def serve(
     app: Callable[[str], Guard], about: str, *, port: int, browser: bool, on_ready: Callable[[str], None]
 ) -> None:
-    """Serve an application on this machine until Ctrl-C.
+    """Serve an application on this machine until Ctrl-C; `port` and errors are those of `listening_at`.
 
     Args:
         app: creates the application from its access token.
         about: description of the page for the printed line.
-        port: 0 for any free port.
         browser: whether to open the page in a browser.
         on_ready: called with the text to print, which contains the address, once the page can be opened.
-
-    Raises:
-        SettingsError: the port is taken.
     """
     token, listening = secrets.token_urlsafe(24), listening_at(port)
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/?token={token}"
