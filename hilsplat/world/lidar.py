@@ -51,34 +51,27 @@ class LidarScan:
     origins: Float[np.ndarray, "S 3"]
 
 
-def beam_directions(azimuth_steps: int) -> Float[np.ndarray, "R 3"]:
+def beam_directions() -> Float[np.ndarray, "R 3"]:
     """Return one turn's unit vectors, ordered by beam from the lowest, then by azimuth from +x to +y."""
     share = (np.arange(BEAMS) + 0.5) / BEAMS
     up = np.radians(INCLINATION_DEG[0] + share * (INCLINATION_DEG[1] - INCLINATION_DEG[0]))[:, None]
-    around = 2 * np.pi * (np.arange(azimuth_steps) + 0.5)[None] / azimuth_steps
+    around = 2 * np.pi * (np.arange(AZIMUTH_STEPS) + 0.5)[None] / AZIMUTH_STEPS
     level = np.cos(up)
     grid = np.broadcast_arrays(level * np.cos(around), level * np.sin(around), np.sin(up))
     return np.stack(grid, axis=-1).reshape(-1, 3)
 
 
-def scan_street(
-    scene: WorldScene,
-    camera_centres: Float[np.ndarray, "V 3"],
-    azimuth_steps: int = AZIMUTH_STEPS,
-    poses: int = POSES,
-    range_noise_m: float = RANGE_NOISE_M,
-    lost_share: float = LOST_SHARE,
-) -> LidarScan:
+def scan_street(scene: WorldScene, camera_centres: Float[np.ndarray, "V 3"]) -> LidarScan:
     """Scan a street from above evenly spaced camera centres; the centres are in the order of the drive.
 
     The scene's seed also determines noise and losses. The sky yields no returns.
     """
     rng = np.random.default_rng([scene.seed, 31])
-    chosen = np.unique(np.linspace(0, len(camera_centres) - 1, poses).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(camera_centres) - 1, POSES).round().astype(int))
     origins = camera_centres[chosen] + np.array([0.0, 0.0, ABOVE_CAMERA_M])
     sky = [node.id for node in scene.nodes if node.id in scene.background and node.text == "sky"]
-    directions = beam_directions(azimuth_steps)
-    beams = np.repeat(np.arange(BEAMS), azimuth_steps)
+    directions = beam_directions()
+    beams = np.repeat(np.arange(BEAMS), AZIMUTH_STEPS)
     rows = []
     for pose, origin in enumerate(origins):
         hits = scene.caster.nearest(origin.astype(np.float32)[None], directions.astype(np.float32))
@@ -90,8 +83,8 @@ def scan_street(
         noise, luck = rng.normal(0.0, 1.0, len(directions)), rng.random(len(directions))
         ids = np.where((prim >= 0)[:, None], scene.node_ids[prim], NONE)
         kept = (prim >= 0) & ~np.isin(ids[:, 0], sky) & (away < MAX_RANGE_M)
-        kept &= (facing > GLANCING_COSINE) & (luck >= lost_share)
-        measured = away[kept] + range_noise_m * noise[kept]
+        kept &= (facing > GLANCING_COSINE) & (luck >= LOST_SHARE)
+        measured = away[kept] + RANGE_NOISE_M * noise[kept]
         points = origin + measured[:, None] * directions[kept]
         rows.append((points, ids[kept], np.full(kept.sum(), pose), measured, beams[kept]))
     points, ids, pose_index, ranges, beam = (np.concatenate(column) for column in zip(*rows, strict=True))

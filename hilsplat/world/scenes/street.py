@@ -141,7 +141,7 @@ class _Street:
         side = -1 if rng.random() < 0.6 else 1
         yaw = float(rng.choice([0.0, 180.0]) + rng.uniform(-35, 35))
         y = side * float(rng.uniform(KERB + 1.0, FRONT - 0.9))
-        return _Spot(float(rng.uniform(-6, 20)), y, 0.14, yaw)
+        return _Spot(float(rng.uniform(-6, 20)), y, WALK_Z, yaw)
 
     def furniture_spot(self, side: int, model: ObjectModel) -> _Spot:
         """Draw a spot beside the kerb, on the sidewalk."""
@@ -150,12 +150,12 @@ class _Street:
         y = side * (KERB + 0.62)
         toward_road = -90.0 * side
         if model.name == "traffic sign":
-            return _Spot(x, y, 0.14, 180 + float(rng.uniform(-18, 18)))
+            return _Spot(x, y, WALK_Z, 180 + float(rng.uniform(-18, 18)))
         if model.name == "traffic light":
-            return _Spot(float(rng.uniform(9.5, 13.0)), y, 0.14, 180 + float(rng.uniform(-8, 8)))
+            return _Spot(float(rng.uniform(9.5, 13.0)), y, WALK_Z, 180 + float(rng.uniform(-8, 8)))
         if model.name == "fence":
-            return _Spot(x, side * (KERB + 0.4), 0.14, toward_road)
-        return _Spot(x, y, 0.14, toward_road)
+            return _Spot(x, side * (KERB + 0.4), WALK_Z, toward_road)
+        return _Spot(x, y, WALK_Z, toward_road)
 
 
 def build_street(seed: int, objects: int) -> WorldScene:
@@ -205,14 +205,14 @@ def _add_buildings(street: _Street) -> int:
         while x < STREET_X[1] - 4:
             model = street.assembly.draw("building")
             width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
-            count += street.put(model, _Spot(x + width / 2, side * FRONT, 0.14, -90.0 * side)) is not None
+            count += street.put(model, _Spot(x + width / 2, side * FRONT, WALK_Z, -90.0 * side)) is not None
             x += width + (float(rng.uniform(1.5, 3.0)) if rng.random() < 0.25 else 0.0)
     for x, yaw in ((STREET_X[1] + 8, 180.0), (STREET_X[0] - 8, 0.0)):
         y = -16.0
         while y < 12:
             model = street.assembly.draw("building")
             width = float(np.ptp(model.triangles[..., 1])) + 2 * GAP
-            count += street.put(model, _Spot(x, y + width / 2, 0.14, yaw)) is not None
+            count += street.put(model, _Spot(x, y + width / 2, WALK_Z, yaw)) is not None
             y += width
     return count
 
