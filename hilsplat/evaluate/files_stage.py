@@ -75,7 +75,7 @@ def run_evaluate_files(
         min_region_px: smaller regions of a synthetic scene are not scored; None for the default setting.
 
     Raises:
-        ArtifactError: a view has no predictions, or a file cannot be read.
+        ArtifactError: a view has no predictions, or a file is missing or malformed.
         MisalignedArtifactError: a prediction and its labels differ in size, or the labels lack its text.
         SettingsError: neither labels nor truth and scene are given, or both are.
     """
@@ -286,12 +286,7 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
 
 
 def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
-    """Read class ids of points from ScanNet's text format, one integer per line; 0 means no class.
-
-    Raises:
-        ArtifactError: the file is missing or malformed.
-        MisalignedArtifactError: the number of points differs.
-    """
+    """Read class ids of points from ScanNet's text format, one integer per line; 0 means no class."""
     words = _text(path).split()
     try:
         values = np.array(words, dtype=np.int64)
@@ -317,10 +312,6 @@ def read_point_instances(
     """Read masks, class ids and confidences in ScanNet's format: lines of mask file, class id and confidence.
 
     A mask file, relative to the folder of `path`, has one integer per point, non-zero inside the instance.
-
-    Raises:
-        ArtifactError: a file is missing or malformed.
-        MisalignedArtifactError: the number of points in a mask differs.
     """
     masks, classes, confidences = [], [], []
     for number, line in enumerate(_text(path).splitlines(), 1):

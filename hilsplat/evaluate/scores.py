@@ -1,7 +1,4 @@
-"""Rows of `scores.csv`, one number each, and matches of predicted instances in `instances.npz`.
-
-The official average precision pools the matches of all scans, so a number per scan would not suffice.
-"""
+"""Rows of `scores.csv`, and instance matches in `instances.npz`, which average precision pools over scans."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -129,7 +129,6 @@ def pair_disagreement(
 
     The first share is among all pairs of points, the second among pairs in the same mask in at least one
     view; nan if there is no such pair. Points in no mask have label -1 and differ from all other points.
-    All pairs are counted, via the contingency table of the labels.
     """
     rows = np.unique(labels_a, return_inverse=True)[1]
     names, columns = np.unique(labels_b, return_inverse=True)

@@ -98,8 +98,7 @@ def run_comparison(
             for method in (("tree", "field") if variant == "default" else ("field",))
         ]
         truths = shown_truths(scene, truth, labels, data_root, evaluate)
-        own = () if truths else queries
-        rows = [*annotated_rows(truths, settings), *free_rows(methods[0].scene, own, settings)]
+        rows = annotated_rows(truths, settings) if truths else free_rows(methods[0].scene, queries, settings)
         save_png_and_pdf(draw_methods(methods, rows, evaluate), out)
         several = over_views(scene, rows, truths)
         save_png_and_pdf(draw_views(methods, several, evaluate), Path(out).with_name("views.png"))

@@ -1,8 +1,7 @@
 """Instance segmentation of points: AP, AP50 and AP25 of the ScanNet benchmark.
 
 Source: OpenMask3D's copy of ScanNet/ScanNet `BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py`,
-including its quirks. Predictions are matched in the order given; ScanNet's own script uses the order of a
-dict, which is undefined in Python 2. OpenMask3D assigns every ScanNet200 prediction the confidence 1.
+including its quirks; the protocol `scannet200/instances` lists our departures.
 """
 
 from collections.abc import Sequence

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 class FlatProtocols:
     """Scores one view under further protocols, one text at a time.
 
-    Args:
-        level: only texts of this level are queried; None for data without levels.
-        words: settings that change the relevancy, for the protocol names.
+    Only texts of `level` are queried, unless the data has no levels (None). The protocol names contain
+    `words`, the settings that change the relevancy.
     """
 
     def __init__(

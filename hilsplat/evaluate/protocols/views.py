@@ -1,10 +1,8 @@
 """Score a scene's answers in one view: LERF-OVS, 3D-OVS, Hi-LERF and Hi-3DOVS.
 
 Protocols `lerf/*` query every distinct text, with its regions merged over levels; `hierarchy/*` query every
-(text, level). Protocol cards state how a method answers. `hierarchy/annotations` has only the HC of the
-annotations themselves, the score of perfect masks. `hierarchy/path` queries the chain of texts from the whole
-down, which gives more information than the paper's protocol. A missing or empty prediction counts as 0.
-Only Gaussians and nodes visible in the view compete, except for nodes under `hierarchy/scene-wide`.
+(text, level), and `hierarchy/path` every chain of texts. Protocol cards state how a method answers. A missing
+or empty prediction counts as 0.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,8 +1,4 @@
-"""Averages of scores, in the order that the protocol defines, and blocks of measured rows.
-
-Scores are a frame of `scores.csv` rows (`evaluate.scores.read_scores`). A (view, query) pair without a
-prediction has a row with value 0 unless its protocol omits such pairs.
-"""
+"""Averages of scores (`scores.read_scores`) in the order that the protocol defines, and measured rows."""
 
 import re
 import statistics

@@ -3,21 +3,15 @@
 import hashlib
 import re
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 
 from hilsplat.base.errors import ArtifactError
-from hilsplat.evaluate.protocols.cards import (
-    CARDS,
-    LERF_LANGSPLAT,
-    LEVEL_GIVEN,
-    TREE_NODES,
-    card_of,
-)
+from hilsplat.evaluate.protocols.cards import CARDS, LERF_LANGSPLAT, LEVEL_GIVEN, TREE_NODES, card_of
 from hilsplat.evaluate.protocols.points import class_set
 from hilsplat.evaluate.protocols.views import label_of
 from hilsplat.settings import EvaluateSettings
+from tests.conftest import PROJECT
 
 DECIDED = {
     # full name: digest of metrics, averaging, missing, rule and classes
@@ -76,28 +70,22 @@ def test_a_protocol_changes_only_with_its_version():
     assert found == DECIDED, "raise the version of a protocol that changed, then write its digest here"
 
 
+PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
+
+
 def test_cards_are_named_after_benchmark_and_variant_and_state_their_source():
     assert len({card.name for card in CARDS}) == len(CARDS)
     for card in CARDS:
         assert re.fullmatch("[^/]+/[^/]+", card.name)
-        assert card.full_name == f"{card.name}@{card.version}"
         assert card.selection and card.source
         assert not card.classes or class_set(card.classes)[1].name == card.classes
-
-
-PUBLIC = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{7} \S+\.(py|cc)(:\w+)?")
-TABLES = Path(__file__).parents[4] / "docs" / "tables.md"
-
-
-def test_a_card_names_its_public_function_unless_there_is_none():
-    for card in CARDS:
         assert bool(card.public) != card.source.startswith("none"), card.name
         assert not card.public or PUBLIC.fullmatch(card.public), card.public
 
 
 def test_the_documentation_lists_every_protocol_with_its_public_function():
     rows = {}
-    for line in TABLES.read_text(encoding="utf-8").splitlines():
+    for line in (PROJECT / "docs" / "tables.md").read_text(encoding="utf-8").splitlines():
         if re.match(r"\| `[\w/-]+@\d", line):
             names, public, *_ = (cell.strip() for cell in line.strip("|").split("|"))
             rows |= dict.fromkeys(re.findall(r"`([^`]+)`", names), public.strip("`"))
