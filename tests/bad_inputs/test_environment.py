@@ -26,6 +26,7 @@ STAGE = " ".join(CONTRIBUTE)
         (f"--log config/config.yaml coverage-tree --masks {MASKS} --out new", "is not a .log file"),
         ("run -- --cores 0", "with --cores 0, no job can start"),
         ("run -- --config 'only=[1'", "--config is not valid YAML"),
+        ("run -- -n --config results=config/config.yaml groups=[ci]", "config.yaml is not a folder"),
     ],
 )
 def test_what_surrounds_a_command(line: str, words: str, project: Path):
@@ -42,11 +43,3 @@ def test_what_surrounds_a_command(line: str, words: str, project: Path):
 def test_more_threads_than_cores_cost_nothing(project: Path):
     script = f"{sys.executable} -m hilsplat {QUERY} --threads 100000"
     assert subprocess.run(script, shell=True, cwd=project, timeout=60, check=True).returncode == 0
-
-
-def test_results_that_are_a_file(project: Path):
-    (project / "elsewhere").write_text("")
-    script = f"{sys.executable} -m hilsplat run -- -n --config results=elsewhere groups=[ci]"
-    ended = subprocess.run(script, shell=True, cwd=project, capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 1
-    assert "elsewhere is not a folder" in ended.stdout + ended.stderr

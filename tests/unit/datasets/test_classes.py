@@ -40,14 +40,8 @@ def test_subsets_lack_the_classes_that_their_sources_exclude():
     assert SCANNET_10.texts == ten
     assert set(SCANNET200.texts) - set(SCANNET200_INSTANCES.texts) == {"wall", "floor"}
     assert set(REPLICA_51.texts) - set(REPLICA_48.texts) == {"wall", "floor", "ceiling"}
-    assert "tv screen" in REPLICA_48.texts
+    assert [sum(members) for members in splits_of(SCANNET200).values()] == [66, 68, 66]  # head, common, tail
     assert WAYMO_22.ids == tuple(range(1, 23)) and WAYMO_22.texts[6] == "pedestrian"
-
-
-def test_scannet200_has_its_splits():
-    splits = splits_of(SCANNET200)
-    assert [sum(splits[split]) for split in ("head", "common", "tail")] == [66, 68, 66]
-    assert max(SCANNET200.ids) == 1191
 
 
 def test_classes_equal_the_companion_lists():

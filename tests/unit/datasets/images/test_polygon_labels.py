@@ -113,17 +113,12 @@ def test_a_world_written_as_lerf_ovs_is_read_back_equal(true_world, lerf):
     assert "texts missing from the published list: Ring, bear, head, nose, paw" in reported
 
 
-def test_boxes_keep_the_whole_pixels_inside(tmp_path):
-    for box, whole in (([2.0, 3.0, 5.0, 6.0], [2, 3, 5, 6]), ([2.5, 3.5, 5.5, 6.5], [3, 4, 5, 6])):
-        polygon = [[box[0], box[1]], [box[2], box[1]], [box[2], box[3]]]
-        (found,) = read_isat(label_file(tmp_path, [thing(segmentation=polygon, bbox=box)])).objects
-        assert found.box_xyxy.tolist() == whole
-
-
-def test_categories_differ_by_case(lerf):
-    objects = [thing("Pot"), thing("pot"), thing("pot")]
-    label_file(lerf / "label" / "figurines", objects, (40, 24), "frame_00001")
-    assert [r.text for r in open_scene(lerf, "figurines").views["frame_00001.png"]] == ["Pot", "pot"]
+def test_categories_differ_by_case_and_boxes_keep_the_whole_pixels_inside(lerf):
+    triangle = thing("pot", [[2.5, 3.5], [5.5, 3.5], [5.5, 6.5]], bbox=[2.5, 3.5, 5.5, 6.5])
+    label_file(lerf / "label" / "figurines", [thing("Pot"), triangle, thing("pot")], (40, 24), "frame_00001")
+    large, small = open_scene(lerf, "figurines").views["frame_00001.png"]
+    assert (large.text, small.text) == ("Pot", "pot")
+    assert small.boxes().tolist() == [[3, 4, 5, 6], [2, 3, 5, 6]]
 
 
 def test_labels_are_matched_by_name_even_if_an_earlier_image_is_missing(lerf):
@@ -150,6 +145,7 @@ def test_a_polygon_that_reaches_outside_the_image_is_clipped_and_reported(tmp_pa
         ("[]", "is not a JSON object"),
         ('{"shapes": []}', "has no `objects` list"),
         ('{"info": {}, "objects": []}', "does not state a valid image size"),
+        ('{"info": {"height": 20001, "width": 9}, "objects": []}', r"valid image size\n.*at most 20000\n"),
         (thing(category=None), "has no category"),
         (thing(segmentation=[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]), "segmentation is not a polygon"),
         (thing(segmentation=[]), "segmentation is not a polygon"),
