@@ -58,10 +58,7 @@ def draw_classes(out: Path, names: Sequence[str] = TABLETOP) -> None:
     for index, name in enumerate(names):
         logger.info("draw %s", name)
         scene, camera = _alone(build_object("tabletop", name, np.random.default_rng(0)))
-        axes = figure.add_subplot(rows, CLASS_COLUMNS, index + 1)
-        axes.imshow(render_view(scene, camera, 3))
-        axes.set_axis_off()
-        axes.set_title(name, fontsize=10, pad=3)
+        _show(figure.add_subplot(rows, CLASS_COLUMNS, index + 1), render_view(scene, camera, 3), name)
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.965, wspace=0.03, hspace=0.17)
     _write(figure, out)
 
@@ -110,20 +107,21 @@ def draw_scenes(kind: str, seeds: Sequence[int], out: Path) -> None:
             panels.append(coloured(nearest, colours))
         for column, (title, panel) in enumerate(zip(titles, panels, strict=True)):
             axes = figure.add_subplot(rows, 4 * across, index * 4 + column + 1)
-            axes.imshow(panel, interpolation="nearest" if column else None)
-            axes.set_axis_off()
-            if index < across:
-                axes.set_title(title, fontsize=10, pad=3)
-            if column == 0:
-                _write_name(axes, 0.03, f"{kind} {seed}", 7.5)
+            name, interpolation = ("", "nearest") if column else (f"{kind} {seed}", None)
+            _show(axes, panel, title if index < across else "", name, interpolation)
     top = 1 - 0.24 / (PANEL_INCHES * rows + 0.25)
     figure.subplots_adjust(left=0.003, right=0.997, bottom=0.005, top=top, wspace=0.025, hspace=0.03)
     _write(figure, out)
 
 
-def _write_name(axes: "Axes", x: float, name: str, fontsize: float | int) -> None:
-    """Write a name in the top left corner of a panel."""
-    axes.text(x, 0.97, name, color="white", fontsize=fontsize, va="top", transform=axes.transAxes)
+def _show(
+    axes: "Axes", pixels: np.ndarray, title: str, name: str = "", interpolation: str | None = None
+) -> None:
+    """Show an image in a panel, with an optional title above it and a name in its top left corner."""
+    axes.imshow(pixels, interpolation=interpolation)
+    axes.set_axis_off()
+    axes.set_title(title, fontsize=10, pad=3)
+    axes.text(0.02, 0.97, name, color="white", fontsize=8, va="top", transform=axes.transAxes)
 
 
 def _write(figure: "Figure", out: Path) -> None:
@@ -175,12 +173,7 @@ def show_world(world_folder: Path, out: Path) -> None:
         panels += [(level.label, _panel(truth, image.name, level, colours)) for level in LEVELS]
         for column, (title, pixels) in enumerate(panels):
             axes = figure.add_subplot(grid[row, column])
-            axes.imshow(pixels, interpolation="nearest")
-            axes.set_axis_off()
-            if row == 0:
-                axes.set_title(title, fontsize=10)
-            if column == 0:
-                _write_name(axes, 0.02, image.name, 8)
+            _show(axes, pixels, "" if row else title, "" if column else image.name, "nearest")
     per_column = -(-len(lines) // columns)
     for column in range(columns):
         axes = figure.add_subplot(grid[:, 4 + column])
