@@ -1,12 +1,10 @@
 """Model cards of the small models: recipe, quality and limitations."""
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from hilsplat.base.artifacts import sha256_of_file, write_json, write_text
 from hilsplat.base.images import write_png
@@ -37,11 +35,9 @@ def digests(folder: Path) -> dict[str, str]:
 
 def draw_curve(folder: Path, curve: Curve, prefix: str, what: str) -> None:
     """Draw the column `<prefix><level>` of a learning curve for each level; `what` labels the value axis."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.6, 2.8), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     steps = [row["step"] for row in curve]
     for label, colour in LEVEL_COLOURS.items():
@@ -50,9 +46,7 @@ def draw_curve(folder: Path, curve: Curve, prefix: str, what: str) -> None:
     axes.set(xlabel="step", ylabel=what, ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    write_png(folder / "curve.png", np.asarray(Image.open(buffer).convert("RGB")))
+    figure.savefig(folder / "curve.png", metadata={"Software": None})
 
 
 def draw_masks(folder: Path, encoder: SamEncoder, decoder: SamDecoder, views: LabelledViews) -> None:
