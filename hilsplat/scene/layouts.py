@@ -47,9 +47,9 @@ def trained_gaussians(folder: Path) -> Path | None:
     """Return the PLY that 3DGS or nerfstudio wrote to a folder after the most training steps, or None."""
     starts = ("output/*/", "output/", "")
     patterns = [f"{start}point_cloud/iteration_*/point_cloud.ply" for start in starts]
-    found = [path for pattern in patterns for path in Path(folder).glob(pattern)]
+    found = [path for pattern in patterns for path in folder.glob(pattern)]
     found.sort(key=lambda path: (int(path.parent.name.partition("_")[2] or 0), path.stat().st_mtime_ns))
-    others = [path for name in EXPORTED for path in sorted(Path(folder).glob(name))]
+    others = [path for name in EXPORTED for path in sorted(folder.glob(name))]
     return [*others, *found][-1] if others or found else None
 
 
@@ -61,8 +61,8 @@ def dataparser_of(ply: Path, source: Path) -> Path | None:
     """
     places = [ply.parent]
     if ply.name == "splat.ply":
-        runs = sorted(Path(source).glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last folder is a timestamp
-        places += [Path(source), *(run.parent for run in runs[-1:])]
+        runs = sorted(source.glob(f"outputs/*/*/*/{DATAPARSER}"))  # the last folder is a timestamp
+        places += [source, *(run.parent for run in runs[-1:])]
     return next((place / DATAPARSER for place in places if (place / DATAPARSER).is_file()), None)
 
 
@@ -74,13 +74,13 @@ def transforms_of(folder: Path, named: Path | None = None) -> Path | None:
 
 def langsplat_features(folder: Path) -> Path | None:
     """Return the folder of masks and CLIP vectors written by LangSplat's preprocessing, or None."""
-    features = Path(folder) / "language_features"
+    features = folder / "language_features"
     return features if any(features.glob("*_s.npy")) else None
 
 
 def label_files(folder: Path) -> list[Path]:
     """Return the label files of a LERF-OVS scene, in its `label/` folder or in the one beside the scene."""
-    folder = Path(folder).resolve()
+    folder = folder.resolve()
     for place in (folder / "label", folder.parent / "label" / folder.name):
         if found := sorted(place.glob("*.json")):
             return found
@@ -89,7 +89,6 @@ def label_files(folder: Path) -> list[Path]:
 
 def photo_folder(folder: Path) -> Path:
     """Return the folder of a source's photographs: the source itself, or else an export's image folder."""
-    folder = Path(folder)
     if list_images(folder):
         return folder
     if (folder / "images").is_dir():
@@ -99,12 +98,11 @@ def photo_folder(folder: Path) -> Path:
 
 
 def has_known_poses(folder: Path, named: Path | None = None) -> bool:
-    """Return whether a folder has poses that `find_known_poses` supports, or other poses are given."""
-    if named is not None:
-        return named != NO_POSES
-    has_file = (folder / POSES_BOUNDS).is_file() or any(folder.glob("transforms*.json"))
-    has_export = any((polycam_folders(folder), record3d_export(folder)))
-    return has_file or has_export or (folder / "sparse").is_dir()
+    """Return whether poses are given, or a folder has poses that `find_known_poses` finds or refuses."""
+    try:
+        return find_known_poses(folder, named) is not None
+    except SceneError:
+        return True
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,6 @@ def find_known_poses(folder: Path, named: Path | None = None) -> KnownPoses | No
     Raises:
         SceneError: there is a `sparse/` folder without a complete model, or `named` has no poses.
     """
-    folder = Path(folder)
     if named == NO_POSES:
         return None
     if named is not None:

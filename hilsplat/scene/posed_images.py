@@ -114,11 +114,10 @@ def write_posed_images(
         content: dict[str, object] = {"frames": frames}
         if points is not None:
             content["ply_file_path"] = "points.ply"
-            columns = {axis: ("<f4", np.asarray(points)[:, k]) for k, axis in enumerate("xyz")}
+            columns, kinds = [*points.T], [(axis, "<f4") for axis in "xyz"]
             if colours is not None:
-                columns |= {name: ("u1", colours[:, k]) for k, name in enumerate(("red", "green", "blue"))}
-            table = np.empty(len(points), [(name, kind) for name, (kind, _) in columns.items()])
-            for name, (_, values) in columns.items():
-                table[name] = values
+                columns += [*colours.T]
+                kinds += [(name, "u1") for name in ("red", "green", "blue")]
+            table = np.rec.fromarrays(columns, dtype=kinds)
             PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(temporary / "points.ply")
         write_text(temporary / "transforms.json", json.dumps(content, indent=1) + "\n")

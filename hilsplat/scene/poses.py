@@ -45,7 +45,6 @@ LOST_PICTURE = "not_registered.png"
 WEAK_POINTS_PER_VIEW = 13
 """Minimum points per registered view in good runs on renders; unusable runs had 4 to 18."""
 
-
 NEIGHBOURS = 3
 """Number of registered photographs reported for each unregistered one."""
 
@@ -88,7 +87,6 @@ def run_poses(
         ImageError: an image is empty, truncated or unreadable.
         RegistrationError: too few views were registered.
     """
-    images, out = Path(images), Path(out)
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # by default, COLMAP logs each step
     with stage_log("poses", name) as counts, work_folder(out) as work:
         known = find_known_poses(images, named) if images.is_dir() else None
@@ -210,15 +208,16 @@ def registration_report(
     members = [{model.images[i].name for i in model.reg_image_ids()} for model in models]
     views: dict[str, Any] = {}
     for image in images:
+        is_registered = image.view in errors
         entry: dict[str, Any] = {
             "file": image.source.name,
-            "registered": image.view in errors,
+            "registered": is_registered,
             **matches[image.view],
         }
-        if image.view in errors:
-            of_view = errors[image.view]
-            entry["observations"] = len(of_view)
-            entry["reprojection_error_px"] = round(float(of_view.mean()), 4) if len(of_view) else None
+        if is_registered:
+            px = errors[image.view]
+            entry["observations"] = len(px)
+            entry["reprojection_error_px"] = round(float(px.mean()), 4) if len(px) else None
         else:
             entry["why_not"] = _why_not(image.view, entry, members)
         views[image.view] = entry

@@ -85,7 +85,7 @@ class SceneRow:
 
 def project_root(sheet: Path) -> Path:
     """Return the base folder of relative sources: the parent of `config/`, or else the sheet's own folder."""
-    folder = Path(sheet).resolve().parent
+    folder = sheet.resolve().parent
     return folder.parent if folder.name == "config" else folder
 
 
@@ -106,7 +106,6 @@ def read_sheet(
     Raises:
         SceneError: the sheet cannot be used; the message names line, column and fix.
     """
-    path = Path(path)
     lines = content_lines(path)
     if not lines:
         raise SceneError(f"scene sheet {path} is empty", fix=f"begin it with the line: {' '.join(COLUMNS)}")

@@ -55,7 +55,7 @@ def import_poses(
         SceneError: the model or transforms file cannot be used.
         RegistrationError: too few of the source's views have an image.
     """
-    described, points, errors = read_source(known)
+    described, points = read_source(known)
     present = [view for view in described if view.image is not None]
     files = [view.image for view in described if view.image is not None]
     missing = sorted(view.name for view in described if view.image is None)
@@ -97,15 +97,15 @@ def import_poses(
         logger.warning("%s: %s", name, warning)
     entries: dict[str, Any] = {}
     for posed, file, view in zip(present, files, views, strict=True):
-        entries[view.view] = {"file": file.name, "registered": True, **errors.get(posed.name, {})}
+        entries[view.view] = {"file": file.name, "registered": True, **posed.report}
     for gone in missing:
         entries[gone] = {"file": gone, "registered": False, "why_not": "its image file is missing"}
     for path in unposed:
         lacks = {"file": path.name, "registered": False, "why_not": "the source has no pose for it"}
         entries.setdefault(path.name, lacks)
-    observed = [(entry["observations"], entry["reprojection_error_px"]) for entry in errors.values()]
-    num_observations = sum(count for count, error in observed if error is not None)
-    total_error = sum(count * error for count, error in observed if error is not None)
+    observed = [view.report for view in described if view.report.get("observations")]
+    num_observations = sum(entry["observations"] for entry in observed)
+    total_error = sum(entry["observations"] * entry["reprojection_error_px"] for entry in observed)
     source = ", ".join(
         path.relative_to(known.root).as_posix() if path.is_relative_to(known.root) else path.name
         for path in known.files

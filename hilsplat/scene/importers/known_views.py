@@ -7,7 +7,7 @@ nerfstudio's `polycam_utils.py`, `record3d_utils.py` and `process_data.py`.
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,6 @@ from hilsplat.scene.posed_images import OPENGL_TO_OPENCV, rigid_pose
 
 Points = tuple[np.ndarray, np.ndarray]
 """Positions and colours."""
-
-Errors = dict[str, dict[str, Any]]
-"""Number of observations and mean reprojection error of each view."""
 
 AGAIN = "export it again"
 
@@ -56,6 +53,7 @@ class KnownView:
         camera: lens for the image size stated by the source.
         cam_from_source: world-to-camera transform, OpenCV axes.
         border_px: width of a blank border to crop, px of the camera.
+        report: number of observations and mean reprojection error, if the source has observations.
     """
 
     name: str
@@ -64,16 +62,17 @@ class KnownView:
     cam_from_source: Float64[np.ndarray, "4 4"]
     is_test: bool = False
     border_px: int = 0
+    report: dict[str, Any] = field(default_factory=dict)
 
 
-def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None, Errors]:
-    """Read the posed views of a folder in any supported format, with points and errors if available."""
+def read_source(known: KnownPoses) -> tuple[list[KnownView], Points | None]:
+    """Read the posed views of a folder in any supported format, with points if available."""
     if known.kind == "colmap":
         return read_colmap(known)
     if known.kind == "transforms":
-        return *read_transforms(known), {}
+        return read_transforms(known)
     readers = {"polycam": read_polycam, "record3d": read_record3d, "llff": read_llff}
-    return checked(readers[known.kind](known), known), None, {}
+    return checked(readers[known.kind](known), known), None
 
 
 def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
@@ -105,28 +104,24 @@ def checked(views: list[KnownView], known: KnownPoses) -> list[KnownView]:
     return views
 
 
-def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points, Errors]:
+def read_colmap(known: KnownPoses) -> tuple[list[KnownView], Points]:
     """Read a COLMAP model."""
     folder = known.files[0]
     require_whole_files(folder)
     try:
         model = pycolmap.Reconstruction(folder)
-        views = []
+        views, errors = [], reprojection_errors(model)
         images = (model.images[image_id] for image_id in model.reg_image_ids())
         for image in sorted(images, key=lambda image: image.name):
             file, camera = _find_image(known.root, image.name), pycolmap.Camera(camera_of(image).todict())
-            views.append(KnownView(image.name, file, camera, pose_matrix(image.cam_from_world())))
-        errors = {
-            name: {
-                "observations": len(of_view),
-                "reprojection_error_px": round(float(of_view.mean()), 4) if len(of_view) else None,
-            }
-            for name, of_view in reprojection_errors(model).items()
-        }
+            pose, px = pose_matrix(image.cam_from_world()), errors[image.name]
+            mean = round(float(px.mean()), 4) if len(px) else None
+            report = {"observations": len(px), "reprojection_error_px": mean}
+            views.append(KnownView(image.name, file, camera, pose, report=report))
         points = sparse_points(model)
     except (ValueError, RuntimeError, IndexError) as error:  # also raised for references to missing entries
         raise SceneError(f"the COLMAP model in {folder} cannot be read: {error}", fix=AGAIN) from error
-    return checked(views, known), points, errors
+    return checked(views, known), points
 
 
 def _find_image(root: Path, name: str) -> Path | None:
@@ -205,13 +200,15 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
         else:
             focal_x = width / 2 / math.tan(float(frame["camera_angle_x"]) / 2)
         focal_y = float(frame.get("fl_y", focal_x))
-        centre = [float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
-        lens = [float(frame.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2")]
+        params = [focal_x, focal_y, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2))]
+        distortion = [float(frame.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2")]
         further = [float(frame.get(key, 0.0)) for key in ("k3", "k4")]
+        name, params = ("OPENCV", params + distortion) if any(distortion) else ("PINHOLE", params)
+        camera = pycolmap.Camera(model=name, width=width, height=height, params=params)
     except KeyError as error:
         expected = "fl_x (px) or camera_angle_x (radians)"
         raise SceneError(f"{where} has no focal length", expected=expected, fix=AGAIN) from error
-    except (TypeError, ValueError, OverflowError, OSError) as error:
+    except (TypeError, ValueError, ArithmeticError, OSError) as error:
         raise SceneError(f"{where}: the intrinsics are not valid: {error}", fix=AGAIN) from error
     model = str(frame.get("camera_model", "OPENCV"))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE") or any(further):
@@ -220,16 +217,7 @@ def _frame_camera(where: str, frame: Mapping[str, Any], image: Path | None) -> p
             expected="PINHOLE or OPENCV with k1, k2, p1, p2",
             fix="undistort the images first",
         )
-    if not (focal_x > 0 and focal_y > 0 and 0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
-        raise SceneError(
-            f"{where}: the focal length or image size is not valid",
-            expected=f"a focal length above 0, sides of 1 to {MAX_SIDE_PX} px",
-            found=f"{focal_x:g} and {focal_y:g}, {width:g} x {height:g} px",
-            fix=AGAIN,
-        )
-    name, distortion = ("OPENCV", lens) if any(lens) else ("PINHOLE", [])
-    params = [focal_x, focal_y, *centre, *distortion]
-    return pycolmap.Camera(model=name, width=width, height=height, params=params)
+    return camera
 
 
 def _read_ply_points(path: Path) -> Points:

@@ -18,24 +18,23 @@ POSE_BYTES = 56
 
 
 def _number(data: mmap.mmap, form: str) -> int:
-    """Read a number; raise struct.error beyond the end of the file."""
+    """Read a record's start up to and including its only number; raise struct.error beyond the file's end."""
     (found,) = struct.unpack(f"<{form}", data.read(struct.calcsize(f"<{form}")))
     return int(found)
 
 
 def _skip(data: mmap.mmap, count: int) -> None:
-    """Advance by a number of bytes; raise ValueError beyond the end of the file."""
+    """Advance by a number of bytes; raise struct.error beyond the end of the file."""
     if count > len(data) - data.tell():
-        raise ValueError("it is truncated")
+        raise struct.error
     data.seek(count, os.SEEK_CUR)
 
 
 def _camera(data: mmap.mmap) -> None:
-    _skip(data, 4)
-    model = _number(data, "i")
+    model = _number(data, "4xi16x")
     if not 0 <= model < len(PARAMETERS):
         raise ValueError(f"camera model {model} is unknown")
-    _skip(data, 16 + 8 * PARAMETERS[model])
+    _skip(data, 8 * PARAMETERS[model])
 
 
 def _image(data: mmap.mmap) -> None:
@@ -48,24 +47,19 @@ def _image(data: mmap.mmap) -> None:
 
 
 def _point(data: mmap.mmap) -> None:
-    _skip(data, 43)
-    _skip(data, 8 * _number(data, "Q"))
+    _skip(data, 8 * _number(data, "43xQ"))
 
 
 def _rig(data: mmap.mmap) -> None:
-    _skip(data, 4)
-    sensors = _number(data, "I")
-    if sensors:
-        _skip(data, 8)
+    sensors = _number(data, "4xI")
+    _skip(data, 8 * min(sensors, 1))
     for _ in range(sensors - 1):
-        _skip(data, 8)
-        if _number(data, "B"):
+        if _number(data, "8xB"):
             _skip(data, POSE_BYTES)
 
 
 def _frame(data: mmap.mmap) -> None:
-    _skip(data, 8 + POSE_BYTES)
-    _skip(data, 16 * _number(data, "I"))
+    _skip(data, 16 * _number(data, f"{8 + POSE_BYTES}xI"))
 
 
 RECORDS: dict[str, Callable[[mmap.mmap], None]] = {
@@ -92,8 +86,6 @@ def require_whole_files(folder: Path) -> None:
 
 
 def _require_whole(path: Path, record: Callable[[mmap.mmap], None]) -> None:
-    if not path.stat().st_size:
-        raise ValueError("it is empty")
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         count = _number(data, "Q")
         if count > len(data):
