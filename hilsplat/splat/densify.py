@@ -43,16 +43,6 @@ MIN_GATE = 1e-6
 """Gaussians whose noise factor is smaller than this get no noise."""
 
 
-@compiled
-def _add_lengths(means_px, drawn, half_width, half_height, total, seen):
-    """Add each drawn Gaussian's gradient length, in the units of 3DGS, to `total`, and 1 to `seen`."""
-    for i in range(len(total)):
-        if drawn[i]:
-            x, y = half_width * means_px[i, 0], half_height * means_px[i, 1]
-            total[i] += np.sqrt(x * x + y * y)
-            seen[i] += 1
-
-
 @dataclass
 class ScreenGradients:
     """Summed screen-space gradient lengths of each Gaussian, and the number of steps that drew it."""
@@ -66,8 +56,10 @@ class ScreenGradients:
         return ScreenGradients(np.zeros(n), np.zeros(n, np.int32))
 
     def add(self, means_px: Float32[np.ndarray, "N 2"], drawn: np.ndarray, size_hw: tuple[int, int]) -> None:
-        """Add the gradients of one view's step."""
-        _add_lengths(means_px, drawn, size_hw[1] / 2, size_hw[0] / 2, self.total, self.seen)
+        """Add the gradients of one view's step; they are zero for Gaussians that are not drawn."""
+        x, y = means_px[:, 0] * np.float64(size_hw[1] / 2), means_px[:, 1] * np.float64(size_hw[0] / 2)
+        self.total += np.sqrt(x * x + y * y)
+        self.seen += drawn
 
     def mean(self) -> Float64[np.ndarray, " N"]:
         """Return the average lengths; 0 for Gaussians that were never drawn."""

@@ -52,8 +52,6 @@ MIN_SIDE_PX = 64
 """Minimum shorter side of shrunk images."""
 MAX_SHOWN = 8
 """Maximum number of views on the contact sheet of test views."""
-SUMMARY = ("split", "psnr_db", "ssim", "gaussians")
-"""Report entries that are copied to the index."""
 ERROR_GAIN = 4
 """Factor by which displayed errors are multiplied."""
 TABLES = ("parameters", "first", "second")
@@ -314,7 +312,8 @@ def write_report(
         if curve is not None:
             _draw_curves(temporary / "curves.png", curve)
         write_json(temporary / "report.json", report)
-        write_index(temporary, scores, **{name: report[name] for name in SUMMARY})
+        summary = {name: report[name] for name in ("split", "psnr_db", "ssim", "gaussians")}
+        write_index(temporary, scores, **summary)
     for warning in report["warnings"]:
         logger.warning("%s: %s", scene.name, warning)
     return report
@@ -322,15 +321,12 @@ def write_report(
 
 def _draw_curves(path: Path, curve: Float64[np.ndarray, "S 4"]) -> None:
     """Plot loss, training PSNR and number of Gaussians over the steps."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3), layout="constrained")
-    FigureCanvasAgg(figure)
-    steps = curve[:, 0]
     titles = ("loss", "PSNR of the step's view, dB", "Gaussians")
     for axes, values, title in zip(figure.subplots(1, 3), curve[:, 1:].T, titles, strict=True):
-        axes.plot(steps, values, linewidth=0.8)
+        axes.plot(curve[:, 0], values, linewidth=0.8)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)

@@ -133,14 +133,9 @@ def write_flyaround(
                 shown.append(frame)
             yield frame
 
-    write_film(folder / "flyaround.mp4", frames(), FRAMES_PER_S)
-    write_png(folder / "flyaround.png", contact_sheet(shown, columns=4))
-
-
-def write_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> None:
-    """Encode one or more frames of the same size as MP4 (see `encoded_film`)."""
-    for _ in encoded_film(path, frames, per_second):
+    for _ in encoded_film(folder / "flyaround.mp4", frames(), FRAMES_PER_S):
         pass
+    write_png(folder / "flyaround.png", contact_sheet(shown, columns=4))
 
 
 def encoded_film(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], per_second: int) -> Iterator[None]:

@@ -42,11 +42,10 @@ def fractional_bits(gaussians: Gaussians) -> int:
 def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) -> bytes:
     """Return the given Gaussians as an SPZ file; identical Gaussians produce identical bytes.
 
-    Positions beyond 2**(23 - bits), a thousand times the spread of the scene, are clipped, and harmonics
-    beyond degree 3 are omitted. Spatially sorted rows compress best. `bits` is from `fractional_bits`.
+    Positions beyond 2**(23 - bits), a thousand times the spread of the scene, are clipped. Spatially sorted
+    rows compress best. `bits` is from `fractional_bits`.
     """
-    degree = min(gaussians.sh_degree, 3)
-    sh = gaussians.sh[rows, : (degree + 1) ** 2]
+    sh = gaussians.sh[rows]
     steps = np.rint(gaussians.means[rows].astype(np.float64) * FLIPPED * 2**bits)
     fixed = np.clip(steps, -LARGEST_STEP, LARGEST_STEP).astype("<i4")
     quats = gaussians.quats[rows] / np.linalg.norm(gaussians.quats[rows], axis=1, keepdims=True)
@@ -60,7 +59,7 @@ def spz_bytes(gaussians: Gaussians, rows: Int64[np.ndarray, " g"], bits: int) ->
         _byte(127.5 * turned + 127.5),
         _byte(harmonics * HARMONIC_STEP + 128),
     )
-    head = HEADER.pack(MAGIC, VERSION, len(rows), degree, bits, 0, 0)
+    head = HEADER.pack(MAGIC, VERSION, len(rows), gaussians.sh_degree, bits, 0, 0)
     return gzip.compress(head + b"".join(column.tobytes() for column in columns), GZIP_LEVEL, mtime=0)
 
 
