@@ -51,25 +51,14 @@ def enliven(model) -> None:
 def sam_parts(transformers, tmp_path_factory):
     """A SAM for images of 64 px: transformers' model, its processor, and its exported folder."""
     folder = tmp_path_factory.mktemp("sam")
-    vision = transformers.SamVisionConfig(
-        hidden_size=16,
-        output_channels=16,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        image_size=64,
-        patch_size=8,
-        window_size=4,
-        global_attn_indexes=[1],
-        mlp_dim=32,
-        num_pos_feats=8,
+    sizes = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "mlp_dim": 32}
+    image = {"image_size": 64, "patch_size": 8}
+    attention = {"window_size": 4, "global_attn_indexes": [1], "num_pos_feats": 8}
+    config = transformers.SamConfig(
+        {**sizes, **image, **attention, "output_channels": 16},
+        {"hidden_size": 16, **image, "mask_input_channels": 4},
+        {**sizes, "iou_head_hidden_dim": 16},
     )
-    prompt = transformers.SamPromptEncoderConfig(
-        hidden_size=16, image_size=64, patch_size=8, mask_input_channels=4
-    )
-    decoder = transformers.SamMaskDecoderConfig(
-        hidden_size=16, num_hidden_layers=2, num_attention_heads=2, mlp_dim=32, iou_head_hidden_dim=16
-    )
-    config = transformers.SamConfig(vision.to_dict(), prompt.to_dict(), decoder.to_dict())
     model = transformers.SamModel(config).eval()
     enliven(model)
     images = transformers.SamImageProcessor(
@@ -98,16 +87,13 @@ def clip_parts(transformers, tmp_path_factory):
     tokenizer = transformers.CLIPTokenizerFast(
         str(folder / "vocab.json"), str(folder / "merges.txt"), model_max_length=16
     )
-    text = transformers.CLIPTextConfig(
-        vocab_size=len(words),
-        max_position_embeddings=16,
-        bos_token_id=len(words) - 2,
-        eos_token_id=len(words) - 1,
-        pad_token_id=len(words) - 1,
-        **SMALL,
+    begin, end = len(words) - 2, len(words) - 1
+    tokens = {"bos_token_id": begin, "eos_token_id": end, "pad_token_id": end}
+    config = transformers.CLIPConfig(
+        {"vocab_size": len(words), "max_position_embeddings": 16, **tokens, **SMALL},
+        {"image_size": 32, "patch_size": 8, **SMALL},
+        projection_dim=12,
     )
-    vision = transformers.CLIPVisionConfig(image_size=32, patch_size=8, **SMALL)
-    config = transformers.CLIPConfig(text.to_dict(), vision.to_dict(), projection_dim=12)
     model = transformers.CLIPModel(config).eval()
     enliven(model)
     images = transformers.CLIPImageProcessor(

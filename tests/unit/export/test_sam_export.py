@@ -49,26 +49,24 @@ def theirs(sam_parts, photograph):
     return points, inputs, outputs
 
 
-def test_images_are_prepared_as_by_the_processor(ours, theirs, photograph):
+def test_images_embeddings_scores_and_small_masks_agree(ours, sam_parts, theirs, photograph):
+    points, inputs, outputs = theirs
     pixels, frame = ours.prepare(photograph)
-    np.testing.assert_allclose(pixels, theirs[1]["pixel_values"].numpy(), atol=TOLERANCE)
-    assert frame.resized_hw == tuple(theirs[1]["reshaped_input_sizes"][0].tolist())
-    assert frame.original_hw == tuple(theirs[1]["original_sizes"][0].tolist())
-
-
-def test_embeddings_agree(ours, sam_parts, theirs, photograph):
-    model = sam_parts[0]
+    np.testing.assert_allclose(pixels, inputs["pixel_values"].numpy(), atol=TOLERANCE)
+    assert frame.resized_hw == tuple(inputs["reshaped_input_sizes"][0].tolist())
+    assert frame.original_hw == tuple(inputs["original_sizes"][0].tolist())
     with torch.no_grad():
-        embeddings = model.get_image_embeddings(theirs[1]["pixel_values"])
-        positional = model.get_image_wide_positional_embeddings()
+        embeddings = sam_parts[0].get_image_embeddings(inputs["pixel_values"]).numpy()
+        positional = sam_parts[0].get_image_wide_positional_embeddings().numpy()
     encoded = ours.encode(photograph)
     assert embeddings.std() > 0.1
-    np.testing.assert_allclose(encoded.features["image_embeddings"], embeddings.numpy(), atol=TOLERANCE)
-    np.testing.assert_allclose(
-        encoded.features["image_positional_embeddings"][0],
-        positional.numpy().reshape(16, 8, 8),
-        atol=TOLERANCE,
-    )
+    np.testing.assert_allclose(encoded.features["image_embeddings"], embeddings, atol=TOLERANCE)
+    found = encoded.features["image_positional_embeddings"][0]
+    np.testing.assert_allclose(found, positional.reshape(16, 8, 8), atol=TOLERANCE)
+    scores, logits = ours.decode(encoded, points)
+    assert outputs.pred_masks.std() > 0.1
+    np.testing.assert_allclose(scores, outputs.iou_scores[0].numpy(), atol=TOLERANCE)
+    np.testing.assert_allclose(logits, outputs.pred_masks[0].numpy(), atol=TOLERANCE)
 
 
 def test_rowwise_global_attention_gives_the_same_result(ours, photograph):
@@ -86,14 +84,6 @@ def test_rowwise_global_attention_gives_the_same_result(ours, photograph):
     ):
         np.testing.assert_allclose(found, expected, atol=1e-5)
     assert with_rowwise_attention(path, [0, 7], 2, 8) is None  # there is no layer 7
-
-
-def test_scores_and_low_resolution_masks_agree(ours, theirs, photograph):
-    points, _, outputs = theirs
-    scores, logits = ours.decode(ours.encode(photograph), points)
-    assert outputs.pred_masks.std() > 0.1
-    np.testing.assert_allclose(scores, outputs.iou_scores[0].numpy(), atol=TOLERANCE)
-    np.testing.assert_allclose(logits, outputs.pred_masks[0].numpy(), atol=TOLERANCE)
 
 
 def test_masks_and_boxes_agree_at_full_size(ours, sam_parts, theirs, photograph):
@@ -155,23 +145,19 @@ def test_check_describes_the_export(sam_parts):
     assert "image      64 x 64 px" in text
 
 
-def test_sam_2_stretches_images_to_its_square(sam2_parts, photograph):
-    pixels, frame = SamModel.load(sam2_parts[1]).prepare(photograph)
+def test_sam_2_stretches_images_and_gives_what_transformers_gives(sam2_parts, photograph):
+    reference, folder = sam2_parts
+    model = SamModel.load(folder)
+    pixels, frame = model.prepare(photograph)
     assert frame == Frame((60, 100), (64, 64), (64, 64), stretched=True)
-    assert pixels.shape == (1, 3, 64, 64)
     # the bottom right corner is image, not padding
     last = (photograph[-1, -1] / 255 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
     assert np.abs(pixels[0, :, -1, -1] - last).max() < 0.5
-
-
-def test_sam_2_gives_what_transformers_gives(sam2_parts, photograph):
-    reference, folder = sam2_parts
-    model = SamModel.load(folder)
     points = point_grid(3) * (100, 60)
     scores, logits = model.decode(model.encode(photograph), points)
     with torch.no_grad():
         found = reference(
-            pixel_values=torch.from_numpy(model.prepare(photograph)[0]),
+            pixel_values=torch.from_numpy(pixels),
             input_points=torch.from_numpy(points * (64 / 100, 64 / 60)).float()[None, :, None],
             input_labels=torch.ones((1, 9, 1), dtype=torch.int64),
         )

@@ -15,26 +15,14 @@ from hilsplat.scene.assemble import (
     up_direction,
 )
 from hilsplat.scene.colmap import pycolmap
+from tests.unit.splat.three_gaussians_world import ring
 
 
-def look_at(centre, target, up):
-    """World-to-camera matrix of a level camera, OpenCV axes."""
-    forward = np.subtract(target, centre) / np.linalg.norm(np.subtract(target, centre))
-    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
-    return pose
-
-
-def ring(up_axis=1, radius=10.0, views=6):
-    angles = np.arange(views) * 2 * np.pi / views
-    up = np.eye(3)[up_axis]
-    plane = [axis for axis in range(3) if axis != up_axis]
-    centres = np.zeros((views, 3))
-    centres[:, plane[0]], centres[:, plane[1]] = radius * np.cos(angles), radius * np.sin(angles)
-    centres[:, up_axis] = 5.0
-    return np.stack([look_at(centre, np.zeros(3), up) for centre in centres])
+def ring_with_y_up():
+    """Poses of six cameras that look down at the origin from a distance of sqrt(10.44), at height 1.2."""
+    poses = ring(6, 48).cam_from_world
+    poses[:, :3, :3] = poses[:, :3, :3] @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    return poses
 
 
 def test_every_eighth_view_by_name_is_held_out_of_eight_or_more():
@@ -47,7 +35,7 @@ def test_every_eighth_view_by_name_is_held_out_of_eight_or_more():
 
 
 def test_up_is_found_from_level_cameras_that_look_down():
-    poses = ring(up_axis=1)
+    poses = ring_with_y_up()
     np.testing.assert_allclose(up_direction(poses), [0, 1, 0], atol=1e-9)
     # an arc of 60 degrees: the mean of the cameras' own up axes would lean
     np.testing.assert_allclose(up_direction(poses[:2]), [0, 1, 0], atol=1e-9)
@@ -58,16 +46,16 @@ def test_up_is_found_from_level_cameras_that_look_down():
 
 
 def test_scene_coordinates_centre_the_points_and_put_cameras_at_distance_one():
-    poses = ring(radius=10.0)
+    poses = ring_with_y_up()
     points = np.array([[0.0, 0, 0], [0, 0, 0], [100, 0, 0]])  # the median ignores the outlier
     similarity = normalising_similarity(poses, points, metric=False, turn=True)
     moved = move_cameras(poses, similarity)
     centres = -np.einsum("vji,vj->vi", moved[:, :3, :3], moved[:, :3, 3])
     np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 1.0)
-    np.testing.assert_allclose(centres[:, 2], 5 / np.sqrt(125))  # source y is up, and becomes z
+    np.testing.assert_allclose(centres[:, 2], 1.2 / np.sqrt(10.44))  # source y is up, and becomes z
     # a point keeps its pixel: camera coordinates are scaled, not rotated
     point = np.array([1.0, 2.0, 3.0, 1.0])
-    expected = (poses[0] @ point)[:3] / np.sqrt(125)
+    expected = (poses[0] @ point)[:3] / np.sqrt(10.44)
     np.testing.assert_allclose((moved[0] @ (similarity @ point))[:3], expected, atol=1e-12)
     # metric sources keep their metre, and imports their axes
     similarity = normalising_similarity(poses, np.array([[1.0, 2, 3]]), metric=True, turn=False)

@@ -17,6 +17,7 @@ from hilsplat.scene.poses import MAX_ROWS, check_registration, name_neighbours, 
 from hilsplat.scene.scene import Scene
 from hilsplat.scene.view_names import view_name, view_names
 from hilsplat.settings import PosesSettings
+from tests.unit.splat.three_gaussians_world import looking_at_the_origin
 
 
 def pose_photos(folder, out, **settings):
@@ -42,10 +43,7 @@ def plane_views(folder, views=5, size=160, step_deg=9):
     for number in range(views):
         angle = np.radians(45 + step_deg * (number - (views - 1) / 2))
         centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.0 + 0.2 * (number % 2)])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
+        rotation = looking_at_the_origin(centre)[:3, :3]
         y, x = np.mgrid[:size, :size] + 0.5
         rays = np.stack([(x - size / 2) / focal, (y - size / 2) / focal, np.ones_like(x)], axis=-1) @ rotation
         image = np.zeros((size, size, 3))

@@ -15,18 +15,22 @@ from hilsplat.splat.rasterise.api import render
 NUM_VIEWS, SIZE_PX = 9, 48
 
 
+def looking_at_the_origin(centre: np.ndarray) -> np.ndarray:
+    """World-to-camera matrix of a level camera at `centre`; z is up."""
+    forward = -centre / np.linalg.norm(centre)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return pose
+
+
 def ring(number: int, size: int) -> Cameras:
     """Cameras on a circle of radius 3, at height 1.2, that look at the origin; z is up."""
-    poses = []
-    for angle in np.linspace(0, 2 * np.pi, number, endpoint=False):
-        centre = 3 * np.array([np.cos(angle), np.sin(angle), 0.4])
-        forward = -centre / np.linalg.norm(centre)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ centre
-        poses.append(pose)
+    angles = np.linspace(0, 2 * np.pi, number, endpoint=False)
+    centres = [3 * np.array([np.cos(angle), np.sin(angle), 0.4]) for angle in angles]
+    poses = [looking_at_the_origin(centre) for centre in centres]
     K = np.array([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1.0]])
     names = tuple(f"{view:03d}.png" for view in range(number))
     return Cameras(names, np.stack(poses), np.tile(K, (number, 1, 1)), np.full((number, 2), size, np.int32))
