@@ -66,8 +66,7 @@ def rendered_latents(
     the remaining normalised weights are divided by their sum. Results are bit-identical to sparse products.
     """
     rows = weights.indptr, weights.indices, weights.data
-    shares = np.zeros((weights.shape[0], features.shape[1]), np.float32)
-    _add_shares(*rows, (features != 0).any(axis=2), shares)
+    shares = weights @ (features != 0).any(axis=2).astype(np.float32)
     shown = []
     for level in range(features.shape[1]):
         pixels = np.flatnonzero(shares[:, level] > MIN_LATENT_SHARE)
@@ -77,18 +76,6 @@ def rendered_latents(
         _render(*rows, pixels, share, wide.reshape(-1), wide.shape[1], found.reshape(-1))
         shown.append((pixels, found[:, : features.shape[2]]))
     return shown
-
-
-@compiled
-def _add_shares(indptr, indices, data, has, shares):
-    for p in range(len(shares)):
-        a, b, c = np.float32(0), np.float32(0), np.float32(0)
-        for k in range(np.uint64(indptr[p]), np.uint64(indptr[p + 1])):
-            g = np.uint64(indices[k])  # unsigned: skips the check for negative indices
-            a += data[k] if has[g, 0] else np.float32(0)
-            b += data[k] if has[g, 1] else np.float32(0)
-            c += data[k] if has[g, 2] else np.float32(0)
-        shares[p, 0], shares[p, 1], shares[p, 2] = a, b, c
 
 
 @compiled

@@ -87,9 +87,8 @@ class StackedWeights:
 
     def product(self, features: Float[np.ndarray, "N 3 D"]) -> Float[np.ndarray, "N 3 D"]:
         """Return W' diag(valid_l) W F_l for every level, in the precision of F, on one thread."""
-        out, W = np.zeros_like(features), self.weights
-        _weights_product(W.indptr, W.indices, W.data, self.valid, np.ascontiguousarray(features), out)
-        return out
+        W, levels = self.weights, zip(self.valid.T, features.swapaxes(0, 1), strict=True)
+        return np.stack([W.T @ (valid[:, None] * (W @ own)) for valid, own in levels], axis=1)
 
     def form(self, features: Float32[np.ndarray, "N 3 D"]) -> float:
         """Return the sum over levels of tr F'GF, summed in float64."""
@@ -147,23 +146,3 @@ def _gram_product(begin, end, indptr, indices, values, features, width, out):
             store(out, own, whole)
             store(out, own + width, part)
             store(out, own + 2 * width, subpart)
-
-
-@compiled
-def _weights_product(indptr, indices, data, valid, features, out):
-    levels, channels = features.shape[1], features.shape[2]
-    rendered = np.zeros((levels, channels), features.dtype)
-    for p in range(len(indptr) - 1):
-        rendered[:] = 0
-        for k in range(indptr[p], indptr[p + 1]):
-            j, weight = indices[k], data[k]
-            for level in range(levels):
-                if valid[p, level]:
-                    for c in range(channels):
-                        rendered[level, c] += weight * features[j, level, c]
-        for k in range(indptr[p], indptr[p + 1]):
-            j, weight = indices[k], data[k]
-            for level in range(levels):
-                if valid[p, level]:
-                    for c in range(channels):
-                        out[j, level, c] += weight * rendered[level, c]

@@ -25,7 +25,7 @@ from hilsplat.field.code import (
     autoencoder_file,
     layers_of,
     torch_generator,
-    unit,
+    unit_rows,
 )
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, require_same_masks
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -176,7 +176,7 @@ def loss_gradients(
     channels = vectors.shape[1]
     encoder, decoder = layers_of(channels, latent)
     codes, to_codes = _forward(parameters, encoder, vectors)
-    latents = unit(codes)
+    latents = unit_rows(codes)
     outputs, to_outputs = _forward(parameters, decoder, latents)
     slope = -vectors * np.float32((2 / channels + cosine_weight) / len(vectors))
     slope = _backward(parameters, decoder, to_outputs, _slope_before_unit(outputs, slope), gradients)
@@ -222,52 +222,25 @@ def _backward(
         if layer.relu:
             slope *= values > 0
         if layer.norm:
-            names = f"{layer.norm}.weight", f"{layer.norm}.bias"
-            of_norm = (gradients[name] for name in names)
-            _normalised_backward(slope, scaled, spread, parameters[names[0]], *of_norm)
+            of_weight, of_bias = (gradients[f"{layer.norm}.{name}"] for name in ("weight", "bias"))
+            np.sum(slope * scaled, axis=0, out=of_weight)
+            np.sum(slope, axis=0, out=of_bias)
+            common = np.float32(1 / len(slope)) * (of_bias + scaled * of_weight)
+            slope = parameters[f"{layer.norm}.weight"] * spread * (slope - common)
     return slope
 
 
 def _slope_before_unit(values: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the gradient before `unit` from that after `unit`; the component along the vectors vanishes."""
+    """Return the gradient before `unit_rows` from that after it; the component along the vectors vanishes."""
     length = np.sqrt(np.square(values).sum(axis=1, keepdims=True))
     units = values / length
     return (slope - units * (units * slope).sum(axis=1, keepdims=True)) / length
 
 
-@compiled(error_model="numpy")
-def _normalised(values, weight, bias):
+def _normalised(values: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> Passed:
     """Apply BatchNorm (batch statistics) and ReLU; return normalised inputs, 1 / deviation and outputs."""
-    rows, columns = values.shape
-    mean, var = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-    scaled, out = np.empty_like(values), np.empty_like(values)
-    share = np.float32(1.0 / rows)
-    for row in range(rows):
-        for c in range(columns):
-            mean[c] += share * values[row, c]
-    for row in range(rows):
-        for c in range(columns):
-            var[c] += share * (values[row, c] - mean[c]) ** 2
-    spread = np.float32(1.0) / np.sqrt(var + np.float32(NORM_EPS))
-    for row in range(rows):
-        for c in range(columns):
-            scaled[row, c] = (values[row, c] - mean[c]) * spread[c]
-            out[row, c] = max(scaled[row, c] * weight[c] + bias[c], np.float32(0.0))
-    return scaled, spread, out
-
-
-@compiled(error_model="numpy")
-def _normalised_backward(slope, scaled, spread, weight, of_weight, of_bias):
-    """Convert gradients `slope` from a BatchNorm's outputs to its inputs; write those of weight and bias."""
-    rows, columns = slope.shape
-    of_weight[:] = 0
-    of_bias[:] = 0
-    for row in range(rows):
-        for c in range(columns):
-            of_weight[c] += slope[row, c] * scaled[row, c]
-            of_bias[c] += slope[row, c]
-    share = np.float32(1.0 / rows)
-    for row in range(rows):
-        for c in range(columns):
-            common = share * (of_bias[c] + scaled[row, c] * of_weight[c])
-            slope[row, c] = weight[c] * spread[c] * (slope[row, c] - common)
+    share = np.float32(1 / len(values))
+    centred = values - (share * values).sum(axis=0)
+    spread = 1 / np.sqrt((share * np.square(centred)).sum(axis=0) + np.float32(NORM_EPS))
+    scaled = centred * spread
+    return scaled, spread, np.maximum(scaled * weight + bias, 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float, Float32, Int64
 
 from hilsplat.base.arrays import made, read_tensors, write_tensors
 from hilsplat.base.artifacts import read_npz, remake, sealed
@@ -62,9 +62,7 @@ class LinearCode:
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
         """Decode latents to vectors of unit length."""
-        vectors = self.mean + latents @ self.basis
-        length = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-        return (vectors / length).astype(np.float32)
+        return unit_rows(self.mean + latents @ self.basis)
 
     def cosine_terms(self, vectors: Float32[np.ndarray, "V C"]) -> tuple:
         """Return m.v and U v of each vector, |m|^2, and U m, so that e.v = (m.v + z.Uv) / |m + U z|."""
@@ -182,9 +180,9 @@ def torch_generator(seed: int) -> np.random.RandomState:
     return np.random.RandomState(seed % 2**32)
 
 
-def unit(vectors: Float32[np.ndarray, "B C"]) -> Float32[np.ndarray, "B C"]:
-    """Scale rows to unit length."""
-    return vectors / np.maximum(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)), np.float32(1e-12))
+def unit_rows(rows: Float[np.ndarray, "B C"]) -> Float[np.ndarray, "B C"]:
+    """Scale rows to length 1; a row of zeros is unchanged."""
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 
 class Autoencoder:
@@ -211,7 +209,7 @@ class Autoencoder:
                 factor = scale / np.sqrt(var + np.float32(NORM_EPS))
                 values = np.maximum(values * factor + (shift - mean * factor), 0)
             values = values @ weight.T + bias
-        return unit(values)
+        return unit_rows(values)
 
     def decode_array(self, latents: Float32[np.ndarray, "B D"]) -> Float32[np.ndarray, "B C"]:
         """Decode latents of any length to vectors of unit length."""

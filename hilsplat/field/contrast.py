@@ -11,6 +11,7 @@ from jaxtyping import Float32, Float64, Int64
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.contributions.mask_operator import MaskOperator
 from hilsplat.contributions.rows import Contributions
+from hilsplat.field.code import unit_rows
 from hilsplat.field.losses import (
     common_ancestor_depth,
     instance_loss_literal,
@@ -76,7 +77,7 @@ def distinct(
     unrelated in the tree adds almost no information to the gradients of the kept pairs. Rows are in order of
     preference, `depth` is their `common_ancestor_depth`, and `most_alike` is a cosine.
     """
-    unit = means / np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+    unit = unit_rows(means)
     alike = (unit @ unit.T > most_alike) & (depth == 0)
     kept = np.zeros(len(means), bool)
     for row in range(len(means)):

@@ -28,14 +28,8 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from hilsplat.base.levels import LEVELS, NONE
-from hilsplat.field.code import LinearCode
-from hilsplat.methods.common.groups import (
-    density_clusters,
-    features_of_groups,
-    group_means,
-    kmeans,
-    unit_rows,
-)
+from hilsplat.field.code import LinearCode, unit_rows
+from hilsplat.methods.common.groups import density_clusters, features_of_groups, group_means, kmeans
 from hilsplat.methods.common.training import alike, of_seen, product, train, unit
 from hilsplat.methods.langsplat_v2 import as_vectors
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views

@@ -22,7 +22,7 @@ from hilsplat.base.compiled import compiled
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.progress import track
 from hilsplat.field.adam import Adam, in_random_order
-from hilsplat.field.code import LinearCode
+from hilsplat.field.code import LinearCode, unit_rows
 from hilsplat.methods.common.groups import kmeans
 from hilsplat.methods.method import LabelledView, MethodInputs, labelled_views
 from hilsplat.settings import MethodSettings
@@ -67,16 +67,17 @@ def step(
 ) -> tuple[float, Float32[np.ndarray, "N E"], Float32[np.ndarray, "E D"]]:
     """Return the loss over a view's labelled pixels, and its gradients for logits and codebook."""
     chosen, shares = largest_shares(logits)
-    rows = weights.indptr, weights.indices, weights.data
-    mixed = np.zeros((weights.shape[0], len(codebook)), np.float32)
-    _mix(*rows, chosen, shares, mixed)
-    vectors = as_vectors(targets, code)
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    kept = np.arange(0, chosen.size + 1, chosen.shape[1])
+    mixture = sp.csr_matrix((shares.ravel(), chosen.ravel(), kept), shape=logits.shape)
+    mixed = (weights @ mixture).toarray()
+    vectors = unit_rows(as_vectors(targets, code))
     entries = as_vectors(codebook, code)
     loss, by_rendered = cosine_loss(mixed @ entries, vectors)
     by_mixed = by_rendered @ entries.T
     by_share, by_logits = np.zeros_like(shares), np.zeros_like(logits)
-    _pull(*rows, chosen, shares, by_mixed, by_share, by_logits)
+    _pull(weights.indptr, weights.indices, weights.data, chosen, by_mixed, by_share)
+    by_kept = shares * (by_share - (shares * by_share).sum(axis=1, keepdims=True))
+    np.put_along_axis(by_logits, chosen, by_kept, axis=1)
     return loss, by_logits, (mixed.T @ by_rendered)[:, :-1]
 
 
@@ -141,26 +142,10 @@ def _largest(logits, chosen, shares):
 
 
 @compiled
-def _mix(indptr, indices, data, chosen, shares, out):
+def _pull(indptr, indices, data, chosen, by_mixed, by_share):
+    """Write the gradient of each Gaussian's kept shares."""
     for p in range(len(indptr) - 1):
         for j in range(indptr[p], indptr[p + 1]):
             g = indices[j]
             for k in range(chosen.shape[1]):
-                out[p, chosen[g, k]] += data[j] * shares[g, k]
-
-
-@compiled
-def _pull(indptr, indices, data, chosen, shares, by_mixed, by_share, by_logits):
-    """Compute the adjoint of `_mix`, then of the softmax over the kept entries."""
-    kept = chosen.shape[1]
-    for p in range(len(indptr) - 1):
-        for j in range(indptr[p], indptr[p + 1]):
-            g = indices[j]
-            for k in range(kept):
                 by_share[g, k] += data[j] * by_mixed[p, chosen[g, k]]
-    for g in range(len(chosen)):
-        mean = np.float32(0)
-        for k in range(kept):
-            mean += shares[g, k] * by_share[g, k]
-        for k in range(kept):
-            by_logits[g, chosen[g, k]] = shares[g, k] * (by_share[g, k] - mean)

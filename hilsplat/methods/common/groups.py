@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE
+from hilsplat.field.code import unit_rows
 from hilsplat.methods.method import MethodInputs
 from hilsplat.settings import MethodSettings
 
@@ -61,11 +62,6 @@ def standardised(means: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"
     """Centre the Gaussians' positions and scale them to a standard deviation of 1 over all three axes."""
     apart = means - means.mean(axis=0)
     return apart / max(float(apart.std()), 1e-12)
-
-
-def unit_rows(rows: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n D"]:
-    """Scale rows to length 1; a row of zeros is unchanged."""
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 
 def nearest(points: Shaped[np.ndarray, "n C"], count: int) -> Int64[np.ndarray, "n k"]:
