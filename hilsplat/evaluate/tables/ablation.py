@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from hilsplat.datasets.sources import LEVELLED
 from hilsplat.evaluate.protocols.cards import LEVEL_GIVEN, PATH
 from hilsplat.evaluate.tables import measured
-from hilsplat.evaluate.tables.rows import Block, Cell, Sources, Table
+from hilsplat.evaluate.tables.rows import Cell, Sources, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,56 +34,39 @@ COLUMNS_NOTE = (
 )
 
 
-def ablation_table(sources: Sources) -> Table:
-    """Build the paper's ablation: parts of its method enabled one after the other, in the paper's reading."""
-    note = (
+ABLATIONS = {
+    "ablation": (
+        "Ablation",
+        "ablation",
         "Initial-2D: 2D mask levels from the coverage tree. 3D-HC: 3D hierarchical clustering (L_h). "
-        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md describes how we read each."
-    )
-    return _table(sources, "ablation", "Ablation", "ablation", note)
-
-
-def component_table(sources: Sources) -> Table:
-    """Build our own ablation: the contribution of each part of the default field and its code."""
-    note = "Rows name the enabled losses; d is the size of a latent."
-    return _table(sources, "components", "Parts of the default field", "parts", note)
-
-
-def theta_table(sources: Sources) -> Table:
-    """Build the sweep over the coverage threshold."""
-    note = (
+        "Instance, Part: contrastive losses (L_ins, L_part). docs/paper.md describes how we read each.",
+    ),
+    "components": (
+        "Parts of the default field",
+        "parts",
+        "Rows name the enabled losses; d is the size of a latent.",
+    ),
+    "theta": (
+        "Influence of the coverage threshold theta",
+        "coverage threshold",
         "theta determines which masks of a view are nested. Rows in the paper's reading take levels from the "
         "coverage tree (masks.levels: tree), so theta moves masks between levels. With levels from SAM's "
-        "heads, theta affects a field only through L_ins and L_part, and not the linked semantic tree."
-    )
-    title = "Influence of the coverage threshold theta"
-    return _table(sources, "theta", title, "coverage threshold", note, ("field",))
-
-
-def omega_table(sources: Sources) -> Table:
-    """Build the sweep over the similarity degree."""
-    note = (
+        "heads, theta affects a field only through L_ins and L_part, and not the linked semantic tree.",
+    ),
+    "omega": (
+        "Influence of the similarity degree Omega",
+        "similarity degrees",
         "Omega appears only in L_ins. Rows in the paper's reading use lambda_1 = exp(-6) and "
-        "lambda_2 = exp(-5); with 1e-6 and 1e-5, all rows are equal."
-    )
-    title = "Influence of the similarity degree Omega"
-    return _table(sources, "omega", title, "similarity degrees", note, ("field",))
+        "lambda_2 = exp(-5); with 1e-6 and 1e-5, all rows are equal.",
+    ),
+}
+"""Ablation (the paper's, ours, sweeps) -> its title, the heading of the reported rows, and a note."""
 
 
-def _table(
-    sources: Sources,
-    name: str,
-    title: str,
-    reported: str,
-    note: str,
-    methods: tuple[str, ...] = ("field", "tree", "tree-path"),
-) -> Table:
-    blocks = [sources.reported(PAPER_DATA, reported, families=False), *component_blocks(sources, methods)]
-    return sources.finished(name, title, blocks, (COLUMNS_NOTE, note))
-
-
-def component_blocks(sources: Sources, methods: tuple[str, ...]) -> list[Block]:
-    """Return blocks with one row per variant and method, and the ablation's protocols side by side."""
+def ablation_table(sources: Sources, name: str) -> Table:
+    """Build a table in `ABLATIONS`: a row per variant and method, the ablation's protocols side by side."""
+    title, reported, note = ABLATIONS[name]
+    methods = ("field",) if name in ("theta", "omega") else ("field", "tree", "tree-path")
     scores = measured.with_seeds(sources.scores)
     blocks = measured.measured_blocks(
         replace(sources, scores=sources.scores[sources.scores["method"].isin(methods)]),
@@ -93,7 +76,9 @@ def component_blocks(sources: Sources, methods: tuple[str, ...]) -> list[Block]:
         frozenset({"Avg, best threshold", AGAINST}),
         over_seeds=lambda part: {AGAINST: against_default(scores, part)},
     )
-    return [replace(block, columns=tuple(block.filled_columns())) for block in blocks]
+    filled = [replace(block, columns=tuple(block.filled_columns())) for block in blocks]
+    reported_rows = sources.reported(PAPER_DATA, reported, families=False)
+    return sources.finished(name, title, [reported_rows, *filled], (COLUMNS_NOTE, note))
 
 
 def component_cells(scores: "pd.DataFrame", part: "pd.DataFrame") -> dict[str, Cell]:

@@ -10,14 +10,8 @@ from hilsplat.base.artifacts import write_text
 from hilsplat.base.errors import ArtifactError
 from hilsplat.base.files import project_path
 from hilsplat.evaluate.scores import read_instances, read_scores
-from hilsplat.evaluate.tables.ablation import ablation_table, component_table, omega_table, theta_table
-from hilsplat.evaluate.tables.costs import (
-    SECONDS,
-    cost_table,
-    efficiency_table,
-    pruning_table,
-    read_costs,
-)
+from hilsplat.evaluate.tables.ablation import ablation_table
+from hilsplat.evaluate.tables.costs import SECONDS, cost_table, efficiency_table, pruning_table, read_costs
 from hilsplat.evaluate.tables.formats import as_csv, as_html, as_latex, as_markdown
 from hilsplat.evaluate.tables.image_tables import frames_table, hierarchy_table, lerf_table, ovs_table
 from hilsplat.evaluate.tables.point_tables import replica_table, scannet_table, waymo_table
@@ -54,8 +48,8 @@ TABLES: dict[str, TableKind] = {
     "scannet": TableKind(scannet_table, ("room", "scannet")),
     "waymo": TableKind(waymo_table, ("street", "waymo")),
     "hierarchy": TableKind(hierarchy_table, ("tabletop", "room", "street", "lerf_ovs", "3d_ovs")),
-    "ablation": TableKind(ablation_table, LEVELLED, "ablation_variants"),
-    "components": TableKind(component_table, LEVELLED, "component_variants"),
+    "ablation": TableKind(partial(ablation_table, name="ablation"), LEVELLED, "ablation_variants"),
+    "components": TableKind(partial(ablation_table, name="components"), LEVELLED, "component_variants"),
     "cost": TableKind(cost_table, LEVELLED, shows_costs=True),
     "cost-seconds": TableKind(partial(cost_table, seconds=True), LEVELLED, shows_costs=True),
     "pruning": TableKind(pruning_table, LEVELLED, "pruning_variants", shows_costs=True),
@@ -64,8 +58,8 @@ TABLES: dict[str, TableKind] = {
     ),
     "efficiency": TableKind(efficiency_table, LEVELLED, shows_costs=True),
     "efficiency-seconds": TableKind(partial(efficiency_table, seconds=True), LEVELLED, shows_costs=True),
-    "theta": TableKind(theta_table, LEVELLED, "theta_variants"),
-    "omega": TableKind(omega_table, LEVELLED, "omega_variants"),
+    "theta": TableKind(partial(ablation_table, name="theta"), LEVELLED, "theta_variants"),
+    "omega": TableKind(partial(ablation_table, name="omega"), LEVELLED, "omega_variants"),
     "frames-hi-lerf": TableKind(partial(frames_table, data="Hi-LERF"), ("tabletop", "lerf_ovs")),
     "frames-hi-3dovs": TableKind(partial(frames_table, data="Hi-3DOVS"), ("tabletop", "3d_ovs")),
 }
