@@ -7,11 +7,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hilsplat.base.lanes import WIDTH
-
-_VECTOR = ir.VectorType(ir.FloatType(), WIDTH)
-_ZERO = ir.Constant(_VECTOR, [ir.Constant(ir.FloatType(), 0.0)] * WIDTH)
-_FIRST = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+from hilsplat.base.lanes import LANES, WIDTH, splat
 
 _HAS_AVX512 = bool(binding.get_host_cpu_features().get("avx512f"))
 """With AVX-512, a core has 32 registers of 16 numbers, otherwise 16 registers of at most 8."""
@@ -40,10 +36,11 @@ def rows_of_products(rows: int) -> Any:
             )
             (y_first, y_next), (a_first, a_next), (x_first, x_next) = args[1:3], args[4:6], args[7:9]
             many, from_zero, both = args[9:]
+            zero = ir.Constant(LANES.vector, None)
 
             def vectors(data: Any, start: Any, count: int) -> list[Any]:
                 places = [builder.add(start, ir.Constant(start.type, k * WIDTH)) for k in range(count)]
-                return [builder.bitcast(builder.gep(data, [at]), _VECTOR.as_pointer()) for at in places]
+                return [builder.bitcast(builder.gep(data, [at]), LANES.vector.as_pointer()) for at in places]
 
             def emit(count: int) -> None:
                 starts, row = [a_first], y_first
@@ -54,7 +51,7 @@ def rows_of_products(rows: int) -> Any:
                     row = builder.add(row, y_next)
                     starts.append(builder.add(starts[-1], a_next))
                 for target in targets:
-                    before = builder.select(from_zero, _ZERO, builder.load(target, align=4))
+                    before = builder.select(from_zero, zero, builder.load(target, align=4))
                     sums.append(cgutils.alloca_once_value(builder, before))
                 with cgutils.for_range(builder, many) as loop:
                     at = builder.add(x_first, builder.mul(loop.index, x_next))
@@ -62,9 +59,7 @@ def rows_of_products(rows: int) -> Any:
                     for number, total in enumerate(sums):
                         place = builder.add(starts[number // count], loop.index)
                         factor = builder.load(builder.gep(a_data, [place]))
-                        undefined = ir.Constant(_VECTOR, ir.Undefined)
-                        one = builder.insert_element(undefined, factor, ir.Constant(ir.IntType(32), 0))
-                        same = builder.shuffle_vector(one, undefined, _FIRST)
+                        same = splat(builder, factor)
                         product = builder.fmul(same, loaded[number % count], flags=("contract",))
                         added = builder.fadd(builder.load(total), product, flags=("contract",))
                         builder.store(added, total)

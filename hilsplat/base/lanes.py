@@ -57,7 +57,7 @@ class _LanesModel(models.PrimitiveModel):
 def _all_equal(
     context: Any, builder: ir.IRBuilder, scalar_type: Any, kind: Any, scalar: ir.Value
 ) -> ir.Value:
-    return _splat(builder, context.cast(builder, scalar, scalar_type, kind.dtype))
+    return splat(builder, context.cast(builder, scalar, scalar_type, kind.dtype))
 
 
 def _binary(python_operator: Any, emit: Any) -> None:
@@ -86,10 +86,11 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(_VECTOR, [ir.Constant(_FLOAT, value)] * WIDTH)
 
 
-def _splat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
-    undefined = ir.Constant(ir.VectorType(scalar.type, WIDTH), ir.Undefined)
+def splat(builder: ir.IRBuilder, scalar: ir.Value, count: int = WIDTH) -> ir.Value:
+    """Return a vector whose elements all equal a scalar."""
+    undefined = ir.Constant(ir.VectorType(scalar.type, count), ir.Undefined)
     one = builder.insert_element(undefined, scalar, ir.Constant(_INT, 0))
-    return builder.shuffle_vector(one, undefined, ir.Constant(_INTS, [0] * WIDTH))
+    return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_INT, count), [0] * count))
 
 
 def _pointer(
@@ -117,7 +118,7 @@ def lanes(typingctx, scalar):
     """Return lanes that all equal one float32 number."""
 
     def codegen(context, builder, sig, args):
-        return _splat(builder, args[0])
+        return splat(builder, args[0])
 
     return LANES(types.float32), codegen
 
@@ -143,7 +144,7 @@ def load_same(typingctx, array, index):
 
     def codegen(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return _splat(builder, builder.load(builder.gep(data, [args[1]])))
+        return splat(builder, builder.load(builder.gep(data, [args[1]])))
 
     return _OF[array.dtype](array, types.intp), codegen
 
@@ -295,13 +296,8 @@ def column_bits(typingctx, words, index, bit):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         held = builder.load(builder.bitcast(builder.gep(data, [args[1]]), kind.as_pointer()), align=2)
         one = builder.shl(ir.Constant(ir.IntType(16), 1), builder.trunc(args[2], ir.IntType(16)))
-        undefined = ir.Constant(kind, ir.Undefined)
-        same = builder.shuffle_vector(
-            builder.insert_element(undefined, one, ir.Constant(_INT, 0)),
-            undefined,
-            ir.Constant(ir.VectorType(_INT, count), [0] * count),
-        )
-        mask = builder.icmp_unsigned("!=", builder.and_(held, same), ir.Constant(kind, None))
+        tested = builder.and_(held, splat(builder, one, count))
+        mask = builder.icmp_unsigned("!=", tested, ir.Constant(kind, None))
         return builder.bitcast(mask, ir.IntType(count))
 
     return types.int64(words, types.intp, types.intp), codegen

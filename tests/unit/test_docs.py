@@ -38,35 +38,30 @@ of_every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page
 
 
 def prose(page: Path) -> str:
-    """A page without its code blocks."""
+    """Return a page without its code blocks."""
     return FENCE.sub("", page.read_text())
 
 
 def inline_code(page: Path) -> list[str]:
-    """What a page writes between single backquotes."""
+    """Return a page's texts in single backquotes."""
     return re.findall(r"`([^`]+)`", " ".join(prose(page).split()))
 
 
 def anchors(page: Path) -> set[str]:
-    """Anchors of a page's headings as GitHub makes them."""
-    found: dict[str, int] = {}
-    names = set()
-    for heading in re.findall(r"^#+ (.+)$", prose(page), re.M):
-        slug = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-        names.add(slug if slug not in found else f"{slug}-{found[slug]}")
-        found[slug] = found.get(slug, 0) + 1
-    return names
+    """Return GitHub's anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", prose(page), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def shell_lines(page: Path) -> list[str]:
-    """Lines of a page's shell blocks, continued ones joined, and inline code that begins with a command."""
+    """Return the joined lines of a page's shell blocks, and inline code that begins with a command."""
     blocks = [text for language, text in FENCE.findall(page.read_text()) if language in ("bash", "")]
     lines = "".join(blocks).replace("\\\n", " ").splitlines()
     return [*lines, *(code for code in inline_code(page) if re.match(r"(hilsplat|snakemake) [a-z-]", code))]
 
 
 def command_of(words: list[str]) -> tuple[Any, list[str]]:
-    """The command that the words after `hilsplat` name, None if there is none, and the rest of the words."""
+    """Return the command that words after `hilsplat` name, or None, and the remaining words."""
     command: Any = typer.main.get_command(app)
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         command, words = command.commands.get(words[0]), words[1:]
@@ -92,10 +87,7 @@ def test_every_command_and_option_exists(page: Path) -> None:
         words = shlex.split(line.replace("...", ""), comments=True)[1:]
         command, rest = command_of(words)
         assert command is not None, f"{line}: no such command"
-        options = {
-            "--help",
-            *(name for each in command.params for name in (*each.opts, *each.secondary_opts)),
-        }
+        options = {name for each in command.params for name in (*each.opts, *each.secondary_opts, "--help")}
         own = rest[: rest.index("--")] if "--" in rest else rest  # the others are Snakemake's
         unknown = [word for word in own if word.startswith("--") and word not in options]
         assert not unknown, f"{line}: no option {', '.join(unknown)}"
@@ -146,7 +138,7 @@ CHECKED = (
 
 
 def checked_arrays() -> list[str]:
-    """A line of a table for each file, from the annotations by which its arrays are checked."""
+    """Return a table row per file, from the annotations by which its arrays are checked."""
     lines = []
     for file, maker, limits in CHECKED:
         cells = []

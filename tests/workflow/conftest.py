@@ -27,7 +27,7 @@ class Project:
     root: Path
 
     def run(self, *command: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
-        """Run a command there and capture what it prints."""
+        """Run a command there and capture its output."""
         how = {"cwd": self.root, "env": self.environment(**environment), "timeout": 1500}
         result = subprocess.run(command, **how, capture_output=True, text=True, check=False)
         if check and result.returncode != 0:
@@ -42,7 +42,7 @@ class Project:
         return subprocess.Popen(command, **where, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def environment(self, **more: str) -> dict[str, str]:
-        """The environment in which `hilsplat` and `snakemake` are the copy's."""
+        """Return the environment variables for running the copy's `hilsplat` and `snakemake`."""
         scripts = sysconfig.get_path("scripts")
         return {
             **os.environ,
@@ -53,11 +53,11 @@ class Project:
         }
 
     def snakemake(
-        self, *words: str, config: str = "ci", cores: int = 2, check: bool = True
+        self, *words: str, config: str = "ci", check: bool = True
     ) -> subprocess.CompletedProcess[str]:
         """Run Snakemake with a configuration of the project."""
-        command = [sys.executable, "-m", "snakemake", "--configfile", f"config/{config}.yaml"]
-        return self.run(*command, "--cores", str(cores), *words, check=check)
+        configured = ("--configfile", f"config/{config}.yaml", "--cores", "2")
+        return self.run(sys.executable, "-m", "snakemake", *configured, *words, check=check)
 
     def hilsplat_run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run `hilsplat run` with the CI configuration."""
@@ -65,9 +65,11 @@ class Project:
         return self.run(*command, check=check)
 
     def hilsplat(self, *words: str, folder: Path | None = None, **environment: str) -> str:
-        """Return what a command of this copy prints, run here or in another folder."""
-        command = (sys.executable, "-c", "from hilsplat.cli.main import main; main()", *words)
-        return Project(folder or self.root).run(*command, PYTHONPATH=str(self.root), **environment).stdout
+        """Return the output of a command of this copy, run here or in another folder."""
+        environment["PYTHONPATH"] = str(self.root)
+        return (
+            Project(folder or self.root).run(sys.executable, "-m", "hilsplat", *words, **environment).stdout
+        )
 
     def planned(self, *words: str) -> set[str]:
         """Rules that a dry run would run, except for the summary that follows every other rule."""

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 from hilsplat.models.store import RECOMMENDED, RELEASES
@@ -16,7 +15,7 @@ SMALL = {
     "masks": {"points_per_side": 8, "min_area_px": 8},
     "semantic_tree": {"min_views": 2},
 }
-RUN = ("--configfile", "config/small.yaml", "--config", "groups=[photos]", "only=[desk]")
+RUN = ("--config", "groups=[photos]", "only=[desk]")
 DESK = Path("results/photos/desk")
 
 
@@ -51,7 +50,7 @@ def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) ->
     assert "masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in told
     assert "meaningless" not in told
 
-    run = snakemake(plain)
+    run = plain.snakemake(*RUN, config="small").stderr
     assert "photos/desk: masks by sam2.1-hiera-small; text queries by clip-vit-base-patch16" in run
     for stage, name in (("masks", "sam2.1-hiera-small"), ("clip", "clip-vit-base-patch16")):
         index = json.loads((plain.root / DESK / "default" / stage / "index.json").read_text())
@@ -64,12 +63,6 @@ def test_get_new_run_and_query(project: Path, plain: Project, tmp_path: Path) ->
     # without these models, the others would recompute masks and vectors; poses and Gaussians are kept
     shutil.rmtree(plain.root / "models/sam2.1-hiera-small")
     shutil.rmtree(plain.root / "models/clip-vit-base-patch16")
-    planned = snakemake(plain, "-n")
+    planned = plain.snakemake("-n", *RUN, config="small").stdout
     assert "rule masks:" in planned and "rule clip:" in planned
     assert "rule poses:" not in planned and "rule gaussians:" not in planned
-
-
-def snakemake(project: Project, *words: str) -> str:
-    """What a run of the photographs prints."""
-    done = project.run(sys.executable, "-m", "snakemake", "--cores", "2", *RUN, *words)
-    return done.stdout + done.stderr
