@@ -236,17 +236,13 @@ def _label_files(scan: str) -> tuple[str, ...]:
     return tuple(f"scans/{scan}/{scan}{suffix}" for suffix in suffixes)
 
 
-OPENGAUSSIAN_SCENES = tuple(
-    f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)
-)
-"""The ten scans of OpenGaussian's table. All but the last are in the training split."""
-
 DATASET = Dataset(
     name="scannet",
     title="ScanNet v2",
     labels="points",
     folder="scannet",
-    scenes=OPENGAUSSIAN_SCENES,
+    # The ten scans of OpenGaussian's table. All but the last are in the training split.
+    scenes=tuple(f"scene{number:04d}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645)),
     licence="code MIT; data under the ScanNet Terms of Use",
     terms="Research use only, with a signed agreement; never redistribute scans or labels made from them.",
     citation="Dai et al., ScanNet: Richly-annotated 3D Reconstructions of Indoor Scenes, CVPR 2017; "

@@ -119,11 +119,9 @@ class Segments(Dataset):
         """Return the missing paths of a segment; empty if the segment is a file of release 1."""
         if find_record(root, scene) is not None:
             return ()
-        split = find_parquet(root, scene)
-        places = self.required(scene)
-        if split is not None:
-            places = tuple(place.replace(f"{SPLITS[0]}/", f"{split.name}/", 1) for place in places)
-        return tuple(place for place in places if not (root / place).is_file())
+        split = find_parquet(root, scene) or root / SPLITS[0]
+        paths = [parquet.component_path(split, tag, scene) for tag in parquet.COMPONENTS]
+        return tuple(str(path.relative_to(root)) for path in paths if not path.is_file())
 
 
 DATASET = Segments(
