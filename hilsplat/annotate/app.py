@@ -276,14 +276,9 @@ def run_annotate(
     threads: int,
     on_ready: Callable[[str], None],
 ) -> None:
-    """Serve the annotation page of a scene on this machine until Ctrl-C.
+    """Serve the annotation page of a scene until Ctrl-C.
 
-    Arguments are those of `OpenedScene` and `serve`.
-
-    Raises:
-        ArtifactError: the scene has no photographs with poses yet.
-        SceneError: a label file cannot be used.
-        SettingsError: the port is taken.
+    Arguments and errors are those of `OpenedScene`, `read_labels` and `serve`.
     """
     opened = OpenedScene(folder, labels, variant, threads)
     annotator, annotated = Annotator(opened), len(opened.known())

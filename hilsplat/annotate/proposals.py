@@ -6,7 +6,7 @@ measures nothing.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
 import cv2
@@ -111,8 +111,8 @@ class Proposals:
         masks = HierarchicalMasks.load(path)
         dense = masks.dense()
         rows = [int(row) for row in np.argsort(-masks.area_px, kind="stable") if dense[row, y, x]]
-        levels = [Level(int(level)) for level in masks.level]
-        return _proposals([(f"mask {row}", "", levels[row], dense[row]) for row in rows[-MOST_MASKS:]])
+        level = masks.level.tolist()
+        return _proposals([(f"mask {row}", "", Level(level[row]), dense[row]) for row in rows[-MOST_MASKS:]])
 
     # -- from other views -------------------------------------------------------------------------
 
@@ -180,15 +180,10 @@ class Proposals:
 
     def _weights(self, view: str) -> sp.csr_matrix:
         assert self.gaussians is not None
-        gaussians, camera = self.gaussians, self.scene.cameras[view]
         least = self.tree.min_weight if self.tree is not None else 0.0
-
-        def compute() -> sp.csr_matrix:
-            return normalised_weights(
-                pixel_weights(gaussians, camera, min_weight=least, threads=self.threads)
-            )
-
-        return self._kept.get(("weights", view), compute)
+        camera, threads = self.scene.cameras[view], self.threads
+        draw = partial(pixel_weights, self.gaussians, camera, min_weight=least, threads=threads)
+        return self._kept.get(("weights", view), lambda: normalised_weights(draw()))
 
 
 def _proposals(found: Sequence[tuple[str, str, Level, np.ndarray]]) -> list[Proposal]:

@@ -63,7 +63,9 @@ class FieldScene(SceneViews):
         """
         answer = self._latent_relevancy
         shown, vectors = self.latents(view), self.text_vectors(texts)
-        placed = self._placed_latents(view) if answer.is_linear or not exact else None
+        placed = None
+        if answer.is_linear or not exact:
+            placed = self._views.get(("placed", view), lambda: [answer.prepare(each) for _, each in shown])
         height, width = self.camera(view).size_hw
         maps = np.zeros((len(texts), len(LEVELS), height * width), np.float32)
         for index, (pixels, latents) in enumerate(shown):
@@ -121,13 +123,6 @@ class FieldScene(SceneViews):
         return self._views.get(
             ("latents", view),
             lambda: rendered_latents(self.view_weights(view), self.trained()[0].features),
-        )
-
-    def _placed_latents(self, view: str) -> list:
-        """Return a view's look-up data for each level, computed at the first look-up."""
-        return self._views.get(
-            ("placed", view),
-            lambda: [self._latent_relevancy.prepare(latents) for _, latents in self.latents(view)],
         )
 
     @cached_property

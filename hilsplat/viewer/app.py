@@ -151,14 +151,7 @@ def _picture(text: str) -> np.ndarray:
 def run_view(
     folder: Path, *, variant: str, port: int, browser: bool, threads: int, on_ready: Callable[[str], None]
 ) -> None:
-    """Serve the page of a scene on this machine until Ctrl-C.
-
-    Arguments are those of `ViewerScene` and `serve`.
-
-    Raises:
-        ArtifactError: the scene has no Gaussians yet.
-        SettingsError: the port is taken.
-    """
+    """Serve the page of a scene until Ctrl-C; arguments and errors are those of `ViewerScene` and `serve`."""
     shown = ViewerScene(folder, variant, threads)
     viewer = Viewer(shown)
     viewer.thread.worker.submit(shown.warm_up).result()
@@ -167,10 +160,7 @@ def run_view(
 
 
 class EmbeddedViewer:
-    """A notebook frame with the page of a scene; `close` stops the page's server.
-
-    Arguments are those of `LanguageScene.show`.
-    """
+    """A notebook frame with the page of a scene; arguments are those of `LanguageScene.show`."""
 
     def __init__(self, found: FinishedScene, *, text: str, height: int, proxy: str, threads: int) -> None:
         self.token, self.height, self.proxy, self.text = secrets.token_urlsafe(24), height, proxy, text

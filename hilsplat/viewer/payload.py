@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from typing_extensions import TypedDict  # pydantic needs this class before Python 3.12
 
-from hilsplat.base.levels import LEVELS, Level
+from hilsplat.base.levels import LEVELS
 from hilsplat.query.hits import Hit, doubts_of
 from hilsplat.query.language_scene import LanguageScene, path_of
 from hilsplat.query.scene_views import upright
@@ -97,7 +97,7 @@ def crossing(cameras: Cameras) -> Float64[np.ndarray, " 3"]:
 def described_nodes(scene: LanguageScene) -> dict[str, Any]:
     """Describe the outline: one entry per node, in row order."""
     tree, names, naming = scene.tree, scene.names, scene.naming
-    members = [np.bincount(column[column >= 0], minlength=len(tree)) for column in tree.node_of_gaussian.T]
+    members = np.bincount(tree.node_of_gaussian.ravel() + 1, minlength=len(tree) + 1)[1:]
     return {
         "version": names.version,
         "levels": [level.label for level in LEVELS],
@@ -108,7 +108,7 @@ def described_nodes(scene: LanguageScene) -> dict[str, Any]:
                 "name": names.of_node.get(node, ""),
                 "called": "" if naming is None else naming.of_node[node] or "?",
                 "surface": naming is not None and naming.surfaces[node],
-                "gaussians": int(members[Level(int(tree.level[node])).index][node]),
+                "gaussians": int(members[node]),
                 "views": int(tree.views[node]),
                 "quality": round(float(tree.quality[node]), 3),
                 "centroid": [round(value, 5) for value in tree.centroid[node].tolist()],

@@ -12,20 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
-from onnx import TensorProto, helper, numpy_helper
+import onnx.parser
 from tokenizers import Tokenizer, models, pre_tokenizers
 
 from hilsplat.base.artifacts import write_index, write_json
 from hilsplat.base.images import write_png
 from hilsplat.base.provenance import Inputs, write_provenance
 from hilsplat.cli.main import app
-from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import index_entry
-from hilsplat.segment.masks import HierarchicalMasks
 from hilsplat.splat.coordinates import write_coordinates
 from hilsplat.splat.ply import save_ply
+from tests.unit.evaluate.builders import cameras_of, masks_of
 from tests.unit.round_gaussians import round_gaussians
 
 HEIGHT, WIDTH = 24, 36
@@ -53,27 +51,19 @@ def region_mask(name: str, shift: int = 0) -> np.ndarray:
 
 def write_colour_clip(folder: Path) -> None:
     """A CLIP of 4-px crops whose vectors are colours."""
-    value = helper.make_tensor_value_info
     table = np.array([GENERIC, *WORDS.values()], np.float32)
     table /= np.linalg.norm(table, axis=1, keepdims=True)
-    vision = [helper.make_node("ReduceMean", ["pixel_values"], ["image_embeds"], axes=[2, 3], keepdims=0)]
-    text = [
-        helper.make_node("Gather", ["table", "input_ids"], ["words"]),
-        helper.make_node("ReduceSum", ["words", "one"], ["text_embeds"], keepdims=0),
-    ]
-    image = value("pixel_values", TensorProto.FLOAT, ["batch", 3, 4, 4])
-    ids = value("input_ids", TensorProto.INT64, ["batch", "words_of_text"])
-    constants = {"table": table, "one": np.array([1])}
+    rows = ", ".join(map(str, table.ravel().tolist()))
+    head = '<ir_version: 9, opset_import: ["": 17]> colours'
+    vision = f"""{head} (float[batch, 3, 4, 4] pixel_values) => (float[batch, 3] image_embeds) {{
+        image_embeds = ReduceMean <axes = [2, 3], keepdims = 0> (pixel_values) }}"""
+    text = f"""{head} (int64[batch, words_of_text] input_ids) => (float[batch, 3] text_embeds)
+        <float[{len(table)}, 3] table = {{{rows}}}, int64[1] one = {{1}}> {{
+        words = Gather (table, input_ids)
+        text_embeds = ReduceSum <keepdims = 0> (words, one) }}"""
     folder.mkdir(parents=True)
-    for name, nodes, given, made, held in (
-        ("vision_model", vision, image, "image_embeds", {}),
-        ("text_model", text, ids, "text_embeds", constants),
-    ):
-        initialisers = [numpy_helper.from_array(array, key) for key, array in held.items()]
-        output = value(made, TensorProto.FLOAT, ["batch", 3])
-        graph = helper.make_graph(nodes, "colours", [given], [output], initialisers)
-        opsets = [helper.make_opsetid("", 17)]
-        onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=9), folder / f"{name}.onnx")
+    for name, graph in (("vision_model", vision), ("text_model", text)):
+        onnx.save(onnx.parser.parse_model(graph), folder / f"{name}.onnx")
     described = {"size": {"shortest_edge": 4}, "crop_size": {"height": 4, "width": 4}}
     described |= {"image_mean": [0, 0, 0], "image_std": [1, 1, 1]}
     (folder / "config.json").write_text(json.dumps({"model_type": "clip"}))
@@ -112,8 +102,7 @@ def _write_scene() -> None:
         photograph = np.zeros((HEIGHT, WIDTH + NUM_VIEWS, 3), np.uint8)
         photograph[:, shift : shift + WIDTH] = canvas
         write_png(SCENE / "scene/images" / name, photograph)
-    sizes = np.full((NUM_VIEWS, 2), (HEIGHT, WIDTH + NUM_VIEWS), np.int32)
-    cameras = Cameras(names, poses, np.tile(K, (NUM_VIEWS, 1, 1)), sizes)
+    cameras = cameras_of(poses, K, (HEIGHT, WIDTH + NUM_VIEWS))
     split = {name: "test" if name == names[-1] else "train" for name in names}
     points = np.zeros((0, 3), np.float32)
     colours = points.astype(np.uint8)
@@ -130,12 +119,8 @@ def _write_scene() -> None:
     write_coordinates(SCENE / "gaussians.ply", scene, gaussians, {"kind": "fitted"})
     masks, entries = SCENE / "default/masks", {}
     for shift, name in enumerate(names[:-1]):
-        dense = np.stack([region_mask(region[0], shift) for region in REGIONS])
-        levels, ones = (
-            np.array([region[1] for region in REGIONS], np.uint8),
-            np.ones(len(REGIONS), np.float32),
-        )
-        found = HierarchicalMasks.from_dense(dense, levels, ones, ones)
+        dense = [region_mask(region[0], shift) for region in REGIONS]
+        found = masks_of(dense, [region[1] for region in REGIONS])
         found.save(masks / f"{name}.npz")
         entries[name] = index_entry(found)
     identity = {"segmenter": "graph", "model": None, "model_sha256": None}

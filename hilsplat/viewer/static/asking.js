@@ -6,7 +6,7 @@ import { acts, choose } from "./choosing.js";
 import { overlay, redraw, restyle } from "./drawing.js";
 import { $, nameOf } from "./elements.js";
 import { asking, keep, showKept, whenReopened } from "./kept.js";
-import { answererOf, failed, host, level, main, outlines, page, panes, tell, threshold, variantOf } from "./state.js";
+import { answererOf, failed, host, level, main, outlines, page, panes, tell, variantOf } from "./state.js";
 import { styleOf } from "./styles.js";
 
 const PICTURE_PX = 512;

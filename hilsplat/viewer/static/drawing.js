@@ -67,10 +67,7 @@ export function drawn() {
   frames++;
   host.dataset.drawn = frames;
   if ($("loading").textContent && !$("loading").dataset.kept) $("loading").textContent = "";
-  if (!document.body.dataset.ready) {
-    document.body.dataset.ready = "yes";
-    performance.mark("first-frame");
-  }
+  document.body.dataset.ready ||= "yes";
   remember();
 }
 

@@ -11,14 +11,12 @@ export function describe() {
   if (!gl) return { works: false, name: "no WebGL2" };
   const info = gl.getExtension("WEBGL_debug_renderer_info");
   const name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-  const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
   gl.getExtension("WEBGL_lose_context")?.loseContext();
-  return { works: true, name, largest, software: /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name) };
+  return { works: true, name, software: /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name) };
 }
 
 export class Renderer {
   kind = "gl";
-  lastMs = 0;
 
   constructor(host, onOrdered) {
     this.canvas = document.createElement("canvas");
@@ -26,7 +24,7 @@ export class Renderer {
     this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
     this.onOrdered = onOrdered;
     this.nodeTextures = new Map();
-    this.sorted = { count: 0, row: null, pending: false, number: 0 };
+    this.sorted = { count: 0, row: null, pending: false };
     this.worker = api.sorter();
     this.worker.onmessage = ({ data }) => this.ordered(data);
   }
@@ -166,7 +164,7 @@ export class Renderer {
 
   // panes: [{variant, style}], side by side with one camera. width and height: of the whole canvas, px.
   draw(camera, panes, width, height) {
-    const gl = this.gl, begin = performance.now();
+    const gl = this.gl;
     this.resize(width, height);
     this.order(camera);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -178,7 +176,6 @@ export class Renderer {
     const each = Math.floor(width / panes.length);
     panes.forEach((pane, k) => this.pane(camera, pane, k * each, each, height, 0));
     this.numbers = null;
-    this.lastMs = performance.now() - begin;
   }
 
   pane(camera, pane, left, width, height, numbering) {

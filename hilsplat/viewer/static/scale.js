@@ -1,7 +1,7 @@
 // The relevancy colour bar, and the number of Gaussians at or above the threshold.
 
 import { $, counted } from "./elements.js";
-import { levelIndex, main, page, panes, threshold } from "./state.js";
+import { levelIndex, main, panes, threshold } from "./state.js";
 import { RAMP } from "./styles.js";
 
 let shown = "";

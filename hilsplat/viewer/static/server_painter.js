@@ -10,7 +10,6 @@ const fetched = async (frame) => createImageBitmap(await api.frame(frame));
 
 export class ServerPainter {
   kind = "server";
-  lastMs = 0;
 
   constructor(host, onDrawn, onError) {
     this.canvas = document.createElement("canvas");
@@ -47,10 +46,8 @@ export class ServerPainter {
   }
 
   async fetch(frames, each, height, number) {
-    const begin = performance.now();
     const pictures = await Promise.all(frames.map(fetched));
     pictures.forEach((picture, k) => { this.context.drawImage(picture, k * each, 0, each, height); picture.close(); });
-    this.lastMs = performance.now() - begin;
     this.drawn = number;
   }
 

@@ -30,5 +30,5 @@ onmessage = ({ data }) => {
   for (let e = 0; e < count; e++) { const at = low[keys[e] & 4095]++; other[at] = rows[e]; otherKeys[at] = keys[e]; }
   const order = data.order && data.order.length >= count ? data.order : new Uint32Array(means.length / 3);
   for (let e = 0; e < count; e++) order[count - 1 - high[otherKeys[e] >>> 12]++] = other[e];
-  postMessage({ order, count, number: data.number }, [order.buffer]);
+  postMessage({ order, count }, [order.buffer]);
 };

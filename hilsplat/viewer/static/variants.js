@@ -2,7 +2,7 @@
 
 import * as api from "./api.js";
 import { ask, listAnswers } from "./asking.js";
-import { acts, choose } from "./choosing.js";
+import { choose } from "./choosing.js";
 import { restyle } from "./drawing.js";
 import { $, counted, make } from "./elements.js";
 import { askKeptAgain, keepFromStart } from "./kept.js";

@@ -14,7 +14,7 @@ import pytest
 
 import hilsplat
 from hilsplat.annotate.labels import Label, label_path, write_labels
-from hilsplat.base.artifacts import read_npy
+from hilsplat.base.artifacts import read_index, read_npy
 from hilsplat.base.errors import ModelError, SettingsError
 from hilsplat.cli.user_commands import scene_folder
 from hilsplat.datasets.registry import open_labelled
@@ -23,7 +23,6 @@ from hilsplat.models.folder import open_model_folder
 from hilsplat.query.answer import answer
 from hilsplat.query.names import NO_FILE, NodeNames
 from hilsplat.scene.finished import FinishedScene
-from hilsplat.scene.scene import Scene
 from tests.unit.artifact_changes import change_index, write_record
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
 
@@ -40,6 +39,13 @@ def elsewhere(tmp_path, monkeypatch) -> Path:
     folder.mkdir()
     monkeypatch.chdir(folder)
     return folder
+
+
+@pytest.fixture
+def copied(desk, elsewhere) -> Path:
+    """Relative path of a scene in a copy of the project, to change."""
+    shutil.copytree(desk, "copy")
+    return Path("copy") / SCENE
 
 
 COMMAND = "from hilsplat.cli.main import main; main()"
@@ -104,15 +110,13 @@ def test_a_moved_results_folder_finds_its_clip_by_digest(desk, elsewhere):
     assert hilsplat.open("archive/outcomes/photos/desk").query("mug") == hits
 
 
-def test_another_clip_is_refused(desk, elsewhere):
-    shutil.copytree(desk, elsewhere / "copy")
-    described = elsewhere / "copy/models/colours/preprocessor_config.json"
+def test_another_clip_is_refused(copied):
+    described = Path("copy/models/colours/preprocessor_config.json")
     described.write_text(described.read_text().replace('"image_std": [1, 1, 1]', '"image_std": [2, 1, 1]'))
-    recorded = json.loads((desk / SCENE / "default/clip/index.json").read_text())
     with pytest.raises(ModelError, match="the CLIP model that embedded the masks in") as caught:
-        hilsplat.open(Path("copy") / SCENE)
+        hilsplat.open(copied)
     message = str(caught.value)
-    assert recorded["model_sha256"][:12] in message
+    assert read_index(copied / "default/clip")["model_sha256"][:12] in message
     assert re.search(r"copy/models/colours with digest [0-9a-f]{12}", message)
     assert "models/clip-tiny with digest" in message  # what the checkout has
     assert "rerun the clip stage" in message
@@ -126,28 +130,24 @@ def test_a_missing_clip_is_reported_with_the_searched_folders(desk, elsewhere, m
         hilsplat.open("desk")
 
 
-def test_the_embedded_clip_warns_that_it_does_not_know_photographs(desk, elsewhere, caplog):
-    shutil.copytree(desk, elsewhere / "copy")
-    with caplog.at_level("WARNING"):
-        assert hilsplat.open(Path("copy") / SCENE).caution == ""  # colours is a CLIP of its own
+def test_the_embedded_clip_warns_that_it_does_not_know_photographs(copied, caplog):
+    assert hilsplat.open(copied).caution == ""  # colours is a CLIP of its own
     assert "meaningless" not in caplog.text
-    card = elsewhere / "copy/models/colours/config.json"
+    card = Path("copy/models/colours/config.json")
     card.write_text(json.dumps({**json.loads(card.read_text()), "world_only": True}))
-    digest = open_model_folder(card.parent).digest
-    change_index(elsewhere / "copy" / SCENE / "default/clip", model_sha256=digest)
-    with caplog.at_level("WARNING"):
-        caution = hilsplat.open(Path("copy") / SCENE).caution
+    change_index(copied / "default/clip", model_sha256=open_model_folder(card.parent).digest)
+    scene = hilsplat.open(copied)
+    caution = scene.caution
     assert caution.startswith("colours was trained only on the synthetic world: its answers")
     assert f"photos/desk: {caution}" in caplog.text
-    assert caution in next(answer(Path("copy") / SCENE, "mug")) and "hilsplat models get" in caution
+    assert caution in next(answer(copied, "mug")) and "hilsplat models get" in caution
     # CLIP isn't used for a name that the user gave
-    named = replace(hilsplat.open(Path("copy") / SCENE), names=NodeNames({0: "the frog"}))
+    named = replace(scene, names=NodeNames({0: "the frog"}))
     assert named.caution_about("The frog") == "" and named.caution_about("the frog > nose") == caution
     # the embedded models were trained on synthetic scenes
-    place = elsewhere / "copy" / SCENE / "scene"
-    for images, expected in ((str(place), caution), ("results/synthetic/x/world/images", "")):
-        write_record(place, inputs={"images": {"path": images}})
-        assert hilsplat.open(Path("copy") / SCENE).caution == expected
+    for images, expected in ((str(copied / "scene"), caution), ("results/synthetic/x/world/images", "")):
+        write_record(copied / "scene", inputs={"images": {"path": images}})
+        assert hilsplat.open(copied).caution == expected
 
 
 def test_a_copy_without_recorded_settings_warns(desk, elsewhere, caplog):
@@ -215,10 +215,8 @@ def test_an_export_does_not_replace_a_folder_with_files(desk, elsewhere, project
     assert (elsewhere / "mine/thesis.txt").read_text() == "years of work"
 
 
-def test_labels_exported_in_the_layout_of_lerf_are_read_back(desk, elsewhere, project):
-    shutil.copytree(desk, elsewhere / "copy")
-    scene = Scene.load(elsewhere / "copy" / SCENE / "scene")
-    (view,), size_hw = scene.views()[:1], scene.cameras[scene.views()[0]].size_hw
+def test_labels_exported_in_the_layout_of_lerf_are_read_back(copied, elsewhere, project):
+    view, size_hw = "000.png", (HEIGHT, WIDTH + NUM_VIEWS)
     ring = [(1, 1), (5, 1), (5, 4), (1, 4)]
     labels = [
         Label(id=3, level=1, text="mug", polygons=[ring, [(7, 1), (8, 1), (8, 2)]]),
@@ -226,9 +224,9 @@ def test_labels_exported_in_the_layout_of_lerf_are_read_back(desk, elsewhere, pr
     ]
     source = elsewhere / "annotated/photos/desk"
     write_labels(label_path(source, view), view, size_hw, labels, NO_FILE)
-    done = run_command(project, "export", str(Path("copy") / SCENE), "--as", "labels", "--data-root", ".")
+    done = run_command(project, "export", str(copied), "--as", "labels", "--data-root", ".")
     assert "labels of 1 views" in done.stdout
-    out = elsewhere / "copy" / SCENE / "export/labels"
+    out = copied / "export/labels"
     assert {path.name for path in out.iterdir()} == {view, f"{Path(view).stem}.json"}
     shutil.copytree(out, elsewhere / "back/annotated/photos/desk")
     before, after = (open_labelled("annotated/photos/desk", root) for root in (elsewhere, elsewhere / "back"))
@@ -258,14 +256,11 @@ def test_exported_langsplat_files_are_read_back(desk, elsewhere, project):
         assert before[rows] == pytest.approx(back, abs=1e-3)
 
 
-def test_variants_open_shared_artifacts_once(desk, tmp_path):
-    shutil.copytree(desk, tmp_path / "copy")
-    scene = tmp_path / "copy" / SCENE
-    (scene / "omega-2").mkdir()
-    shutil.copy(scene / "default/field.safetensors", scene / "omega-2")
-    record = json.loads((scene / "default/field.safetensors.provenance.json").read_text())
-    (scene / "omega-2/field.safetensors.provenance.json").write_text(json.dumps(record))
-    scenes = open_variants(scene, ["default", "omega-2"], 1)
+def test_variants_open_shared_artifacts_once(copied):
+    (copied / "omega-2").mkdir()
+    for part in copied.glob("default/field.safetensors*"):
+        shutil.copy(part, copied / "omega-2")
+    scenes = open_variants(copied, ["default", "omega-2"], 1)
     first, second = scenes["default"], scenes["omega-2"]
     assert first.gaussians is second.gaussians
     assert first.tree is second.tree

@@ -4,7 +4,6 @@ import asyncio
 import json
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
@@ -18,14 +17,9 @@ TOKEN = "secret-of-the-test"
 ADDRESS = "http://127.0.0.1:4000"
 
 
-@pytest.fixture(scope="session")
-def built_desk(desk_project) -> Path:
-    return desk_project
-
-
 @pytest.fixture(scope="module")
-def shown(built_desk) -> ViewerScene:
-    return ViewerScene(built_desk / SCENE)
+def shown(desk_project) -> ViewerScene:
+    return ViewerScene(desk_project / SCENE)
 
 
 def browser_of(app: Guard) -> TestClient:

@@ -123,8 +123,8 @@ def test_field_relevancy_of_every_gaussian(client, scene, shown):
     assert values[nodes == mug.node].mean() > values[nodes != mug.node].mean() + 50
 
 
-def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, built_desk):
-    names_file = built_desk / SCENE / FILE
+def test_names_are_stored_and_matched_and_need_the_last_version(client, scene, desk_project):
+    names_file = desk_project / SCENE / FILE
     outline = client.get("/api/variant/default").json()
     (book,) = ask(client, "book", level="whole")["hits"]
     node = book["node"]
@@ -358,11 +358,11 @@ def test_an_exported_page_contains_everything_it_needs(client, shown):
             assert used in imports, (name, used)
 
 
-def test_gaussians_are_shown_during_a_run_before_queries_work(built_desk, tmp_path):
-    whole, growing = built_desk / SCENE, tmp_path / "photos/desk"
+def test_gaussians_are_shown_during_a_run_before_queries_work(desk_project, tmp_path):
+    whole, growing = desk_project / SCENE, tmp_path / "photos/desk"
     later = ("clip", "autoencoder", "field.safetensors*", "models")
     shutil.copytree(whole, growing, ignore=shutil.ignore_patterns(*later))
-    shutil.copytree(built_desk / "models", tmp_path / "models")
+    shutil.copytree(desk_project / "models", tmp_path / "models")
     shown = ViewerScene(growing)
     with browsing(shown) as client:
         assert client.get("/api/scene").json()["variants"] == []
@@ -382,11 +382,11 @@ def test_gaussians_are_shown_during_a_run_before_queries_work(built_desk, tmp_pa
         assert ask(client, "mug", answerer="field")["hits"]
 
 
-def test_a_scene_with_too_many_gaussians_is_refused(built_desk, monkeypatch):
+def test_a_scene_with_too_many_gaussians_is_refused(desk_project, monkeypatch):
     monkeypatch.setattr("hilsplat.viewer.viewer_scene.MAX_GAUSSIANS", 100)
     message = r"too large for the page\n.*at most 100 Gaussians\n.*\n.*max_gaussians"
     with pytest.raises(ArtifactError, match=message):
-        ViewerScene(built_desk / SCENE)
+        ViewerScene(desk_project / SCENE)
 
 
 def test_a_scene_without_gaussians_is_refused(tmp_path):

@@ -18,9 +18,9 @@ from tests.unit.viewer.conftest import browsing
 
 
 @pytest.fixture
-def desk(built_desk, tmp_path) -> Path:
+def desk(desk_project, tmp_path) -> Path:
     """A copy of the finished desk, to change."""
-    shutil.copytree(built_desk, tmp_path / "project")
+    shutil.copytree(desk_project, tmp_path / "project")
     return tmp_path / "project" / SCENE
 
 

