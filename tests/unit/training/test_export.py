@@ -17,7 +17,6 @@ from models.training.sam import (
     SamDecoder,
     SamEncoder,
     positional_embeddings,
-    shared_features,
 )
 
 
@@ -89,22 +88,20 @@ def test_the_preview_is_every_second_row_and_column_of_the_masks(sam):
 
 
 @pytest.mark.parametrize("cells", [16, 23])
-def test_masks_decoded_in_bands_equal_masks_decoded_at_once(sam, cells):
+def test_masks_decoded_in_bands_equal_masks_decoded_by_pixel(sam, cells):
     _, decoder, _ = sam
     generator = torch.Generator().manual_seed(cells)
     embeddings = torch.randn(2, EMBEDDING, cells, cells, generator=generator)
     positional = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]] * 2), cells)
     points, labels = torch.rand(2, 3, 1, 2, generator=generator) * 60, torch.ones(2, 3, 1, dtype=torch.int64)
+    prompts = points, labels, embeddings, positional
+    every = torch.arange((2 * cells) ** 2).reshape(2 * cells, 2 * cells)
+    every, few = (pixels.reshape(1, 1, -1).expand(2, 3, -1) for pixels in (every, every[::2, ::2]))
     with torch.no_grad():
-        scores, logits = decoder(points, labels, embeddings, positional)
-        place = torch.cat([embeddings, positional], dim=1)
-        token, first, bias, second, shift = decoder.written(points, labels, place)
-        shared = shared_features(embeddings, positional)[:, None, :-1].flatten(3)
-        expected = second @ torch.relu(first @ shared + bias[..., None]) + shift[..., None]
-        expected = expected.reshape(2, 3, 3, 2 * cells, 2 * cells)
-        every_fourth = expected[..., ::2, ::2].flatten(3)
-        expected_scores = decoder.predicted_iou(token, every_fourth, torch.full((1, 1, 1), 4.0))
-    assert (logits - expected).abs().max() < 1e-5 * expected.abs().max()
+        scores, logits = decoder(*prompts)
+        _, expected = decoder.at_pixels(*prompts, every, torch.ones(every.shape))
+        expected_scores, _ = decoder.at_pixels(*prompts, few, torch.full(few.shape, 4.0))
+    assert (logits.flatten(3) - expected).abs().max() < 1e-5 * expected.abs().max()
     assert torch.allclose(scores, expected_scores, atol=1e-5)
 
 

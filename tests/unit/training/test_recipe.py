@@ -12,12 +12,9 @@ from models.training.settings import TrainingSettings
 from models.training.train import train_models
 
 
-def test_only_training_scenes_are_rendered_for_training():
+def test_no_scene_is_both_trained_and_measured_on():
     with pytest.raises(SceneError, match="not in the training split"):
         scene_of_seed(201)
-
-
-def test_no_scene_is_both_trained_and_measured_on():
     trained, measured = training_seeds(5, 3)
     assert trained == [1_000_000, 1_000_001, 1_000_002, 1_000_003, 1_000_004]
     assert measured == [1_999_997, 1_999_998, 1_999_999]

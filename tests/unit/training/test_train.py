@@ -11,7 +11,6 @@ from models.training.crops import list_crops
 from models.training.loop import Budget, Tuning, learning_rate
 from models.training.measure_clip import measure_clip, measure_queries
 from models.training.measure_sam import draw_regions, measure_everything
-from models.training.sam import positional_embeddings
 from models.training.sam_loss import segmentation_loss
 from models.training.train_clip import train_clip
 from models.training.train_sam import train_sam
@@ -22,15 +21,9 @@ WINDOWS = {"stages": SMALL, "grown_stages": (CropStage(1.0, 64, 2, 12, 96),)}
 FAST = Tuning(peak=3e-3, warmup=4, average=0.8, measure_every=8, save_every=8)
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def test_the_segmenter_learns(tmp_path):
     views, unseen = drawn_views(6, 64), drawn_views(2, 64, seed=9)
-    state = tmp_path_factory.mktemp("state")
-    return train_sam(views, unseen, Budget(steps=24), 0, state, **WINDOWS, tuning=FAST)
-
-
-def test_the_segmenter_learns(trained):
-    _, _, curve = trained
+    _, _, curve = train_sam(views, unseen, Budget(steps=24), 0, tmp_path, **WINDOWS, tuning=FAST)
     assert [row["step"] for row in curve] == [8, 16, 24]
     assert curve[-1]["mask_loss"] < 0.8 * curve[0]["mask_loss"]
     assert curve[-1]["semantic_loss"] < curve[0]["semantic_loss"]
@@ -92,21 +85,6 @@ def test_segmentation_loss_is_near_zero_for_the_ground_truth_and_ignores_unknown
     one_wrong = torch.cat([right[:, :, :2], wrong[:, :, 2:]], dim=2)
     partly = torch.tensor([[[1.0, 1.0, 0.0]]])
     assert sum(segmentation_loss(partly, one_wrong, truth, weights, partly)).item() < 1e-3
-
-
-def test_logits_at_sampled_pixels_equal_those_of_the_whole_mask(trained):
-    encoder, decoder, _ = trained
-    generator = torch.Generator().manual_seed(0)
-    pixels = torch.randn(2, 3, 64, 64, generator=generator)
-    points, labels = torch.full((2, 3, 1, 2), 20.0), torch.ones((2, 3, 1), dtype=torch.int64)
-    positional = positional_embeddings(torch.tensor([[0.0, 0.0, 1.0]] * 2), 16)
-    places = torch.randint(0, 32 * 32, (2, 3, 50), generator=generator)
-    with torch.no_grad():
-        embeddings = encoder(pixels)
-        _, masks = decoder(points, labels, embeddings, positional)
-        _, sampled = decoder.at_pixels(points, labels, embeddings, positional, places, torch.ones(2, 3, 50))
-    expected = masks.flatten(3).gather(3, places[:, :, None].expand(-1, -1, 3, -1))
-    assert torch.allclose(sampled, expected, atol=1e-3)
 
 
 def test_only_large_regions_are_measured():
