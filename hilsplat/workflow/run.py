@@ -129,6 +129,7 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", "-C", nargs="*", action="extend", default=[])
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", type=Path, default=[])
+    parser.add_argument("--cores", "-c")
     given, others = parser.parse_known_args(list(options))
     configs = [project_path(path) for path in (*configs, *given.configfile)]
     try:
@@ -157,8 +158,8 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     command = ["snakemake", "--snakefile", str(_snakefile(configs)), *others]
     command += ["--configfile", *map(str, configs)] if configs else []
     command += ["--config", *given.config] if given.config else []
-    if not _has(others, *ELSEWHERE, "--cores", "-c", "--jobs", "-j"):
-        command += ["--cores", str(_all_cores())]
+    if given.cores or not _has(others, *ELSEWHERE, "--jobs", "-j"):
+        command += ["--cores", given.cores or str(_all_cores())]
     if _has(others, "-n", "--dry-run", "--dryrun"):
         return _start(command, plan, targets, scenes)
     try:
@@ -170,7 +171,8 @@ def run(targets: Sequence[str], configs: Sequence[Path], options: Sequence[str])
     with lock:
         _recover(command, plan.results)
         if not _has(others, *ELSEWHERE):
-            for line in forecasts(plan, _cores_of(command)):
+            cores = int(given.cores) if given.cores and given.cores.isdigit() else 0
+            for line in forecasts(plan, cores or _all_cores()):
                 logger.info("%s", line)
         mark_run()
         status = _start(command, plan, targets, scenes)
@@ -234,14 +236,6 @@ def _has(words: Sequence[str], *options: str) -> bool:
         for word in words
         for option in options
     )
-
-
-def _cores_of(command: Sequence[str]) -> int:
-    """Return the number after `--cores`, or all cores of this process."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--cores", "-c", default="all")
-    cores = parser.parse_known_args(list(command))[0].cores
-    return int(cores) if cores.isdigit() and int(cores) else _all_cores()
 
 
 def _all_cores() -> int:

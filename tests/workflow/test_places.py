@@ -33,13 +33,13 @@ def clone(plain: Project) -> Project:
 
 
 def plan_of(project: Project, folder: Path, *words: str) -> str:
-    """Return what a dry run in another folder prints."""
+    """Return the output of a dry run in another folder."""
     command = [sys.executable, "-m", "snakemake", "-n", "--cores", "2", *words]
     return Project(folder).run(*command, PYTHONPATH=str(project.root)).stdout
 
 
 def written_files(root: Path) -> dict[Path, int]:
-    """When each file was written. Bytecode doesn't count: to root no folder is read-only."""
+    """Return each file's modification time, except bytecode: root can write to read-only folders."""
     return {
         path: path.stat().st_mtime_ns
         for path in root.rglob("*")

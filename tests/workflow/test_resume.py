@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from hilsplat.base.artifacts import read_index
+from hilsplat.scene.scene import Scene
 from tests.unit.artifact_changes import change_index
 from tests.workflow.conftest import SCENE, Project
 
 
 def finished_entries(cache: Path) -> list[Path]:
-    """Entries of a cache; what is hidden is incomplete."""
+    """Return the complete entries of a cache; hidden ones are incomplete."""
     return [file for file in cache.rglob("*.npz") if "/." not in str(file.relative_to(cache.parent))]
 
 
@@ -60,16 +62,13 @@ def test_a_killed_stage_resumes(copy_of_finished: Project, name: str, entries: i
     resumed = project.run(*command)
     assert project.files(path) == expected
     if path.is_dir():
-        assert all(file.exists() for file in kept), "finished views were thrown away"
+        assert all(file.exists() for file in kept), "finished views were recomputed"
         views = entries // ENTRIES.get(path.name, 1)
         assert int(re.search(r"from_cache (\d+)", resumed.stderr)[1]) >= views
 
 
 def test_one_more_view_costs_one_view(copy_of_finished: Project) -> None:
     """When a view is added, masks and CLIP of the other views come from the cache."""
-    from hilsplat.base.artifacts import read_index
-    from hilsplat.scene.scene import Scene
-
     project = copy_of_finished
     folder = project.root / SCENE
     scene = Scene.load(folder / "scene")

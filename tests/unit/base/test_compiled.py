@@ -30,7 +30,7 @@ print(loop(2), sum(loop.stats.cache_hits.values()))
 
 @pytest.fixture
 def package(project: Path, tmp_path: Path) -> Path:
-    """A package `hilsplat` of a compiled loop that calls a compiled loop of another module."""
+    """A package `hilsplat` with a compiled loop that calls one in another module."""
     root = tmp_path / "hilsplat"
     shutil.copytree(project / "hilsplat/base", root / "base", ignore=shutil.ignore_patterns("__pycache__"))
     for name, text in {"__init__": "", **MODULES}.items():
@@ -39,7 +39,7 @@ def package(project: Path, tmp_path: Path) -> Path:
 
 
 def call(package: Path, *edit: str) -> tuple[int, int]:
-    """Result of `loop(2)` in a new process that edits a module before the call, and hits of the cache."""
+    """Return `loop(2)` from a new process that first edits a module, and the number of cache hits."""
     environment = {**os.environ, "PYTHONPATH": str(package.parent)}
     environment.pop("NUMBA_CACHE_DIR", None)
     command = [sys.executable, "-c", CALL, *edit]

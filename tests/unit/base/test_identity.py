@@ -17,7 +17,7 @@ from hilsplat.workflow.stages import STAGES
 
 
 def package(folder: Path, **modules: str) -> Path:
-    """A package `hilsplat` with the given modules; `sub_b` is the module `hilsplat.sub.b`."""
+    """Write a package `hilsplat` with these modules; `sub_b` is `hilsplat.sub.b`."""
     root = folder / "hilsplat"
     for name, text in modules.items():
         path = root.joinpath(*name.split("_")).with_suffix(".py")
@@ -29,13 +29,13 @@ def package(folder: Path, **modules: str) -> Path:
 
 
 def found(folder: Path, **modules: str) -> set[str]:
-    """What hilsplat.a:g reaches, without the package's name."""
+    """Return the names that hilsplat.a:g reaches, without the package."""
     root = package(folder, **modules)
     return {name.removeprefix("hilsplat.") for name in reached("hilsplat.a:g", root=root)}
 
 
 def same(folder: Path, one: dict[str, str], other: dict[str, str]) -> bool:
-    """Whether hilsplat.a:g has the same digest in two packages."""
+    """Return whether hilsplat.a:g has the same digest in two packages."""
     digests = {
         code_digest("hilsplat.a:g", root=package(folder / str(number), **modules))
         for number, modules in enumerate((one, other))
@@ -195,7 +195,7 @@ def copy(project: Path, tmp_path: Path) -> Path:
 
 
 def changed(copy: Path, project: Path, places: dict[str, str] = STAGES, *roots: str) -> set[str]:
-    """Names of the places whose digest is another than that of the project."""
+    """Return the places whose digest differs from the project's."""
     digests = [
         {name: code_digest(*roots, place, root=root) for name, place in places.items()}
         for root in (copy, project / "hilsplat")
@@ -283,7 +283,7 @@ def test_a_digest_is_computed_once_until_a_module_changes(tmp_path, monkeypatch)
     first = code_digest("hilsplat.a:g", root=root)
     forget()
     with monkeypatch.context() as patch:
-        patch.setattr(identity, "_digest_of", None)  # a second process does not look again
+        patch.setattr(identity, "_digest_of", None)  # a second process reads the stored digest
         assert code_digest("hilsplat.a:g", root=root) == first
     forget()
     (root / "b.py").write_text(BASE["b"].replace("ONE = 1", "ONE = 100"))

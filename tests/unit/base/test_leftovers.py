@@ -1,4 +1,4 @@
-"""Killed writers leave artifacts whole, and the next clean-up removes what they did not finish."""
+"""Killed writers leave artifacts whole, and the next clean-up removes unfinished files."""
 
 import os
 import signal
@@ -80,7 +80,7 @@ while is_killed:
 
 
 def after_kills(kind: str, folder: Path) -> list[str]:
-    """Content of an artifact and names of leftovers, after kills before every line of the writer."""
+    """Return the artifact and leftover names after a kill before each line of the writer."""
     command = [sys.executable, "-c", KILL, kind, str(folder)]
     return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()
 
@@ -110,7 +110,7 @@ with {writer}(sys.argv[1]) as temporary:
 
 @pytest.fixture(params=["atomic_path", "atomic_folder"])
 def writers(tmp_path, request) -> Iterator[list[subprocess.Popen]]:
-    """Processes that write, with process numbers of a dead and of a living process here."""
+    """Writing processes that have the ids of a dead and of a live process here."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     script = WRITER.format(writer=request.param)

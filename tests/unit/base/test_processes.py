@@ -50,14 +50,14 @@ job.wait()
 
 
 def ended(stream) -> bool:
-    """Whether every process that holds the other end of a pipe ended within ten seconds."""
+    """Return whether each process with the other end of a pipe ended within ten seconds."""
     readable, _, _ = select.select([stream], [], [], 10)
     return bool(readable) and stream.read() == b""
 
 
 @pytest.mark.parametrize("between", ["exec ", "true; ", "(", "sh -c '(\"$@\"); true' sh "])
 def test_a_job_ends_with_the_workflow_that_started_it(between):
-    """Also if a shell stands between the two, as with an activated environment."""
+    """A shell may be in between, as with an activated environment."""
     command = f"{between}{shlex.join([sys.executable, '-c', JOB])}{')' if between == '(' else ''}"
     workflow = subprocess.Popen([sys.executable, "-c", WORKFLOW, command], stdout=subprocess.PIPE)
     assert workflow.stdout.readline() and workflow.stdout.readline() == b"started\n"
