@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tests.workflow.conftest import Project
 
-COMMAND = [sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2"]
+COMMAND = (sys.executable, "-m", "hilsplat", "run", "--config", "config/ci.yaml", "--", "--cores", "2")
 POLL_S = 0.25
 LEFT_KIB = 64  # space left on a full disk
 WAKE_S = 60  # maximum time in which a job that was frozen at its start detects that its Snakemake has ended
@@ -48,14 +48,7 @@ class Run:
         self._log = project.root / "said.log"
         self._filler = project.root / "results/filler"
         with self._log.open("w") as stream:
-            self.process = subprocess.Popen(
-                COMMAND,
-                cwd=project.root,
-                env=project.environment(),
-                stdout=stream,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            self.process = project.start(*COMMAND, output=stream)
 
     def said(self) -> str:
         """Return the end of its output."""
@@ -141,22 +134,17 @@ class Run:
     def clean_up_elsewhere(self, chance: random.Random) -> None:
         """Clean up the shared folder as another machine of the same name, with other process numbers."""
         code = "import sys; from hilsplat.base import processes; processes.remove_leftovers(sys.argv[1])"
-        command = ["unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results"]
-        ended = self._beside(command)
+        command = ("unshare", "--pid", "--fork", "--mount-proc", sys.executable, "-c", code, "results")
+        ended = self.project.run(*command, check=False)
         if ended.returncode:
             self.problems.append(f"no clean-up in another process namespace: {ended.stderr}")
 
     def run_twice(self, chance: random.Random) -> None:
         """Start a second run in the same project, which must refuse without disturbing the first."""
-        second = self._beside(COMMAND)
+        second = self.project.run(*COMMAND, check=False)
         said = second.stdout + second.stderr
         if self.is_running() and (second.returncode == 0 or "another hilsplat run" not in said):
             self.problems.append(f"a second run was not refused:\n{said}")
-
-    def _beside(self, command: list[str]) -> "subprocess.CompletedProcess[str]":
-        """Run a command in the project, and return it with its output."""
-        root, environment = self.project.root, self.project.environment()
-        return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
 
 
 def mounted(folder: Path, *options: str) -> bool:

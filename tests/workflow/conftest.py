@@ -8,6 +8,7 @@ import sys
 import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -36,10 +37,10 @@ class Project:
             )
         return result
 
-    def start(self, *command: str) -> subprocess.Popen:
-        """Start a silent command there, in its own process group."""
+    def start(self, *command: str, output: IO[str] | int = subprocess.DEVNULL) -> subprocess.Popen:
+        """Start a command there, in its own process group."""
         where = {"cwd": self.root, "env": self.environment(), "start_new_session": True}
-        return subprocess.Popen(command, **where, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        return subprocess.Popen(command, **where, stdout=output, stderr=output)
 
     def environment(self, **more: str) -> dict[str, str]:
         """Return the environment variables for running the copy's `hilsplat` and `snakemake`."""
