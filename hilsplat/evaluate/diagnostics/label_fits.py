@@ -1,5 +1,7 @@
 """Best IoU of any mask or node with annotated regions, by level: the upper limit for any query."""
 
+import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,6 +90,15 @@ def nodes_of_view(tree: SemanticTree, weights: sp.csr_matrix) -> dict[Level, np.
     return found
 
 
+def masks_of_view(path: Path) -> dict[Level, Bool[np.ndarray, "M P"]]:
+    """Load the masks of a view, by level; a level may have none."""
+    masks = HierarchicalMasks.load(path)
+    rows = {level: masks.rows_of(level) for level in LEVELS}
+    return {
+        level: masks.dense(own).reshape(len(own), math.prod(masks.size_hw)) for level, own in rows.items()
+    }
+
+
 def run_label_fits(
     folder: Path, variant: str, labels: str, data_root: Path, out: Path, threads: int = 1
 ) -> str:
@@ -104,7 +115,7 @@ def run_label_fits(
     truths_of(labelled, scene, 0)  # raises if they don't fit
     tree = SemanticTree.load(folder / variant / "semantic_tree")
     gaussians = load_ply(folder / "gaussians.ply")
-    fits: dict[tuple[str, str], dict[Level, Fits]] = {}
+    fits = defaultdict[tuple[str, str], dict[Level, Fits]](lambda: {level: Fits() for level in LEVELS})
     with stage_log("label_fits", scene.name) as counts:
         for view in track(list(labelled.views), "views compared"):
             camera = scene.cameras[view]
@@ -113,14 +124,9 @@ def run_label_fits(
             raw = pixel_weights(gaussians, camera, min_weight=tree.min_weight, threads=threads)
             found = {"nodes": nodes_of_view(tree, normalised_weights(raw))}
             if (masks / f"{view}.npz").is_file():
-                own = HierarchicalMasks.load(masks / f"{view}.npz")
-                dense = {level: own.dense(own.rows_of(level)) for level in LEVELS}
-                flat = {level: each.reshape(len(each), -1) for level, each in dense.items()}
-                found[f"masks, {masks_label(masks)}"] = flat
+                found[f"masks, {masks_label(masks)}"] = masks_of_view(masks / f"{view}.npz")
             for what, by_level in found.items():
-                add_view(
-                    fits.setdefault((what, split), {level: Fits() for level in LEVELS}), regions, by_level
-                )
+                add_view(fits[what, split], regions, by_level)
         counts["views"] = len(labelled.views)
     rows = [
         [scene.name, what, split, level.label, *each[level].row()]

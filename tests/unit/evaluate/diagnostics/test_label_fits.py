@@ -6,9 +6,9 @@ import numpy as np
 
 from hilsplat.annotate.labels import Label, label_path, traced, write_labels
 from hilsplat.base.levels import Level
-from hilsplat.evaluate.diagnostics.label_fits import Fits, add_view, run_label_fits
+from hilsplat.evaluate.diagnostics.label_fits import Fits, add_view, masks_of_view, run_label_fits
 from hilsplat.query.names import NO_FILE
-from tests.unit.evaluate.builders import box, region_of
+from tests.unit.evaluate.builders import box, masks_of, region_of
 from tests.unit.finished_desk import HEIGHT, NUM_VIEWS, SCENE, WIDTH, region_mask
 
 
@@ -33,6 +33,12 @@ def test_levels_are_compared_with_their_own_and_with_all_and_children_with_their
     assert fits[Level.WHOLE].best == [7 / 8] and fits[Level.WHOLE].containment == []
     assert fits[Level.PART].best == [2 / 4] and fits[Level.PART].anywhere == [1.0]
     assert fits[Level.PART].containment == [1 / 2]  # pixel 1 of the rim's best mask 0..1 is in the mug's 1..7
+
+
+def test_a_view_may_lack_masks_at_a_level(tmp_path):
+    masks_of([strip(0, 4), strip(2, 8)], [1, 1]).save(tmp_path / "v.npz")
+    shapes = {level: masks.shape for level, masks in masks_of_view(tmp_path / "v.npz").items()}
+    assert shapes == {Level.WHOLE: (2, 12), Level.PART: (0, 12), Level.SUBPART: (0, 12)}
 
 
 def test_a_finished_scene_is_measured_by_level_and_split(desk_project, tmp_path):
