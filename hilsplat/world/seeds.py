@@ -1,7 +1,5 @@
 """Scene seeds reserved for training the small models, for development, and for the benchmark."""
 
-from hilsplat.base.errors import SceneError
-
 TRAINING_SEEDS = range(1_000_000, 2_000_000)
 """Scenes on which the small embedded models are trained."""
 
@@ -20,15 +18,3 @@ def split_of_seed(seed: int) -> str:
         if seed in seeds:
             return split
     return "free"
-
-
-def require_split(seed: int, split: str) -> None:
-    """Raise `SceneError` if a scene seed is not in one of `SPLITS`."""
-    seeds = SPLITS[split]
-    if seed not in seeds:
-        raise SceneError(
-            f"scene seed {seed} is not in the {split} split",
-            expected=f"{seeds.start} to {seeds.stop - 1}",
-            found=f"{seed}, split {split_of_seed(seed)}",
-            fix="use a seed from this split; scenes for training and for evaluation must differ",
-        )

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hilsplat.base.artifacts import read_npz, sha256_of_bytes, sha256_of_json, write_npz
-from hilsplat.base.errors import ArtifactError
+from hilsplat.base.errors import ArtifactError, SceneError
 from hilsplat.base.levels import LEVELS, Level
 from hilsplat.base.processes import in_processes
 from hilsplat.base.progress import track
@@ -20,7 +20,7 @@ from hilsplat.world.objects.catalogue import CLASSES, GENERATOR_VERSION, build_o
 from hilsplat.world.render import label_view, render_view
 from hilsplat.world.scenes.kinds import KINDS, build_scene, training_camera
 from hilsplat.world.scenes.scene import WorldScene
-from hilsplat.world.seeds import TRAINING_SEEDS, require_split
+from hilsplat.world.seeds import TRAINING_SEEDS, split_of_seed
 from models.training.data import LabelledNode, LabelledViews
 from models.training.sam import FRAME_PX
 
@@ -70,7 +70,13 @@ def kind_of_seed(seed: int) -> tuple[str, int]:
 
 def scene_of_seed(seed: int) -> WorldScene:
     """Build a training scene; raise SceneError if the seed is not in the training split."""
-    require_split(seed, "training")
+    if seed not in TRAINING_SEEDS:
+        raise SceneError(
+            f"scene seed {seed} is not in the training split",
+            expected=f"{TRAINING_SEEDS.start} to {TRAINING_SEEDS.stop - 1}",
+            found=f"{seed}, split {split_of_seed(seed)}",
+            fix="use a seed from this split; scenes for training and for evaluation must differ",
+        )
     kind, objects = kind_of_seed(seed)
     return build_scene(kind, seed, objects)
 

@@ -10,7 +10,7 @@ from hilsplat.base.errors import SceneError
 from hilsplat.world.scenes import tabletop
 from hilsplat.world.scenes.kinds import build_scene, scene_cameras
 from hilsplat.world.scenes.tabletop import TABLE_RADIUS
-from hilsplat.world.seeds import SPLITS, require_split, split_of_seed
+from hilsplat.world.seeds import SPLITS, split_of_seed
 
 
 def test_splits_of_seeds_are_disjoint():
@@ -19,12 +19,6 @@ def test_splits_of_seeds_are_disjoint():
     assert [split_of_seed(seed) for seed in (99, 100, 199, 200, 299, 300, 1_000_000, 1_999_999)] == [
         "free", "development", "development", "benchmark", "benchmark", "free", "training", "training",
     ]  # fmt: skip
-
-
-def test_a_seed_from_another_split_is_refused():
-    require_split(201, "benchmark")
-    with pytest.raises(SceneError, match=r"seed 201 is not in the training split"):
-        require_split(201, "training")
 
 
 KINDS = ("tabletop", "room", "street")
