@@ -224,7 +224,7 @@ class RunSettings(StageSettings):
             SettingsError: the variant is unknown or an override cannot be used.
         """
         variant, _ = _parts_of(variant)
-        merged = {name: getattr(self, name).model_dump() for name in SECTIONS}
+        sections: dict[str, Section] = {name: getattr(self, name) for name in SECTIONS}
         layers = [(f"overrides.{scope}", self.overrides.get(scope, {})) for scope in scopes]
         if variant != "default" or variant in self.variants:
             if variant not in self.variants:
@@ -245,12 +245,12 @@ class RunSettings(StageSettings):
                         expected=f"one of {', '.join(VARIANT_SECTIONS)}",
                         fix="put it under overrides for a group or a scene, or in another configuration file",
                     )
-                merged[section].update(values)
+                changed = sections[section].model_dump() | values
                 try:
-                    SECTIONS[section].model_validate(merged[section])
+                    sections[section] = SECTIONS[section].model_validate(changed)
                 except ValidationError as error:
                     raise settings_error(error, f"{where}.{section}", SECTIONS[section]) from error
-        return StageSettings.model_validate(merged)
+        return StageSettings.model_validate(sections)
 
 
 def _parts_of(name: str) -> tuple[str, int]:

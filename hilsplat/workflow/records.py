@@ -170,11 +170,10 @@ class Records:
             return DAMAGED, "its provenance is damaged"
         if record is None:
             return DAMAGED, "it has no provenance"
-        damage = self._damage(artifact, record)
-        reason = next(self._differences(record, expected), None)
-        if damage:
+        if damage := self._damage(artifact, record):
             return DAMAGED, damage
-        return (STALE, reason) if reason else (WHOLE, "")
+        reason = next(self._differences(record, expected), "")
+        return (STALE if reason else WHOLE), reason
 
     def _damage(self, artifact: Path, record: Provenance) -> str | None:
         """Return the first file that is missing or differs from what was written, or None."""
