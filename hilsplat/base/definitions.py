@@ -303,10 +303,8 @@ def _bound_in(body: Iterable[ast.AST], package: str) -> dict[str, Import | None]
             names.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):
             imports |= _imports(node, package)
-        elif isinstance(node, ast.ExceptHandler | ast.MatchAs | ast.MatchStar) and node.name:
+        elif isinstance(node, ast.ExceptHandler) and node.name:
             names.add(node.name)
-        elif isinstance(node, ast.MatchMapping) and node.rest:
-            names.add(node.rest)
         elif isinstance(node, ast.Global):
             declared_global |= set(node.names)
     return {**dict.fromkeys(names - declared_global), **imports}
