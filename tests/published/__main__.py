@@ -85,12 +85,7 @@ LARGEST_FACTOR = 1.5
 
 
 def write_data(work: Path, root: Path) -> None:
-    """Write one scene of each data set.
-
-    Args:
-        work: for the synthetic scenes.
-        root: the data root.
-    """
+    """Write one scene of each data set below the data root, from synthetic scenes in `work`."""
     for kind in ("tabletop", "room", "street"):
         run_world(f"world:{kind}:{SEED}", WORLD, work / kind, threads=2)
     table = TrueWorld.open(work / "tabletop")
@@ -132,7 +127,7 @@ def rehearse(work: Path, cores: int) -> int:
     start = time.monotonic()
     project.run(*command, "--", "--cores", str(cores))
     taken = (time.monotonic() - start) / 3600
-    problems = [*unfilled(project.root / "results" / "tables")]
+    problems = unfilled(project.root / "results" / "tables")
     if not 1 / LARGEST_FACTOR <= taken / hours <= LARGEST_FACTOR:
         problems.append(f"the run took {taken:.2f} hours, and the dry run said {hours:.2f}")
     for problem in problems:
@@ -147,15 +142,13 @@ def unfilled(tables: Path) -> list[str]:
     for name in TABLES:
         with (tables / f"{name}.csv").open(encoding="utf-8") as stream:
             measured = [row for row in csv.DictReader(stream) if row["kind"] == "measured"]
-        missing = {*MEASURED.get(name, ())} - {row["data"] for row in measured}
         if not measured and name not in MEASURED:
             found.append(f"table {name} has no measured row")
+        missing = {*MEASURED.get(name, ())} - {row["data"] for row in measured}
         found += [f"table {name} has no measured row of {dataset}" for dataset in sorted(missing)]
-        found += [
-            f"no measured row of table {name} has a value in column {column}"
-            for column in FILLED.get(name, ())
-            if not any(row.get(column) for row in measured)
-        ]
+        for column in FILLED.get(name, ()):
+            if not any(row.get(column) for row in measured):
+                found.append(f"no measured row of table {name} has a value in column {column}")
     return found
 
 

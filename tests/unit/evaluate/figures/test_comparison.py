@@ -36,14 +36,6 @@ def test_tree_and_field_of_an_exact_world_answer_with_the_truth(block_world, row
             assert np.count_nonzero(mask != row.truth) <= 0.05 * row.truth.size, (method, row.text)
 
 
-def test_titles_name_the_method_and_its_iou(block_world, rows):
-    methods = [Answerer("hilsplat (tree)", "tree", block_world.answers)]
-    figure = draw_methods(methods, rows[1], EVALUATE)
-    titles = [axes.get_title() for axes in figure.get_axes()]
-    assert titles[:2] == ["truth, 001.png", "hilsplat (tree)\nIoU 1.00"]
-    assert len(titles) == 2 * len(rows[1])
-
-
 def test_many_methods_are_rows_and_queries_columns(block_world, rows):
     methods = [
         Answerer(f"method {n}", "tree", block_world.answers) for n in range(comparison.MAX_COLUMNS + 1)
