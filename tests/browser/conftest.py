@@ -14,11 +14,11 @@ import pytest
 
 import hilsplat
 from hilsplat.base.images import write_png
-from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.splat.gaussians import Gaussians
 from hilsplat.splat.ply import save_ply
 from tests.conftest import PROJECT
+from tests.unit.evaluate.builders import cameras_of
 from tests.unit.finished_desk import SCENE
 
 HOW = "apt-get install chromium libgl1-mesa-dri libegl1; pip install -e '.[browser-tests]'"
@@ -65,6 +65,12 @@ def desk(desk_project) -> Path:
 
 
 @pytest.fixture
+def own_desk(desk_project, tmp_path) -> Path:
+    """A copy of the desk, to change."""
+    return shutil.copytree(desk_project, tmp_path / "project") / SCENE
+
+
+@pytest.fixture
 def scene(desk):
     return hilsplat.open(desk)
 
@@ -93,13 +99,11 @@ def cloud(tmp_path_factory) -> Path:
     poses[:, 2, 3] = 4.0
     poses[:, 0, 3] = (-1, 0, 1)
     K = np.array([[300.0, 0, 190], [0, 310, 150], [0, 0, 1]])
-    names = ("000.png", "001.png", "002.png")
-    cameras = Cameras(names, poses, np.tile(K, (3, 1, 1)), np.full((3, 2), (300, 400), np.int32))
+    cameras = cameras_of(poses, K, (300, 400))
     points = np.zeros((0, 3), np.float32)
-    split = dict.fromkeys(names, "train")
+    split = dict.fromkeys(cameras.names, "train")
     scene = folder / "scene"
-    (scene / "images").mkdir(parents=True)
-    for name in names:
+    for name in cameras.names:
         write_png(scene / "images" / name, np.full((300, 400, 3), 90, np.uint8))
     Scene(scene, "photos/cloud", "metre", cameras, split, points, points.astype(np.uint8), np.eye(4)).save()
     return folder

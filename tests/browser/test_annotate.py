@@ -1,7 +1,6 @@
 """The annotation page in a real browser; elements are found by role and label."""
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,14 +19,8 @@ SIZE = (HEIGHT, WIDTH + NUM_VIEWS)
 
 
 @pytest.fixture
-def root(tmp_path) -> Path:
-    """Where annotations are written."""
-    return tmp_path
-
-
-@pytest.fixture
-def page(opened, browser, desk, root) -> Iterator:
-    with serving(desk, "annotate", "--data-root", str(root)) as address:
+def page(opened, desk, tmp_path) -> Iterator:
+    with serving(desk, "annotate", "--data-root", str(tmp_path)) as address:
         page = opened(address)
         yield page
         page.close()  # before its server ends, because the page polls it
@@ -100,24 +93,24 @@ def offers_at(page, x: int, y: int):
     return offers
 
 
-def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, root):
+def test_a_whole_and_its_part_are_drawn_cut_saved_and_scored(page, tmp_path):
     draw_mug(page)
     page.locator("#view").press("j")  # a part of it
     name(page, "handle")
     polygon(page, (10, 4), (30, 4), (30, 10), (10, 10))
     assert things(page) == ["mug, whole", "handle, part"]
-    mug, handle = kept(root)
+    mug, handle = kept(tmp_path)
     assert (handle.parent, handle.level, handle.origin) == (mug.id, 2, "drawn")
     expected = np.zeros(SIZE, bool)
     expected[4:11, 10:16] = True  # cut at the mug's side
     np.testing.assert_array_equal(handle.mask(SIZE), expected)
-    scene = open_labelled("annotated/photos/desk", root)
+    scene = open_labelled("annotated/photos/desk", tmp_path)
     assert [region.path for region in scene.views["000.png"]] == [("mug",), ("mug", "handle")]
 
 
-def test_the_brush_adds_and_the_eraser_removes_pixels(page, root):
+def test_the_brush_adds_and_the_eraser_removes_pixels(page, tmp_path):
     draw_mug(page)
-    before = kept(root)[0].mask(SIZE)
+    before = kept(tmp_path)[0].mask(SIZE)
     page.get_by_role("slider", name="Radius of the brush, pixels").fill("2")
     for key, changes in (("b", (1, 0)), ("e", (0, 1))):
         page.locator("#view").press(key)
@@ -125,14 +118,14 @@ def test_the_brush_adds_and_the_eraser_removes_pixels(page, root):
         drag(page, (10, row), (18, row))
         saved(page)
         assert page.evaluate("getSelection().type") != "Range"  # or the photograph turns blue
-        after = kept(root)[0].mask(SIZE)
+        after = kept(tmp_path)[0].mask(SIZE)
         more, less = (after & ~before).any(), (before & ~after).any()
         assert (more, less) == changes
         before = after
 
 
-def test_changes_are_undone_and_redone_even_after_a_reload_and_each_is_saved(page, root):
-    file = label_path(root / "annotated/photos/desk", "000.png")
+def test_changes_are_undone_and_redone_even_after_a_reload_and_each_is_saved(page, tmp_path):
+    file = label_path(tmp_path / "annotated/photos/desk", "000.png")
     draw_mug(page)
     first = file.read_bytes()
     draw_book(page)
@@ -151,25 +144,25 @@ def test_changes_are_undone_and_redone_even_after_a_reload_and_each_is_saved(pag
     assert file.read_bytes() == both
 
 
-def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, root):
+def test_a_proposed_node_is_scored_only_after_it_is_accepted(page, tmp_path):
     offers = offers_at(page, 6, 6)
     assert offers.count() == 3
     offers.nth(0).click()
     saved(page)
     name(page, "mug")
     saved(page)
-    (mug,) = kept(root)
+    (mug,) = kept(tmp_path)
     assert mug.origin == "proposed" and mug.text == "mug"
-    assert open_labelled("annotated/photos/desk", root).views["000.png"] == ()
+    assert open_labelled("annotated/photos/desk", tmp_path).views["000.png"] == ()
     assert things(page) == ["mug, whole, proposed"]
     page.locator("#view").press("a")
     saved(page)
-    assert kept(root)[0].origin == "accepted"
+    assert kept(tmp_path)[0].origin == "accepted"
     polygon(page, (1, 1), (4, 1), (4, 4))  # adds to the chosen thing
-    assert kept(root)[0].origin == "edited"
+    assert kept(tmp_path)[0].origin == "edited"
 
 
-def test_a_new_thing_has_neither_name_nor_parent(page, root):
+def test_a_new_thing_has_neither_name_nor_parent(page, tmp_path):
     draw_mug(page)
     offers_at(page, 6, 6).get_by_text("subpart").first.click()
     page.get_by_text("Proposed without a parent: the parent of a subpart is a part").wait_for()
@@ -177,37 +170,37 @@ def test_a_new_thing_has_neither_name_nor_parent(page, root):
     assert page.locator("#text").input_value() == "" and page.locator("#title").inner_text() == "New thing"
     offers_at(page, 26, 6).first.click()
     saved(page)
-    assert [label.text for label in kept(root)] == ["mug", "unnamed", "unnamed"]
-    assert {label.parent for label in kept(root)} == {None}
+    assert [label.text for label in kept(tmp_path)] == ["mug", "unnamed", "unnamed"]
+    assert {label.parent for label in kept(tmp_path)} == {None}
     page.locator("#view").press("a")
     page.get_by_role("status").get_by_text("Accepted.").wait_for()
     page.locator("#view").press("Control+z")
     assert page.get_by_role("status").inner_text() == ""
 
 
-def test_things_are_transferred_to_the_next_photograph(page, root):
+def test_things_are_transferred_to_the_next_photograph(page, tmp_path):
     draw_mug(page)
     page.locator("#view").press("]")
     page.get_by_role("button", name="From others").click()
     page.get_by_text("1 proposed").first.wait_for()
     saved(page)
-    (mug,), (carried,) = kept(root), kept(root, "001.png")
+    (mug,), (carried,) = kept(tmp_path), kept(tmp_path, "001.png")
     assert (carried.id, carried.text, carried.origin) == (mug.id, "mug", "proposed")
 
 
-def test_concurrent_changes_are_not_overwritten(page, opened, root):
+def test_concurrent_changes_are_not_overwritten(page, opened, tmp_path):
     opened.expected.append("412 (Precondition Failed)")
     draw_mug(page)
-    path = label_path(root / "annotated/photos/desk", "000.png")
-    theirs = [kept(root)[0].model_copy(update={"text": "cup"})]
+    path = label_path(tmp_path / "annotated/photos/desk", "000.png")
+    theirs = [kept(tmp_path)[0].model_copy(update={"text": "cup"})]
     write_labels(path, "000.png", SIZE, theirs, version_of(path))
     draw_book(page)
     page.get_by_text("have changed since they were read").wait_for()
     page.get_by_role("treeitem", name="cup, whole").wait_for()
-    assert kept(root) == theirs and things(page) == ["cup, whole"]
+    assert kept(tmp_path) == theirs and things(page) == ["cup, whole"]
 
 
-def test_files_are_exported_and_imported_again(page, root, tmp_path):
+def test_files_are_exported_and_imported_again(page, tmp_path):
     draw_mug(page)
     page.locator("#save summary").click()
     with page.expect_download() as started:
@@ -215,23 +208,23 @@ def test_files_are_exported_and_imported_again(page, root, tmp_path):
     file = tmp_path / "coco.json"
     started.value.save_as(file)
     assert json.loads(file.read_text())["categories"] == [{"id": 1, "name": "mug"}]
-    before = kept(root)[0].mask(SIZE)
+    before = kept(tmp_path)[0].mask(SIZE)
     page.locator("#view").press("Control+z")
     saved(page)
-    assert kept(root) == []
+    assert kept(tmp_path) == []
     page.get_by_label("Files to import").set_input_files(file)
     page.get_by_text("1 label imported into 1 photograph.").wait_for()
     saved(page)
-    np.testing.assert_array_equal(kept(root)[0].mask(SIZE), before)
+    np.testing.assert_array_equal(kept(tmp_path)[0].mask(SIZE), before)
     page.get_by_label("Files to import").set_input_files(file)
     page.get_by_text("0 labels imported into 0 photographs; already present: 1.").wait_for()
     assert things(page) == ["mug, whole"]
 
 
-def test_a_refused_change_and_later_ones_are_undone(page, opened, root):
+def test_a_refused_change_and_later_ones_are_undone(page, opened, tmp_path):
     opened.expected.append("422")
     draw_mug(page)
-    first = kept(root)
+    first = kept(tmp_path)
     held, free = [], []
     page.route("**/api/labels/**", lambda route: route.continue_() if free else held.append(route))
     outside = {"id": 9, "level": 2, "parent": 1, "text": "lid", "polygons": [[[30, 2], [36, 2], [36, 9]]]}
@@ -244,10 +237,10 @@ def test_a_refused_change_and_later_ones_are_undone(page, opened, root):
         route.continue_()
     page.get_by_text("is entirely outside").wait_for()
     saved(page)
-    assert kept(root) == first and things(page) == ["mug, whole"]
+    assert kept(tmp_path) == first and things(page) == ["mug, whole"]
     page.locator("#view").press("Control+z")  # the mug, as before
     saved(page)
-    assert kept(root) == [] and things(page) == []
+    assert kept(tmp_path) == [] and things(page) == []
 
 
 def area(root: Path) -> int:
@@ -255,32 +248,30 @@ def area(root: Path) -> int:
     return int(np.count_nonzero(mug.mask(SIZE)))
 
 
-def test_corners_of_the_chosen_outline_are_moved_added_and_removed(page, root):
+def test_corners_of_the_chosen_outline_are_moved_added_and_removed(page, tmp_path):
     draw_mug(page)
-    before = area(root)
+    before = area(tmp_path)
     page.locator("#view").press("v")
     drag(page, (15, 20), (20, 22), (25, 20))
     saved(page)
-    wider = area(root)
-    assert wider > before + 60 and kept(root)[0].mask(SIZE)[19, 21]
+    wider = area(tmp_path)
+    assert wider > before + 60 and kept(tmp_path)[0].mask(SIZE)[19, 21]
     drag(page, (1, 10), (6, 10))  # the left side gets a corner
     saved(page)
-    assert area(root) < wider - 20 and not kept(root)[0].mask(SIZE)[10, 2]
+    assert area(tmp_path) < wider - 20 and not kept(tmp_path)[0].mask(SIZE)[10, 2]
     page.keyboard.down("Alt")
     page.mouse.click(*place(page, 25, 20))
     page.keyboard.up("Alt")
     saved(page)
-    assert not kept(root)[0].mask(SIZE)[19, 21]
+    assert not kept(tmp_path)[0].mask(SIZE)[19, 21]
     page.keyboard.press("Control+z")
     saved(page)
-    assert kept(root)[0].mask(SIZE)[19, 21]
+    assert kept(tmp_path)[0].mask(SIZE)[19, 21]
 
 
-def test_sam_outlines_clicked_things(opened, browser, desk, tmp_path):
-    folder = tmp_path / "results/photos/desk"
-    shutil.copytree(desk, folder)
-    change_index(folder / "default/masks", segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
-    with serving(folder, "annotate", "--data-root", str(tmp_path)) as address:
+def test_sam_outlines_clicked_things(opened, own_desk, tmp_path):
+    change_index(own_desk / "default/masks", segmenter="sam", model=str(PROJECT / "models/sam-tiny"))
+    with serving(own_desk, "annotate", "--data-root", str(tmp_path)) as address:
         page = opened(address)
         page.locator("#view").press("s")
         page.mouse.click(*place(page, 28, 20))
@@ -309,18 +300,15 @@ def test_the_page_fits_a_phone_and_has_no_tool_for_a_missing_sam(page):
     assert phone_fits(page) and not page.locator("#segment-label").is_visible()
 
 
-def test_a_rewritten_scene_is_reported(opened, desk, root, tmp_path_factory):
-    project = tmp_path_factory.mktemp("changing")
-    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
-    folder = project / desk.relative_to(desk.parents[2])
-    with serving(folder, "annotate", "--data-root", str(root)) as address:
+def test_a_rewritten_scene_is_reported(opened, own_desk, tmp_path):
+    with serving(own_desk, "annotate", "--data-root", str(tmp_path)) as address:
         page = opened(address)
         assert not page.get_by_role("alert").is_visible()
-        write_again(folder / "default/semantic_tree")
+        write_again(own_desk / "default/semantic_tree")
         page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree).").wait_for()
         name(page, "rim")  # the photographs are the same
         polygon(page, (1, 1), (15, 1), (15, 5), (1, 5))
-        assert [label.text for label in kept(root)] == ["rim"]
+        assert [label.text for label in kept(tmp_path)] == ["rim"]
         page.get_by_role("button", name="Reload").click()
         page.get_by_role("alert").wait_for(state="hidden")
         page.get_by_role("treeitem", name="rim, whole").wait_for()

@@ -183,22 +183,12 @@ def test_an_address_opens_the_same_view_with_the_same_queries(opened, desk_addre
     np.testing.assert_allclose(found["K"], expected["K"], rtol=1e-3)
 
 
-RECORD_TEXTS = """() => {
-  window.texts = [];
-  const options = { subtree: true, childList: true, characterData: true, attributes: true };
-  new MutationObserver(() => window.texts.push(document.body.textContent)).observe(document.body, options);
-}"""
-
-
 def test_films_show_progress_and_gifs_have_the_chosen_size(opened, desk_address, tmp_path):
     page = opened(desk_address)
     page.locator("#save summary").click()
     page.get_by_label("Longer side of the GIF").select_option("240")
     page.locator("#save summary").click()
-    page.evaluate(RECORD_TEXTS)  # a small film may be done before this process looks
     gif = Image.open(save(page, "Film, GIF", tmp_path / "flight.gif"))
-    texts = page.evaluate("window.texts")
-    assert any("of 60 pictures" in text for text in texts)
     assert max(gif.size) == 240 and gif.n_frames > 10
     page.get_by_role("progressbar", name="Film").wait_for(state="hidden")
     page.locator("#save summary").click()
@@ -236,12 +226,9 @@ def test_an_exported_page_opens_from_a_file_with_its_answers(opened, browser, de
     context.close()
 
 
-def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opened, desk, tmp_path_factory):
-    project = tmp_path_factory.mktemp("changing")
-    shutil.copytree(desk.parents[2], project, dirs_exist_ok=True)
-    folder = project / desk.relative_to(desk.parents[2])
+def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opened, own_desk):
     opened.expected.append("409")  # the browser reports what was refused
-    with serving(folder) as address:
+    with serving(own_desk) as address:
         page = opened(address, "server")
         page.locator("#view").focus()
         ask(page, "mug > handle")
@@ -249,10 +236,11 @@ def test_a_rewritten_scene_is_reported_and_reloaded_without_the_old_choice(opene
         page.locator("#overlay path.chosen").first.wait_for(state="attached")
         page.wait_for_timeout(800)  # until the address holds the choice
         assert "node=" in page.url and not page.get_by_role("alert").is_visible()
-        with np.load(folder / "default/semantic_tree/tree.npz") as held:
+        tree = own_desk / "default/semantic_tree"
+        with np.load(tree / "tree.npz") as held:
             arrays = {**held, "quality": held["quality"] * 0.5}
-        with atomic_folder(folder / "default/semantic_tree") as new:
-            shutil.copytree(folder / "default/semantic_tree", new, dirs_exist_ok=True)
+        with atomic_folder(tree) as new:
+            shutil.copytree(tree, new, dirs_exist_ok=True)
             np.savez(new / "tree.npz", **arrays)
             change_index(new)
         page.get_by_role("alert").get_by_text("The scene has changed (semantic_tree)").wait_for()

@@ -1,7 +1,5 @@
 """Both pages used by the keyboard alone."""
 
-import shutil
-
 from hilsplat.annotate.labels import label_path, read_labels
 from hilsplat.base.artifacts import read_json
 from tests.browser.conftest import serving
@@ -24,12 +22,10 @@ def press(page, *keys: str) -> None:
         page.keyboard.press(key)
 
 
-def test_querying_choosing_naming_and_saving_in_the_viewer(opened, desk, tmp_path):
-    folder = tmp_path / "project" / desk.relative_to(desk.parents[2])
-    shutil.copytree(desk.parents[2], tmp_path / "project")  # the names of this test are its own
-    with serving(folder) as address:
+def test_querying_choosing_naming_and_saving_in_the_viewer(opened, own_desk, tmp_path):
+    with serving(own_desk) as address:
         page = opened(address)
-        query_choose_name_and_save(page, folder, tmp_path)
+        query_choose_name_and_save(page, own_desk, tmp_path)
         page.close()
 
 
