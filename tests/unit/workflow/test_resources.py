@@ -84,21 +84,17 @@ def test_threads_grow_with_the_pixels_of_a_scene(tmp_path):
     assert JobResources(many).threads(JOB) == 3, "a cluster doesn't know the cores of its nodes"
 
 
-def test_a_gpu_is_requested_where_the_settings_say_so(tmp_path):
-    found = JobResources(plan(tmp_path, gaussians={"device": "cuda"}))
-    assert [found.gpus(section)(JOB) for section in ("gaussians", "contributions")] == [1, 0]
-
-
 @pytest.mark.parametrize(
     ("segmenter", "build", "expected"),
     [("sam", True, [1, 1]), ("graph", True, [0, 1]), ("sam", False, [0, 0])],
 )
-def test_networks_request_a_gpu_with_onnxruntimes_gpu_build(
+def test_device_cuda_and_networks_with_onnxruntimes_gpu_build_request_a_gpu(
     tmp_path, monkeypatch, segmenter, build, expected
 ):
     monkeypatch.setattr("hilsplat.workflow.resources.is_installed", lambda name: build)
-    found = JobResources(plan(tmp_path, masks={"segmenter": segmenter}))
+    found = JobResources(plan(tmp_path, masks={"segmenter": segmenter}, gaussians={"device": "cuda"}))
     assert [found.gpus(section)(JOB) for section in ("masks", "clip")] == expected
+    assert [found.gpus(section)(JOB) for section in ("gaussians", "contributions")] == [1, 0]
 
 
 def test_the_number_of_gaussians_is_read_from_the_header_of_a_ply(tmp_path):
