@@ -21,6 +21,15 @@ _SIDE = 16  # zero columns left and right of a padded row; at least 3 channels x
 _ZERO, _TWO = np.float32(0.0), np.float32(2.0)
 
 
+@compiled(inline="always")
+def _blurred(source, at, step):
+    """Return the window's weighted sum along an axis, centred at an index of a flat array."""
+    total = lanes(_ZERO)
+    for k in range(2 * RADIUS + 1):
+        total = total + lanes(_TAPS[k]) * load(source, at + (k - RADIUS) * step)
+    return total
+
+
 @compiled
 def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sums):
     """Compute SSIM and L1 sums of padded rows begin..end and, in `slopes`, SSIM's derivatives.
@@ -56,15 +65,9 @@ def _ssim_rows(begin, end, num, stride, image, target, slopes, ssim_sums, l1_sum
         total, total_l1 = 0.0, 0.0
         for group in range(groups):
             at = _SIDE + group * _LANES
-            x_mean, t_mean, xx, tt, xt = zero, zero, zero, zero, zero
-            for k in range(2 * RADIUS + 1):
-                tap = lanes(_TAPS[k])
-                here = at + 3 * (k - RADIUS)
-                x_mean = x_mean + tap * load(moments, here)
-                t_mean = t_mean + tap * load(moments, row_length + here)
-                xx = xx + tap * load(moments, 2 * row_length + here)
-                tt = tt + tap * load(moments, 3 * row_length + here)
-                xt = xt + tap * load(moments, 4 * row_length + here)
+            x_mean, t_mean = _blurred(moments, at, 3), _blurred(moments, row_length + at, 3)
+            xx, tt = _blurred(moments, 2 * row_length + at, 3), _blurred(moments, 3 * row_length + at, 3)
+            xt = _blurred(moments, 4 * row_length + at, 3)
             product = x_mean * t_mean
             squares = x_mean * x_mean + t_mean * t_mean
             a1 = two * product + c1
@@ -101,30 +104,18 @@ def _gradient_rows(begin, end, num, stride, image, target, slopes, l1_weight, ss
     row_length = groups * _LANES + 2 * _SIDE
     rows = np.zeros(3 * row_length, np.float32)
     out = np.empty(_LANES, np.float32)
-    zero, two = lanes(_ZERO), lanes(_TWO)
+    two = lanes(_TWO)
     map_size = len(slopes) // 3
     for y in range(begin, end):
         for group in range(groups):
             at = _SIDE + group * _LANES
-            a, b, c = zero, zero, zero
-            for k in range(2 * RADIUS + 1):
-                tap = lanes(_TAPS[k])
-                spot = (y + k) * stride + at
-                a = a + tap * load(slopes, spot)
-                b = b + tap * load(slopes, map_size + spot)
-                c = c + tap * load(slopes, 2 * map_size + spot)
-            store(rows, at, a)
-            store(rows, row_length + at, b)
-            store(rows, 2 * row_length + at, c)
+            spot = (y + RADIUS) * stride + at
+            for k in range(3):
+                store(rows, k * row_length + at, _blurred(slopes, k * map_size + spot, stride))
         for group in range(groups):
             at = _SIDE + group * _LANES
-            a, b, c = zero, zero, zero
-            for k in range(2 * RADIUS + 1):
-                tap = lanes(_TAPS[k])
-                here = at + 3 * (k - RADIUS)
-                a = a + tap * load(rows, here)
-                b = b + tap * load(rows, row_length + here)
-                c = c + tap * load(rows, 2 * row_length + here)
+            a, b = _blurred(rows, at, 3), _blurred(rows, row_length + at, 3)
+            c = _blurred(rows, 2 * row_length + at, 3)
             spot = (y + RADIUS) * stride + at
             store(out, 0, a + two * load(image, spot) * b + load(target, spot) * c)
             for lane in range(min(_LANES, num - group * _LANES)):
