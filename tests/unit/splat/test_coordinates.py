@@ -29,13 +29,8 @@ def turned(seed: int) -> np.ndarray:
     return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
 
 
-def directions(number: int) -> np.ndarray:
-    values = np.random.default_rng(5).normal(size=(number, 3))
-    return values / np.linalg.norm(values, axis=1, keepdims=True)
-
-
 def test_basis_is_that_of_3dgs():
-    d = directions(30)
+    d = Rotation.random(30, rng=np.random.default_rng(5)).as_matrix()[:, 0]
     expected = np.stack([harmonic(*d.T) for harmonic in SH], axis=1)
     np.testing.assert_allclose(sh_basis(d, 3), expected, atol=1e-14)
 

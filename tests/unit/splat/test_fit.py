@@ -244,11 +244,6 @@ def row_of_gaussians(opacity: list[float], scale: float = 0.2) -> dict[str, np.n
     return row | {"opacity_logits": logit(np.array(opacity)).astype(np.float32), "sh": sh}
 
 
-def started(parameters: dict[str, np.ndarray]) -> Adam:
-    """Return Adam with copies of the parameters."""
-    return Adam.start({name: values.copy() for name, values in parameters.items()})
-
-
 @pytest.mark.parametrize(("opacity", "number"), [(0.3, 1), (0.75, 2), (0.8, 5), (0.99, 20), (0.999, 51)])
 def test_coincident_gaussians_cover_what_one_covered(opacity, number):
     new = 1 - (1 - opacity) ** (1 / number)  # 0.5 for two of 0.75
@@ -328,7 +323,7 @@ def test_noise_is_normal_numbers_times_the_covariance_and_spares_opaque_gaussian
     generator = np.random.default_rng(2)
     parameters["log_scales"] = np.log(generator.uniform(0.001, 0.02, (32, 3))).astype(np.float32)
     parameters["quats"] = (3 * generator.normal(size=(32, 4))).astype(np.float32)
-    adam = started(parameters)
+    adam = Adam.start(parameters | {"means": parameters["means"].copy()})
     add_noise(adam, MCMC, 1e-4, 2.0, np.random.default_rng(0))
     normal = np.random.default_rng(0).standard_normal((32, 3), dtype=np.float32)
     root = rotation_matrices(parameters["quats"]) * np.exp(parameters["log_scales"].astype(float))[:, None]

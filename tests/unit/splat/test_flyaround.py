@@ -18,14 +18,10 @@ from hilsplat.splat.flyaround import (
 from tests.unit.splat.three_gaussians_world import ring
 
 
-def shuffled_ring(number: int) -> list[Camera]:
-    cameras = ring(number, 48)
-    order = np.random.default_rng(3).permutation(number)
-    return [cameras[cameras.names[row]] for row in order]
-
-
 def test_the_closed_path_circles_a_ring_once_in_any_order():
-    path = closed_path(shuffled_ring(24), 60)
+    cameras = ring(24, 48)
+    order = np.random.default_rng(3).permutation(24)
+    path = closed_path([cameras[cameras.names[row]] for row in order], 60)
     centres = np.stack([camera.centre for camera in path])
     radius = np.linalg.norm(centres[:, :2], axis=1)
     assert 2.85 < radius.min() <= radius.max() < 3.0  # smoothing cuts the corners a little
