@@ -13,7 +13,6 @@ The language field's losses and the semantic tree need no other data from the im
 """
 
 import logging
-from collections.abc import Mapping
 from functools import cache as cache_calls
 from pathlib import Path
 
@@ -38,7 +37,6 @@ from hilsplat.contributions.compositing import normalised_weights
 from hilsplat.contributions.quadratic import Gram, StackedWeights
 from hilsplat.contributions.quadratic_builder import QuadraticBuilder, QuadraticCheckpoint
 from hilsplat.contributions.view_matrices import label_maps, labelled_rows, view_contributions
-from hilsplat.scene.cameras import Camera
 from hilsplat.scene.scene import Scene
 from hilsplat.segment.digests import MASKS_SHA256, digests_in, load_masks
 from hilsplat.segment.masks import HierarchicalMasks
@@ -133,7 +131,17 @@ def run_contributions(
     }
     names = digests if read_index(masks_folder).get("partial") else scene.views("train")
     cameras = [scene.cameras[name] for name in names]
-    keys = [_key(camera, digests, about) for camera in cameras]
+    keys = [
+        sha256_of_json(
+            {
+                **about,
+                "masks": digests.get(camera.name),
+                "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
+                "view": camera.name,
+            }
+        )
+        for camera in cameras
+    ]
     together = views_together(scene, threads)
     threads_each = max(1, threads // together)
     store = ViewCache(Path(cache) / "contributions", compressed=False)
@@ -231,15 +239,3 @@ def run_contributions(
             nonzeros=nonzeros,
         )
     checkpoint.forget()
-
-
-def _key(camera: Camera, digests: Mapping[str, str], about: Mapping[str, object]) -> str:
-    """Return a digest of all inputs of a view's matrices."""
-    return sha256_of_json(
-        {
-            **about,
-            "masks": digests.get(camera.name),
-            "camera": sha256_of_bytes(camera.cam_from_world.tobytes(), camera.K.tobytes()),
-            "view": camera.name,
-        }
-    )

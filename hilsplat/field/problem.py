@@ -63,12 +63,10 @@ class QuadraticProblem:
         """Number of labelled pixels at all levels, the divisor that converts sums to means."""
         return max(float(self.pixels.sum(dtype=np.float64)), 1.0)
 
-    def hessian_product(
-        self, features: Float32[np.ndarray, "N 3 D"], curved: Float32[np.ndarray, "N 3 D"] | None = None
-    ) -> Float32[np.ndarray, "N 3 D"]:
-        """Return half the Hessian of the summed losses times the features; `curved` is G F, if available."""
+    def hessian_product(self, features: Float32[np.ndarray, "N 3 D"]) -> Float32[np.ndarray, "N 3 D"]:
+        """Return half the Hessian of the summed losses times the features."""
         language, clustering, ridge = self.weights
-        out = self.quadratic.product(features) if curved is None else curved.copy()
+        out = self.quadratic.product(features)
         out *= np.float32(language + clustering)
         if clustering:
             spread = self.masks.spread(self.pixels[:, None] * self.masks.means(features))
@@ -103,18 +101,16 @@ class QuadraticProblem:
         }
 
 
-def conjugate_gradient(
-    problem: QuadraticProblem, steps: int, curved: Float32[np.ndarray, "N 3 D"] | None = None
-) -> np.ndarray:
+def conjugate_gradient(problem: QuadraticProblem, steps: int) -> Float32[np.ndarray, "N 3 D"]:
     """Minimise the quadratic part in a few steps from the lifted start, preconditioned by the visible mass.
 
-    Levels and channels do not interact, so each pair has its own step size. `curved` is G F_lifted, if known.
+    Levels and channels do not interact, so each pair has its own step size.
     """
     scale = problem.mass * np.float32(max(sum(problem.weights), 1e-12))
     inverse = np.where(scale > 0, 1 / np.maximum(scale, 1e-20), 0).astype(np.float32)
     features = problem.lifted.copy()
     residual = problem.right_side()
-    residual -= problem.hessian_product(features, curved)
+    residual -= problem.hessian_product(features)
     direction, ratio = np.zeros_like(residual), np.zeros(residual.shape[1:], np.float32)
     power = scaled_squares(inverse, residual)
     for _ in range(steps):

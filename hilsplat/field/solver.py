@@ -45,14 +45,12 @@ def solve_field(
         return value + contrastive, _rows(gradient)[shown]
 
     lifted = problem.lifted
-    at_lift = problem.quadratic.product(lifted)
     report: dict[str, object] = {"lifted": problem.terms(lifted) | contrast.values(lifted)}
     if settings.cg_steps and any(problem.weights):
-        features = conjugate_gradient(problem, settings.cg_steps, at_lift)
+        features = conjugate_gradient(problem, settings.cg_steps)
         report["after_cg"] = problem.terms(features) | contrast.values(features)
     else:
         features = lifted.copy()
-    del at_lift
     if (settings.weight_instance or settings.weight_part) and settings.lbfgs_steps:
         first_step = total / (2 * max(sum(problem.weights), 1e-3))
         unscale(lbfgs(objective, _rows(features)[shown] * root, settings.lbfgs_steps, first_step))

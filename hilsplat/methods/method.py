@@ -110,12 +110,7 @@ Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
 
 
 def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: int) -> None:
-    """Compute the field of a scene with a baseline, and write it to `out`, a `field.safetensors` file.
-
-    Raises:
-        SettingsError: there is no such method.
-        ArtifactError: the method returned features of the wrong shape or non-finite values.
-    """
+    """Compute the field of a scene with a baseline, and write it to `out`, a `field.safetensors` file."""
     fit, contributions = method_of(settings.name), inputs.contributions
     with stage_log(f"method {settings.name}", Path(inputs.scene_folder).parent.name) as counts:
         features = np.asarray(fit(inputs, settings, seed), dtype=np.float32)
@@ -153,11 +148,7 @@ class LabelledView:
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Return the labelled pixels of each training view that has any, in every `pixel_step`-th row and column.
-
-    Raises:
-        ArtifactError: no view has a labelled pixel.
-    """
+    """Return each training view's labelled pixels, if any, in every `pixel_step`-th row and column."""
     found = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):

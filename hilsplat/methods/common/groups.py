@@ -15,6 +15,7 @@ from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import LEVELS, NONE
 from hilsplat.field.code import unit_rows
 from hilsplat.methods.method import MethodInputs
+from hilsplat.semantic_tree.nodes import level_ious
 from hilsplat.settings import MethodSettings
 
 ROUNDS = 20  # Lloyd iterations; more would reduce the error by less than 1 %
@@ -103,17 +104,13 @@ def associated_codes(
     masks in fewer than `MIN_VIEWS` views get 0; in a scene with one view, one is enough.
     """
     contributions = inputs.contributions
-    num_groups = int(group.max(initial=NONE)) + 1
-    has = np.flatnonzero(group != NONE)
-    member = sp.csr_matrix((np.ones(len(has)), (has, group[has])), shape=(len(group), num_groups))
-    weights = contributions.matrix("S")[rows].astype(np.float64)
-    shared = (weights @ member).tocoo()
-    mask, of = shared.row.astype(np.int64), shared.col.astype(np.int64)
-    area = np.asarray(weights.sum(axis=1)).ravel()
-    size = np.stack([np.bincount(group[has], seen[has], num_groups) for seen in contributions.mass()])
+    weights, mass = contributions.matrix("S")[rows].astype(np.float64), contributions.mass()
+    iou = level_ious(group.astype(np.int32), weights, mass, contributions.view[rows]).tocoo()
+    num_groups, score = iou.shape[1], iou.data
+    mask, of = iou.row.astype(np.int64), iou.col.astype(np.int64)
     view = contributions.view[rows][mask]
-    score = shared.data / (area[mask] + size[view, of] - shared.data)
     if features is not None:
+        has = np.flatnonzero(group != NONE)
         of_mask = contributions.matrix("A")[rows] @ features
         of_group, _ = group_means(features[has], group[has], num_groups)
         score = score * (1 - np.abs(of_mask[mask] - of_group[of]).mean(axis=1))
@@ -122,7 +119,7 @@ def associated_codes(
     first = order[np.flatnonzero(np.diff(key, prepend=-1))]
     best = first[score[first] > MIN_SCORE]
     means, counts = group_means(inputs.latents[rows[mask[best]]], of[best], num_groups)
-    found = counts >= min(MIN_VIEWS, len(size))
+    found = counts >= min(MIN_VIEWS, len(mass))
     return features_of_groups(group, np.where(found[:, None], means, 0).astype(np.float32))
 
 

@@ -90,18 +90,13 @@ class Toy:
         return language, clustering
 
 
-def test_terms_equal_the_losses_of_rendered_pixels():
-    toy = Toy((1.0, 0.3, 0.1))
-    terms = toy.problem.terms(toy.features)
-    language, clustering = toy.dense_losses(torch.from_numpy(toy.features).double())
-    assert terms["language"] == pytest.approx(language.item(), rel=1e-5)
-    assert terms["clustering"] == pytest.approx(clustering.item(), rel=1e-5)
-
-
-def test_gradient_equals_autograd_through_rendering():
+def test_terms_and_gradient_equal_those_of_rendered_pixels():
     toy = Toy((0.7, 0.4, 0.0))
     features = torch.from_numpy(toy.features).double().requires_grad_()
     language, clustering = toy.dense_losses(features)
+    terms = toy.problem.terms(toy.features)
+    assert terms["language"] == pytest.approx(language.item(), rel=1e-5)
+    assert terms["clustering"] == pytest.approx(clustering.item(), rel=1e-5)
     (expected,) = torch.autograd.grad(0.7 * language + 0.4 * clustering, features)
     half = toy.problem.hessian_product(toy.features) - toy.problem.right_side()
     assert 2 / toy.problem.total_pixels * half == pytest.approx(expected.numpy(), abs=1e-6)

@@ -1,9 +1,6 @@
 """Methods that group Gaussians: losses worked by hand or by plain loops, groups known by construction."""
 
 import inspect
-import os
-import subprocess
-import sys
 import types
 
 import numpy as np
@@ -49,22 +46,18 @@ def one_view(weights, labels, size_hw):
     )
 
 
-def test_views_without_labelled_pixels_are_refused():
-    inputs = one_view([1, 1], np.full((2, 3), -1, np.int32), (1, 2))
-    with pytest.raises(ArtifactError, match="no training view has a labelled pixel on a 3 px grid"):
-        inspect.unwrap(labelled_views)(inputs, 3)
-
-
 def test_labelled_pixels_are_covered_and_have_their_coordinates():
     # 2 x 3 pixels: 0 not labelled, 4 not covered
     labels = np.full((6, 3), 0, np.int32)
     labels[0] = -1
-    inputs = one_view([1, 1, 1, 1, 0, 1], labels, (2, 3))
-    (view,) = inspect.unwrap(labelled_views)(inputs, 2)  # columns 0 and 2 of row 0
+    inputs, views_of = one_view([1, 1, 1, 1, 0, 1], labels, (2, 3)), inspect.unwrap(labelled_views)
+    (view,) = views_of(inputs, 2)  # columns 0 and 2 of row 0
     assert view.xy.tolist() == [[2, 0]]
-    (view,) = inspect.unwrap(labelled_views)(inputs, 1)
+    (view,) = views_of(inputs, 1)
     assert view.xy.tolist() == [[1, 0], [2, 0], [0, 1], [2, 1]]
     assert view.chosen(np.array([3, 0])).xy.tolist() == [[2, 1], [1, 0]]
+    with pytest.raises(ArtifactError, match="no training view has a labelled pixel on a 3 px grid"):
+        views_of(inputs, 3)
 
 
 def test_gradient_of_the_sparse_product_is_that_of_the_dense_one():
@@ -98,20 +91,14 @@ def test_smoothing_is_the_mean_distance_to_the_mean_of_the_mask():
     assert smoothing_loss(rendered, means, torch.tensor([0, 0, 1])).item() == pytest.approx((2 + 2) / 2)
 
 
-def test_the_closest_masks_have_the_largest_contrast_weight():
-    # on a line at 0, 1, 3: squares 1, 9, 4; from each mask the closest weighs 1, the farthest 0.55, later 0.1
-    means = torch.tensor([[0.0], [1.0], [3.0]])
-    for done, far in ((0.0, 0.55), (0.5, 0.1)):
-        every = (1 / 2 + far / 10) + (1 / 2 + far / 5) + (1 / 5 + far / 10)
-        assert contrast_loss(means, done).item() == pytest.approx(every / 6)
-    assert contrast_loss(means[:2], 0.5).item() == pytest.approx(1 / 2)  # of two masks each is the closest
-    # with a fourth mask the ranks weigh 0.4, 0.7 and 1 at first, then 0.1, 0.1 and 1
-    means = torch.tensor([[0.0], [1.0], [3.0], [100.0]])
-    first, later = contrast_loss(means, 0.0).item(), contrast_loss(means, 0.5).item()
-    middle = 1 / 10 + 1 / 5 + 1 / 10 + 1 / (99**2 + 1)
-    farthest = 1 / (100**2 + 1) + 1 / (99**2 + 1) + 1 / (97**2 + 1) + 1 / (100**2 + 1)
-    assert first - later == pytest.approx((0.6 * middle + 0.3 * farthest) / 12, rel=1e-3)
-    assert contrast_loss(means[:1], 0.0).item() == 0
+@pytest.mark.parametrize(("done", "weights"), [(0.0, (0.4, 0.7, 1)), (0.5, (0.1, 0.1, 1))])
+def test_the_closest_masks_have_the_largest_contrast_weight(done, weights):
+    means = RNG.normal(size=(4, 6))
+    squares = np.square(means[:, None] - means).sum(axis=2)
+    farthest_first = np.sort(squares, axis=1)[:, :0:-1]
+    expected = (weights / (farthest_first + 1)).mean()
+    assert contrast_loss(torch.from_numpy(means), done).item() == pytest.approx(expected)
+    assert contrast_loss(torch.from_numpy(means[:1]), done).item() == 0
 
 
 def test_the_coarse_codebook_splits_by_position_and_the_fine_one_by_feature():
@@ -147,7 +134,7 @@ def test_a_group_has_the_average_code_of_its_best_mask_in_each_view(
     contributions = types.SimpleNamespace(
         matrix={"S": sp.csr_matrix(shares), "A": sp.csr_matrix(means)}.get,
         mass=lambda: np.ones((num_views, 3), np.float32),
-        view=np.array([0, 0, 1]),
+        view=np.array([0, 0, 1], np.int32),
     )
     inputs = types.SimpleNamespace(contributions=contributions, latents=np.float32([[1], [5], [2]]))
     features = np.float32([[0], [0], [1]])
@@ -163,17 +150,12 @@ def test_neighbour_loss_is_the_divergence_per_class():
     assert neighbour_loss(logits, others, 2).item() == pytest.approx(expected / 2)
 
 
-def test_patches_share_the_masks_that_contain_both():
-    labels = np.repeat(np.int32([[0, 2, 4], [0, 2, 5], [0, 3, -1], [1, -1, -1]]), 3, axis=0)
-    labels = np.concatenate([labels, np.int32([[0, -1, -1]])])  # a patch of one pixel is left out
-    patch, shared = patches(labels)
-    assert patch.tolist() == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3 + [-1]
-    assert shared.tolist() == [[3, 2, 1, 0], [2, 3, 1, 0], [1, 1, 2, 0], [0, 0, 0, 1]]
-
-
 def test_hierarchical_loss_matches_a_plain_loop_over_pixels():
     labels = np.repeat(np.int32([[0, 2, 4], [0, 2, 5], [0, 3, -1], [1, -1, -1]]), 4, axis=0)
-    patch, shared = patches(labels)
+    patch, shared = patches(np.append(labels, np.int32([[0, -1, -1]]), axis=0))
+    assert patch.tolist() == [*np.arange(4).repeat(4), -1]  # a patch of one pixel is left out
+    assert shared.tolist() == [[3, 2, 1, 0], [2, 3, 1, 0], [1, 1, 2, 0], [0, 0, 0, 1]]
+    patch = patch[:-1]
     rendered = unit(torch.from_numpy(RNG.normal(size=(16, 3)).astype(np.float32)))
     found = hierarchical_loss(rendered, torch.from_numpy(patch), torch.from_numpy(shared)).item()
     x = rendered.numpy().astype(np.float64)
@@ -209,25 +191,19 @@ def test_clusters_of_smaller_distances_are_inside_those_of_larger_ones():
         assert len(np.unique(found[:, [coarse, fine]], axis=0)) == len(np.unique(found[:, fine]))
 
 
-def minimax(length, edges, start, end):
-    """Least over paths of the longest edge, by adding edges from the shortest."""
-    part = list(range(1 + max(max(edge) for edge in edges)))
-    for k in np.argsort(length, kind="stable"):
-        a, b = edges[k]
-        part = [part[a] if p == part[b] else p for p in part]
-        if part[start] == part[end]:
-            return length[k]
-    return 2.0
-
-
-def test_ultrametric_is_the_least_longest_edge_of_any_path():
-    vectors = torch.from_numpy(RNG.normal(size=(12, 3)))
+def test_ultrametric_is_the_least_longest_edge_of_any_path_and_two_without_a_path():
+    vectors = torch.from_numpy(RNG.normal(size=(13, 3)))
     edges = np.array([(a, b) for a in range(12) for b in range(a + 1, 12) if RNG.random() < 0.3]).T
-    pairs = np.array([(a, b) for a in range(12) for b in range(12)]).T
-    found = ultrametric(vectors, edges, np.zeros(edges.shape[1]), pairs).numpy()
-    length = np.linalg.norm(vectors.numpy()[edges[0]] - vectors.numpy()[edges[1]], axis=1)
-    expected = [0.0 if a == b else minimax(length, edges.T.tolist(), a, b) for a, b in pairs.T]
-    assert found == pytest.approx(np.array(expected), abs=1e-6)
+    found = ultrametric(vectors, edges, np.zeros(edges.shape[1]), np.indices((13, 13)).reshape(2, -1))
+    longest = np.where(np.eye(13), 0, np.inf)
+    apart = np.linalg.norm(vectors[edges[0]] - vectors[edges[1]], axis=1)
+    longest[edges[0], edges[1]] = longest[edges[1], edges[0]] = apart
+    for way in range(13):
+        longest = np.minimum(longest, np.maximum(longest[:, way, None], longest[way]))
+    longest[np.isinf(longest)] = 2
+    assert found.numpy() == pytest.approx(longest.ravel(), abs=1e-6)
+    none = ultrametric(vectors, edges[:, :0], np.zeros(0), np.array([[0, 2], [2, 2]]))
+    assert none.tolist() == [2, 0]
 
 
 def test_border_penalties_choose_the_tree_but_do_not_change_lengths_or_gradients():
@@ -239,12 +215,6 @@ def test_border_penalties_choose_the_tree_but_do_not_change_lengths_or_gradients
     assert ultrametric(vectors, edges, np.zeros(3), pairs).item() == pytest.approx(0.4)
     inside.sum().backward()
     assert vectors.grad.ravel().tolist() == pytest.approx([-1.0, 1.0, 0.0])
-
-
-def test_pixels_without_a_path_are_two_apart():
-    vectors = torch.zeros(3, 2)
-    found = ultrametric(vectors, np.array([[0], [1]]), np.zeros(1), np.array([[0, 0, 2], [2, 1, 2]]))
-    assert found.tolist() == pytest.approx([2, 0, 0], abs=1e-5)
 
 
 def test_the_third_pixel_of_a_triplet_is_outside_the_mask_but_inside_its_parent():
@@ -464,23 +434,3 @@ def test_distant_starts_find_separated_groups_in_one_round(seed):
     _, nearest = kmeans(rows + 0.01 * rng.random(rows.shape).astype(np.float32), 3, seed, rounds=1)
     found = nearest.reshape(3, 10)
     assert (found == found[:, :1]).all() and len(np.unique(found)) == 3
-
-
-def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads():
-    code = (
-        "import numpy as np; from hilsplat.methods.common.groups import kmeans;"
-        "rows = np.random.default_rng(0).normal(size=(5000, 16)).astype(np.float32);"
-        "centroids, nearest = kmeans(rows, 100, 3, 5);"
-        "import hashlib; print(hashlib.sha256(centroids.tobytes() + nearest.tobytes()).hexdigest())"
-    )
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in ("1", "2")
-    }
-    assert len(found) == 1
