@@ -13,8 +13,7 @@ Departs from the published code:
     - Gaussians' codes are blended unscaled; LangSplat first scales each code to unit length;
     - weights below `contributions.min_weight` are dropped.
 
-`hilsplat.field.literal_trainer` (loss `l1`) renders at every step, and averages over all pixels like
-LangSplat. It also trains all levels in one run. It treats alpha and unit length like this module.
+`hilsplat.field.literal_trainer` (loss `l1`) renders at every step and averages over all pixels.
 """
 
 import numpy as np

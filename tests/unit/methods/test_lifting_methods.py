@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from hilsplat.base.errors import SettingsError
 from hilsplat.base.levels import Level
-from hilsplat.field.adam import in_random_order
+from hilsplat.field.adam import Adam, in_random_order
 from hilsplat.field.code import Autoencoder, LinearCode
 from hilsplat.methods import dr_splat, langsplat_v2, lifted, occam
 from hilsplat.methods.langsplat import train_level
@@ -43,49 +43,23 @@ def test_lifted_averages_masks_by_their_weight_in_a_gaussian():
 # ---- LangSplat ----
 
 
-def l1_by_scipy(features, weights, targets):
-    """Gradient, for the features, of the mean absolute difference of rendered and painted codes, by scipy."""
-    apart = weights @ features - targets
-    scale = np.float32(1 / max(apart.size, 1))
-    return (weights.T @ (np.sign(apart) * scale)).astype(np.float32)
-
-
-def adam_in_numpy(values, gradients, rate):
-    """Adam in place, a step for each gradient; a gradient may depend on the values before its step."""
-    first, second = np.zeros_like(values), np.zeros_like(values)
-    for step, gradient in enumerate(gradients, 1):
-        first[:] = np.float32(0.9) * first + np.float32(1 - 0.9) * gradient
-        second[:] = np.float32(0.999) * second + np.float32(1 - 0.999) * gradient * gradient
-        scale = np.float32((1 - 0.999**step) ** -0.5)
-        values -= np.float32(rate / (1 - 0.9**step)) * first / (np.sqrt(second) * scale + np.float32(1e-15))
-
-
-def painted(weights, labels):
-    """A view whose masks are the first rows of the contributions."""
-    rows = np.arange(labels.max() + 1)
-    return LabelledView(
-        0, rows, sp.csr_matrix(weights, dtype=np.float32), labels, np.zeros((len(labels), 2), int)
-    )
-
-
 @pytest.mark.parametrize("channels", [1, 3])
-def test_training_has_the_bytes_of_products_in_scipy_and_adam_in_numpy(channels):
+def test_training_has_the_bytes_of_products_in_scipy(channels):
     rng = np.random.default_rng(channels)
     latents = rng.normal(size=(5, channels)).astype(np.float32)
-    views = [
-        painted(sp.random(40, 9, 0.4, "csr", np.float32, rng), rng.integers(-1, 5, (40, 3)).astype(np.int32))
-        for _ in range(3)
-    ]
+    views = []
+    for number in range(3):
+        weights = sp.random(40, 9, 0.4, "csr", np.float32, rng)
+        labels = rng.integers(-1, 5, (40, 3)).astype(np.int32)
+        views.append(LabelledView(number, np.arange(5), weights, labels, np.zeros((40, 2), int)))
     settings = MethodSettings(name="langsplat", steps=50)
-    features, order = np.zeros((9, channels), np.float32), np.random.default_rng(4)
-    drawn = np.concatenate([order.permutation(3)[::-1] for _ in range(17)])[: settings.steps]
-
-    def gradients():
-        for view in (views[number] for number in drawn):
-            pixels = view.at(Level.PART)
-            yield l1_by_scipy(features, view.weights[pixels], latents[view.labels[pixels, Level.PART.index]])
-
-    adam_in_numpy(features, gradients(), settings.rate)
+    features = np.zeros((9, channels), np.float32)
+    adam = Adam(features, settings.rate)
+    for view in in_random_order(views, np.random.default_rng(4), settings.steps):
+        pixels = view.at(Level.PART)
+        weights = view.weights[pixels]
+        apart = weights @ features - latents[view.labels[pixels, Level.PART.index]]
+        adam.step(weights.T @ (np.sign(apart) * np.float32(1 / apart.size)))
     assert np.array_equal(train_level(views, latents, Level.PART, 9, settings, seed=4), features)
 
 
