@@ -36,21 +36,17 @@ def test_thresholds_out_of_order_are_refused(method, wrong, direction):
         thresholds_of(settings, method.THRESHOLDS)
 
 
-def one_view(weights, labels, size_hw):
-    """Stand-in inputs with one view."""
-    return types.SimpleNamespace(
-        contributions=types.SimpleNamespace(views=("a",), rows_of_views=lambda: [np.arange(1)]),
-        view_weights=lambda view: sp.csr_matrix(np.float32(weights)[:, None]),
-        view_labels=lambda view: labels,
-        view_camera=lambda view: types.SimpleNamespace(size_hw=size_hw),
-    )
-
-
 def test_labelled_pixels_are_covered_and_have_their_coordinates():
     # 2 x 3 pixels: 0 not labelled, 4 not covered
     labels = np.full((6, 3), 0, np.int32)
     labels[0] = -1
-    inputs, views_of = one_view([1, 1, 1, 1, 0, 1], labels, (2, 3)), inspect.unwrap(labelled_views)
+    inputs = types.SimpleNamespace(
+        contributions=types.SimpleNamespace(views=("a",), rows_of_views=lambda: [np.arange(1)]),
+        view_weights=lambda view: sp.csr_matrix(np.float32([[1], [1], [1], [1], [0], [1]])),
+        view_labels=lambda view: labels,
+        view_camera=lambda view: types.SimpleNamespace(size_hw=(2, 3)),
+    )
+    views_of = inspect.unwrap(labelled_views)
     (view,) = views_of(inputs, 2)  # columns 0 and 2 of row 0
     assert view.xy.tolist() == [[2, 0]]
     (view,) = views_of(inputs, 1)
