@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # imports pycolmap, which evaluation doesn't need
     from hilsplat.scene.importers.known_views import KnownView
 
 ROUNDING_PX = 1.0
-"""Maximum difference, after scaling, between sides of an image and of a label that is its scaled copy."""
+"""Maximum difference in side length, after scaling, between an image and a label of the same shape."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -232,7 +232,7 @@ def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
         f"the CLIP model that embedded the masks in {clip_folder} was not found",
         expected=f"a model folder with digest {expected[:12]}, originally {recorded}",
         found=", ".join(f"{folder} with digest {digest[:12]}" for folder, digest in seen.items())
-        or f"no CLIP model at {recorded} or in {', '.join(map(str, stores)) or 'any folder models/'}",
+        or f"no CLIP model at {recorded} or in {', '.join(map(str, stores)) or 'any models/ folder'}",
         fix=f"fetch it (hilsplat models get), copy its folder into {user_models()}, or rerun the clip stage "
         "with a CLIP model that you have",
     )

@@ -180,7 +180,7 @@ def scene_from_true(true: Cameras, found: Cameras) -> tuple[Float64[np.ndarray, 
     if scale <= 0:
         raise MisalignedArtifactError(
             "no similarity transform maps the ground-truth cameras to the scene's cameras",
-            expected="camera centres with the same arrangement",
+            expected="camera centres in the same arrangement",
             found="coincident or mirrored centres",
             fix="check registration.png; the poses have probably failed",
         )

@@ -23,8 +23,8 @@ FACTORED_MIB = 250
 """Memory that the factored decoder needs for a 1024 px image. Measured: 104 MiB while 1024 prompts are
 previewed, plus the masks of the prompts that are kept."""
 CLIP_TOKEN_MIB = 0.03
-"""Memory per patch of a crop in a CLIP model, besides two arrays of attention weights. Measured: 521 MiB for
-64 crops in ViT-B/16."""
+"""Memory per patch of a crop in a CLIP model, not counting two arrays of attention weights. Measured: 521 MiB
+for 64 crops in ViT-B/16."""
 UNKNOWN_BYTES_PER_PX = 400
 """Memory for encoding an image, per pixel, if the configuration does not describe the network (sam-tiny)."""
 

@@ -1,7 +1,7 @@
 """Checks of a set of photographs for likely problems, before the set is processed.
 
 Thresholds were chosen on three sets of real photographs that all register, on blurred, darkened and
-over-exposed copies of them, and on pictures of a camera that only rotates (values: docs/scene.md).
+over-exposed copies of them, and on pictures from a camera that only rotates (values: docs/scene.md).
 """
 
 import functools

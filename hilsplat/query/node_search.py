@@ -61,9 +61,9 @@ class NodeHits:
         ids: rows of the semantic tree, best first.
         values: sort key of each node: its cosine margin for the last text, plus a bonus (one text) or minus a
             penalty (a path) that depends on its ancestors.
-        route: how the best node was found: "flat" for one text. On a path, "child": it has an ancestor at the
-            level of every earlier text, the last being its parent; "descendant": only some, or the last isn't
-            its parent; "fallback": none, or no node is part of a plausible answer to the first text.
+        route: how the best node was found: "flat" for one text. On a path, "child": its parent is at the
+            level of the text before, and ancestors are at the levels of all earlier texts; "descendant": some
+            ancestors are; "fallback": none is, or nothing plausible matches the first text.
         texts: the best match of each text of the query, coarse to fine.
     """
 

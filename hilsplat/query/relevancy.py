@@ -249,7 +249,7 @@ class LatentRelevancy:
 
 
 def lost_for_error(scale: float, channels: int) -> float:
-    """Return the largest loss outside the directions with which no relevancy error can exceed `ERROR`.
+    """Return the largest loss at which every relevancy error is at most `ERROR`.
 
     Relevancy is 1 / (1 + exp(-s (e.q - g))) with a unit text q. The nearest phrase's g is computed from the
     full vector, so only e.q has an error: at most |q| = 1 times the distance of e from its stored form. This

@@ -158,7 +158,7 @@ def upscaled_runs(
     """
     num_y, taps_y = weight_y.shape
     num_x, taps_x = weight_x.shape
-    # first column of the crop that reads each low-resolution column, or a later one
+    # for each low-resolution column: the first column of the crop that reads it or a later column
     low_w = first_x[-1] + taps_x
     reader = np.searchsorted(first_x, np.arange(low_w + 1))
     out, count = np.empty(max(1024, 64 * len(rows)), np.uint32), 0

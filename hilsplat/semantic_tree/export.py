@@ -50,7 +50,7 @@ def write_selection_ply(
     labels: Int32[np.ndarray, " g"] | None = None,
     names: Sequence[str] = (),
 ) -> None:
-    """Copy some Gaussians of a 3DGS PLY, such as those selected by a query.
+    """Copy selected Gaussians from a 3DGS PLY, such as the answer to a query.
 
     Args:
         labels: label of each Gaussian, counted from 1; written as the property `label`.

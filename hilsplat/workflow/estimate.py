@@ -16,8 +16,8 @@ from hilsplat.workflow.scene_data import of_variant
 
 GPU_GAIN = {"gaussians": 4, "masks": 27, "clip": 60}
 """Rule -> speed with a GPU relative to one core. The value for `gaussians` was measured on a fit of 100,000
-Gaussians (docs/benchmarks.md), with loss and Adam on the CPU. The others are from published times on an RTX
-3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."""
+Gaussians (docs/benchmarks.md), with loss and Adam on the CPU. The others are based on published times on an
+RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."""
 
 OTHERS = "tables"  # row for jobs without a scene
 

@@ -11,7 +11,7 @@ from hilsplat.scene.sheet import PHOTOS
 
 
 def check_models(stages: StageSettings, where: str) -> None:
-    """Refuse a missing model folder, or one with another kind of model; `stages` must not contain `auto`."""
+    """Raise an error if a model folder is missing or has the wrong kind; `stages` must not contain `auto`."""
     models = [("clip", "clip", stages.clip.model, stages.clip.variant)]
     if stages.masks.segmenter == "sam":
         models.append(("masks", "sam", stages.masks.model, stages.masks.variant))

@@ -89,7 +89,7 @@ class HierarchyAnnotations:
 
     @staticmethod
     def load(folder: Path) -> "HierarchyAnnotations":
-        """Read the folder; raise ArtifactError if annotations.json is missing or has another format."""
+        """Read the folder; raise ArtifactError if annotations.json is missing or has a different format."""
         record = read_json(folder / "annotations.json")
         if record.get("format") != FORMAT:
             raise ArtifactError(

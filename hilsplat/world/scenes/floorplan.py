@@ -34,7 +34,7 @@ class Room:
         return self.depth if wall % 2 == 0 else self.width
 
     def at_wall(self, wall: int, along: float, away: float) -> Float[np.ndarray, " 2"]:
-        """Return the point `away` from a wall into the room, and `along` the wall from its middle, m."""
+        """Return the point at distances `away` from a wall and `along` from the wall's middle, m."""
         half = self.width / 2 if wall % 2 == 0 else self.depth / 2
         return rotation_about("z", 90.0 * wall)[:2, :2] @ np.array([away - half, along])
 

@@ -136,7 +136,7 @@ class Assembly:
         self.background: list[int] = []
 
     def draw(self, name: str, kind: str | None = None) -> ObjectModel:
-        """Draw the next object, of a class from this kind of scene or from `kind`.
+        """Draw the next object; its class belongs to `kind`, or by default to this kind of scene.
 
         The object's appearance depends on the seed and the number of objects drawn before.
         """
