@@ -1,6 +1,9 @@
 """Compiled loops that sum weights of Gaussians over masks, and products of weights over pixels."""
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from hilsplat.base.compiled import compiled
 
@@ -22,7 +25,7 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
         pixel counts (masks x 2): painted pixels, and those in the half; row sizes; columns; sums over raw
         masks, painted pixels, and those in the half (entries x 3, float64, in pixel order).
     """
-    sums, found = np.zeros((num_gaussians, SUMS)), np.empty(num_gaussians, np.int32)
+    sums, found = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
     counts = np.zeros((last - first, 2), np.int64)
     sizes = np.zeros(last - first, np.int64)
     columns, values = np.empty(1024, np.int32), np.empty((1024, 3))
@@ -42,16 +45,18 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
                 counts[m - first, 1] += in_half > 0
                 for k in range(indptr[p], indptr[p + 1]):
                     j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
-                    if add_products(sums, j, 1.0, painted, in_half, np.float64(data[k])) == 0:
+                    at, weight = np.int64(j) * SUMS, np.float64(data[k])
+                    if add_products(sums, at, 1.0, painted, in_half, weight) == 0:
                         found[count] = np.int32(j)
                         count += 1
         found[:count] = np.sort(found[:count])
         if done + count > len(columns):
             columns, values = enlarged(columns, values, done, 2 * (done + count))
         for k in range(count):
+            at = np.int64(found[k]) * SUMS
             columns[done + k] = found[k]
-            values[done + k] = sums[found[k], :3]
-            sums[found[k]] = 0
+            values[done + k] = sums[at : at + 3]
+            sums[at : at + SUMS] = 0
         done += count
         sizes[m - first] = count
     return counts, sizes, columns[:done], values[:done]
@@ -83,15 +88,27 @@ def transpose(indptr, indices, begins, pixels, places):
             filled[indices[k]] += 1
 
 
-@compiled
-def add_products(sums, row, whole, part, subpart, value):
-    """Add `value` times three numbers, and 1, to a row of sums; return the number of previous additions."""
-    before = sums[row, 3]
-    sums[row, 0] += whole * value
-    sums[row, 1] += part * value
-    sums[row, 2] += subpart * value
-    sums[row, 3] = before + 1.0
-    return before
+@intrinsic
+def add_products(typingctx, sums, at, whole, part, subpart, value):
+    """Add `value` times three numbers, and 1, to the sums at `at`, as one vector and without fusing.
+
+    Returns the number of previous additions.
+    """
+
+    def codegen(context, builder, sig, args):
+        number, lane = ir.DoubleType(), ir.IntType(32)
+        four = ir.VectorType(number, SUMS)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
+        weights = values = ir.Constant(four, [ir.Constant(number, 1.0)] * SUMS)
+        for index, each in enumerate(args[2:5]):
+            weights = builder.insert_element(weights, each, ir.Constant(lane, index))
+            values = builder.insert_element(values, args[5], ir.Constant(lane, index))
+        before = builder.load(place, align=8)
+        builder.store(builder.fadd(before, builder.fmul(weights, values)), place, align=8)
+        return builder.extract_element(before, ir.Constant(lane, SUMS - 1))
+
+    return types.float64(sums, types.intp, *[types.float64] * 4), codegen
 
 
 @compiled
@@ -106,9 +123,12 @@ def enlarged(indices, values, kept, room):
 @compiled
 def _load(first, last, indices, values, sums):
     """Load pairs of a row into the sums, and mark the pairs as known."""
+    levels = values.shape[1]
     for k in range(first, last):
-        sums[indices[k], :3] = values[k]
-        sums[indices[k], 3] = 1
+        at = np.int64(indices[k]) * SUMS
+        for level in range(levels):
+            sums[at + level] = values[k, level]
+        sums[at + levels] = 1
 
 
 @compiled
@@ -121,7 +141,7 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
         part: row starts, columns and values of W, and whether each pixel has a mask at each level.
         columns: output of `transpose` for the part: starts, pixels and places.
         rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
-        sums: (N, SUMS), zero before and after the call.
+        sums: SUMS numbers per Gaussian, zero before and after the call.
         fresh: buffer for all columns.
         out_indptr, out_indices, out_values: late pairs; columns are sorted within rows.
 
@@ -132,6 +152,7 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
     begins, pixels, places = columns
     row_indptr, row_indices, row_values = rows
     late_indptr, late_indices, late_values = late
+    levels = row_values.shape[1]
     done = 0
     for i in range(begin, end):
         first, last = row_indptr[i - begin], row_indptr[i - begin + 1]
@@ -148,7 +169,8 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
             subpart = weight if valid[p, 2] else 0.0
             for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
                 j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
-                if add_products(sums, j, whole, part_weight, subpart, np.float64(data[k])) == 0:
+                at, value = np.int64(j) * SUMS, np.float64(data[k])
+                if add_products(sums, at, whole, part_weight, subpart, value) == 0:
                     fresh[count] = np.int32(j)
                     count += 1
         if count:
@@ -158,8 +180,10 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
             out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
         if shown:
             for k in range(first, last):
-                row_values[k] = sums[row_indices[k], :3]
-                sums[row_indices[k]] = 0
+                at = np.int64(row_indices[k]) * SUMS
+                for level in range(levels):
+                    row_values[k, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
             new = 0
             for place in range(done, done + size):
                 if new < count and (old == old_end or fresh[new] < late_indices[old]):
@@ -168,9 +192,11 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
                 else:
                     column = late_indices[old]
                     old += 1
+                at = np.int64(column) * SUMS
                 out_indices[place] = column
-                out_values[place] = sums[column, :3]
-                sums[column] = 0
+                for level in range(levels):
+                    out_values[place, level] = sums[at + level]
+                sums[at : at + SUMS] = 0
         else:
             out_indices[done : done + size] = late_indices[old:old_end]
             out_values[done : done + size] = late_values[old:old_end]

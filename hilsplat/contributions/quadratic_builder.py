@@ -103,7 +103,7 @@ class GramBuilder:
         self._late = [_Rows(end - begin) for begin, end in self._ranges]
         self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
         for _ in range(self._threads):
-            sums, fresh = np.zeros((num_gaussians, SUMS)), np.empty(num_gaussians, np.int32)
+            sums, fresh = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
             self._idle.put((sums, fresh, np.empty(1024, np.int32), np.empty((1024, len(LEVELS)))))
 
     @property
