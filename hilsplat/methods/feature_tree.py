@@ -34,7 +34,7 @@ RIDGE = 1e-3  # weight of the pull towards the random start; prevents drift in u
 def farthest_alike(
     means: Float32[np.ndarray, "M D"], contributions: Contributions, parents: dict[str, np.ndarray]
 ) -> tuple[float, ...]:
-    """Return half the median distance of two masks that share a view, a level and a parent, per level."""
+    """Return, per level, half the median distance between masks that share a view and a parent."""
     found: list[list[float]] = [[] for _ in LEVELS]
     for view, rows in zip(contributions.views, contributions.rows_of_views(), strict=True):
         level, parent = contributions.level[rows], parents[view]
