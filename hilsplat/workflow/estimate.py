@@ -1,5 +1,8 @@
 """Estimates for the user: the jobs of a dry run, and the time until photographs can be queried."""
 
+import resource
+import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +25,7 @@ RTX 3090: SAM ViT-H's generator takes 4 s per picture, CLIP B/16 5 ms per crop."
 OTHERS = "tables"  # row for jobs without a scene
 
 NOTES = (
-    "On another machine, hours can be off by a factor of two. Memory is that of the largest job.",
+    "Hours are scaled by the time that Python takes to start here. Memory is that of the largest job.",
     "GPU: published times of a 24 GB card for fits, SAM and CLIP; other jobs run on the CPU.",
 )
 
@@ -62,16 +65,26 @@ class RunEstimate:
             return []
         cores = self.resources.cores or 1
         head = ("", "scenes", "jobs", "disk", "memory", f"hours, {cores} cores", "hours, GPU")
-        names = sorted(self._jobs, key=lambda name: (name == OTHERS, name))
-        rows = [_row(name, self._jobs[name], cores) for name in names]
-        total = _row("all", [job for name in names for job in self._jobs[name]], cores)
+        names, scale = sorted(self._jobs, key=lambda name: (name == OTHERS, name)), machine_scale()
+        rows = [_row(name, self._jobs[name], cores, scale) for name in names]
+        total = _row("all", [job for name in names for job in self._jobs[name]], cores, scale)
         return ["Estimate for this run:", *_aligned([head, *rows, total]), *NOTES]
 
 
-def _row(name: str, jobs: Sequence[JobEstimate], cores: int) -> tuple[str, ...]:
+def machine_scale() -> float:
+    """Return the CPU time in which a stage's process starts on this machine, relative to `START_S`."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-c", "import hilsplat.cli.main, hilsplat.evaluate.stage"], check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / START_S
+
+
+def _row(name: str, jobs: Sequence[JobEstimate], cores: int, scale: float) -> tuple[str, ...]:
     scenes = {job.scene for job in jobs if job.scene}
-    core_s = sum(job.core_s for job in jobs)
-    with_gpu_s = sum(job.core_s / (job.gpu_gain or cores) for job in jobs)
+    core_s = scale * sum(job.core_s for job in jobs)
+    with_gpu_s = sum(
+        job.core_s / job.gpu_gain if job.gpu_gain else scale * job.core_s / cores for job in jobs
+    )
     return (
         name,
         str(len(scenes)) if scenes else "",
