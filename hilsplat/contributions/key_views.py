@@ -43,6 +43,9 @@ def key_views(scene: Scene, gaussians_ply: Path, share: float, threads: int = 1)
 
     A Gaussian is weighted by its mean visible mass, halved for each chosen view that shows it, so that views
     of uncovered regions are preferred. The result does not depend on `threads`.
+
+    Raises:
+        SceneError: there are no training views.
     """
     names, gaussians = train_views(scene), load_ply(gaussians_ply)
 

@@ -286,7 +286,12 @@ def read_view_masks(folder: Path, view: str) -> dict[tuple[str, str], Bool[np.nd
 
 
 def read_point_classes(path: Path, num_points: int) -> Int64[np.ndarray, " P"]:
-    """Read class ids of points from ScanNet's text format, one integer per line; 0 means no class."""
+    """Read class ids of points from ScanNet's text format, one integer per line; 0 means no class.
+
+    Raises:
+        ArtifactError: the file is missing or malformed.
+        MisalignedArtifactError: the number of points differs.
+    """
     words = _text(path).split()
     try:
         values = np.array(words, dtype=np.int64)
@@ -312,6 +317,10 @@ def read_point_instances(
     """Read masks, class ids and confidences in ScanNet's format: lines of mask file, class id and confidence.
 
     A mask file, relative to the folder of `path`, has one integer per point, non-zero inside the instance.
+
+    Raises:
+        ArtifactError: a file is missing or malformed.
+        MisalignedArtifactError: the number of points in a mask differs.
     """
     masks, classes, confidences = [], [], []
     for number, line in enumerate(_text(path).splitlines(), 1):

@@ -268,7 +268,11 @@ def autoencoder_file(folder: Path) -> Path:
 
 
 def load_latents(folder: Path, contributions: Contributions) -> Float32[np.ndarray, "M D"]:
-    """Return the latent of each mask, in the contributions' row order; latents of other masks are refused."""
+    """Return the latent of each mask, in the contributions' row order.
+
+    Raises:
+        MisalignedArtifactError: the latents belong to other masks.
+    """
     require_same_masks(folder, contributions.folder)
     return read_npz(sealed(folder, "latents.npz"), "latents")["latents"]
 

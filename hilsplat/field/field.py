@@ -116,7 +116,11 @@ def field_losses(
 
 
 def read_parents(tree_folder: Path, contributions: Contributions) -> dict[str, np.ndarray]:
-    """Return the parent of each mask in the coverage trees, by view; trees of other masks are refused."""
+    """Return the parent of each mask in the coverage trees, by view.
+
+    Raises:
+        MisalignedArtifactError: the trees were computed from other masks.
+    """
     require_same_masks(tree_folder, contributions.folder)
     return {
         view: read_npz(sealed(tree_folder, f"{view}.npz"), "parent")["parent"] for view in contributions.views

@@ -110,7 +110,12 @@ Fit = Callable[[MethodInputs, MethodSettings, int], np.ndarray]
 
 
 def run_method(inputs: MethodInputs, out: Path, settings: MethodSettings, seed: int) -> None:
-    """Compute the field of a scene with a baseline, and write it to `out`, a `field.safetensors` file."""
+    """Compute the field of a scene with a baseline, and write it to `out`, a `field.safetensors` file.
+
+    Raises:
+        SettingsError: there is no such method.
+        ArtifactError: the method returned features of the wrong shape or non-finite values.
+    """
     fit, contributions = method_of(settings.name), inputs.contributions
     with stage_log(f"method {settings.name}", Path(inputs.scene_folder).parent.name) as counts:
         features = np.asarray(fit(inputs, settings, seed), dtype=np.float32)
@@ -148,7 +153,11 @@ class LabelledView:
 
 
 def labelled_views(inputs: MethodInputs, pixel_step: int) -> list[LabelledView]:
-    """Return each training view's labelled pixels, if any, in every `pixel_step`-th row and column."""
+    """Return each training view's labelled pixels, if any, in every `pixel_step`-th row and column.
+
+    Raises:
+        ArtifactError: no view has a labelled pixel.
+    """
     found = []
     rows = inputs.contributions.rows_of_views()
     for number, name in enumerate(track(list(inputs.contributions.views), "weights of views")):

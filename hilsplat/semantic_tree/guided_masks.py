@@ -35,6 +35,9 @@ def run_guided_masks(
     The masks of the key views are kept unchanged; `semantic_tree_folder` contains their semantic tree.
 
     Departs: SAM and LangSplat use a grid of prompts in every view (measured in docs/experiments.md).
+
+    Raises:
+        MisalignedArtifactError: the tree was computed from other Gaussians.
     """
     scene, gaussians = Scene.load(scene_folder), load_ply(gaussians_ply)
     tree = SemanticTree.load(semantic_tree_folder)

@@ -25,7 +25,12 @@ POLICY = (
 
 
 def html_page(shown: ViewerScene, asked: Page, static: dict[str, bytes]) -> exports.Steps:
-    """Make the page of a scene, with one step per crop; 60,000 Gaussians take 8 MB."""
+    """Make the page of a scene, with one step per crop; 60,000 Gaussians take 8 MB.
+
+    Raises:
+        SettingsError: a text is empty, or the variant cannot be queried.
+        StaleSceneError: a part of the scene was rewritten since it was opened.
+    """
     scene = shown.answering(asked.variant)
     questions = [*asked.kept, *([asked.last] if asked.last else [])]
     with shown.unchanged():
