@@ -163,6 +163,15 @@ def test_npz_of_the_same_arrays_has_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "write", [artifacts.write_npy, lambda path, array: artifacts.write_npz(path, a=array)]
+)
+def test_objects_are_never_pickled(tmp_path: Path, write) -> None:
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        write(tmp_path / "a", np.array([{}], dtype=object))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
     ("save", "read"), [(np.save, artifacts.read_npy), (np.savez, artifacts.read_npz)], ids=["npy", "npz"]
 )
 def test_objects_are_never_unpickled(tmp_path: Path, save, read) -> None:
