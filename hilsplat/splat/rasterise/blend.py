@@ -3,8 +3,8 @@
 A tile is 16x16 pixels in sixteen 4x4 blocks; a block is one vector of 16 lanes. Lanes outside the image
 start with zero transmittance. Lists are processed in chunks of CHUNK entries, whose Gaussians are copied to
 contiguous memory; each entry has a bit for every block that it can reach (the sixteen blocks are also one
-vector). The forward pass computes the weights of each block's own Gaussians, then sums their channels in
-registers. The backward pass sums the gradient of each Gaussian over its blocks.
+vector). The forward pass blends each block's own Gaussians and keeps the sums in registers. The backward pass
+sums the gradient of each Gaussian over its blocks.
 
 The backward pass runs front to back and repeats the forward pass, so both have exactly the same
 transmittance. It keeps one number per pixel, R = sum over channels of (contribution of the remaining
@@ -122,19 +122,21 @@ def _shine(exponent, light):
 
 
 @compiled(inline="always")
-def weigh(block, first, count, reach, records, transmittance, entries, weights):
+def weigh(block, first, count, reach, records, shades, width, transmittance, entries, weights):
     """Compute the weights of a chunk's Gaussians that reach a block, front to back.
 
     Args:
         first, count: entries of the chunk in the band.
+        shades: channels; those of Gaussian k start at k * width.
         entries, weights: outputs: each Gaussian's position in the chunk, and its 16 weights.
 
     Returns:
-        number of Gaussians processed before all pixels were finished.
+        number of Gaussians processed before all pixels were finished, and the sums of the first 4 channels.
     """
     light = load(transmittance, block * LANES)
     px, py = load(_X, block * LANES), load(_Y, block * LANES)
     done = 0
+    one, two, three, four = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
     for word in range(0, count, 64):
         bits = column_bits(reach, first + word, block)
         if count - word < 64:
@@ -147,10 +149,24 @@ def weigh(block, first, count, reach, records, transmittance, entries, weights):
             entries[done] = k
             store(weights, done * LANES, weight)
             done += 1
+            shade = k * width
+            one = one + weight * load_same(shades, shade)
+            two = two + weight * load_same(shades, shade + 1)
+            three = three + weight * load_same(shades, shade + 2)
+            four = four + weight * load_same(shades, shade + 3)
             if not any_ge(light, lanes(_STOP)):
                 break
     store(transmittance, block * LANES, light)
-    return done
+    return done, one, two, three, four
+
+
+@compiled(inline="always")
+def _add_group(sums, at, one, two, three, four):
+    """Add to the sums of 4 channels."""
+    store(sums, at, load(sums, at) + one)
+    store(sums, at + LANES, load(sums, at + LANES) + two)
+    store(sums, at + 2 * LANES, load(sums, at + 2 * LANES) + three)
+    store(sums, at + 3 * LANES, load(sums, at + 3 * LANES) + four)
 
 
 @compiled
@@ -183,8 +199,11 @@ def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geom
             for block in range(BLOCKS):
                 if not (alive >> block) & 1:
                     continue
-                done = weigh(block, first, count, reach, records, transmittance, entries, weights)
-                for group in range(0, per_gaussian, GROUP):
+                done, one, two, three, four = weigh(
+                    block, first, count, reach, records, shades, per_gaussian, transmittance, entries, weights
+                )
+                _add_group(sums, block * stride, one, two, three, four)
+                for group in range(GROUP, per_gaussian, GROUP):
                     one, two, three, four = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
                     for n in range(done):
                         weight = load(weights, n * LANES)
@@ -193,11 +212,7 @@ def blend(begin, end, base, tiles_x, tile_start, tile_end, gaussian, reach, geom
                         two = two + weight * load_same(shades, shade + 1)
                         three = three + weight * load_same(shades, shade + 2)
                         four = four + weight * load_same(shades, shade + 3)
-                    at = block * stride + group * LANES
-                    store(sums, at, load(sums, at) + one)
-                    store(sums, at + LANES, load(sums, at + LANES) + two)
-                    store(sums, at + 2 * LANES, load(sums, at + 2 * LANES) + three)
-                    store(sums, at + 3 * LANES, load(sums, at + 3 * LANES) + four)
+                    _add_group(sums, block * stride + group * LANES, one, two, three, four)
         for block in range(BLOCKS):
             left, upper = x0 + 4 * (block & 3), y0 + 4 * (block >> 2)
             columns = min(4, width - left)
@@ -379,7 +394,9 @@ def sparse_rows(
             count = min(tile_end[tile] - chunk, CHUNK)
             gather(chunk - base, count, x0, y0, gaussian, geometry, records)
             for block in range(BLOCKS):
-                done = weigh(block, chunk - base, count, reach, records, transmittance, entries, by_lane)
+                done = weigh(
+                    block, chunk - base, count, reach, records, records, 0, transmittance, entries, by_lane
+                )[0]
                 if out is None:
                     for n in range(done):
                         for lane in range(LANES):
