@@ -111,7 +111,7 @@ def run_coverage_tree(masks_folder: Path, out: Path, settings: CoverageTreeSetti
                 "subpart_with_parent": int(has_parent[masks.rows_of(Level.SUBPART)].sum()),
                 "deepest": int(depth.max(initial=0)),
             }
-        write_index(folder, index, scene=scene, theta=settings.theta)
+        write_index(folder, index, scene=scene)
         counts.update(
             views=len(index),
             masks=sum(entry["masks"] for entry in index.values()),

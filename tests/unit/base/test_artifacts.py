@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +27,12 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
         raise RuntimeError
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
+    with (
+        pytest.raises(RuntimeError),  # the error of the block, though it has not created the file
+        artifacts.atomic_folder(tmp_path / "out") as folder,
+        artifacts.atomic_path(folder / "b.txt"),
+    ):
+        raise RuntimeError
 
 
 @pytest.fixture(params=[0o022, 0o077, 0o002], ids=oct)
@@ -80,6 +87,17 @@ def test_the_files_of_a_folder_are_flushed_once_before_it_replaces_the_former_on
     files = [str(new / name) for name in ("inner/b.txt", "inner/c.txt", "inner", "a.txt")]
     assert sorted(flushed[:4]) == sorted(files)
     assert flushed[4:] == [str(new), str(tmp_path)]
+
+
+@pytest.mark.parametrize(("code", "is_raised"), [(errno.EINVAL, False), (errno.EIO, True)])
+def test_only_file_systems_that_cannot_flush_are_excused(tmp_path, monkeypatch, code, is_raised) -> None:
+    def fail(_: int) -> None:
+        raise OSError(code, "flush")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="flush") if is_raised else nullcontext():
+        artifacts.write_text(tmp_path / "a.txt", "text")
+    assert (tmp_path / "a.txt").exists() != is_raised
 
 
 @pytest.fixture
@@ -255,6 +273,10 @@ def test_a_second_writer_is_refused(tmp_path: Path) -> None:
         artifacts.output_lock(tmp_path / "out"),
     ):
         pass
+
+
+def test_digest_of_parts_depends_on_their_boundaries() -> None:
+    assert artifacts.sha256_of_bytes(b"ab", b"c") != artifacts.sha256_of_bytes(b"a", b"bc")
 
 
 def test_folder_digest_follows_names_and_bytes(tmp_path: Path) -> None:

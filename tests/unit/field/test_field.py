@@ -1,5 +1,6 @@
 """The sparse solver against dense algebra and autograd, and the stage."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from hilsplat.field.contrast import Contrast, ViewRelations, compared, distinct
 from hilsplat.field.field import run_field
 from hilsplat.field.literal_trainer import ViewTargets, view_losses
 from hilsplat.field.problem import QuadraticProblem, conjugate_gradient
-from hilsplat.field.solver import keep_labelled, solve_field
+from hilsplat.field.solver import dot, keep_labelled, solve_field
 from hilsplat.methods.method import MethodInputs
 from hilsplat.semantic_tree.build import run_semantic_tree
 from hilsplat.settings import AutoencoderSettings, FieldSettings, SemanticTreeSettings
@@ -180,6 +181,24 @@ def test_contrastive_weights_lower_their_terms():
     _, plain = solve_field(toy.problem, toy.contrast(without))
     assert "after_lbfgs" not in plain
     assert plain["after_cg"]["language"] < plain["lifted"]["language"]
+
+
+def test_the_first_step_of_lbfgs_starts_at_the_conjugate_gradient_and_lowers_the_objective():
+    toy = Toy((1.0, 0.3, 0.1))
+    weights = {"language": 1.0, "clustering": 0.3, "ridge": 0.1, "instance": 0.5, "part": 0.1}
+    settings = FieldSettings(weight_instance=0.5, weight_part=0.1, cg_steps=3, lbfgs_steps=1)
+    _, report = solve_field(toy.problem, toy.contrast(settings))
+    before, after = (
+        sum(weight * report[phase][name] for name, weight in weights.items())
+        for phase in ("after_cg", "after_lbfgs")
+    )
+    assert after < before
+
+
+@pytest.mark.parametrize("length", range(9))
+def test_dot_products_contain_every_element(length):
+    a, b = np.random.default_rng(length).normal(size=(2, length)).astype(np.float32)
+    assert dot(a, b) == pytest.approx(math.fsum(a.astype(float) * b.astype(float)), rel=1e-12)
 
 
 def test_lbfgs_reaches_the_minimum_of_the_whole_objective():

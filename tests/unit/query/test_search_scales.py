@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from hilsplat.base.levels import Level
 from hilsplat.query.hits import doubts_of
 from hilsplat.query.language_scene import LanguageScene
-from hilsplat.query.node_search import search
+from hilsplat.query.node_search import margin_range, search
 from hilsplat.scene.cameras import Cameras
 from hilsplat.scene.scene import Scene
 from hilsplat.semantic_tree.tree import SemanticTree
@@ -40,6 +40,13 @@ def test_in_a_scene_of_one_thing_its_part_is_ahead_of_an_orphan(heads_as_bear):
     hits = searched(tree, [bear, head], "bear", "head")
     assert (hits.ids.tolist(), hits.route) == ([1], "child")
     assert searched(tree, [bear, [0.0, 2.00, 2.16]], "bear", "head").ids.tolist() == [2]
+
+
+@pytest.mark.parametrize(
+    ("margin", "expected"), [([0.3, 0.1], 0.3), ([-0.3, -0.1], 0.3), ([0.3, -0.1], 0.4), ([], 0)]
+)
+def test_range_of_margins_contains_a_tie(margin, expected):
+    assert margin_range(np.array(margin, float)) == pytest.approx(expected)
 
 
 def test_twins_do_not_make_the_penalty_vanish():

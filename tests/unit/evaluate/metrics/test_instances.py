@@ -95,6 +95,7 @@ def test_only_the_first_match_marks_a_prediction_as_used():
 
 
 HALF_VOID, OTHER = [(A, 4), (VOID, 4)], [(A, 4), (9001, 4)]
+TWO_OTHERS = [(A, 4), (9001, 4), (VOID, 4)]
 
 
 @pytest.mark.parametrize(
@@ -107,6 +108,7 @@ HALF_VOID, OTHER = [(A, 4), (VOID, 4)], [(A, 4), (9001, 4)]
         # the more confident one is on an object of another class: P = 1/2 at R = 1
         (OTHER, [(0, 4, 0.5), (4, 8, 0.9)], (CLASS, 9), 0.25),
         (OTHER, [(0, 4, 0.5), (4, 8, 0.9)], (CLASS,), 1),  # void if class 9 is not evaluated
+        (TWO_OTHERS, [(0, 4, 0.5), (4, 8, 0.9), (8, 12, 0.8)], (CLASS, 9), 0.25),  # only one is in void
     ],
 )
 def test_predictions_in_void_are_ignored_and_others_are_false_positives(
