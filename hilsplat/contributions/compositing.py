@@ -29,9 +29,9 @@ def normalised_weights(weights: sp.csr_matrix) -> sp.csr_matrix:
 
 @compiled
 def _normalise(indptr, indices, data, min_alpha):
-    done, begin = 0, indptr[0]
+    done, begin = np.uint64(0), np.uint64(indptr[0])  # unsigned: skips the check for negative indices
     for row in range(len(indptr) - 1):
-        end = indptr[row + 1]
+        end = np.uint64(indptr[row + 1])
         alpha = 0.0
         for k in range(begin, end):
             alpha += data[k]
@@ -39,7 +39,7 @@ def _normalise(indptr, indices, data, min_alpha):
             for k in range(begin, end):
                 indices[done] = indices[k]
                 data[done] = data[k] / alpha
-                done += 1
+                done += np.uint64(1)
         begin, indptr[row + 1] = end, done
     return done
 

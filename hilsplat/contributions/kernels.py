@@ -6,9 +6,16 @@ from numba import types
 from numba.extending import intrinsic
 
 from hilsplat.base.compiled import compiled
+from hilsplat.base.lanes import prefetch, splat
 
 SUMS = 4
-"""Numbers per pair that are summed together: three sums, and the number of products added (0: new pair)."""
+"""Numbers per pair that are summed as one vector: a sum per level, and padding."""
+
+AHEAD = 8
+"""Weights of W are fetched into the cache this many pixels before they are needed."""
+
+PLACE = np.uint64(2**32 - 1)
+"""Bits of a cell (see `transpose`) that contain its place; the higher bits contain its row."""
 
 
 @compiled
@@ -65,34 +72,37 @@ def summed_masks(first, last, runs, offsets, level_index, labels, half, indptr, 
 @compiled
 def move_to_front(rows, indptr, indices, data):
     """Move the weights of some rows of W to the front of its arrays, and return the number of weights."""
-    done = 0
+    done = np.uint64(0)  # unsigned: skips the check for negative indices
     for row in rows:
-        for k in range(indptr[row], indptr[row + 1]):
+        for k in range(np.uint64(indptr[row]), np.uint64(indptr[row + 1])):
             indices[done], data[done] = indices[k], data[k]
-            done += 1
+            done += np.uint64(1)
     return done
 
 
 @compiled
-def transpose(indptr, indices, begins, pixels, places):
-    """Return each column's start, and the row and place of its values; `begins` must be zero."""
-    for k in range(indptr[-1]):
-        begins[indices[k] + 1] += 1
+def transpose(indptr, indices, begins, cells):
+    """Return each column's start, and the cells of its values: row * 2**32 + place.
+
+    `begins` must be zero. All integers are unsigned, which skips the checks for negative indices.
+    """
+    for k in range(np.uint64(indptr[-1])):
+        begins[np.uint64(indices[k]) + np.uint64(1)] += 1
     begins[:] = np.cumsum(begins)
-    filled = begins[:-1].copy()
+    filled = begins[:-1].astype(np.uint32)
     for p in range(len(indptr) - 1):
-        for k in range(indptr[p], indptr[p + 1]):
-            at = filled[indices[k]]
-            pixels[at] = p
-            places[at] = k
-            filled[indices[k]] += 1
+        for k in range(np.uint64(indptr[p]), np.uint64(indptr[p + 1])):
+            j = np.uint64(indices[k])
+            at = np.uint64(filled[j])
+            cells[at] = (np.uint64(p) << np.uint64(32)) | k
+            filled[j] = np.uint32(at + np.uint64(1))
 
 
 @intrinsic
 def add_products(typingctx, sums, at, whole, part, subpart, value):
-    """Add `value` times three numbers, and 1, to the sums at `at`, as one vector and without fusing.
+    """Add `value` times three numbers to the sums at `at`, as one vector and without fusing.
 
-    Returns the number of previous additions.
+    Returns the first sum as it was before.
     """
 
     def codegen(context, builder, sig, args):
@@ -100,13 +110,13 @@ def add_products(typingctx, sums, at, whole, part, subpart, value):
         four = ir.VectorType(number, SUMS)
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         place = builder.bitcast(builder.gep(data, [args[1]]), four.as_pointer())
-        weights = values = ir.Constant(four, [ir.Constant(number, 1.0)] * SUMS)
+        weights = ir.Constant(four, [ir.Constant(number, 0.0)] * SUMS)
         for index, each in enumerate(args[2:5]):
             weights = builder.insert_element(weights, each, ir.Constant(lane, index))
-            values = builder.insert_element(values, args[5], ir.Constant(lane, index))
         before = builder.load(place, align=8)
-        builder.store(builder.fadd(before, builder.fmul(weights, values)), place, align=8)
-        return builder.extract_element(before, ir.Constant(lane, SUMS - 1))
+        products = builder.fmul(weights, splat(builder, args[5], SUMS))
+        builder.store(builder.fadd(before, products), place, align=8)
+        return builder.extract_element(before, ir.Constant(lane, 0))
 
     return types.float64(sums, types.intp, *[types.float64] * 4), codegen
 
@@ -121,27 +131,20 @@ def enlarged(indices, values, kept, room):
 
 
 @compiled
-def _load(first, last, indices, values, sums):
-    """Load pairs of a row into the sums, and mark the pairs as known."""
-    levels = values.shape[1]
-    for k in range(first, last):
-        at = np.int64(indices[k]) * SUMS
-        for level in range(levels):
-            sums[at + level] = values[k, level]
-        sums[at + levels] = 1
-
-
-@compiled
-def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr, out_indices, out_values):
+def add_to_block(
+    begin, end, part, columns, rows, late, number, sums, fresh, out_indptr, out_indices, out_values
+):
     """Add the pixels of a part to rows begin..end of G.
 
-    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output.
+    Pairs in `rows` are summed in place; pairs in `late` and new pairs are written to the output. The sums of
+    one row fit into the fastest cache: its pairs are numbered from 1, first those of `rows`, then of `late`.
 
     Args:
         part: row starts, columns and values of W, and whether each pixel has a mask at each level.
-        columns: output of `transpose` for the part: starts, pixels and places.
+        columns: output of `transpose` for the part: starts and cells.
         rows, late: row starts, columns, and sums by level (E x 3); no pair is in both.
-        sums: SUMS numbers per Gaussian, zero before and after the call.
+        number: an integer per Gaussian, zero before and after the call.
+        sums: buffer for SUMS numbers per Gaussian.
         fresh: buffer for all columns.
         out_indptr, out_indices, out_values: late pairs; columns are sorted within rows.
 
@@ -149,7 +152,7 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
         `out_indices` and `out_values`, or larger copies if they were too small.
     """
     indptr, indices, data, valid = part
-    begins, pixels, places = columns
+    begins, cells = columns
     row_indptr, row_indices, row_values = rows
     late_indptr, late_indices, late_values = late
     levels = row_values.shape[1]
@@ -157,22 +160,31 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
     for i in range(begin, end):
         first, last = row_indptr[i - begin], row_indptr[i - begin + 1]
         old, old_end = late_indptr[i - begin], late_indptr[i - begin + 1]
-        count, shown = 0, begins[i] < begins[i + 1]
+        known, shown = last - first + old_end - old, begins[i] < begins[i + 1]
+        count = known
         if shown:
-            _load(first, last, row_indices, row_values, sums)
-            _load(old, old_end, late_indices, late_values, sums)
+            _number(first, last, row_indices, row_values, 0, number, sums)
+            _number(old, old_end, late_indices, late_values, last - first, number, sums)
         for t in range(begins[i], begins[i + 1]):
-            p = pixels[t]
-            weight = np.float64(data[places[t]])
+            p, place = cells[t] >> np.uint64(32), cells[t] & PLACE
+            ahead = np.int64(cells[min(t + AHEAD, len(cells) - 1)] & PLACE)
+            prefetch(indices, ahead)
+            prefetch(data, ahead)
+            weight = np.float64(data[place])
             whole = weight if valid[p, 0] else 0.0
             part_weight = weight if valid[p, 1] else 0.0
             subpart = weight if valid[p, 2] else 0.0
-            for k in range(np.uint64(places[t]), np.uint64(indptr[p + 1])):
+            for k in range(place, np.uint64(indptr[p + 1])):
                 j = np.uint64(indices[k])  # unsigned: skips the check for negative indices
-                at, value = np.int64(j) * SUMS, np.float64(data[k])
-                if add_products(sums, at, whole, part_weight, subpart, value) == 0:
-                    fresh[count] = np.int32(j)
+                at = np.int64(number[j])
+                if at == 0:
+                    fresh[count - known] = np.int32(j)
                     count += 1
+                    at = np.int64(count)
+                    number[j] = np.int32(count)
+                    sums[at * SUMS : at * SUMS + SUMS] = 0
+                add_products(sums, at * SUMS, whole, part_weight, subpart, np.float64(data[k]))
+        count -= known
         if count:
             fresh[:count] = np.sort(fresh[:count])
         size = old_end - old + count
@@ -180,10 +192,9 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
             out_indices, out_values = enlarged(out_indices, out_values, done, 2 * (done + size))
         if shown:
             for k in range(first, last):
-                at = np.int64(row_indices[k]) * SUMS
+                number[row_indices[k]] = 0
                 for level in range(levels):
-                    row_values[k, level] = sums[at + level]
-                sums[at : at + SUMS] = 0
+                    row_values[k, level] = sums[(k - first + 1) * SUMS + level]
             new = 0
             for place in range(done, done + size):
                 if new < count and (old == old_end or fresh[new] < late_indices[old]):
@@ -192,17 +203,26 @@ def add_to_block(begin, end, part, columns, rows, late, sums, fresh, out_indptr,
                 else:
                     column = late_indices[old]
                     old += 1
-                at = np.int64(column) * SUMS
                 out_indices[place] = column
                 for level in range(levels):
-                    out_values[place, level] = sums[at + level]
-                sums[at : at + SUMS] = 0
+                    out_values[place, level] = sums[np.int64(number[column]) * SUMS + level]
+                number[column] = 0
         else:
             out_indices[done : done + size] = late_indices[old:old_end]
             out_values[done : done + size] = late_values[old:old_end]
         done += size
         out_indptr[i - begin + 1] = done
     return out_indices, out_values
+
+
+@compiled
+def _number(first, last, indices, values, before, number, sums):
+    """Number the pairs first..last from `before` + 1, and load their sums."""
+    for k in range(first, last):
+        at = before + k - first + 1
+        number[indices[k]] = np.int32(at)
+        for level in range(values.shape[1]):
+            sums[at * SUMS + level] = values[k, level]
 
 
 @compiled

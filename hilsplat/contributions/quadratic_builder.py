@@ -98,13 +98,14 @@ class GramBuilder:
         edges = np.linspace(0, num_gaussians, BLOCKS + 1).astype(np.int64).tolist()
         self._ranges = list(pairwise(edges))
         self._threads = max(1, threads)
-        self._pixels = self._places = np.zeros(0, np.int32)
+        self._cells = np.zeros(0, np.uint64)
         self._rows = [_Rows(end - begin) for begin, end in self._ranges]
         self._late = [_Rows(end - begin) for begin, end in self._ranges]
         self._idle: SimpleQueue[tuple[np.ndarray, ...]] = SimpleQueue()  # buffers of each thread
         for _ in range(self._threads):
-            sums, fresh = np.zeros(num_gaussians * SUMS), np.empty(num_gaussians, np.int32)
-            self._idle.put((sums, fresh, np.empty(1024, np.int32), np.empty((1024, len(LEVELS)))))
+            number, fresh = np.zeros(num_gaussians, np.int32), np.empty(num_gaussians, np.int32)
+            sums = np.empty((num_gaussians + 1) * SUMS)
+            self._idle.put((number, sums, fresh, np.empty(1024, np.int32), np.empty((1024, len(LEVELS)))))
 
     @property
     def nonzeros(self) -> int:
@@ -117,18 +118,18 @@ class GramBuilder:
         arrays = (weights.indptr, weights.indices, weights.data, part.valid)
         columns = self._columns(weights)
 
-        def grow(number: int) -> None:
-            begin, end = self._ranges[number]
+        def grow(block: int) -> None:
+            begin, end = self._ranges[block]
             if columns[0][begin] == columns[0][end]:
                 return
-            rows, late, indptr = self._rows[number], self._late[number], np.zeros(end - begin + 1, np.int64)
-            sums, fresh, *buffers = self._idle.get()
-            known = rows.arrays(), late.arrays()
+            rows, late, indptr = self._rows[block], self._late[block], np.zeros(end - begin + 1, np.int64)
+            number, sums, fresh, *buffers = self._idle.get()
+            known = rows.arrays(), late.arrays(), number
             buffers = add_to_block(begin, end, arrays, columns, *known, sums, fresh, indptr, *buffers)
             late.replace(indptr, *buffers)
-            self._idle.put((sums, fresh, *buffers))
+            self._idle.put((number, sums, fresh, *buffers))
             if MERGE_AT * late.nonzeros > rows.nonzeros:
-                self._merged(number)
+                self._merged(block)
 
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(grow, range(BLOCKS)))
@@ -141,19 +142,17 @@ class GramBuilder:
             self._late[number] = _Rows(len(rows.indptr) - 1)
         return rows
 
-    def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where each Gaussian's list begins, and lists of the pixels and places of its weights in W.
+    def _columns(self, weights: sp.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
+        """Return where each Gaussian's list begins, and lists of the pixel and place of each weight in W.
 
         A place is where the upper triangle's columns begin in the pixel's row of W. The lists are reused
         for the next part, because allocating memory takes longer than filling it.
         """
-        dtype = np.int32 if weights.nnz < 2**31 else np.int64
-        if len(self._places) < weights.nnz or self._places.dtype != dtype:
-            self._pixels = np.empty(weights.nnz * 9 // 8, np.int32)
-            self._places = np.empty(len(self._pixels), dtype)
+        if len(self._cells) < weights.nnz:
+            self._cells = np.empty(weights.nnz * 9 // 8, np.uint64)
         begins = np.zeros(weights.shape[1] + 1, np.int64)
-        transpose(weights.indptr, weights.indices, begins, self._pixels, self._places)
-        return begins, self._pixels, self._places
+        transpose(weights.indptr, weights.indices, begins, self._cells)
+        return begins, self._cells
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all sums so far as arrays."""

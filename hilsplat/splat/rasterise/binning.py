@@ -19,8 +19,8 @@ _SLACK, _RELATIVE = np.float32(1e-2), np.float32(1e-6)
 to the squared terms of the exponent (float32 rounding: 6e-8)."""
 AHEAD = 16
 """Rows are prefetched this many list entries ahead."""
-MAX_ENTRIES = 2**21
-"""Maximum number of tile list entries in memory: 8 MiB, and 72 MiB of gradients for 3 channels."""
+MAX_ENTRIES = 2**22
+"""Maximum number of tile list entries in memory: 16 MiB, and 144 MiB of gradients for 3 channels."""
 
 _SPAN = np.float32(3.0)
 """Distance between a block's first and last pixel centre."""
