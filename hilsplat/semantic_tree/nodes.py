@@ -106,9 +106,12 @@ def linked_nodes(
                 of_cluster[cluster], len(kept), weights, view, mass, total_mass
             )
 
-        fits, iou = best_fits(level_ious(winners(kept)[1], weights, mass, view))
-        kept = kept[np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views]
         of_cluster, node, share = winners(kept)
+        fits, iou = best_fits(level_ious(node, weights, mass, view))
+        is_best = np.bincount(fits[iou > MIN_FIT], minlength=len(kept)) >= settings.min_views
+        if not is_best.all():
+            kept = kept[is_best]
+            of_cluster, node, share = winners(kept)
         renumber = renumbered_without_empty(node, len(kept))
         of_mask = renumber[of_cluster[cluster]].astype(np.int64)
         return LevelNodes(of_mask, renumber[node], share, quality[kept[renumber[:-1] != NONE]])
