@@ -20,8 +20,8 @@ from hilsplat.cli.stage import (
     world_app,
 )
 
-SceneWithMasks = Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has masks")]
-MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks to measure")]
+SceneWithMasks = Annotated[str, typer.Argument(help="synthetic scene that has masks, as dataset/scene")]
+MeasuredMasks = Annotated[str, typer.Option(help="variant whose masks are measured")]
 NEIGHBOURS = 2  # number of nearest views that each view is compared with
 
 
@@ -32,7 +32,7 @@ def world_make(
     settings: Settings = "{}",
     threads: Threads = 1,
 ) -> None:
-    """Make a synthetic scene: images, and the ground truth that only evaluate reads."""
+    """Make a synthetic scene: images, and ground truth for evaluation only."""
     section = section_of("world", settings)
     beside = (out / "images", out / "truth")
     with stage("world", out, settings=section, beside=beside) as run:
@@ -41,10 +41,10 @@ def world_make(
 
 @world_app.command("show")
 def world_show(
-    scene: Annotated[str, typer.Argument(help="dataset/scene of a finished synthetic scene")],
+    scene: Annotated[str, typer.Argument(help="finished synthetic scene, as dataset/scene")],
     results: Results = Path("results"),
 ) -> None:
-    """Draw a contact sheet beside the scene: views, labels by level, and the tree with its texts."""
+    """Write a contact sheet to world.png: views, labels by level, and the tree with its texts."""
     from hilsplat.world.pictures import show_world
 
     target = results / scene / "world.png"
@@ -78,7 +78,7 @@ def world_gallery(
 def world_inconsistency(
     scene: SceneWithMasks, variant: MeasuredMasks = "default", results: Results = Path("results")
 ) -> None:
-    """Measure with exact geometry how often a surface point has different masks in the two nearest views.
+    """Measure, using exact geometry, how often a surface point has different masks in neighbouring views.
 
     Writes consistency.csv beside the masks.
     """
@@ -98,7 +98,7 @@ def world_masks(
         Path | None, typer.Option(help="PNG to write, with CSV and PDF beside it; default: beside the masks")
     ] = None,
 ) -> None:
-    """Compare masks with the ground-truth regions by level, and draw the errors."""
+    """Compare masks with ground-truth regions at each level, and draw the errors."""
     folder = results / scene
     truth, masks_folder = folder / "world" / "truth", folder / variant / "masks"
     target = out or masks_folder.with_name("masks_truth.png")
@@ -110,8 +110,8 @@ def world_masks(
 
 @world_app.command("semantic-tree")
 def world_tree(
-    scene: Annotated[str, typer.Argument(help="dataset/scene of a synthetic scene that has a tree")],
-    variant: Annotated[str, typer.Option(help="variant whose tree to measure")] = "default",
+    scene: Annotated[str, typer.Argument(help="synthetic scene that has a tree, as dataset/scene")],
+    variant: Annotated[str, typer.Option(help="variant whose tree is measured")] = "default",
     results: Results = Path("results"),
     threads: Threads = 2,
 ) -> None:
@@ -139,7 +139,7 @@ def models_get(
     ] = None,
     revision: Annotated[str | None, typer.Option(help="branch, tag or commit of the repository")] = None,
     variant: Annotated[
-        str, typer.Option(help="precision of the networks: quantized, fp16, int8, ...; default: full")
+        str, typer.Option(help="network precision: quantized, fp16, int8, ...; default: full precision")
     ] = "",
     out: Annotated[
         Path | None, typer.Option(help="models folder; default: HILSPLAT_MODELS, or the user's data folder")
@@ -165,10 +165,10 @@ def models_list() -> None:
 
 @models_app.command("check")
 def models_check(
-    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all installed")] = None,
+    folder: Annotated[Path | None, typer.Argument(help="model folder; default: all installed models")] = None,
     variant: Annotated[str, typer.Option(help="suffix of the network files, such as fp16")] = "",
 ) -> None:
-    """Describe a model folder, or all installed ones, and time one image."""
+    """Describe one model or all installed models, and measure the time per image."""
     from hilsplat.embed.model_check import check_model, check_models
 
     text, num_failed = (check_model(folder, variant), 0) if folder is not None else check_models()
@@ -203,17 +203,17 @@ def cache_prune(
     context: typer.Context,
     days: Annotated[float | None, typer.Option(min=0, help="delete entries unused for N days")] = None,
     max_mib: Annotated[
-        float | None, typer.Option(min=0, help="delete least recently used entries until N MiB are left")
+        float | None, typer.Option(min=0, help="delete least recently used entries until N MiB remain")
     ] = None,
     stage: Annotated[
         list[str] | None,
         typer.Option(
             help="cache to prune: masks, clip, contributions or gaussians (fit checkpoints, kept for at "
-            "least a day); default: all, but gaussians only with --days"
+            "least a day); default: all caches, including gaussians only if --days is given"
         ),
     ] = None,
 ) -> None:
-    """Delete unfinished files of killed jobs and, with a limit, cache entries, which can be recomputed."""
+    """Delete unfinished files of killed jobs and, if a limit is given, cache entries (recomputed on use)."""
     from hilsplat.base.cache import prune_cache, size_table
 
     number, freed_mib = prune_cache(context.obj, stage or [], days=days, max_mib=max_mib)
@@ -236,7 +236,7 @@ def datasets_check(
     data_root: DataRoot,
     scene: Annotated[list[str] | None, typer.Option(help="scene to read; default: all found")] = None,
 ) -> None:
-    """Read all labels of a data set and report what was found, and any problems, scene by scene."""
+    """Read all labels of a data set, and report the contents and any problems of each scene."""
     from hilsplat.datasets.registry import check, dataset_of
 
     report, num_failed = check(dataset_of(name), data_root, scene or ())
@@ -251,7 +251,7 @@ def datasets_export(
     data_root: DataRoot,
     out: PathOut,
 ) -> None:
-    """Write the images and poses of a scene as a folder that `poses` imports."""
+    """Write the images and poses of a scene to a folder that the poses command can import."""
     from hilsplat.datasets.registry import readers_of
     from hilsplat.datasets.sources import DATA_PREFIX, image_files
 
@@ -262,12 +262,12 @@ def datasets_export(
 
 @datasets_app.command("fits")
 def datasets_fits(
-    scene: Annotated[str, typer.Argument(help="dataset/scene in the results folder that has a tree")],
+    scene: Annotated[str, typer.Argument(help="scene with a tree in the results folder, as dataset/scene")],
     labels: Annotated[
         str | None,
-        typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own for this scene"),
+        typer.Option(help="labels with levels, such as hi_lerf/figurines; default: your own labels"),
     ] = None,
-    variant: Annotated[str, typer.Option(help="variant whose masks and tree to measure")] = "default",
+    variant: Annotated[str, typer.Option(help="variant whose masks and tree are measured")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     threads: Threads = 2,

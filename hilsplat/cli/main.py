@@ -28,7 +28,7 @@ from hilsplat.cli import scene_commands, stage_commands, user_commands, group_co
 
 
 def main() -> None:
-    """Run the command; an error that the user can fix prints a message without a traceback."""
+    """Run the command; for errors that the user can fix, print a message without a traceback."""
     end_with_workflow()
     try:
         require_working_directory()
@@ -40,7 +40,7 @@ def main() -> None:
             raise
         logging.getLogger("hilsplat").error("%s", message)
         sys.exit(1)
-    finally:  # otherwise garbage collection at exit, of numba and matplotlib objects, takes 0.4 s
+    finally:  # otherwise, garbage-collecting numba and matplotlib objects at exit takes 0.4 s
         gc.freeze()
 
 

@@ -8,7 +8,7 @@ import typer
 
 from hilsplat.cli.stage import app
 
-POSES_HELP = "COLMAP model, transforms.json, or their folder; none: compute poses; default: use any found"
+POSES_HELP = "COLMAP model or transforms.json, or its folder; none: compute poses; default: use any found"
 
 
 @app.command()
@@ -35,9 +35,9 @@ def run_command(
         typer.Option(help="configuration file that overrides config/config.yaml; may be repeated"),
     ] = None,
 ) -> None:
-    """Run the workflow for everything in the configuration, or for single scenes, tables or files.
+    """Run the workflow for everything in the configuration, or only for given scenes, tables or files.
 
-    A killed run continues. Options after -- are passed to Snakemake: hilsplat run desk -- --cores 1
+    Rerunning resumes a killed run. Options after -- are passed to Snakemake: hilsplat run desk -- --cores 1
     """
     from hilsplat.workflow.run import run
 
@@ -61,7 +61,7 @@ def new(
         typer.Option(help="LangSplat's features; none: use SAM and CLIP; default: use any features found"),
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(help="LERF-OVS labels for scores; none: no labels; default: use any found")
+        Path | None, typer.Option(help="LERF-OVS labels for scoring; none: no labels; default: use any found")
     ] = None,
 ) -> None:
     """Add photographs, a video, or a scene from COLMAP, 3DGS, nerfstudio or LangSplat to the scene sheet.

@@ -51,11 +51,11 @@ MOST_THREADS = max(16, os.cpu_count() or 1)
 Memory = Annotated[
     float | None,
     typer.Option(
-        min=1, help="memory for concurrent views, in MiB; default: all free memory; does not affect results"
+        min=1, help="memory for views in parallel, in MiB; default: all free memory; does not affect results"
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, max=2_000_000_000, help="random seed")]
-Cache = Annotated[Path, typer.Option(help="cache folder for finished views, to resume from")]
+Cache = Annotated[Path, typer.Option(help="cache folder of finished views, for resuming")]
 Results = Annotated[Path, typer.Option(help="results folder")]
 DataRoot = Annotated[Path, typer.Option(help="folder of the data sets")]
 
@@ -87,12 +87,12 @@ def stage(
     plugins: tuple[str, ...] = (),
     beside: tuple[Path, ...] = (),
 ) -> Iterator[Any]:
-    """Yield a stage's function, to be called with a log, lock, disk space check and provenance record.
+    """Yield a stage's function; a call is logged, locked, checked for disk space and recorded in provenance.
 
     Args:
         out: output; its provenance is written next to it.
-        settings: the section that the stage uses, or several sections by name. If it has the setting
-            `device`, provenance records the device that `auto` resolves to.
+        settings: the section that the stage uses, or several sections by name. If a single section has a
+            setting `device`, provenance records the device that `auto` resolves to.
         seed: None if the stage is deterministic.
         inputs: name -> file, folder or list of files that the stage reads; None for an input not given.
         plugins: import paths of the readers or baselines that the stage uses (`base.plugins`).
@@ -135,7 +135,7 @@ def stage(
             )
     except HilsplatError:
         raise
-    except Exception as error:  # a system error, or a bug: log the traceback of a bug
+    except Exception as error:  # a system error, or a bug, whose traceback is logged
         if (problem := system_error(error)) is not None:
             raise problem from error
         if sys.gettrace() is not None:  # for post-mortem debugging
@@ -157,20 +157,20 @@ def _recorded(settings: Any) -> dict[str, Any]:
 
 
 def section_of(name: str, text: str) -> Any:
-    """Read one section of the settings from JSON, and replace `auto` by the installed models."""
+    """Parse one section of the settings from JSON, and replace `auto` with the installed models."""
     from hilsplat.configuration import parse_section, with_models
 
     return with_models(parse_section(name, text))
 
 
 def model_input(section: Any) -> dict[str, Path]:
-    """Return a section's model folder as an input, or {} if it is missing, which the stage then reports."""
+    """Return a section's model folder as an input, or {} if it is missing (the stage reports the error)."""
     folder = model_path(section.model)
     return {"model": folder} if folder.is_dir() else {}
 
 
 def json_option(option: str, text: str, kind: type) -> Any:
-    """Parse a JSON option, a list or dict of strings; raise SettingsError for anything else."""
+    """Parse a JSON option that must be a list or dict of strings; raise SettingsError otherwise."""
     try:
         value = parse_json(text)
     except ValueError as error:

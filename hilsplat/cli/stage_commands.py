@@ -39,9 +39,9 @@ Queries = Annotated[str, typer.Option(help="JSON list of queries, for a scene wi
 def find_poses(
     images: PathIn,
     out: PathOut,
-    name: Annotated[str, typer.Option(help="dataset/scene, for messages")] = "scene",
+    name: Annotated[str, typer.Option(help="name of the scene in messages, as dataset/scene")] = "scene",
     unit: Annotated[str, typer.Option(help="unit of length: metre or arbitrary")] = "arbitrary",
-    render: Annotated[bool, typer.Option(help="the images are renders, with an ideal lens")] = False,
+    render: Annotated[bool, typer.Option(help="treat the images as renders with an ideal lens")] = False,
     poses: Annotated[Path | None, typer.Option(help=POSES_HELP)] = None,
     settings: Settings = "{}",
     seed: Seed = 0,
@@ -106,7 +106,7 @@ def masks(
         raise HilsplatError(
             f"masks: the segmenter {section.segmenter} must not use the ground truth",
             found=f"--truth {truth}",
-            fix="omit --truth, or set masks.segmenter to truth-perturbed, a diagnostic",
+            fix="omit --truth, or, for diagnosis only, set masks.segmenter to truth-perturbed",
         )
     if is_diagnostic:
         faults = section_of("perturb", perturb)
@@ -141,7 +141,7 @@ def masks(
 
 @app.command("coverage-tree")
 def coverage_tree(masks: PathIn, out: PathOut, settings: Settings = "{}") -> None:
-    """Compute the parent of each mask: the coverage tree of each view."""
+    """Compute each view's coverage tree: the parent of each mask."""
     section = section_of("coverage_tree", settings)
     with stage("coverage_tree", out, settings=section, inputs={"masks": masks}) as run:
         run(masks, out, section)
@@ -193,7 +193,7 @@ def clip(
     threads: Threads = 1,
     memory: Memory = None,
 ) -> None:
-    """Embed the crops that show each node best, or every mask, with CLIP."""
+    """Embed the best crops of each node, or every mask, with CLIP."""
     section = section_of("clip", settings)
     inputs = {"scene": scene, "masks": masks, **model_input(section), "semantic_tree": semantic_tree}
     if features is not None:
@@ -232,13 +232,13 @@ def semantic_tree(
     seed: Seed = 0,
     threads: Threads = 1,
 ) -> None:
-    """Compute nodes at three levels, by linking masks of all views or clustering Gaussians by features."""
+    """Compute nodes at three levels, by linking masks across views or clustering Gaussians by features."""
     section = section_of("semantic_tree", settings)
     inputs = {"contributions": contributions, "masks": masks, "coverage_tree": coverage_tree}
     if (section.evidence == "features") != (coverage_tree is not None):
         raise SettingsError(
             "semantic_tree.evidence and the options do not match",
-            expected="--coverage-tree with evidence: features, and only then",
+            expected="--coverage-tree if evidence is features, and no --coverage-tree otherwise",
         )
     if coverage_tree is None:
         with stage("semantic_tree", out, settings=section, inputs=inputs) as run:
@@ -397,7 +397,7 @@ def table(
     out: Annotated[Path, typer.Option(help="CSV to write, with .md, .tex and .html files beside it")],
     scores: Annotated[list[Path] | None, typer.Argument(help="scores.csv of each scene and variant")] = None,
     labels: Annotated[str, typer.Option(help="JSON: variant -> its name in the table")] = "{}",
-    absent: Annotated[list[str] | None, typer.Option(help="what was not measured, and why")] = None,
+    absent: Annotated[list[str] | None, typer.Option(help="an entry that was not measured, and why")] = None,
 ) -> None:
     """Build one table of the paper, with reported, measured and stand-in rows."""
     scores = scores or []
@@ -454,7 +454,7 @@ def comparison(
     evaluate: EvaluateSection = "{}",
     threads: Threads = 1,
 ) -> None:
-    """Compare variants: queries by method, one query in four views, features at three levels."""
+    """Draw a comparison of variants: queries by method, one query in four views, features at three levels."""
     section, protocol = section_of("figures", settings), section_of("evaluate", evaluate)
     compared, named = json_option("--variants", variants, list), json_option("--names", names, dict)
     texts, both = json_option("--queries", queries, list), {"figures": section, "evaluate": protocol}

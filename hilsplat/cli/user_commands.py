@@ -1,4 +1,4 @@
-"""Commands that use a finished scene, check results and machine, and print all settings."""
+"""Commands that use a finished scene, check results or the machine, or print all settings."""
 
 import gc
 import glob
@@ -44,8 +44,8 @@ def query(
 ) -> None:
     """Find the objects or parts that match a text in a finished scene.
 
-    Prints score, level, position, size and best views of each answer; writes a picture (panel.png) and the
-    answers' Gaussians (selection.ply).
+    Prints the score, level, position, size and best views of each answer. Writes a picture (panel.png) and
+    the answers' Gaussians (selection.ply).
     """
     gc.disable()  # garbage collection would take two seconds, a tenth of the query time
     try:
@@ -69,7 +69,7 @@ def query(
 
 
 def scene_folder(scene: str, results: Path) -> Path:
-    """Return the folder of a scene, given by name (SettingsError if ambiguous), dataset/scene, or path."""
+    """Return the folder of a scene (name, dataset/scene or path); SettingsError if a name is ambiguous."""
     named, path = results / scene, Path(scene)
     if "/" not in scene:
         found = sorted(folder.parent for folder in results.glob(f"*/{glob.escape(scene)}/scene"))
@@ -87,7 +87,7 @@ def scene_folder(scene: str, results: Path) -> Path:
 def verify(
     results: Annotated[Path, typer.Argument(help="results folder, or a copy of it")] = Path("results"),
 ) -> None:
-    """Check every digest of a results folder, and print the Snakemake command that repairs it."""
+    """Check all digests in a results folder, and print the Snakemake command that repairs it."""
     from hilsplat.workflow.records import verify
 
     report, is_whole = verify(results)
@@ -98,7 +98,7 @@ def verify(
 
 @app.command()
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="print a list of findings as JSON")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the findings as a JSON list")] = False,
 ) -> None:
     """Check this machine: libraries, GPU, models, disk, memory. The exit status is 1 if there is a fault."""
     from hilsplat.workflow.doctor import examine
@@ -153,7 +153,7 @@ def export(
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     out: Annotated[
-        Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder (replaced)")
+        Path | None, typer.Option(help="new folder; default: export/FORM in the scene's folder (overwritten)")
     ] = None,
     threads: Threads = 2,
 ) -> None:
@@ -231,16 +231,16 @@ def view(
 @app.command()
 def annotate(
     scene: SceneName,
-    variant: Annotated[str, typer.Option(help="variant whose masks or nodes are proposed")] = "default",
+    variant: Annotated[str, typer.Option(help="variant whose masks or nodes are suggested")] = "default",
     results: Results = Path("results"),
     data_root: DataRoot = Path(),
     port: Port = 0,
     browser: Browser = True,
     threads: Threads = 2,
 ) -> None:
-    """Annotate the photographs of a scene, with levels and parents, in a browser on this machine.
+    """Annotate regions of a scene's photographs, with levels and parents, in a browser on this machine.
 
-    Writes annotated/DATASET/SCENE below the data root after each change; evaluate reads it like any data set.
+    Writes annotated/DATASET/SCENE in the data root after each change; evaluate reads it like any data set.
     """
     from hilsplat.annotate.app import run_annotate
     from hilsplat.scene.scene import Scene
