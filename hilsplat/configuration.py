@@ -1,4 +1,4 @@
-"""The configuration of a run: the section of each stage, variants, seeds, scenes and tables."""
+"""The configuration of a run: settings of each stage, variants, seeds, scenes and tables."""
 
 import difflib
 import json
@@ -79,7 +79,7 @@ Settings = TypeVar("Settings", bound=Section)
 
 
 def with_models(section: Settings) -> Settings:
-    """Replace `auto` in a section by existing models, so that records name the models that were used.
+    """Replace `auto` in a section with existing models, so that records name the models that were used.
 
     `masks.segmenter: auto` selects the SAM model in `masks.model` or, if that is also auto, the best
     pretrained SAM; if there is none, the graph segmenter. `masks.model: auto` and `clip.model: auto`
@@ -100,7 +100,7 @@ def with_models(section: Settings) -> Settings:
 
 
 def settings_error(error: ValidationError, where: str, model: type[BaseModel]) -> SettingsError:
-    """Convert pydantic's error to one line per key: location, problem, and what is allowed."""
+    """Convert pydantic's error to one line per key: location, problem, and allowed or found values."""
     lines = []
     for problem in error.errors():
         path = [str(part) for part in problem["loc"]]
@@ -171,7 +171,7 @@ class RunSettings(StageSettings):
     sweep_scenes: tuple[str, ...] = knob(
         (), "scenes in ablation, sweep and pruning tables; empty: all tabletop and photographed scenes"
     )
-    seeds: int = knob(1, "seeds for random training; if several, tables report mean and spread", ge=1, le=10)
+    seeds: int = knob(1, "number of training seeds; if above 1, tables report mean and spread", ge=1, le=10)
     variants: dict[str, dict[str, dict[str, Any]]] = knob(
         {}, "named overrides: variant -> section -> setting -> value; 'default' always exists"
     )
@@ -190,7 +190,7 @@ class RunSettings(StageSettings):
         return (value,) if isinstance(value, str) else value
 
     def every_variant(self) -> list[str]:
-        """Return all variants, tabulated or not, once per seed: "default", then as in `variants`."""
+        """Return all variants, tabulated or not, once per seed, in order: "default", then `variants`."""
         return [
             name for first in dict.fromkeys(["default", *self.variants]) for name in self._all_seeds(first)
         ]
@@ -221,7 +221,7 @@ class RunSettings(StageSettings):
             scopes: keys of `overrides` to apply, general ones first (group, then dataset/scene).
 
         Raises:
-            SettingsError: the variant is unknown or an override cannot be used.
+            SettingsError: the variant is unknown or an override is invalid.
         """
         variant, _ = _parts_of(variant)
         sections: dict[str, Section] = {name: getattr(self, name) for name in SECTIONS}
@@ -243,7 +243,7 @@ class RunSettings(StageSettings):
                     raise SettingsError(
                         f"{where}.{section}: variants cannot change this section, because they share it",
                         expected=f"one of {', '.join(VARIANT_SECTIONS)}",
-                        fix="put it under overrides for a group or a scene, or in another configuration file",
+                        fix="put it under overrides for a group or a scene, or in a separate configuration",
                     )
                 changed = sections[section].model_dump() | values
                 try:
@@ -260,10 +260,10 @@ def _parts_of(name: str) -> tuple[str, int]:
 
 
 def parse_run(config: dict[str, Any]) -> RunSettings:
-    """Validate a configuration with variants and overrides; raise SettingsError, which names each bad key."""
+    """Validate a configuration with variants and overrides; raise a SettingsError that names all bad keys."""
     if "\\u0000" in json.dumps(config, default=str):
         raise SettingsError(
-            "a string in the configuration contains a null byte", fix="remove it; commands do not accept it"
+            "a string in the configuration contains a null byte", fix="remove it; commands cannot contain one"
         )
     try:
         run = RunSettings.model_validate(config)
@@ -330,7 +330,7 @@ def read_config(path: Path) -> dict[str, Any]:
         fault = "cannot be used" if isinstance(error, yaml.constructor.ConstructorError) else "is not YAML"
         raise SettingsError(
             f"{path}{place} {fault}: {error.problem or error.context}",
-            fix="indent with spaces, close brackets and quotes, and quote strings with a colon or braces",
+            fix="indent with spaces, close brackets and quotes, and quote strings with colons or braces",
         ) from error
     except FileNotFoundError as error:
         raise SettingsError(f"{path} is missing", fix="correct the path") from error
@@ -342,7 +342,7 @@ def read_config(path: Path) -> dict[str, Any]:
     try:
         json.dumps(found, default=str)
     except (ValueError, RecursionError, TypeError) as error:  # a self-referencing alias; a list as key
-        raise SettingsError(f"{path} cannot be used: {error}", fix="no aliases, no lists as keys") from error
+        raise SettingsError(f"{path} cannot be used: {error}", fix="remove aliases and list keys") from error
     return found
 
 

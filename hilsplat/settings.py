@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 LARGEST = 2_000_000_000
-"""Maximum of an integer setting: libraries accept 32 bits, and a run adds up to 10 to its seed."""
+"""Maximum of an integer setting: libraries use 32-bit integers, and a run adds up to 10 to its seed."""
 
 
 def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **limits: Any) -> Any:
@@ -21,7 +21,7 @@ def knob(default: Any, what: str, *, unit: str = "", origin: str = "ours", **lim
 
 
 class Section(BaseModel):
-    """Frozen settings of one stage. Unknown keys and numbers that are not finite are refused."""
+    """Frozen settings of one stage. Unknown keys and non-finite numbers are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
@@ -31,7 +31,7 @@ class Section(BaseModel):
         """Refuse booleans where a number or a word is expected, because YAML reads yes and no as booleans."""
         if isinstance(value, bool) and not _takes(cls.model_fields[info.field_name].annotation, bool):
             raise ValueError(
-                "a number or a word is expected; YAML reads yes, no, on and off as true and false"
+                "expected a number or word; YAML reads yes, no, on and off as booleans unless quoted"
             )
         return value
 
@@ -53,7 +53,7 @@ Auto = Literal["auto"]
 
 
 class WorldSettings(Section):
-    """Rendering of a synthetic scene. Its content depends on its kind and seed in the scene sheet."""
+    """Rendering of a synthetic scene. The content depends on its kind and seed, given in the scene sheet."""
 
     views: int = knob(40, "number of views", unit="views", ge=3, le=1000)
     image_px: int = knob(256, "height and width of each view", unit="px", ge=32, le=4096)
@@ -83,7 +83,7 @@ class PosesSettings(Section):
     )
     max_features: int = knob(4096, "SIFT features per image", ge=100, le=32768, origin="COLMAP: 8192")
     min_registered_share: float = knob(
-        0.7, "minimum share of the views in the largest model, or poses fail", unit="share", gt=0, le=1
+        0.7, "minimum share of the views in the largest model; below it, poses fail", unit="share", gt=0, le=1
     )
     several_models: Literal["largest", "stop"] = knob(
         "largest", "if the photographs form several models: use the largest, or stop"
@@ -98,8 +98,8 @@ class GaussiansSettings(Section):
     steps_per_view: int = knob(60, "steps per training view, up to `iterations` in total", ge=1)
     max_gaussians: int = knob(50_000, "maximum number of Gaussians at any step", ge=100)
     image_scale: float = knob(1.0, "scale of the images in the fit; 0.5 halves their sides", gt=0, le=1)
-    quarter_until: Share = knob(0.15, "share of the iterations with quarter-size images", origin="3DGS: 0")
-    half_until: Share = knob(0.75, "share of the iterations below full size", origin="3DGS: 0")
+    quarter_until: Share = knob(0.15, "share of iterations that use quarter-size images", origin="3DGS: 0")
+    half_until: Share = knob(0.75, "share of iterations that use images below full size", origin="3DGS: 0")
     sh_degree: int = knob(2, "degree of the spherical harmonics of the colours", ge=0, le=3, origin="3DGS: 3")
     ssim_weight: Share = knob(0.2, "D-SSIM's share of the loss; the rest is L1", origin="3DGS")
     # A fit takes a fifteenth of the published number of steps, so each step must be larger (docs/splat.md).
@@ -113,7 +113,7 @@ class GaussiansSettings(Section):
     scales_rate: float = knob(0.01, "step size of the log scales", gt=0, origin="3DGS: 5e-3")
     quats_rate: float = knob(0.004, "step size of the quaternions", gt=0, origin="3DGS: 1e-3")
     sh_rate: float = knob(
-        4e-3, "step size of the constant harmonics; others: 1/20 of it", gt=0, origin="3DGS: 2.5e-3"
+        4e-3, "step size of the constant harmonics; the others use 1/20 of it", gt=0, origin="3DGS: 2.5e-3"
     )
     densify_from: Share = knob(
         0.06, "start of densification, as a share of iterations", origin="3DGS: 500 / 30000"
@@ -139,7 +139,7 @@ class GaussiansSettings(Section):
     )
     initial: Literal["points", "random", "frozen"] = knob(
         "points",
-        "initial Gaussians; points: at the sparse points; random: at random points visible to cameras; "
+        "initial Gaussians; points: at the sparse points; random: at random points in view of cameras; "
         "frozen: exactly one per sparse point, in a fixed position (for evaluate.points: frozen)",
         origin="OpenGaussian on ScanNet: frozen",
     )
@@ -155,8 +155,8 @@ class MasksSettings(Section):
     segmenter: Literal["auto", "sam", "graph", "truth-perturbed"] = knob(
         "sam",
         "sam: the SAM model in `model`; graph: OpenCV's graph segmentation (no weights); auto: sam if "
-        "pretrained, else graph; truth-perturbed: a diagnostic, ground-truth masks of a synthetic scene with "
-        "the faults in perturb",
+        "pretrained, else graph; truth-perturbed (diagnostic): ground-truth masks of a synthetic scene with "
+        "the faults set in perturb",
     )
     model: str = knob(
         "models/sam-tiny",
@@ -179,17 +179,17 @@ class MasksSettings(Section):
     )
     prompts: Literal["grid", "guided"] = knob(
         "grid",
-        "prompts in views after the key views; guided: nodes of the key views, and grid points that no "
+        "prompts in all but the key views; guided: nodes of the key views, and grid points that no "
         "node covers",
         origin="SAM, LangSplat: grid",
     )
     levels: Literal["head", "tree"] = knob(
         "head",
-        "source of levels; head: SAM's output head; tree: depth in the tree of all masks of the view, by "
-        "theta",
+        "source of levels; head: SAM's output head; tree: depth in the tree of all masks of the view, which "
+        "is computed with theta",
         origin="paper: three levels by theta; LangSplat: head",
     )
-    theta: float | None = knob(None, "for levels = tree; default: coverage_tree.theta", gt=0.5, lt=1)
+    theta: float | None = knob(None, "theta for levels: tree; default: coverage_tree.theta", gt=0.5, lt=1)
     points_per_side: int = knob(32, "point prompts per image side", ge=1, le=128, origin="LangSplat: 32")
     points_per_batch: Annotated[int, Field(ge=1, le=4096)] | Auto = knob(
         "auto",
@@ -210,7 +210,7 @@ class MasksSettings(Section):
     )
     stability: Literal["estimate", "full"] = knob(
         "estimate",
-        "masks used to measure stability; estimate: the network's small masks; full: full size",
+        "masks used to measure stability; estimate: the network's small masks; full: full-size masks",
         origin="SAM: full",
     )
     generator: Literal["hilsplat", "official"] = knob(
@@ -236,7 +236,7 @@ class MasksSettings(Section):
     nms_inner: Share = knob(0.5, "threshold for suppressing inner masks", origin="LangSplat")
     graph_scales: tuple[float, float, float] = knob(
         (0.12, 0.04, 0.015),
-        "graph: minimum segment size at whole, part, subpart, as a share of the image side",
+        "graph: minimum segment size of whole, part and subpart, as a share of the image side",
     )
 
 
@@ -278,7 +278,7 @@ class CoverageTreeSettings(Section):
 
     theta: float = knob(
         0.9,
-        "a mask is the child of a mask that covers more than this share of it",
+        "mask A is a child of mask B if B covers more than this share of A",
         unit="share",
         gt=0.5,
         lt=1,
@@ -295,7 +295,7 @@ class ClipSettings(Section):
     )
     crops: Literal["auto", "nodes", "masks"] = knob(
         "auto",
-        "masks to embed; nodes: those showing each node best; masks: all; auto: by autoencoder.targets",
+        "masks to embed; nodes: those showing each node best; masks: all; auto: set by autoencoder.targets",
         origin="paper, LangSplat: masks",
     )
     crops_per_node: int = knob(5, "nodes: maximum number of crops averaged per node", ge=1, le=32)
@@ -311,7 +311,7 @@ class ClipSettings(Section):
     )
     crop: Literal["box", "langsplat"] = knob(
         "box",
-        "box: a mask's entire box, area filter; langsplat: without last row and column, bilinear filter",
+        "box: a mask's entire box, area filter; langsplat: no last row and column, bilinear filter",
         origin="LangSplat",
     )
     background: Literal["black", "keep"] = knob(
@@ -323,10 +323,10 @@ class ClipSettings(Section):
 class ContributionsSettings(Section):
     """Weights of the Gaussians in each mask, with frozen geometry."""
 
-    min_weight: float = knob(1 / 255, "smaller weights of a Gaussian at a pixel are dropped", ge=0, lt=1)
+    min_weight: float = knob(1 / 255, "weights below this (of a Gaussian at a pixel) are dropped", ge=0, lt=1)
     keep: Literal["auto", "gram", "weights", "none"] = knob(
         "auto",
-        "gram: pairs of Gaussians; weights: pixel weights of all views; auto: the one with fewer "
+        "gram: store pairs of Gaussians; weights: store pixel weights of all views; auto: the one with fewer "
         "non-zeros; none: neither, which suffices for a semantic tree without a field",
     )
     device: Literal["auto", "cpu", "cuda"] = knob(
@@ -339,15 +339,15 @@ class SemanticTreeSettings(Section):
 
     evidence: Literal["masks", "features"] = knob(
         "masks",
-        "masks: linked across views; features: Gaussians clustered by features trained with L alone, with "
-        "the weights and readings of section field",
+        "masks: linked across views; features: Gaussians clustered by features, which are trained with only "
+        "the loss L, as set in section field",
         origin="paper: features",
     )
     feature_size: int = knob(6, "features: number of dimensions", ge=2, le=64, origin="OpenGaussian: 6")
     link_threshold: float = knob(0.3, "minimum pooled IoU to join mask clusters", gt=0, lt=1)
     min_views: int = knob(3, "minimum number of views with masks of a node", ge=1)
     parent_coverage: float = knob(
-        0.5, "a node is the child of a coarser node that contains more than this share of it", gt=0, lt=1
+        0.5, "node A is a child of a coarser node B if B contains more than this share of A", gt=0, lt=1
     )
     whole_side: float = knob(
         0.35, "graph: regions that touch in 3D form wholes of up to about this share of a view's side", gt=0
@@ -355,7 +355,7 @@ class SemanticTreeSettings(Section):
 
     @property
     def is_random(self) -> bool:
-        """Whether the tree depends on the seed: features start at random, linked masks do not."""
+        """Whether the tree depends on the seed: features start at random; linking is deterministic."""
         return self.evidence == "features"
 
 
@@ -401,7 +401,7 @@ class FieldSettings(Section):
     )
     part_mode: Literal["literal", "disentangle"] = knob(
         "disentangle",
-        "literal: Eq. 5 as printed; disentangle: parts repel each other, as the paper's text says",
+        "literal: Eq. 5 as printed; disentangle: parts repel each other, as the paper's text states",
         origin="paper: literal",
     )
     omega: float = knob(10.0, "similarity degree Omega: base of distances in L_ins", gt=1, origin="paper: 10")
@@ -415,8 +415,8 @@ class FieldSettings(Section):
     ridge: float = knob(0.1, "weight of the pull towards the initial features, per visible mass", ge=0)
     trainer: Literal["fast", "literal"] = knob(
         "fast",
-        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: the same objective by "
-        "rendering a view for each Adam step (iterations, rate), which takes hours",
+        "fast: sparse products of frozen geometry (cg_steps, lbfgs_steps); literal: the same objective, with "
+        "a rendered view for each Adam step (iterations, rate), which takes hours",
         origin="paper: literal",
     )
     iterations: int = knob(30_000, "steps of the literal trainer, each on one view", ge=1, origin="paper")
@@ -428,13 +428,13 @@ class FieldSettings(Section):
     )
     min_labelled_share: float = knob(
         0.3,
-        "a Gaussian gets a latent at a level if the level's masks contain this share of its weight; 0: all",
+        "a Gaussian gets a latent at a level if masks of that level contain this share of its weight; 0: all",
         ge=0,
         lt=1,
         origin="paper, LangSplat: 0",
     )
     cg_steps: int = knob(6, "conjugate-gradient steps on the quadratic losses", ge=0)
-    lbfgs_steps: int = knob(6, "L-BFGS steps, if L_ins or L_part has a weight", ge=0)
+    lbfgs_steps: int = knob(6, "L-BFGS steps, if the weight of L_ins or L_part is not 0", ge=0)
     min_mask_px: int = knob(50, "minimum area of masks in L_ins and L_part", unit="px", ge=1)
     prune_cosine: Share = knob(
         1.0,
@@ -445,7 +445,7 @@ class FieldSettings(Section):
 
     @property
     def is_random(self) -> bool:
-        """Whether the field depends on the seed: the literal trainer draws views; a start may be random."""
+        """Whether the field depends on the seed: the literal trainer and some starts are random."""
         return self.trainer == "literal" or self.start in ("random", "langsplat")
 
     @model_validator(mode="after")
@@ -474,7 +474,7 @@ class MethodSettings(Section):
     pixel_step: int = knob(2, "trained methods: pixel stride in x and y", ge=1, origin="LangSplat: 1")
     codebook: tuple[Size, Size] = knob(
         (64, 10),
-        "opengaussian: groups by feature and position, and groups by feature within each",
+        "opengaussian: number of groups by feature and position, and of groups by feature within each",
         origin="OpenGaussian: (64, 10) on LERF, (64, 5) on ScanNet",
     )
     thresholds: tuple[Granularity, Granularity, Granularity] | Auto = knob(
@@ -516,21 +516,21 @@ class EvaluateSettings(Section):
         "scale of the threshold; normalised_pm1: maps stretched to [-1, 1], so 0.4 is 70 % of the range",
         origin="LangSplat's code",
     )
-    majority: bool = knob(True, "smooth a map's mask by 7 x 7 px majority vote", origin="LangSplat's code")
+    majority: bool = knob(True, "smooth a map's mask by a 7 x 7 px majority vote", origin="LangSplat's code")
     level_rule: Literal["max", "mean_in_mask"] = knob(
         "max",
-        "level if none is given; max: that of the highest value; mean_in_mask: highest mean in its mask",
+        "level if none is given; max: the one with the highest value; mean_in_mask: highest mean in its mask",
         origin="LangSplat: max",
     )
     node_select: float = knob(
         0.95,
-        "a node is selected with the best if its cosine margin is lower by at most (1 - node_select) times "
+        "a node is also selected if its cosine margin is below the best by at most (1 - node_select) times "
         "the level's range of margins, or three times that if it looks like the best",
         ge=0,
         le=1,
     )
     ancestors: float = knob(
-        0.2, "share of the ancestors' mean margin added to a node's own for ranking", ge=0
+        0.2, "share of the ancestors' mean margin added to a node's margin for ranking", ge=0
     )
     min_region_px: int = knob(60, "minimum area of scored regions", unit="px", ge=1)
     methods: tuple[Literal["tree", "tree-path", "field"], ...] = knob(
@@ -541,7 +541,7 @@ class EvaluateSettings(Section):
     )
     points: Literal["nearest", "vote", "density", "frozen"] = knob(
         "nearest",
-        "Gaussians used for a labelled point; nearest: the nearest opaque one; vote: 5 within "
+        "Gaussians used for a labelled point; nearest: the nearest opaque one; vote: up to 5 within "
         "10 cm; density: the 8 densest; frozen: the one at the point (gaussians.initial: frozen, or your own "
         "PLY with one Gaussian per point)",
         origin="OpenGaussian: frozen",

@@ -12,7 +12,7 @@ def test_edits_of_prose_and_unreached_code_rerun_nothing(copy_of_finished: Proje
         file = copy_of_finished.root / path
         file.write_text(file.read_text() + "\n# a comment\nUNUSED = 1\n")
     copy_of_finished.edit("hilsplat/base/images.py", '"""Reading and', '"""Edited. Reading and')
-    copy_of_finished.edit("hilsplat/settings.py", '"a mask is the child', '"a mask becomes the child')
+    copy_of_finished.edit("hilsplat/settings.py", '"mask A is a child', '"mask A becomes a child')
     assert copy_of_finished.planned() == set()
 
 
