@@ -1,4 +1,4 @@
-"""CLIP with onnxruntime: unit vectors of mask crops and texts in one space."""
+"""CLIP in onnxruntime: unit vectors of mask crops and texts in a shared space."""
 
 import logging
 from functools import cached_property
@@ -27,7 +27,7 @@ MODEL_PATTERNS = ("*/config.json", "*/*/config.json")  # configurations of the m
 
 
 class ClipModel:
-    """A loaded CLIP model; each text replaces `{}` in the prompt template."""
+    """A loaded CLIP model; texts are inserted into the prompt template at `{}`."""
 
     precision: str = "fp32"  # precision of the vision network: "fp32" or "int8"
 
@@ -114,7 +114,7 @@ class ClipModel:
                 f"{what} does not match the CLIP model in {self.model.folder}",
                 expected=f"vectors with {self.width} dimensions, as computed by this model",
                 found=f"{numbers} dimensions",
-                fix="set clip.model to the model it was made with, or rerun the clip stage and later stages",
+                fix="set clip.model to the model that computed it, or rerun the clip stage and later stages",
             )
 
     def prepare(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B 3 side side"]:
@@ -123,7 +123,7 @@ class ClipModel:
         return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
 
     def embed_crops(self, crops: UInt8[np.ndarray, "B side side 3"]) -> Float32[np.ndarray, "B C"]:
-        """Return the unit vectors of square crops of `side_px`."""
+        """Return the unit vectors of square crops with side `side_px`."""
         step = self.crops_per_call or len(crops)
         pieces = np.split(self.prepare(crops), range(step, len(crops), step))
         return unit(np.concatenate([self.vision(**{self.pixels: piece})[0] for piece in pieces]))
@@ -204,8 +204,8 @@ def open_clip_of(clip_folder: Path, template: str = "{}") -> ClipModel:
     """Open the CLIP model that embedded the masks of a clip artifact, even if the model folder was moved.
 
     The model is identified by its digest. The recorded path and every folder in `models/` are searched
-    relative to the working directory, the artifact's parent folders (such as the project of the results) and
-    the installation, then the user's models. The vision network is opened on first use.
+    relative to the working directory, the artifact's parent folders (such as the project folder) and the
+    installation, and then among the user's models. The vision network is opened on first use.
 
     Raises:
         ModelError: no CLIP model has the digest of the model that embedded the masks.

@@ -27,11 +27,11 @@ from hilsplat.settings import ClipSettings
 logger = logging.getLogger(__name__)
 
 SHAPE_TOLERANCE = 0.01
-"""Maximum relative difference between the aspect ratios of maps and view attributed to rounding."""
+"""Maximum relative difference in aspect ratio between maps and view that is attributed to rounding."""
 LEAST_SHARE = 0.5
-"""Share of the training views that must have files; with fewer, the files are likely from another scene."""
+"""Minimum share of training views with files; if fewer, the files probably belong to a different scene."""
 CHECKED_MASKS, LEAST_COSINE = 32, 0.8
-"""Number of masks embedded again as a check, and the minimum median cosine similarity to the vectors read.
+"""Number of masks embedded again as a check, and the minimum median cosine with the vectors in the files.
 The same CLIP model reaches 0.99; a different model of the same width, about 0."""
 MAPS: tuple[Level | None, ...] = (None, Level.SUBPART, Level.PART, Level.WHOLE)
 """Levels of the four maps, in order; the first map mixes all levels."""
@@ -57,11 +57,11 @@ def read_view(
     """Read the masks and vectors of one view, with rows in `content_order`.
 
     The mixed-level map is ignored. Where masks of one level overlap, the files contain only the mask
-    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of another
-    size but the same aspect ratio, such as LangSplat's 1080 rows, are resampled by nearest neighbour.
+    painted last. The files contain no scores, so predicted IoU and stability are set to 1. Maps of a
+    different size but the same aspect ratio, such as LangSplat's 1080 rows, are resampled (nearest pixel).
 
     Raises:
-        ArtifactError: a file is missing, damaged, pickled, or not as described above.
+        ArtifactError: a file is missing, damaged, pickled, or in a different format.
         MisalignedArtifactError: the maps' aspect ratio differs from the view's.
     """
     maps_path, vectors_path = (folder / f"{stem_of(view)}_{kind}.npy" for kind in "sf")
@@ -122,7 +122,7 @@ def _read_all(scene: Scene, folder: Path) -> dict[str, tuple[HierarchicalMasks, 
             lacking,
             expected=", ".join(missing[:5]),
             found=", ".join(sorted(path.name for path in folder.glob("*_s.npy"))[:5]) or "none",
-            fix="pass the language_features folder that LangSplat made from the same images",
+            fix="pass the language_features folder that LangSplat wrote for the same images",
         )
     if missing:
         logger.warning("%s: %s", lacking, ", ".join(missing[:5]))
@@ -147,7 +147,7 @@ def read_masks(scene_folder: Path, files: Path, out: Path) -> None:
 def read_clip(scene_folder: Path, files: Path, out: Path, settings: ClipSettings) -> None:
     """Write LangSplat's vectors in the format of the clip stage: `<view>.npy`, with rows as in `read_masks`.
 
-    A MisalignedArtifactError is raised unless `settings.model`, which embeds texts, computed the vectors.
+    A MisalignedArtifactError is raised unless the vectors are those of `settings.model`, which embeds texts.
     """
     scene = Scene.load(scene_folder)
     model = ClipModel.load(Path(settings.model), variant=settings.variant)
@@ -189,8 +189,8 @@ def _require_model(
     if cosine < LEAST_COSINE:
         raise MisalignedArtifactError(
             f"the vectors in {files} were not computed by the CLIP model in {model.model.folder}",
-            expected=f"a median cosine of at least {LEAST_COSINE} with its own vectors of the same masks",
+            expected=f"a median cosine of at least {LEAST_COSINE} with the model's vectors of the same masks",
             found=f"{cosine:.3f} for {len(rows)} masks of {view}",
-            fix="set clip.model to the model that computed them; LangSplat's is clip-vit-b-16-laion2b: "
-            "hilsplat models get clip-vit-b-16-laion2b",
+            fix="set clip.model to the model that computed them; LangSplat uses clip-vit-b-16-laion2b "
+            "(hilsplat models get clip-vit-b-16-laion2b)",
         )

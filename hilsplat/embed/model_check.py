@@ -17,15 +17,15 @@ from hilsplat.models.store import broken_models, present_models
 from hilsplat.segment.sam import SamModel
 
 CACHE = Path("results/.cache")
-"""Folder for measured timings, and for int8 networks if the folder of the models is read-only."""
+"""Folder for measured timings, and for int8 networks if the models folder is read-only."""
 LARGEST_PROVIDER_DIFFERENCE = 0.02
-"""Maximum relative difference attributed to rounding, such as TF32 products on CUDA."""
+"""Maximum relative difference attributed to rounding, such as that of TF32 products on CUDA."""
 Seconds = dict[str, float]
-"""Timings. SAM: per "image", and per prompt for "masks" and the optional "preview". CLIP: per "crop"."""
+"""Timings (s). SAM: "image" per image; "masks" and optional "preview" per prompt. CLIP: "crop" per crop."""
 
 
 def check_model(folder: Path, variant: str = "") -> str:
-    """Run each network of a model on an empty input, also in int8, and describe the model line by line.
+    """Run each network of a model on a blank input, also in int8, and return a description of the model.
 
     Errors as in `open_model_folder` and `Network`.
     """
@@ -62,7 +62,7 @@ def check_model(folder: Path, variant: str = "") -> str:
 
 
 def check_models() -> tuple[str, int]:
-    """Return the report of `check_model` on every installed model, and the number of broken models."""
+    """Return the `check_model` reports of all installed models, and the number of broken models."""
     texts, num_failed = [], 0
     for folder in [*(model.folder for model in present_models()), *broken_models()]:
         try:
@@ -74,7 +74,7 @@ def check_models() -> tuple[str, int]:
 
 
 def provider_disagreement(folder: Path) -> str | None:
-    """Describe how the image network's output differs between providers on a random image, or return None."""
+    """Return how the image network's output for a random image differs between providers, or None."""
     model = open_model_folder(folder)
     providers = execution_providers()
     if len(providers) < 2:

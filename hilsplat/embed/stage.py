@@ -57,8 +57,8 @@ def run_clip(
         semantic_tree_folder: output of the semantic tree stage, with crop ranks; None to embed every mask.
         out: folder to write: `<view>.npy`, float16 (M, C) unit vectors in the masks' order, zero for masks
             that were not selected, and `index.json` with C and the model.
-        cache: folder of the view cache. Entries accumulate: a run that selects other masks embeds only masks
-            that no earlier run embedded.
+        cache: folder of the view cache. Entries accumulate: a run that selects different masks embeds only
+            those that no earlier run embedded.
         threads: views embedded in parallel, if they fit into memory; the result does not depend on it.
         memory_mib: memory that the stage may use; None for all free memory.
 

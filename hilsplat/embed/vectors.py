@@ -47,6 +47,6 @@ def require_every_vector(vectors: Shaped[np.ndarray, "M C"], clip_folder: Path, 
     if without := int((~vectors.any(axis=1)).sum()):
         raise ArtifactError(
             f"{without} of {len(vectors)} masks have no CLIP vector in {clip_folder}; {purpose} needs all",
-            fix="set clip.crops: masks, and rerun the clip stage; or use the vectors of a variant with "
+            fix="set clip.crops to masks and rerun the clip stage, or use the vectors of a variant with "
             "autoencoder.targets: mask",
         )

@@ -1,4 +1,4 @@
-"""Models by name, the files in their hub repositories, and the choice of files that a model needs."""
+"""Model names, the files in hub repositories, and the choice of the files that a model needs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 """PyTorch weights that can be exported, in order of preference. The second is a pickle, but transformers
 doesn't run code in it (`weights_only`)."""
 SMALL_BYTES = 50_000_000
-"""Text files of a PyTorch model above this size are not part of its tokenizer."""
+"""Text files above this size are not part of a PyTorch model's tokenizer."""
 OUT_OF_REACH = (requests.ConnectionError, requests.Timeout, OfflineModeIsEnabled, LocalEntryNotFoundError)
-"""Errors of the connection to the hub."""
+"""Errors raised if the hub cannot be reached."""
 WHOLES = ("onnx/model", "model")
 """Possible paths, without `.onnx`, of a network that contains both halves of a CLIP model."""
 
@@ -37,7 +37,7 @@ class ModelRequest:
 
     @staticmethod
     def named(name: str, variant: str) -> "ModelRequest":
-        """Find a model by its release name or as owner/name, and refuse any other name."""
+        """Find a model by release name or owner/name; raise a DownloadError for any other name."""
         ending = f"-{variant}" if variant else ""
         for release in RELEASES:
             if name in (release.name, release.repository):
@@ -91,7 +91,7 @@ class Listing:
     files: Mapping[str, HubFile]  # by path
 
     def require(self, *paths: str) -> list[HubFile]:
-        """Return files by path, and refuse a repository that lacks one of them."""
+        """Return files by path; raise a DownloadError if the repository lacks one of them."""
         if missing := [path for path in paths if path not in self.files]:
             raise DownloadError(
                 f"{self.repository} lacks {', '.join(missing)}",
@@ -107,7 +107,7 @@ class Choice:
     """The files to download."""
 
     files: Mapping[str, str]  # path in the repository -> path in the model folder
-    exported: bool = False  # they are PyTorch weights, to be exported as networks
+    exported: bool = False  # the files are PyTorch weights, from which networks are exported
 
 
 def read_listing(repository: str, revision: str | None) -> Listing:
@@ -122,10 +122,10 @@ def read_listing(repository: str, revision: str | None) -> Listing:
     files = {}
     for each in info.siblings or ():
         if each.rfilename.startswith("/") or ".." in each.rfilename.split("/"):
-            continue  # no hub has such a path, and the file would be written outside the folder
+            continue  # valid repositories have no such path; the file would be written outside the folder
         digest = each.lfs.sha256 if each.lfs else each.blob_id
         if digest is None or each.size is None:
-            problem = f"{constants.ENDPOINT} reports no size or digest of {each.rfilename} (?blobs=true)"
+            problem = f"{constants.ENDPOINT} reports no size or digest for {each.rfilename} (?blobs=true)"
             raise DownloadError(problem, fix="unset HF_ENDPOINT, or set it to a complete mirror")
         files[each.rfilename] = HubFile(each.rfilename, each.size, digest)
     licence = getattr(info.card_data, "license", None) or ""

@@ -1,6 +1,6 @@
 """`hilsplat models get`: download of models from the hub; only complete, checked models are installed.
 
-PyTorch weights are exported to ONNX networks by optimum, in a separate process (the extra `export`).
+PyTorch weights are exported to ONNX networks by optimum, in a separate process (install the extra `export`).
 """
 
 import importlib.util
@@ -56,7 +56,7 @@ KEPT = "transferred data is kept, and the transfer resumes"
 WAITS_S = (1.0, 2.0, 4.0, 8.0)
 """Waiting times between attempts to download a file."""
 CUT = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
-"""Errors of a broken connection."""
+"""Errors raised by a broken connection."""
 SPARE_BYTES = 200_000_000
 """Disk space that must remain free after a transfer."""
 EXPORT_FACTOR = 4
@@ -95,13 +95,13 @@ def get_models(
         variant: precision of the networks, such as "quantized" or "fp16"; empty for full precision.
 
     Raises:
-        DownloadError: the hub is unreachable, denies access, lacks files, or sends bytes with a wrong digest.
+        DownloadError: the hub is unreachable, denies access, lacks files, or sends files with wrong digests.
         DiskSpaceError: the disk is full or fills up; transferred data is kept.
         ModelError: a downloaded model does not work, or cannot be exported.
     """
     models = models or user_models()
     if not names:
-        logger.info("the recommended pair: %s", " and ".join(RECOMMENDED))
+        logger.info("downloading the recommended pair: %s", " and ".join(RECOMMENDED))
     if revision is not None and len(names) != 1:
         raise DownloadError(f"--revision requires one model, found {len(names)} names", fix="pass one model")
     prepared, texts = [], []
@@ -179,7 +179,7 @@ def _require_space(prepared: Sequence[Prepared], models: Path) -> None:
 
 
 def _install(found: Prepared) -> str:
-    """Download all files, prepare and check the model folder beside its target, and rename it."""
+    """Download all files, prepare and check the folder next to the target, and rename it to the target."""
     listing, choice = found.listing, found.choice
     for path in track(list(choice.files), f"files of {found.requested.name}"):
         _fetch(listing, listing.files[path], found.staging)
@@ -240,7 +240,7 @@ def _download(listing: Listing, file: HubFile, staging: Path) -> None:
 
 
 def _place(found: Prepared, made: Path, **more: Any) -> str:
-    """Check a folder with all files, write `origin.json` into it, and rename it to the target."""
+    """Check a complete folder, write `origin.json` into it, and rename it to the target."""
     if whole_clip(made) is not None:
         with explain_full_disk(made):
             split_whole(made)
@@ -326,7 +326,7 @@ def _innermost(error: BaseException) -> str:
 
 
 def require_exporter(what: str) -> None:
-    """Refuse to continue without the exporter's packages, before anything is downloaded."""
+    """Raise a ModelError before anything is downloaded if the exporter's packages are not installed."""
     if missing := [name for name in NEEDED if not _is_installed(name)]:
         raise ModelError(
             f"{what} has no ONNX networks, and the packages that export them are not installed",
@@ -345,7 +345,7 @@ def _is_installed(module: str) -> bool:
 
 def export_networks(weights: Path, out: Path) -> dict[str, str]:
     """Export the networks of a SAM or CLIP model saved by transformers; return the packages' versions."""
-    logger.info("exporting to ONNX; this takes minutes and memory of about three times the weights' size")
+    logger.info("exporting to ONNX; this takes minutes, and about three times as much memory as the weights")
     words = ("export", "onnx", "--model", str(weights), "--task", "feature-extraction", str(out))
     done = subprocess.run(
         [sys.executable, "-m", "optimum.commands.optimum_cli", *words],

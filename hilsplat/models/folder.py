@@ -69,7 +69,7 @@ def open_model_folder(
         fix: alternative fix, added to the message about missing files.
 
     Raises:
-        ModelError: the folder or some of its files are missing, or it contains another kind of model.
+        ModelError: the folder or some of its files are missing, or it contains a different kind of model.
     """
     folder = model_path(folder)
     alternative = f", or {fix}" if fix else ""
@@ -97,7 +97,7 @@ def open_model_folder(
 
 
 def _layout_of(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str, Any]]:
-    """Return the layout and configuration of a folder, or raise a ModelError if it is of another kind."""
+    """Return a folder's layout and configuration; raise a ModelError for a different kind of model."""
     supported = "; ".join(SUPPORTED[each] for each in ([kind] if kind else SUPPORTED))
     try:
         config = read_json(folder / "config.json")
@@ -112,7 +112,7 @@ def _layout_of(folder: Path, kind: str | None, fix: str) -> tuple[str, dict[str,
     model_type = config.get("model_type", name)
     if name is None or (kind is not None and LAYOUTS[name].kind != kind):
         raise ModelError(
-            f"model folder {folder} contains another kind of model",
+            f"model folder {folder} contains a different kind of model",
             expected=supported,
             found=f"model_type {model_type!r}",
             fix=OTHER_TYPES.get(str(model_type), fix),
@@ -159,7 +159,7 @@ def variants_of(folder: Path, layout: str) -> list[str]:
 
 
 def _preprocessing_of(path: Path) -> dict[str, Any]:
-    """Read the image preprocessing; keys of open_clip are converted.
+    """Read the image preprocessing settings, and convert open_clip's keys.
 
     A ModelError is raised if the file is unreadable, disables a step, or has an invalid mean or deviation.
     """

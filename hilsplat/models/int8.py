@@ -31,7 +31,7 @@ LEAST = {"mask IoU": 0.98, "cosine": 0.99, "rank correlation": 0.95}
 and rank correlation of `WORDS` by cosine with a crop. Two crops of one object from neighbouring views agree
 less."""
 CHECKED_CROPS, CHECKED_VIEWS, CHECKED_GRID = 16, 2, 5
-"""Numbers of crops for checking a CLIP model, and of views and prompts per side for a SAM model."""
+"""Number of crops used to check a CLIP model; numbers of views and of prompts per side for a SAM model."""
 
 
 def may_be_int8(model: ModelFolder) -> bool:
@@ -52,7 +52,7 @@ def int8_network(
 ) -> Network:
     """Open the int8 version of a model's network, which `hilsplat models get` or the first use computes.
 
-    The int8 version is stored beside the model folder, in `.int8`, under a digest of its source.
+    The int8 version is stored beside the model folder, in `.int8`, named by a digest of its source.
 
     Args:
         cache: folder to use instead if the model's parent folder is read-only.
@@ -107,7 +107,7 @@ def use_int8(
 
     Args:
         what: name of the network in the log.
-        inputs: digests of the model and of the data that `measure` reads, the key of cached results.
+        inputs: digests of the model and of the data that `measure` reads; they are the cache key.
         measure: function that returns the agreement of int8 with float32, by keys of `LEAST`.
     """
     kept = ViewCache(cache / "int8").get(

@@ -20,7 +20,7 @@ class NetworkSpec:
 
 @dataclass(frozen=True)
 class Layout:
-    """File names of a kind of model."""
+    """Networks and file names of a kind of model."""
 
     kind: str  # "sam" for segmentation, "clip" for comparing images with texts
     networks: Mapping[str, NetworkSpec]  # required networks, by the names used in this package
@@ -47,8 +47,8 @@ _MASKS: dict[str, Axes] = {"iou_scores": (None, None, 3), "pred_masks": (None, N
 
 DECODER = "prompt_encoder_mask_decoder"
 PREVIEW = "prompt_encoder_mask_preview"
-"""A decoder with the same predicted IoUs, but only every second row and column of the masks. It detects
-duplicate prompts in a fraction of the decoder's time (`segment.generate`). sam-tiny has one."""
+"""A decoder with the same predicted IoUs, but only every second row and column of the masks. It is used
+to detect duplicate prompts in a fraction of the decoder's time (`segment.generate`). sam-tiny has one."""
 
 
 def _places(name: str) -> tuple[str, ...]:

@@ -113,7 +113,7 @@ class Network:
     def __call__(self, **feeds: np.ndarray) -> list[np.ndarray]:
         """Run the network once, and return the outputs in the order of the spec.
 
-        A ModelError is raised if the network rejects the inputs, or an output has another shape.
+        A ModelError is raised if the network rejects the inputs, or an output has an unexpected shape.
         """
         known = {name: value for name, value in feeds.items() if name in self.inputs}
         cast = {name: np.asarray(value, DTYPES[self.inputs[name].type]) for name, value in known.items()}

@@ -1,4 +1,4 @@
-"""Model folders: released models, models that are present, and the models that `auto` selects.
+"""Model folders: released models, installed models, and the models that `auto` selects.
 
 This module opens no networks, so that importing it to plan a run is fast.
 """
@@ -109,7 +109,7 @@ def model_path(path: str | Path) -> Path:
 
 
 def present_models() -> list[PresentModel]:
-    """Return the installed models, best first: released models in order, others by name, embedded last.
+    """Return the installed models, best first: released models, others by name, then embedded models.
 
     If several folders have the same name, the project's models take precedence, then the user's models, then
     the embedded models of the installation.
@@ -188,7 +188,7 @@ def models_table() -> str:
     lines = ["{:<24} {:<5} {:>8}  {:<11} {:<11} {}".format(*row).rstrip() for row in rows]
     lines += [
         "",
-        "hilsplat models get NAME, or owner/name on the hub; without a name, the recommended pair",
+        "Install: hilsplat models get NAME (or owner/name on the hub); without a name, the recommended pair",
         f"Models are stored in {user_models()}; those in a project's models/ take precedence.",
     ]
     return "\n".join(lines)

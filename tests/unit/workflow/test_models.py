@@ -25,8 +25,8 @@ def test_a_missing_device_is_refused(section):
     [
         ("masks", "models/nope", "model folder models/nope is missing"),
         ("clip", "models/nope", "model folder models/nope is missing"),
-        ("masks", "models/clip-tiny", "contains another kind of model"),
-        ("clip", "models/sam-tiny", "contains another kind of model"),
+        ("masks", "models/clip-tiny", "contains a different kind of model"),
+        ("clip", "models/sam-tiny", "contains a different kind of model"),
         ("clip", "hilsplat", "no readable config.json"),
         ("clip", "models/clip-vit-b-16-laion2b", "hilsplat models get clip-vit-b-16-laion2b"),
     ],
